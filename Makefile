@@ -1,0 +1,120 @@
+# Every task of the project; `make` alone lists them. A task sets up what it needs: Python 3.11 or newer and make are
+# enough. Packages go to .venv, at the versions in requirements.lock, and nothing else is downloaded (but by `make data`).
+
+PYTHON ?= python3
+python := .venv/bin/python
+stems := $(basename $(notdir $(sort $(wildcard notebooks/*.ipynb))))
+full := $(stems:%=results/full/%.ipynb)
+smoke := $(stems:%=results/smoke/%.ipynb)
+sources := $(shell find dbthermal -type f -not -path '*/__pycache__/*') $(wildcard data_manifest.yaml)
+papermill := $(python) -m papermill --kernel python3 --no-progress-bar --log-level WARNING
+
+# A mirror of the outside files is named from here, but read from the notebooks' folder too.
+ifneq ($(strip $(DBTHERMAL_DATA)),)
+mirror := $(shell cd "$(DBTHERMAL_DATA)" && pwd)
+ifeq ($(mirror),)
+$(error Invalid DBTHERMAL_DATA '$(DBTHERMAL_DATA)'. Must name a folder)
+endif
+override DBTHERMAL_DATA := $(mirror)
+endif
+export DBTHERMAL_DATA
+
+# The same warnings, threads and settings on every machine, in this process and in the notebooks' kernels. One thread per
+# linear-algebra call, for the order of a sum must not hang on the number of cores; a user's own settings stay out of it.
+export PYTHONWARNINGS := error::RuntimeWarning
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+export MKL_NUM_THREADS ?= 1
+export IPYTHONDIR := $(CURDIR)/.venv/share/ipython
+export JUPYTER_CONFIG_DIR := $(CURDIR)/.venv/etc/jupyter
+export JUPYTER_DATA_DIR := $(CURDIR)/.venv/share/jupyter
+export MPLCONFIGDIR := $(CURDIR)/.venv/share/matplotlib
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+unexport JUPYTER_PATH MPLBACKEND PYTHONHOME PYTHONPATH
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.PHONY: help install format check types pytest nbval test smoke reproduce verify data bench lock clean FORCE
+
+help: ## list the tasks
+	@awk 'BEGIN { FS = ":.*## " } /^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
+
+install: .venv/installed ## set up the environment in .venv
+
+format: .venv/installed ## format the code and mend what the linter can mend
+	$(python) -m ruff format
+	$(python) -m ruff check --fix
+
+check: .venv/installed ## lint, without changing a file
+	$(python) -m ruff format --check
+	$(python) -m ruff check
+
+types: .venv/installed ## check the types
+	$(python) -m mypy
+
+pytest: .venv/installed ## run the tests alone
+	$(python) -m pytest
+
+nbval: .venv/installed ## run every notebook with its own small values, as a test
+	$(if $(stems),$(python) -m pytest --nbval-lax $(stems:%=notebooks/%.ipynb),@echo "no notebooks")
+
+test: check types pytest nbval ## check everything: lint, types, tests, notebooks
+
+smoke: $(smoke) ## run the notebooks with their own small values into results/smoke
+
+reproduce: $(full) ## run the notebooks in order, with the values in params/, into results/full
+
+verify: .venv/installed ## compare results/full with the stored reference numbers
+	$(python) -m dbthermal.verify
+
+data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
+	$(python) -m dbthermal.manifest
+
+bench: .venv/installed ## measure time and memory
+	$(python) -m pytest -m bench --capture=no
+
+lock: .venv/installed ## write requirements.lock anew from pyproject.toml, keeping the pins that still fit
+	PIP_CONSTRAINT=requirements.lock $(python) -m pip install --quiet uv
+	$(python) -m uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --all-extras --group lock \
+	    --no-annotate --no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock' \
+	    --output-file requirements.lock pyproject.toml
+
+clean: ## remove all that make made: results, environment, caches
+	rm -rf results .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find dbthermal tests notebooks -name __pycache__ -prune -exec rm -rf {} +
+
+# The lock constrains the package's own build too; pip renamed the variable for that.
+.venv/installed: pyproject.toml requirements.lock
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo "Invalid Python '$(PYTHON)'. Must be 3.11 or newer: make PYTHON=python3.12" >&2; exit 1; }
+	"$(PYTHON)" -m venv .venv
+	PIP_CONSTRAINT=requirements.lock PIP_BUILD_CONSTRAINT=requirements.lock \
+	    $(python) -m pip install --quiet --editable '.[notebooks,test]'
+	@touch $@
+
+# Which outside files there are changes the results, so a change of theirs counts as a change of a source.
+inputs := DBTHERMAL_DATA=$(DBTHERMAL_DATA) $(sort $(shell find data -type f 2>/dev/null))
+ifneq ($(inputs),$(shell cat results/inputs.txt 2>/dev/null))
+results/inputs.txt: FORCE
+endif
+results/inputs.txt:
+	@mkdir -p $(@D) && echo '$(inputs)' > $@
+
+# The executed notebook stands for all that it writes: a folder's own time does not change with its content. What an
+# earlier run left goes first. A notebook that fails is kept apart, to be read, and leaves nothing that looks whole.
+define execute
+	@echo "$< -> $@"
+	@mkdir -p $(@D) results/failed && rm -rf $(@D)/$** $(@D)/.$** results/failed/$**
+	@$(papermill) $(1) $< $@ || { mv -f $@ results/failed; rm -rf $(@D)/$**; exit 1; }
+endef
+
+results/full/%.ipynb: notebooks/%.ipynb params/%.yaml $(sources) results/inputs.txt .venv/installed
+	$(call execute,--parameters_file params/$*.yaml)
+
+results/smoke/%.ipynb: notebooks/%.ipynb $(sources) results/inputs.txt .venv/installed
+	$(call execute)
+
+# A notebook may open what an earlier one saved.
+chain = $(if $(previous),$(eval results/$(1)/$(stem).ipynb: results/$(1)/$(previous).ipynb))
+$(foreach stem,$(stems),$(call chain,full)$(call chain,smoke)$(eval previous := $(stem)))

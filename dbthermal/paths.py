@@ -1,0 +1,173 @@
+"""The project's folders, known here only.
+
+A notebook is run from its own folder by one tool and from the project's by another, so nothing
+relies on the current folder: the root is the folder that holds ``data_manifest.yaml``, sought
+upwards. One stem, such as ``03_simulation``, names a notebook, its parameters and all its results::
+
+    root/
+      data_manifest.yaml         manifest()
+      data/                      data()
+      notebooks/NN_name.ipynb    notebook("NN_name")
+      params/NN_name.yaml        params("NN_name")
+      results/<run>/             results(run)
+        NN_name.zarr ...         result(run, "NN_name", ".zarr")
+"""
+
+import re
+from pathlib import Path
+
+_MARKER = "data_manifest.yaml"
+
+
+def root() -> Path:
+    """Folder of the project: the nearest one upwards that holds ``data_manifest.yaml``.
+
+    The search starts in the current folder, so that a checkout finds itself, and then in the folder
+    of this package, so that an editable install is found from anywhere.
+
+    Returns
+    -------
+    Path
+        Absolute, with links resolved.
+
+    Raises
+    ------
+    FileNotFoundError
+        If neither search meets the file; the message names both starts.
+    """
+    starts = [Path.cwd().resolve(), Path(__file__).resolve().parent]
+    for start in starts:
+        for folder in (start, *start.parents):
+            if (folder / _MARKER).is_file():
+                return folder
+    raise FileNotFoundError(
+        f"No {_MARKER} in or above '{starts[0]}', nor '{starts[1]}'. "
+        "Must be run inside the project's folder."
+    )
+
+
+def manifest() -> Path:
+    """List of the outside files, ``data_manifest.yaml``.
+
+    Returns
+    -------
+    Path
+        The file that also marks the root.
+    """
+    return root() / _MARKER
+
+
+def data() -> Path:
+    """Folder for the outside files once fetched; it need not exist.
+
+    Returns
+    -------
+    Path
+        ``data`` below the root, never committed.
+    """
+    return root() / "data"
+
+
+def notebook(stem: str) -> Path:
+    """Notebook of a stem.
+
+    Parameters
+    ----------
+    stem : str
+        Such as ``"03_simulation"``.
+
+    Returns
+    -------
+    Path
+        ``notebooks/<stem>.ipynb`` below the root.
+
+    Raises
+    ------
+    ValueError
+        If `stem` is not two digits and a lower-case name.
+    """
+    name = f"{_stem(stem)}.ipynb"
+    return root() / "notebooks" / name
+
+
+def params(stem: str) -> Path:
+    """Parameters of a notebook's full run.
+
+    Parameters
+    ----------
+    stem : str
+        Such as ``"03_simulation"``.
+
+    Returns
+    -------
+    Path
+        ``params/<stem>.yaml`` below the root.
+
+    Raises
+    ------
+    ValueError
+        If `stem` is not two digits and a lower-case name.
+    """
+    name = f"{_stem(stem)}.yaml"
+    return root() / "params" / name
+
+
+def results(run: str) -> Path:
+    """Folder of one run's results; it need not exist, `store` makes it.
+
+    Parameters
+    ----------
+    run : str
+        ``"full"`` for the values in ``params/``, ``"smoke"`` for the small ones in the notebooks,
+        or a name of one's own.
+
+    Returns
+    -------
+    Path
+        ``results/<run>`` below the root.
+
+    Raises
+    ------
+    ValueError
+        If `run` is not one folder name of lower-case letters, digits, ``-`` and ``_``.
+    """
+    if not re.fullmatch(r"[a-z0-9][a-z0-9_-]*", run):
+        raise ValueError(f"Invalid run {run!r}. Must be lower-case letters, digits, '-' and '_'.")
+    return root() / "results" / run
+
+
+def result(run: str, stem: str, ending: str) -> Path:
+    """File or folder of one result.
+
+    Parameters
+    ----------
+    run : str
+        See `results`.
+    stem : str
+        The notebook that makes the result, such as ``"03_simulation"``.
+    ending : str
+        What follows the stem: ``".zarr"``, ``".json"``, ``"_scene.png"``.
+
+    Returns
+    -------
+    Path
+        ``results/<run>/<stem><ending>`` below the root.
+
+    Raises
+    ------
+    ValueError
+        If `run` or `stem` is not a name as above, or `ending` has no suffix or leads to another
+        folder.
+    """
+    if not re.fullmatch(r"(_[a-z0-9_-]+)?\.[a-z0-9]+", ending):
+        raise ValueError(
+            f"Invalid ending {ending!r}. Must be '.suffix' or '_name.suffix', in lower case."
+        )
+    return results(run) / f"{_stem(stem)}{ending}"
+
+
+def _stem(stem: str) -> str:
+    """Return `stem` if it is one, such as ``"03_simulation"``."""
+    if not re.fullmatch(r"[0-9]{2}_[a-z0-9_]+", stem):
+        raise ValueError(f"Invalid stem {stem!r}. Must be two digits, '_' and a lower-case name.")
+    return stem

@@ -1,0 +1,236 @@
+"""Results on disk: datasets as zarr, headline numbers as JSON, figures as PNG.
+
+Each function writes beside its goal and renames, so that what bears a result's name is whole,
+whatever happens on the way. Each result carries the record of what made it (see
+`dbthermal.provenance`) and nothing that differs between two runs of the same code on the same
+input. No other module opens or writes zarr.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+import xarray as xr
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Number = float | int | str | bool
+
+CHUNK_BYTES = 2**20
+"""Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
+
+
+def chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
+    """Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
+
+    Every stage works pixel by pixel on all frames and bands, so a chunk holds the full story of a
+    nearly square tile of pixels, the smallest that has `CHUNK_BYTES` before compression.
+
+    Parameters
+    ----------
+    variable : Variable or DataArray
+        Of any dims; without both ``y`` and ``x`` it is one chunk.
+
+    Returns
+    -------
+    tuple of int
+        One size [element] per dimension, at least 1.
+    """
+    sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
+    if not {"y", "x"} <= sizes.keys():
+        return tuple(sizes.values())
+    pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
+    pixels = math.ceil(CHUNK_BYTES / pixel_bytes)
+    height = min(sizes["y"], math.ceil(math.sqrt(pixels)))
+    width = min(sizes["x"], math.ceil(pixels / height))
+    sizes |= {"y": min(sizes["y"], math.ceil(pixels / width)), "x": width}
+    return tuple(sizes.values())
+
+
+def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:
+    """Write a dataset as zarr (format 3, not consolidated), in place of what the path held.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Of any stage; it is not changed. Encodings left from an earlier file are not used.
+    path : str or Path
+        Folder to write, ``*.zarr``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.provenance.record`; becomes ``attrs["provenance"]``.
+
+    Raises
+    ------
+    ValueError
+        If `path` does not end in ``.zarr``, or `provenance` holds a number that is not finite.
+    """
+    plain = _with_variable_length_strings(dataset.drop_encoding())
+    plain.attrs = {**dataset.attrs, "provenance": json.loads(_json(provenance))}
+    encoding = {name: {"chunks": chunks(variable)} for name, variable in plain.variables.items()}
+    with _whole(path, ".zarr") as part:
+        plain.to_zarr(part, mode="w-", encoding=encoding, zarr_format=3, consolidated=False)
+
+
+def open_dataset(path: str | Path) -> xr.Dataset:
+    """Open what `save` wrote; values are read when they are used.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``.
+
+    Returns
+    -------
+    Dataset
+        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
+        fixed-length kind.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no folder at `path`.
+    """
+    if not Path(path).is_dir():
+        raise FileNotFoundError(
+            f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
+        )
+    dataset = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
+    return _with_fixed_length_strings(dataset)
+
+
+def save_numbers(
+    numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
+) -> None:
+    """Write a notebook's headline numbers as strict JSON, with sorted names.
+
+    Parameters
+    ----------
+    numbers : mapping
+        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean; NumPy
+        scalars too.
+    path : str or Path
+        File to write, ``*.json``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.provenance.record`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of another type or not finite, or `path` does not end in ``.json``.
+    """
+    content = {
+        "numbers": {name: _number(name, value) for name, value in numbers.items()},
+        "provenance": dict(provenance),
+    }
+    with _whole(path, ".json") as part:
+        part.write_text(_json(content, indent=2) + "\n", encoding="utf-8")
+
+
+def read_numbers(path: str | Path) -> dict[str, Number]:
+    """Read the headline numbers that `save_numbers` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ``*.json``.
+
+    Returns
+    -------
+    dict
+        Name to value.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not strict JSON, or holds no numbers.
+    """
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"Invalid number {constant} in '{path}'. Must be finite.")
+
+    content = json.loads(Path(path).read_text(encoding="utf-8"), parse_constant=refuse)
+    if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
+        raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
+    return {name: _number(name, value) for name, value in content["numbers"].items()}
+
+
+def save_figure(
+    figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
+) -> None:
+    """Write a figure as PNG, the same bytes for the same figure.
+
+    Parameters
+    ----------
+    figure : Figure
+        Of matplotlib; it stays open.
+    path : str or Path
+        File to write, ``*.png``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.provenance.record`; becomes the text chunk ``Comment``, as JSON.
+    dpi : int
+        Resolution [pixel/inch], for that of the figure depends on where it is shown.
+
+    Raises
+    ------
+    ValueError
+        If `path` does not end in ``.png``, or `provenance` holds a number that is not finite.
+    """
+    metadata = {"Software": "dbthermal", "Comment": _json(provenance)}
+    with _whole(path, ".png") as part:
+        figure.savefig(part, dpi=dpi, metadata=metadata)
+
+
+@contextmanager
+def _whole(path: str | Path, suffix: str) -> Iterator[Path]:
+    """Give a place beside `path` to write to; move it there if nothing was raised, else drop it."""
+    path = Path(path)
+    if path.suffix != suffix:
+        raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+        part = Path(folder) / path.name
+        yield part
+        if path.is_dir():  # a folder cannot be renamed onto another
+            path.rename(Path(folder) / "replaced")
+        part.replace(path)
+
+
+def _json(content: Mapping[str, Any], indent: int | None = None) -> str:
+    return json.dumps(content, allow_nan=False, ensure_ascii=True, indent=indent, sort_keys=True)
+
+
+def _number(name: str, value: object) -> Number:
+    """Return a headline value as a plain Python one."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(plain, (bool, int, float, str)):
+        raise TypeError(f"Invalid {name!r} = {value!r}. Must be a number, a string or a boolean.")
+    if isinstance(plain, float) and not math.isfinite(plain):
+        raise ValueError(f"Invalid {name!r} = {value!r}. Must be finite.")
+    return plain
+
+
+def _with_variable_length_strings(dataset: xr.Dataset) -> xr.Dataset:
+    """Convert text to the only kind that zarr's format 3 specifies."""
+    return _with_text_as(dataset, "U", np.dtypes.StringDType())
+
+
+def _with_fixed_length_strings(dataset: xr.Dataset) -> xr.Dataset:
+    """Convert text to the kind that NumPy makes of Python's strings."""
+    return _with_text_as(dataset, "T", np.dtype(str))
+
+
+def _with_text_as(dataset: xr.Dataset, kind: str, dtype: np.dtype[Any]) -> xr.Dataset:
+    texts = {
+        name: (variable.dims, variable.to_numpy().astype(object).astype(dtype), variable.attrs)
+        for name, variable in dataset.variables.items()
+        if variable.dtype.kind == kind
+    }
+    return dataset.assign(texts)

@@ -1,0 +1,68 @@
+"""An import points strictly down the layers; the heavy and the optional have one place each."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import dbthermal
+
+PACKAGE = Path(dbthermal.__file__).parent
+LAYERS = (
+    "paths schema planck heat mixing smooth",
+    "response bands frames alignment noise metrics figures store provenance manifest readers",
+    "calibration emissivity separation",
+    "simulation verify",
+)
+LEVEL = {module: level for level, row in enumerate(LAYERS) for module in row.split()}
+ONE_PLACE = {"zarr": "store", "av": "readers", "pooch": "manifest"}
+
+
+def imports() -> Iterator[tuple[str, str]]:
+    """Yield (module, what it imports) for every import in the package, inside functions too."""
+    for path in PACKAGE.rglob("*.py"):
+        module = path.relative_to(PACKAGE).with_suffix("").parts[0]
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                yield from ((module, alias.name) for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                yield from ((module, f"{node.module}.{alias.name}") for alias in node.names)
+
+
+def inner_imports() -> set[tuple[str, str]]:
+    """Pairs of two different modules of this package; those of one family count as one module."""
+    names = ((module, target.split(".")) for module, target in imports())
+    pairs = {(module, name[1]) for module, name in names if name[0] == "dbthermal" and name[1:]}
+    return {(module, target) for module, target in pairs if target not in {module, "__version__"}}
+
+
+def test_every_module_has_a_layer() -> None:
+    """A module is placed before it is used."""
+    modules = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
+    assert modules - {"__init__", "__pycache__"} <= LEVEL.keys()
+
+
+def test_imports_point_strictly_down() -> None:
+    """No module imports from its own layer or from above; the package itself imports none."""
+    wrong = {pair for pair in inner_imports() if LEVEL.get(pair[0], -1) <= LEVEL[pair[1]]}
+    assert wrong == set()
+
+
+def test_optional_packages_have_one_place() -> None:
+    """Zarr, the video codec and the downloader are each behind one module."""
+    places = [(target.split(".")[0], module) for module, target in imports()]
+    assert {pair for pair in places if ONE_PLACE.get(pair[0], pair[1]) != pair[1]} == set()
+
+
+def test_only_store_opens_zarr() -> None:
+    """A folder in zarr's format is opened and written in one module."""
+    texts = {path.stem: path.read_text(encoding="utf-8") for path in PACKAGE.rglob("*.py")}
+    assert {name for name, text in texts.items() if "_zarr(" in text} == {"store"}
+
+
+def test_importing_the_package_is_light() -> None:
+    """`import dbthermal` loads nothing that a program may not need or have."""
+    code = "import sys, dbthermal; print({'torch', 'usb', 'serial', 'matplotlib'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
