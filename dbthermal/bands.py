@@ -1,0 +1,224 @@
+"""Spectral bands, and the exact pair temperature <-> in-band radiance.
+
+A band is a top hat between two edges, which is how the paper names its filters (centre and full
+width at half maximum). `Band.radiance` and `Band.temperature` are inverses of one another to
+rounding, because the second solves the first and uses no table.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal import planck
+
+Array = npt.NDArray[np.float64]
+
+TEMPERATURE_RANGE: Final = (100.0, 2000.0)
+"""Temperatures [K] between which the pair radiance, temperature is defined."""
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
+_NEWTON_STEPS = 50
+
+
+@dataclass(frozen=True)
+class Band:
+    """
+    A spectral band with a top-hat transmission.
+
+    Attributes
+    ----------
+    name : str
+        Label used on the `band` dimension.
+    lower, upper : float
+        Edges [m].
+    """
+
+    name: str
+    lower: float
+    upper: float
+
+    def __post_init__(self) -> None:
+        """Refuse edges that are not a band."""
+        if not 0 < self.lower < self.upper < np.inf:
+            raise ValueError(
+                f"Invalid edges {self.lower} m, {self.upper} m of band '{self.name}'. "
+                "Must be finite with 0 < lower < upper."
+            )
+
+    @property
+    def centre(self) -> float:
+        """Central wavelength [m]."""
+        return 0.5 * (self.lower + self.upper)
+
+    @property
+    def width(self) -> float:
+        """Full width at half maximum [m]."""
+        return self.upper - self.lower
+
+    def nodes(self) -> tuple[Array, Array]:
+        r"""
+        Gauss-Legendre nodes and weights for integrals over the band.
+
+        Returns
+        -------
+        tuple of ndarray
+            Wavelengths (node) [m], increasing, and weights (node) [m]; the weights add up to
+            the band's width. With 40 nodes the integral of Planck's law over 8-14 um is exact
+            to rounding.
+        """
+        return self.centre + 0.5 * self.width * _NODES, 0.5 * self.width * _WEIGHTS
+
+    def radiance(self, temperature: npt.ArrayLike) -> Array:
+        r"""
+        In-band radiance of a blackbody.
+
+        .. math:: B(T) = \int_{\lambda_l}^{\lambda_u} L(\lambda, T) \, d\lambda
+
+        Parameters
+        ----------
+        temperature : array_like
+            Temperature [K], any shape.
+
+        Returns
+        -------
+        ndarray
+            Radiance [W m^-2 sr^-1], same shape.
+
+        Raises
+        ------
+        ValueError
+            If a temperature lies outside `TEMPERATURE_RANGE`.
+        """
+        temperature = self._within_range(np.asarray(temperature, dtype=np.float64))
+        return self._integral(planck.spectral_radiance, temperature)
+
+    def slope(self, temperature: npt.ArrayLike) -> Array:
+        r"""
+        Derivative of the in-band radiance, :math:`dB/dT`.
+
+        Parameters
+        ----------
+        temperature : array_like
+            Temperature [K].
+
+        Returns
+        -------
+        ndarray
+            Slope [W m^-2 sr^-1 K^-1], same shape.
+
+        Raises
+        ------
+        ValueError
+            If a temperature lies outside `TEMPERATURE_RANGE`.
+        """
+        temperature = self._within_range(np.asarray(temperature, dtype=np.float64))
+        return self._integral(planck.spectral_radiance_slope, temperature)
+
+    def temperature(self, radiance: npt.ArrayLike) -> Array:
+        r"""
+        Temperature of the blackbody with a given in-band radiance: the inverse of `radiance`.
+
+        Newton's method on :math:`\ln B` as a function of :math:`1/T`, nearly a straight line,
+        run until the temperature no longer changes.
+
+        Parameters
+        ----------
+        radiance : array_like
+            In-band radiance [W m^-2 sr^-1], any shape.
+
+        Returns
+        -------
+        ndarray
+            Temperature [K], same shape.
+
+        Raises
+        ------
+        ValueError
+            If a radiance is not that of a temperature within `TEMPERATURE_RANGE`.
+        """
+        radiance = np.asarray(radiance, dtype=np.float64)
+        lowest, highest = self.radiance(np.array(TEMPERATURE_RANGE))
+        bad = ~((radiance >= lowest) & (radiance <= highest))
+        if np.any(bad):
+            raise ValueError(
+                f"Invalid radiance {radiance[bad].flat[0]} W m-2 sr-1 in band '{self.name}'. "
+                f"Must lie in [{lowest:.6g}, {highest:.6g}], the radiances of "
+                f"{TEMPERATURE_RANGE[0]} to {TEMPERATURE_RANGE[1]} K."
+            )
+        inverse = 1.0 / planck.brightness_temperature(self.centre, radiance / self.width)
+        for _ in range(_NEWTON_STEPS):
+            temperature = 1.0 / inverse
+            value = self._integral(planck.spectral_radiance, temperature)
+            slope = self._integral(planck.spectral_radiance_slope, temperature)
+            step = np.log(radiance / value) * value / slope / temperature**2
+            inverse = inverse - step
+            if np.all(np.abs(step) <= 4.0 * np.finfo(np.float64).eps * inverse):
+                return 1.0 / inverse
+        raise RuntimeError(
+            f"No convergence in band '{self.name}' after {_NEWTON_STEPS} Newton steps."
+        )
+
+    def _integral(self, function: planck.Spectral, temperature: Array) -> Array:
+        # One pass a node instead of a (..., node) array: whole images fit in memory.
+        total = np.zeros_like(temperature)
+        for wavelength, weight in zip(*self.nodes(), strict=True):
+            total += weight * function(wavelength, temperature)
+        return total
+
+    def _within_range(self, temperature: Array) -> Array:
+        lowest, highest = TEMPERATURE_RANGE
+        bad = ~((temperature >= lowest) & (temperature <= highest))
+        if np.any(bad):
+            raise ValueError(
+                f"Invalid temperature {temperature[bad].flat[0]} K in band '{self.name}'. "
+                f"Must lie in [{lowest}, {highest}] K."
+            )
+        return temperature
+
+
+def _filter(name: str, centre_um: float, fwhm_um: float) -> Band:
+    return Band(name, (centre_um - 0.5 * fwhm_um) * 1e-6, (centre_um + 0.5 * fwhm_um) * 1e-6)
+
+
+FILTERS: Final[Mapping[str, Band]] = MappingProxyType(
+    {
+        band.name: band
+        for band in (
+            Band("8-14", 8e-6, 14e-6),
+            _filter("8.5", 8.5, 0.5),
+            _filter("9.5", 9.5, 0.5),
+            _filter("10.6", 10.6, 1.5),
+            _filter("12.1", 12.1, 0.5),
+        )
+    }
+)
+"""The camera's own band and the four filters of the paper (section 5, experimental setup;
+doi:10.48550/arXiv.2509.11334): centre and full width at half maximum, as top hats."""
+
+
+def get(name: str) -> Band:
+    """
+    Return one of `FILTERS` by its name.
+
+    Parameters
+    ----------
+    name : str
+        Name of the band, e.g. "9.5".
+
+    Returns
+    -------
+    Band
+        The band.
+
+    Raises
+    ------
+    KeyError
+        If there is no such band; the error lists those that exist.
+    """
+    if name not in FILTERS:
+        raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(FILTERS)}.")
+    return FILTERS[name]

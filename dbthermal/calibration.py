@@ -1,0 +1,326 @@
+"""Calibration: the camera's response per band from blackbodies, and emissivity by contact.
+
+The response is the four-parameter Sakuma-Hattori curve beside the paper's linear pair. The
+emissivity of a material follows from thermocouple and blackbody readings, with its uncertainty.
+"""
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.optimize import least_squares
+
+from dbthermal import planck, schema
+from dbthermal import response as responses
+
+Array = npt.NDArray[np.float64]
+
+AMBIENT: Final = 298.15
+"""Ambient temperature [K]; a response refers to the calibrated temperature nearest to it."""
+
+MINIMUM_TEMPERATURES: Final = 4
+"""Fewest blackbody temperatures: the Sakuma-Hattori curve has four parameters."""
+
+_WAVELENGTH_BOUNDS: Final = (1e-6, 3e-5)
+_SHIFT_BOUNDS: Final = (-2e-3, 2e-3)
+_WAVELENGTH_SCALE: Final = 1e-6
+_SHIFT_SCALE: Final = 1e-4
+_ITERATIONS: Final = 50
+
+
+def fit_response(
+    counts: xr.DataArray,
+    noise: xr.DataArray | None = None,
+    *,
+    linear_range: tuple[float, float] | None = None,
+) -> xr.Dataset:
+    r"""
+    Fit the response of each band to blackbody measurements.
+
+    .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
+
+    C and O enter linearly and are eliminated; A and B are found by nonlinear least squares. The
+    linear pair is the least-squares line.
+
+    Parameters
+    ----------
+    counts : DataArray
+        Mean counts (band, temperature) [count] of a blackbody, `temperature` [K] increasing, at
+        least four.
+    noise : DataArray, optional
+        Standard deviation of one pixel's counts from frame to frame, (band) [count]. If given,
+        the response keeps it, and its NETD.
+    linear_range : tuple of float, optional
+        Temperatures [K] between which the line is fitted; all if not given.
+
+    Returns
+    -------
+    Dataset
+        Stage `response` of `schema`: `amplitude` C, `effective_wavelength` A,
+        `wavelength_shift` B, `offset` O, `linear_slope` a, `linear_intercept` b (band);
+        `residual`, `linear_residual` (band, temperature) [count] and the measured `counts`;
+        `reference_temperature`, `temperature_min`, `temperature_max` [K]; and, with a noise,
+        `noise` (band) [count] and `netd` (band) [K].
+
+    Raises
+    ------
+    TypeError
+        If the counts are not a DataArray of numbers.
+    ValueError
+        If dims, units or order are wrong, there are too few temperatures, a value is NaN, counts
+        do not grow with temperature, or the noise does not fit the bands or is not positive.
+
+    References
+    ----------
+    .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
+       Industry 5, 421-427
+    .. [2] Golub, Pereyra (2003), Separable nonlinear least squares, Inverse Problems 19, R1,
+       doi:10.1088/0266-5611/19/2/201
+    """
+    _check_blackbody(counts)
+    names = [str(name) for name in counts["band"].values]
+    temperature = counts["temperature"].values.astype(np.float64)
+    values = counts.values.astype(np.float64)
+    line = _linear_mask(temperature, linear_range)
+    rows = [_fit_band(temperature, row, line) for row in values]
+    parameters = [*responses.COEFFICIENTS, "linear_slope", "linear_intercept"]
+    stage = schema.STAGES["response"]
+    variables: dict[str, xr.DataArray] = {
+        name: xr.DataArray([row[index] for row in rows], dims="band", attrs=stage[name].attrs)
+        for index, name in enumerate(parameters)
+    }
+    scalars = {
+        "reference_temperature": temperature[np.argmin(np.abs(temperature - AMBIENT))],
+        "temperature_min": temperature[0],
+        "temperature_max": temperature[-1],
+    }
+    for name, value in scalars.items():
+        variables[name] = xr.DataArray(value, attrs=stage[name].attrs)
+    result = xr.Dataset(variables, coords={"band": names, "temperature": temperature})
+    result["temperature"].attrs.update(units="K", long_name="blackbody temperature")
+    result["counts"] = (("band", "temperature"), values, {"units": "count"})
+    for name, kind in (("residual", "exact"), ("linear_residual", "linear")):
+        fitted = np.stack(
+            [responses.curve(result, band, kind).counts(temperature) for band in names]
+        )
+        result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
+    return result if noise is None else _with_noise(result, noise)
+
+
+def _check_blackbody(counts: xr.DataArray) -> None:
+    if not isinstance(counts, xr.DataArray):
+        raise TypeError(f"Invalid counts of type {type(counts).__name__}. Must be a DataArray.")
+    schema.check_variable(counts, schema.STAGES["blackbody"]["counts"], "the blackbody counts")
+    temperature = planck.require_positive("temperature [K]", counts["temperature"].values)
+    if temperature.size < MINIMUM_TEMPERATURES:
+        raise ValueError(
+            f"Invalid number of blackbody temperatures {temperature.size}. "
+            f"Must be at least {MINIMUM_TEMPERATURES}."
+        )
+    for name, row in zip(counts["band"].values, counts.values, strict=True):
+        if not np.all(np.isfinite(row)):
+            raise ValueError(f"Invalid counts in band '{name}': NaN or infinite. Must be finite.")
+        falls = np.diff(row) <= 0
+        if np.any(falls):
+            place = int(np.argmax(falls))
+            raise ValueError(
+                f"Invalid counts {row[place + 1]} at {temperature[place + 1]} K in band '{name}', "
+                f"after {row[place]} at {temperature[place]} K. Must grow with temperature."
+            )
+
+
+def _linear_mask(
+    temperature: Array, linear_range: tuple[float, float] | None
+) -> npt.NDArray[np.bool_]:
+    if linear_range is None:
+        return np.ones(temperature.shape, dtype=bool)
+    lowest, highest = linear_range
+    inside = (temperature >= lowest) & (temperature <= highest)
+    if inside.sum() < 2:
+        raise ValueError(
+            f"Invalid linear_range ({lowest}, {highest}) K with {inside.sum()} of the blackbody "
+            "temperatures. Must hold at least two."
+        )
+    return np.asarray(inside)
+
+
+def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) -> tuple[float, ...]:
+    """Amplitude, effective wavelength, shift, offset, linear slope and intercept of one band."""
+
+    def linear_part(shape: Array) -> tuple[Array, Array]:
+        scale = shape[0] * _WAVELENGTH_SCALE * temperature + shape[1] * _SHIFT_SCALE
+        planckian = 1.0 / np.expm1(planck.SECOND_RADIATION_CONSTANT / scale)
+        # Centred and scaled columns: the amplitude is 1e5 or more, the offset any size.
+        centred = planckian - planckian.mean()
+        slope = centred @ (counts - counts.mean()) / (centred @ centred)
+        amplitude, offset = slope, counts.mean() - slope * planckian.mean()
+        return np.array([amplitude, offset]), amplitude * planckian + offset - counts
+
+    lower = [_WAVELENGTH_BOUNDS[0] / _WAVELENGTH_SCALE, _SHIFT_BOUNDS[0] / _SHIFT_SCALE]
+    upper = [_WAVELENGTH_BOUNDS[1] / _WAVELENGTH_SCALE, _SHIFT_BOUNDS[1] / _SHIFT_SCALE]
+    span = counts[-1] - counts[0]
+    found = least_squares(
+        lambda shape: linear_part(shape)[1] / span,
+        [10.0, 0.0],
+        bounds=(lower, upper),
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+        max_nfev=1000,
+    )
+    amplitude, offset = linear_part(found.x)[0]
+    slope, intercept = (
+        np.polynomial.Polynomial.fit(temperature[line], counts[line], 1).convert().coef[::-1]
+    )
+    wavelength, shift = found.x[0] * _WAVELENGTH_SCALE, found.x[1] * _SHIFT_SCALE
+    return (amplitude, wavelength, shift, offset, slope, intercept)
+
+
+def _with_noise(response: xr.Dataset, noise: xr.DataArray) -> xr.Dataset:
+    """Add noise and NETD (noise over slope at the reference temperature)."""
+    names = [str(name) for name in response["band"].values]
+    if not isinstance(noise, xr.DataArray):
+        raise TypeError(f"Invalid noise of type {type(noise).__name__}. Must be a DataArray.")
+    if noise.dims != ("band",):
+        raise ValueError(f"Invalid dims {noise.dims} of the noise. Must be ('band',).")
+    if noise.attrs.get("units", "count") != "count":
+        raise ValueError(f"Invalid units '{noise.attrs['units']}' of the noise. Must be 'count'.")
+    known = [str(name) for name in noise["band"].values] if "band" in noise.coords else []
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise ValueError(f"Missing band '{missing[0]}' of the noise. Has {known}.")
+    values = noise.values[[known.index(name) for name in names]].astype(np.float64)
+    if not np.all(np.isfinite(values) & (values > 0)):
+        raise ValueError(f"Invalid noise {values} count. Must be finite and positive.")
+    slopes = np.array([responses.curve(response, name).reference_slope for name in names])
+    return response.assign(
+        noise=("band", values, {"units": "count", "long_name": "noise of one pixel and frame"}),
+        netd=("band", values / slopes, {"units": "K", "long_name": "NETD"}),
+    )
+
+
+def fit_emissivity(
+    counts: xr.DataArray,
+    object_temperature: xr.DataArray,
+    background_temperature: xr.DataArray,
+    response: xr.Dataset,
+    *,
+    object_temperature_std: float,
+    background_temperature_std: float,
+) -> xr.Dataset:
+    r"""
+    Emissivity of a material per band, by contact thermometry and a reflected blackbody.
+
+    Each measurement i has counts :math:`I_i`, the object's temperature by thermocouple and the
+    reflected blackbody's temperature (equation 10 of the paper [1]_, by least squares):
+
+    .. math:: I_i - U(T_{b,i}) = e \, (U(T_{o,i}) - U(T_{b,i}))
+
+    weighted by the variance of both sides,
+    :math:`s_i^2 = s_I^2 + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2`, iterated in e.
+
+    Parameters
+    ----------
+    counts : DataArray
+        Counts of the material, (band, measurement) [count].
+    object_temperature, background_temperature : DataArray
+        (measurement) [K], within the response's range.
+    response : Dataset
+        From `fit_response`, with its noise.
+    object_temperature_std, background_temperature_std : float
+        Standard deviation of one reading of the thermocouple and of the blackbody [K].
+
+    Returns
+    -------
+    Dataset
+        `emissivity`, `emissivity_std` (band) [1]; `reduced_chi2` (band) [1], near 1 if the
+        uncertainties are honest; `residual` (band, measurement) [count].
+
+    Raises
+    ------
+    ValueError
+        If dims or sizes differ, a temperature lies outside the response, the response has no
+        noise, a deviation is not positive, or object and background never differ by more than
+        three standard deviations of their difference.
+
+    References
+    ----------
+    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334
+    .. [2] ISO 18434-1:2008, Condition monitoring and diagnostics of machines, Thermography
+    """
+    _check_measurements(counts, object_temperature, background_temperature, response)
+    planck.require_positive("object_temperature_std [K]", object_temperature_std)
+    planck.require_positive("background_temperature_std [K]", background_temperature_std)
+    contrast = np.abs(object_temperature.values - background_temperature.values).max()
+    least = 3.0 * float(np.hypot(object_temperature_std, background_temperature_std))
+    if not contrast > least:
+        raise ValueError(
+            f"Invalid contrast {contrast} K between object and background. Must exceed {least} K, "
+            "three standard deviations of the difference, in some measurement."
+        )
+    names = [str(name) for name in counts["band"].values]
+    stds = (object_temperature_std, background_temperature_std)
+    fits = []
+    for index, name in enumerate(names):
+        curve = responses.curve(response, name)
+        warm = responses.require_range(object_temperature.values, curve, "object temperature")
+        cold = responses.require_range(background_temperature.values, curve, "background")
+        noise = float(response["noise"].sel(band=name))
+        fits.append(_fit_one_emissivity(curve, counts.values[index], (warm, cold), stds, noise))
+    value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
+    unit = {"units": "1"}
+    return xr.Dataset(
+        {
+            "emissivity": ("band", value, unit),
+            "emissivity_std": ("band", std, unit),
+            "reduced_chi2": ("band", chi2, unit),
+            "residual": (("band", "measurement"), residual, {"units": "count"}),
+        },
+        coords={"band": names},
+    )
+
+
+def _check_measurements(
+    counts: xr.DataArray, warm: xr.DataArray, cold: xr.DataArray, response: xr.Dataset
+) -> None:
+    if counts.dims != ("band", "measurement"):
+        raise ValueError(f"Invalid dims {counts.dims} of counts. Must be ('band', 'measurement').")
+    for name, array in (("object_temperature", warm), ("background_temperature", cold)):
+        if array.dims != ("measurement",) or array.size != counts.sizes["measurement"]:
+            raise ValueError(
+                f"Invalid {name} {dict(array.sizes)}. Must be (measurement) with "
+                f"{counts.sizes['measurement']} values."
+            )
+    if counts.sizes["measurement"] < 2:
+        raise ValueError("Invalid number of measurements 1. Must be at least 2.")
+    if not np.all(np.isfinite(counts.values)):
+        raise ValueError("Invalid counts: NaN or infinite. Must be finite.")
+    if "noise" not in response:
+        raise ValueError("Missing noise of the response. Must be given to fit_response.")
+
+
+def _fit_one_emissivity(
+    curve: responses.Curve,
+    counts: Array,
+    temperatures: tuple[Array, Array],
+    stds: tuple[float, float],
+    noise: float,
+) -> tuple[float, float, float, Array]:
+    """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""
+    warm, cold = (curve.counts(temperature) for temperature in temperatures)
+    warm_std, cold_std = (
+        curve.count_slope(temperature) * std
+        for temperature, std in zip(temperatures, stds, strict=True)
+    )
+    across, up = warm - cold, counts - cold
+    emissivity = across @ up / (across @ across)
+    for _ in range(_ITERATIONS):
+        variance = noise**2 + (emissivity * warm_std) ** 2 + ((1 - emissivity) * cold_std) ** 2
+        weights = across / variance
+        previous, emissivity = emissivity, (weights @ up) / (weights @ across)
+        if abs(emissivity - previous) < 1e-12:
+            break
+    residual = up - emissivity * across
+    chi2 = np.sum(residual**2 / variance) / (counts.size - 1)
+    return float(emissivity), float((weights @ across) ** -0.5), float(chi2), residual

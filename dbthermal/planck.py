@@ -1,0 +1,146 @@
+"""Planck's law: spectral radiance of a blackbody, its derivative and its exact inverse.
+
+All functions take wavelength in metres and temperature in kelvin, broadcast, and work in SI
+units. The constants are the exact ones of the 2019 SI, from `scipy.constants`.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+from scipy import constants
+
+FIRST_RADIATION_CONSTANT: float = 2.0 * constants.h * constants.c**2
+"""2 h c^2, first radiation constant for radiance [W m^2 sr^-1]."""
+
+SECOND_RADIATION_CONSTANT: float = constants.h * constants.c / constants.k
+"""h c / k, second radiation constant [m K]."""
+
+Array = npt.NDArray[np.float64]
+Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
+
+
+def require_positive(name: str, value: npt.ArrayLike) -> Array:
+    """
+    Return a float array of which every element is finite and positive.
+
+    Parameters
+    ----------
+    name : str
+        What the value is, for the error.
+    value : array_like
+        The value, in any unit.
+
+    Returns
+    -------
+    ndarray
+        The value as float64, same shape.
+
+    Raises
+    ------
+    ValueError
+        If an element is NaN, infinite, zero or negative; the error names the first such element.
+    """
+    array = np.asarray(value, dtype=np.float64)
+    bad = ~(np.isfinite(array) & (array > 0))
+    if np.any(bad):
+        raise ValueError(f"Invalid {name} {array[bad].flat[0]}. Must be finite and positive.")
+    return array
+
+
+def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
+    r"""
+    Spectral radiance of a blackbody.
+
+    .. math:: L(\lambda, T) = \frac{2 h c^2}{\lambda^5 (\exp(c_2 / \lambda T) - 1)}
+
+    The first equation of the paper [1]_ has the factor :math:`\lambda^5` and the :math:`-1` on
+    one level of the denominator; this is the law as Planck gave it.
+
+    Parameters
+    ----------
+    wavelength : array_like
+        Wavelength [m], broadcast against the temperature.
+    temperature : array_like
+        Temperature [K].
+
+    Returns
+    -------
+    ndarray
+        Spectral radiance [W m^-2 sr^-1 m^-1], of the broadcast shape.
+
+    Raises
+    ------
+    ValueError
+        If a wavelength or a temperature is not finite and positive.
+
+    References
+    ----------
+    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
+       arXiv, doi:10.48550/arXiv.2509.11334
+    """
+    wavelength = require_positive("wavelength [m]", wavelength)
+    temperature = require_positive("temperature [K]", temperature)
+    exponent = SECOND_RADIATION_CONSTANT / (wavelength * temperature)
+    # exp(-x) / (1 - exp(-x)) in place of 1 / (exp(x) - 1): no overflow on the Wien side.
+    factor = FIRST_RADIATION_CONSTANT / wavelength**5
+    return np.asarray(factor * np.exp(-exponent) / -np.expm1(-exponent))
+
+
+def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
+    r"""
+    Derivative of the blackbody's spectral radiance with temperature.
+
+    .. math:: \frac{\partial L}{\partial T} = L \, \frac{x}{T (1 - e^{-x})}, \quad
+              x = c_2 / \lambda T
+
+    Parameters
+    ----------
+    wavelength : array_like
+        Wavelength [m].
+    temperature : array_like
+        Temperature [K].
+
+    Returns
+    -------
+    ndarray
+        Slope [W m^-2 sr^-1 m^-1 K^-1].
+
+    Raises
+    ------
+    ValueError
+        As `spectral_radiance`.
+    """
+    radiance = spectral_radiance(wavelength, temperature)
+    temperature = np.asarray(temperature, dtype=np.float64)
+    exponent = SECOND_RADIATION_CONSTANT / (np.asarray(wavelength) * temperature)
+    return np.asarray(radiance * exponent / (temperature * -np.expm1(-exponent)))
+
+
+def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -> Array:
+    r"""
+    Temperature of the blackbody with a given spectral radiance: the exact inverse.
+
+    .. math:: T = \frac{c_2}{\lambda \ln(1 + 2 h c^2 / \lambda^5 L)}
+
+    Parameters
+    ----------
+    wavelength : array_like
+        Wavelength [m].
+    radiance : array_like
+        Spectral radiance [W m^-2 sr^-1 m^-1].
+
+    Returns
+    -------
+    ndarray
+        Temperature [K].
+
+    Raises
+    ------
+    ValueError
+        If a wavelength or a radiance is not finite and positive.
+    """
+    wavelength = require_positive("wavelength [m]", wavelength)
+    radiance = require_positive("spectral radiance [W m^-2 sr^-1 m^-1]", radiance)
+    ratio = FIRST_RADIATION_CONSTANT / (wavelength**5 * radiance)
+    return np.asarray(SECOND_RADIATION_CONSTANT / (wavelength * np.log1p(ratio)))
