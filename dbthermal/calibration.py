@@ -201,13 +201,7 @@ def _with_noise(response: xr.Dataset, noise: xr.DataArray) -> xr.Dataset:
 
 
 def fit_emissivity(
-    counts: xr.DataArray,
-    object_temperature: xr.DataArray,
-    background_temperature: xr.DataArray,
-    response: xr.Dataset,
-    *,
-    object_temperature_std: float,
-    background_temperature_std: float,
+    measured: xr.Dataset, response: xr.Dataset, reading_std: tuple[float, float]
 ) -> xr.Dataset:
     r"""
     Emissivity of a material per band, by contact thermometry and a reflected blackbody.
@@ -222,13 +216,13 @@ def fit_emissivity(
 
     Parameters
     ----------
-    counts : DataArray
-        Counts of the material, (band, measurement) [count].
-    object_temperature, background_temperature : DataArray
-        (measurement) [K], within the response's range.
+    measured : Dataset
+        `counts` of the material (band, measurement) [count]; `object_temperature` by the
+        thermocouple and `background_temperature` of the blackbody (measurement) [K], within the
+        response's range.
     response : Dataset
         From `fit_response`, with its noise.
-    object_temperature_std, background_temperature_std : float
+    reading_std : tuple of float
         Standard deviation of one reading of the thermocouple and of the blackbody [K].
 
     Returns
@@ -249,25 +243,27 @@ def fit_emissivity(
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334
     .. [2] ISO 18434-1:2008, Condition monitoring and diagnostics of machines, Thermography
     """
-    _check_measurements(counts, object_temperature, background_temperature, response)
-    planck.require_positive("object_temperature_std [K]", object_temperature_std)
-    planck.require_positive("background_temperature_std [K]", background_temperature_std)
-    contrast = np.abs(object_temperature.values - background_temperature.values).max()
-    least = 3.0 * float(np.hypot(object_temperature_std, background_temperature_std))
+    _check_measurements(measured, response)
+    stds = planck.require_positive("reading_std [K]", reading_std)
+    warm, cold = (
+        measured[name].values.astype(np.float64)
+        for name in ("object_temperature", "background_temperature")
+    )
+    contrast, least = np.abs(warm - cold).max(), 3.0 * float(np.hypot(*stds))
     if not contrast > least:
         raise ValueError(
             f"Invalid contrast {contrast} K between object and background. Must exceed {least} K, "
             "three standard deviations of the difference, in some measurement."
         )
-    names = [str(name) for name in counts["band"].values]
-    stds = (object_temperature_std, background_temperature_std)
+    names = [str(name) for name in measured["band"].values]
     fits = []
     for index, name in enumerate(names):
         curve = responses.curve(response, name)
-        warm = responses.require_range(object_temperature.values, curve, "object temperature")
-        cold = responses.require_range(background_temperature.values, curve, "background")
+        responses.require_range(warm, curve, "object temperature")
+        responses.require_range(cold, curve, "background temperature")
         noise = float(response["noise"].sel(band=name))
-        fits.append(_fit_one_emissivity(curve, counts.values[index], (warm, cold), stds, noise))
+        counts = measured["counts"].values[index].astype(np.float64)
+        fits.append(_fit_one_emissivity(curve, counts, (warm, cold), stds, noise))
     value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
     unit = {"units": "1"}
     return xr.Dataset(
@@ -281,21 +277,13 @@ def fit_emissivity(
     )
 
 
-def _check_measurements(
-    counts: xr.DataArray, warm: xr.DataArray, cold: xr.DataArray, response: xr.Dataset
-) -> None:
-    if counts.dims != ("band", "measurement"):
-        raise ValueError(f"Invalid dims {counts.dims} of counts. Must be ('band', 'measurement').")
-    for name, array in (("object_temperature", warm), ("background_temperature", cold)):
-        if array.dims != ("measurement",) or array.size != counts.sizes["measurement"]:
-            raise ValueError(
-                f"Invalid {name} {dict(array.sizes)}. Must be (measurement) with "
-                f"{counts.sizes['measurement']} values."
-            )
-    if counts.sizes["measurement"] < 2:
+def _check_measurements(measured: xr.Dataset, response: xr.Dataset) -> None:
+    schema.check(measured, "contact")
+    if measured.sizes["measurement"] < 2:
         raise ValueError("Invalid number of measurements 1. Must be at least 2.")
-    if not np.all(np.isfinite(counts.values)):
-        raise ValueError("Invalid counts: NaN or infinite. Must be finite.")
+    for name, variable in measured.data_vars.items():
+        if not np.all(np.isfinite(variable.values)):
+            raise ValueError(f"Invalid {name}: NaN or infinite. Must be finite.")
     if "noise" not in response:
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
 
@@ -304,7 +292,7 @@ def _fit_one_emissivity(
     curve: responses.Curve,
     counts: Array,
     temperatures: tuple[Array, Array],
-    stds: tuple[float, float],
+    stds: Array,
     noise: float,
 ) -> tuple[float, float, float, Array]:
     """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""

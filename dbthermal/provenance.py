@@ -14,7 +14,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from dbthermal import __version__
+import yaml
+
+from dbthermal import __version__, paths
 
 _PACKAGES = ("numpy", "scipy", "xarray", "zarr")
 
@@ -56,6 +58,34 @@ def record(
         "commit": commit(),
         "inputs": {name: checksum(path) for name, path in (inputs or {}).items()},
     }
+
+
+def named(stem: str, namespace: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Values that a notebook's parameters have, by the names in its YAML file.
+
+    Parameters
+    ----------
+    stem : str
+        Stem of the notebook, such as ``"01_calibration"``.
+    namespace : mapping
+        Where the values are, such as ``globals()`` of the notebook.
+
+    Returns
+    -------
+    dict
+        Name to value.
+
+    Raises
+    ------
+    KeyError
+        If a parameter has no value.
+    """
+    names = yaml.safe_load(paths.params(stem).read_text(encoding="utf-8"))
+    missing = [name for name in names if name not in namespace]
+    if missing:
+        raise KeyError(f"Missing parameter '{missing[0]}' of '{stem}'. Must have a value.")
+    return {name: namespace[name] for name in names}
 
 
 def checksum(path: str | Path) -> str:

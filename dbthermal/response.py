@@ -307,6 +307,41 @@ def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact")
     return result.assign_attrs(schema.STAGES["blackbody"]["counts"].attrs).rename("counts")
 
 
+def apparent_temperature(
+    response: xr.Dataset, counts: xr.DataArray, kind: str = "exact"
+) -> xr.DataArray:
+    """
+    Temperature of the blackbody that would give the same counts, band by band.
+
+    Parameters
+    ----------
+    response : Dataset
+        Stage `response` of `schema`.
+    counts : DataArray
+        (band, ...) [count].
+    kind : {"exact", "linear"}
+        Kind of response.
+
+    Returns
+    -------
+    DataArray
+        Apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN where
+        no temperature gives such counts.
+
+    Raises
+    ------
+    ValueError
+        If a band is missing in the response.
+    """
+    names = [str(name) for name in counts["band"].values]
+    values = [
+        curve(response, name, kind).inverse(part)
+        for name, part in zip(names, counts.values, strict=True)
+    ]
+    result = counts.copy(data=np.stack(values)).rename("apparent_temperature")
+    return result.assign_attrs(units="K", long_name="apparent temperature")
+
+
 def require_range(temperature: npt.ArrayLike, of: Curve, what: str) -> Array:
     """
     Return temperatures that all lie in the calibrated range of a curve.

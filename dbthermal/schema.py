@@ -85,6 +85,13 @@ STAGES: Final = MappingProxyType(
             "gain": Variable(("band", "y", "x"), "float64", "1", "gain of the pixel"),
             "offset": Variable(("band", "y", "x"), "float64", "count", "offset of the pixel"),
         },
+        "contact": {
+            "counts": Variable(("band", "measurement"), "float64", "count", "signal"),
+            "object_temperature": Variable(("measurement",), "float64", "K", "object temperature"),
+            "background_temperature": Variable(
+                ("measurement",), "float64", "K", "background temperature"
+            ),
+        },
         "response": {
             "amplitude": Variable(("band",), "float64", "count", "Sakuma-Hattori amplitude"),
             "effective_wavelength": Variable(

@@ -13,7 +13,8 @@ LAYERS = (
     "paths schema planck heat mixing smooth",
     "response bands frames alignment noise metrics figures store provenance manifest readers",
     "calibration emissivity separation",
-    "simulation verify",
+    "simulation verify published",
+    "experiments",
 )
 LEVEL = {module: level for level, row in enumerate(LAYERS) for module in row.split()}
 ONE_PLACE = {"zarr": "store", "av": "readers", "pooch": "manifest"}

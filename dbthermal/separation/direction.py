@@ -34,7 +34,8 @@ class Direction:
     order : ndarray of int, shape (pixel,)
         Number of smooth functions used.
     contrast : ndarray, shape (pixel,)
-        Variance along the direction over variance across it, in units of the noise [1].
+        Variance along the direction over variance across it, in units of the noise [1], with the
+        largest smooth subspace: what of the object a smaller one leaves is no motion.
     misfit : ndarray, shape (pixel,)
         Variance across the direction over that of the noise, 1 where the model holds [1].
     coefficients : ndarray, shape (2, order, pixel)
@@ -95,9 +96,11 @@ def estimate(signals: Array, functions: Array, noise: tuple[float, float]) -> Di
     centre, radius = 0.5 * (first + second), np.hypot(0.5 * (first - second), cross)
     largest, smallest = centre + radius, centre - radius
     order = choose_order(smallest, frames)
-    largest, smallest, first, second, cross = (
+    contrast = np.full(largest.shape[1], np.inf)
+    np.divide(largest[-1], smallest[-1], out=contrast, where=smallest[-1] > 0)
+    smallest, first, second, cross = (
         np.take_along_axis(values, order[np.newaxis], axis=0)[0]
-        for values in (largest, smallest, first, second, cross)
+        for values in (smallest, first, second, cross)
     )
     angle = 0.5 * np.arctan2(2.0 * cross, first - second)
     ratio = noise[1] / noise[0] * np.tan(angle)
@@ -107,9 +110,7 @@ def estimate(signals: Array, functions: Array, noise: tuple[float, float]) -> Di
         ratio=ratio,
         variance=ratio_variance(ratio, energy, noise, frames - order - 1),
         order=order + 1,
-        contrast=np.divide(
-            largest, smallest, out=np.full_like(largest, np.inf), where=smallest > 0
-        ),
+        contrast=contrast,
         misfit=smallest,
         coefficients=np.stack([(functions.T @ signal) * kept for signal in signals]),
     )

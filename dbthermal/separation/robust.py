@@ -95,6 +95,23 @@ def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None =
     )
 
 
+def plain_slope(abscissa: Array, ordinate: Array) -> Array:
+    """
+    Slope of the ordinary least-squares line of each pixel.
+
+    Parameters
+    ----------
+    abscissa, ordinate : ndarray, shape (time, pixel)
+        The points, in one unit.
+
+    Returns
+    -------
+    ndarray, shape (pixel,)
+        Slope [1].
+    """
+    return _fit(abscissa, ordinate, np.ones_like(abscissa))[0]
+
+
 def _start(abscissa: Array, ordinate: Array, noise: float) -> Array:
     """
     Weights of the best of three starts: all points, those above, those below the plain line.
@@ -105,7 +122,8 @@ def _start(abscissa: Array, ordinate: Array, noise: float) -> Array:
     """
     plain = _fit(abscissa, ordinate, np.ones_like(abscissa))[2]
     best: Array | None = None
-    for weights in (np.ones_like(plain), (plain >= 0).astype(float), (plain <= 0).astype(float)):
+    for start in (np.ones_like(plain), (plain >= 0).astype(float), (plain <= 0).astype(float)):
+        weights = start
         for _ in range(_STARTING_STEPS):
             residual = _fit(abscissa, ordinate, weights)[2]
             deviation = _MAD * _median_magnitude(residual)

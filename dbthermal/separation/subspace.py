@@ -64,7 +64,7 @@ def separate(problem: Problem) -> Separated:
     functions = smooth.basis(problem.time, min(direction.HIGHEST_ORDER, frames // 4))
     found = direction.estimate(problem.signals, functions, problem.noise)
     freedom = frames - found.order
-    still = found.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(freedom)
+    still = found.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames)
     still |= ~np.isfinite(found.variance)
     gray = ~still & (np.abs(1.0 - found.ratio) < _GRAY_SIGMAS * np.sqrt(found.variance))
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -104,30 +104,30 @@ def _object(problem: Problem, functions: Array, found: direction.Direction) -> _
     """Alternate the object temperature and the emissivity, steps 2 and 3."""
     ratio, (first, second) = found.ratio, found.coefficients
     clean = functions @ (second - ratio * first)
+    across = problem.noise[1] ** 2 + (ratio * problem.noise[0]) ** 2
     temperature = problem.temperature(1, clean / (1.0 - ratio))
-    regression: robust.Line | None = None
+    # What k2 leaves possible for e1; its middle serves where the object does not tell.
+    middle = 0.5 * (1.0 + np.maximum(0.0, 1.0 - 1.0 / np.maximum(ratio, 1e-9)))
+    # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
+    guess = robust.plain_slope(problem.blackbody(0, temperature), problem.signals[0])
+    emissivity = np.where((guess > 0) & (guess < 1), guess, middle)
+    temperature = _newton(problem, ratio, emissivity, clean, temperature)[0]
+    line: robust.Line | None = None
     for _ in range(_ROUNDS):
         own = problem.blackbody(0, temperature)
-        regression = robust.regress(own, problem.signals[0], problem.noise[0], start=regression)
-        across = problem.noise[1] ** 2 + (ratio * problem.noise[0]) ** 2
+        line = robust.regress(own, problem.signals[0], problem.noise[0], start=line)
         noise_energy = found.order * across / (1.0 - ratio) ** 2
-        constant = regression.spread < _OBJECT_TO_NOISE * noise_energy
-        # Where the object is constant, the middle of what k2 leaves possible for e1.
-        low = np.maximum(0.0, 1.0 - 1.0 / np.maximum(ratio, 1e-9))
-        emissivity = np.where(constant, 0.5 * (low + 1.0), regression.slope)
-        other = problem.blackbody(1, temperature)
-        slopes = [curve.slope(temperature) for curve in problem.curves]
-        steepness = (1.0 - ratio) * slopes[1] + ratio * emissivity * (slopes[1] - slopes[0])
-        value = (1.0 - ratio) * other + ratio * emissivity * (other - own)
-        temperature = temperature + (clean - value) / steepness
-    assert regression is not None
-    per_ratio = (other - emissivity * (other - own) - functions @ first) / steepness
-    noise_of_fit = smooth.leverage(functions)[:, found.order - 1] * across
-    slope_per_ratio = -emissivity * (1.0 - emissivity) / (1.0 - ratio)
-    smooth_variance = noise_of_fit / steepness**2
+        constant = line.spread < _OBJECT_TO_NOISE * noise_energy
+        emissivity = np.where(constant, middle, line.slope)
+        temperature, steepness, emitted = _newton(problem, ratio, emissivity, clean, temperature)
+    assert line is not None
+    per_ratio = (emitted - functions @ first) / steepness
+    smooth_variance = smooth.leverage(functions)[:, found.order - 1] * across / steepness**2
     expected = problem.noise[0] ** 2 + emissivity**2 * (
         per_ratio**2 * found.variance + smooth_variance
     )
+    slope_per_ratio = -emissivity * (1.0 - emissivity) / (1.0 - ratio)
+    through_fit = emissivity**2 * across / ((1.0 - ratio) ** 2 * line.spread)
     return _Fit(
         temperature=temperature,
         per_ratio=per_ratio,
@@ -136,11 +136,22 @@ def _object(problem: Problem, functions: Array, found: direction.Direction) -> _
         emissivity_per_ratio=np.stack(
             [slope_per_ratio, emissivity - 1.0 + ratio * slope_per_ratio]
         ),
-        own_variance=regression.variance
-        + emissivity**2 * across / ((1.0 - ratio) ** 2 * regression.spread),
+        own_variance=line.variance + through_fit,
         constant=constant,
-        restless=np.mean(regression.residual**2 < _WITHIN**2 * expected, axis=0) < _RESTING,
+        restless=np.mean(line.residual**2 < _WITHIN**2 * expected, axis=0) < _RESTING,
     )
+
+
+def _newton(
+    problem: Problem, ratio: Array, emissivity: Array, clean: Array, temperature: Array
+) -> tuple[Array, Array, Array]:
+    """One step towards h(x) = q: the new x, h'(x), and -dh/dk2 at the old x."""
+    own, other = (problem.blackbody(band, temperature) for band in (0, 1))
+    slopes = [curve.slope(temperature) for curve in problem.curves]
+    emitted = other - emissivity * (other - own)
+    steepness = (1.0 - ratio) * slopes[1] + ratio * emissivity * (slopes[1] - slopes[0])
+    value = other - ratio * emitted
+    return temperature + (clean - value) / steepness, steepness, emitted
 
 
 def _background(problem: Problem, fit: _Fit, found: direction.Direction) -> tuple[Array, Array]:

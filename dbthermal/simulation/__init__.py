@@ -3,17 +3,32 @@
 Everything made here carries `origin = "simulated"`.
 """
 
-from dbthermal.simulation.rig import Rig, blackbody_movies, capture, observe, pattern
-from dbthermal.simulation.scenes import Background, independent_pixels, scene, walkers
+from dbthermal.simulation.rig import (
+    Rig,
+    blackbody_movies,
+    capture,
+    contact_measurements,
+    observe,
+    pattern,
+)
+from dbthermal.simulation.scenes import (
+    Background,
+    independent_pixels,
+    scene,
+    side_by_side,
+    walkers,
+)
 
 __all__ = [
     "Background",
     "Rig",
     "blackbody_movies",
     "capture",
+    "contact_measurements",
     "independent_pixels",
     "observe",
     "pattern",
     "scene",
+    "side_by_side",
     "walkers",
 ]

@@ -157,25 +157,25 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
     Returns
     -------
     Dataset
-        `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies, a
-        smooth vignette (narcissus) included; `dead` (band, y, x).
+        `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies,
+        relative to the mean of the live pixels, a smooth vignette (narcissus) included; `dead`
+        (band, y, x).
     """
     size = (len(rig.bands), *shape)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     vignette = rows**2 + columns**2
+    dead = rng.random(size) < rig.bad_fraction
+    gain = rig.gain_std * (rng.standard_normal(size) - vignette)
+    offset = rig.offset_std * (rng.standard_normal(size) + 2.0 * vignette)
+    mean_gain, mean_offset = (
+        np.mean(part, axis=(1, 2), where=~dead, keepdims=True) for part in (gain, offset)
+    )
+    dims = ("band", "y", "x")
     return xr.Dataset(
         {
-            "gain": (
-                ("band", "y", "x"),
-                (1.0 - rig.gain_std * vignette) * (1.0 + rig.gain_std * rng.standard_normal(size)),
-                {"units": "1"},
-            ),
-            "offset": (
-                ("band", "y", "x"),
-                rig.offset_std * (rng.standard_normal(size) + 2.0 * vignette),
-                {"units": "count"},
-            ),
-            "dead": (("band", "y", "x"), rng.random(size) < rig.bad_fraction),
+            "gain": (dims, 1.0 + gain - mean_gain, {"units": "1"}),
+            "offset": (dims, offset - mean_offset, {"units": "count"}),
+            "dead": (dims, dead),
         },
         coords={"band": list(rig.bands)},
         attrs={"origin": "simulated"},
@@ -261,6 +261,58 @@ def blackbody_movies(
             "band": list(rig.bands),
             "temperature": ("temperature", temperatures, {"units": "K"}),
         },
+        attrs={"origin": "simulated"},
+    )
+
+
+def contact_measurements(
+    response: xr.Dataset,
+    emissivity: xr.DataArray,
+    object_temperature: np.ndarray,
+    background_temperature: np.ndarray,
+    stds: tuple[float, float],
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """
+    Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
+
+    Parameters
+    ----------
+    response : Dataset
+        With `noise`.
+    emissivity : DataArray
+        True emissivity (band) [1].
+    object_temperature, background_temperature : ndarray, shape (measurement,)
+        True temperatures [K].
+    stds : tuple of float
+        Standard deviation of a reading of thermocouple and blackbody [K].
+    rng : Generator
+        Source of the errors.
+
+    Returns
+    -------
+    Dataset
+        `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
+        (measurement) [K], as read.
+    """
+    true = [object_temperature, background_temperature]
+    warm, cold = (
+        _blackbody(response, xr.DataArray(level, dims="measurement", name=name), "float64")
+        for level, name in zip(true, ("object", "background"), strict=True)
+    )
+    noise = response["noise"].values
+    counts = [
+        mixing.leaving(value, warm[index], cold[index]) + rng.normal(0, noise[index], len(true[0]))
+        for index, value in enumerate(emissivity.sel(band=response["band"].values).values)
+    ]
+    read = [level + rng.normal(0, std, len(level)) for level, std in zip(true, stds, strict=True)]
+    return xr.Dataset(
+        {
+            "counts": (("band", "measurement"), np.array(counts), {"units": "count"}),
+            "object_temperature": ("measurement", read[0], {"units": "K"}),
+            "background_temperature": ("measurement", read[1], {"units": "K"}),
+        },
+        coords={"band": response["band"].values},
         attrs={"origin": "simulated"},
     )
 

@@ -1,5 +1,6 @@
 """Scenes with known truth: an object that changes smoothly before a background that does not."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -168,6 +169,33 @@ def scene(
     ).map(lambda variable: variable.assign_attrs(stage[str(variable.name)].attrs))
 
 
+def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArray:
+    """
+    Panels of several materials from left to right, of equal width.
+
+    Parameters
+    ----------
+    emissivity : DataArray
+        (material, band) [1].
+    shape : tuple of int
+        Rows and columns of the image.
+
+    Returns
+    -------
+    DataArray
+        (band, y, x) [1].
+    """
+    panel = np.arange(shape[1]) * emissivity.sizes["material"] // shape[1]
+    columns = emissivity.values[panel].T[:, np.newaxis, :]
+    spread = np.broadcast_to(columns, (emissivity.sizes["band"], *shape))
+    return xr.DataArray(
+        spread,
+        dims=("band", "y", "x"),
+        coords={"band": emissivity["band"].values},
+        attrs={"units": "1"},
+    )
+
+
 def independent_pixels(
     time: Array,
     emissivity: xr.DataArray,
@@ -216,9 +244,7 @@ def walkers(
     emissivity: xr.DataArray,
     rng: np.random.Generator,
     *,
-    level: float = 295.15,
-    hottest: float = 333.15,
-    skin: float = 305.15,
+    temperatures: Sequence[float] = (295.15, 305.15, 333.15),
     crossings: int = 7,
     time_constant: float = 12.0,
 ) -> xr.Dataset:
@@ -238,8 +264,8 @@ def walkers(
         (band) or (band, y, x) [1].
     rng : Generator
         Source of the paths.
-    level, hottest, skin : float
-        Temperature of the room, of the plate's middle at the end, of people [K].
+    temperatures : sequence of float
+        Of the room, of people, and of the plate's middle at the end [K].
     crossings : int
         Number of people.
     time_constant : float
@@ -250,6 +276,7 @@ def walkers(
     Dataset
         The scene.
     """
+    level, skin, hottest = temperatures
     height, width = shape
     rows, columns = np.meshgrid(
         np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij"

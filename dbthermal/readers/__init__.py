@@ -1,0 +1,9 @@
+"""Readers of outside formats: thermal spectra of three libraries, videos drawn in a palette.
+
+A reader takes a path and returns labelled data in SI units, or raises; it mends nothing.
+"""
+
+from dbthermal.readers.spectra import ecostress, slum, ucsb
+from dbthermal.readers.videos import masked_palette_video, palette_video
+
+__all__ = ["ecostress", "masked_palette_video", "palette_video", "slum", "ucsb"]

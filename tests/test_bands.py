@@ -1,0 +1,162 @@
+"""Bands: the exact pair temperature and in-band radiance, against quadrature and tables."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import constants
+from scipy.integrate import quad
+
+from dbthermal import planck
+from dbthermal.bands import FILTERS, TEMPERATURE_RANGE, Band, get
+
+TEMPERATURES = st.floats(100.001, 1999.99)  # at the ends rounding leads out of the range
+NAMES = st.sampled_from(sorted(FILTERS))
+
+
+def fraction_below(product: float) -> float:
+    """Share of a blackbody's radiance below lambda T [m K], by the series of exponentials."""
+    x = planck.SECOND_RADIATION_CONSTANT / product
+    n = np.arange(1, 200)
+    terms = np.exp(-n * x) * (x**3 / n + 3 * x**2 / n**2 + 6 * x / n**3 + 6 / n**4)
+    return float(15.0 / np.pi**4 * terms.sum())
+
+
+@pytest.mark.parametrize(
+    ("product", "published"),
+    [(2.0e-3, 0.066728), (2.4e-3, 0.140256), (4.2e-3, 0.516014), (5.0e-3, 0.633747)],
+)
+def test_series_against_published_table(product: float, published: float) -> None:
+    """The series used below reproduces the blackbody radiation functions of the textbooks.
+
+    Incropera, DeWitt, Fundamentals of Heat and Mass Transfer, table 12.1; its c2 is older.
+    """
+    assert fraction_below(product) == pytest.approx(published, abs=5e-5)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("temperature", [200.0, 300.0, 350.0, 1500.0])
+def test_radiance_against_series(name: str, temperature: float) -> None:
+    """The band's share of sigma T^4 / pi is the series' between its edges: 0.3758 for 8-14 um."""
+    band = FILTERS[name]
+    total = constants.Stefan_Boltzmann * temperature**4 / np.pi
+    edges = [fraction_below(edge * temperature) for edge in (band.lower, band.upper)]
+    share = float(band.radiance(temperature)) / total
+    assert share == pytest.approx(edges[1] - edges[0], abs=1e-9)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("temperature", [*TEMPERATURE_RANGE, 300.0])
+def test_radiance_against_quadrature(name: str, temperature: float) -> None:
+    """Over the whole range, forty nodes agree with adaptive quadrature."""
+    band = FILTERS[name]
+
+    def radiance(micrometres: float) -> float:
+        return float(planck.spectral_radiance(micrometres * 1e-6, temperature)) * 1e-6
+
+    expected = quad(radiance, band.lower * 1e6, band.upper * 1e6, epsabs=0, epsrel=1e-12)[0]
+    assert float(band.radiance(temperature)) == pytest.approx(expected, rel=1e-11)
+
+
+@given(NAMES, st.floats(150.0, 1900.0))
+def test_slope_is_the_derivative(name: str, temperature: float) -> None:
+    """The slope is the central difference of the radiance."""
+    band, step = FILTERS[name], 1e-4 * temperature
+    above, below = band.radiance([temperature + step, temperature - step])
+    difference = float(above - below) / (2.0 * step)
+    assert float(band.slope(temperature)) == pytest.approx(difference, rel=1e-5)
+
+
+def test_filters_dim_the_camera() -> None:
+    """At 300 K the filters pass 10.7, 10.0, 26.6 and 7.2 per cent of the contrast of 8-14 um."""
+    slopes = {name: float(band.slope(300.0)) for name, band in FILTERS.items()}
+    ratios = [slopes[name] / slopes["8-14"] for name in ("8.5", "9.5", "10.6", "12.1")]
+    np.testing.assert_allclose(ratios, [0.1075, 0.1005, 0.2661, 0.0715], rtol=0, atol=5e-5)
+
+
+@pytest.mark.parametrize(("name", "reading"), [("8-14", 325.95), ("9.5", 326.35)])
+def test_linear_response_is_off(name: str, reading: float) -> None:
+    """Linearised between 20 and 30 degrees Celsius, 50 degrees read 52.8 and 53.2."""
+    low, high, hot = FILTERS[name].radiance([293.15, 303.15, 323.15])
+    assert 293.15 + 10.0 * (hot - low) / (high - low) == pytest.approx(reading, abs=0.05)
+
+
+@given(NAMES, TEMPERATURES)
+def test_temperature_inverts_radiance(name: str, temperature: float) -> None:
+    """Temperature to radiance and back is the temperature, to rounding."""
+    band = FILTERS[name]
+    back = float(band.temperature(band.radiance(temperature)))
+    assert back == pytest.approx(temperature, rel=1e-13)
+
+
+@given(NAMES, st.floats(1e-6, 0.999999))
+def test_radiance_inverts_temperature(name: str, share: float) -> None:
+    """Radiance to temperature and back is the radiance, to rounding."""
+    band = FILTERS[name]
+    lowest, highest = band.radiance(TEMPERATURE_RANGE)
+    radiance = float(lowest + share * (highest - lowest))
+    again = float(band.radiance(band.temperature(radiance)))
+    assert again == pytest.approx(radiance, rel=1e-12)
+
+
+def test_images_keep_their_shape() -> None:
+    """An image of temperatures gives an image of radiances, and back."""
+    image = np.linspace(280.0, 340.0, 12).reshape(3, 4)
+    band = FILTERS["9.5"]
+    np.testing.assert_allclose(band.temperature(band.radiance(image)), image, rtol=0, atol=1e-10)
+
+
+def test_nodes_span_the_band() -> None:
+    """The nodes lie inside the band and their weights add up to its width."""
+    band = FILTERS["10.6"]
+    wavelengths, weights = band.nodes()
+    assert band.lower < wavelengths.min() < wavelengths.max() < band.upper
+    assert weights.sum() == pytest.approx(1.5e-6, rel=1e-12)
+
+
+@pytest.mark.parametrize("temperature", [99.9, 2000.1, np.nan, 25.0])
+def test_temperature_outside_the_range(temperature: float) -> None:
+    """A temperature outside the range is named; 25 degrees Celsius are no kelvin."""
+    message = f"Invalid temperature {temperature} K in band '9.5'. Must lie in [100.0, 2000.0] K."
+    for function in (FILTERS["9.5"].radiance, FILTERS["9.5"].slope):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            function([300.0, temperature])
+
+
+@pytest.mark.parametrize("radiance", [-1.0, 0.0, np.nan, 1e9])
+def test_radiance_outside_the_range(radiance: float) -> None:
+    """A radiance of no temperature within the range is named; nothing saturates."""
+    message = f"Invalid radiance {radiance} W m-2 sr-1 in band '8-14'. Must lie in ["
+    with pytest.raises(ValueError, match=re.escape(message)):
+        FILTERS["8-14"].temperature([50.0, radiance])
+
+
+@pytest.mark.parametrize("edges", [(9e-6, 8e-6), (0.0, 8e-6), (8e-6, 8e-6), (8e-6, np.inf)])
+def test_edges_that_are_no_band(edges: tuple[float, float]) -> None:
+    """A band has a positive, finite width."""
+    with pytest.raises(ValueError, match=re.escape("of band 'odd'. Must be finite")):
+        Band("odd", *edges)
+
+
+def test_filters_of_the_paper() -> None:
+    """Centres and widths are the published ones, and each filter goes by its own name."""
+    found = {name: (band.centre * 1e6, band.width * 1e6) for name, band in FILTERS.items()}
+    expected = {
+        "8-14": (11.0, 6.0),
+        "8.5": (8.5, 0.5),
+        "9.5": (9.5, 0.5),
+        "10.6": (10.6, 1.5),
+        "12.1": (12.1, 0.5),
+    }
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        assert found[name] == pytest.approx(values, abs=1e-9)
+        assert get(name).name == name
+
+
+def test_unknown_filter() -> None:
+    """An unknown name is told the known ones."""
+    with pytest.raises(KeyError, match=re.escape("Unknown band '9.25'. Must be one of ['10.6'")):
+        get("9.25")

@@ -1,0 +1,104 @@
+"""Planck's law against closed forms and constants that it must contain."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import constants
+from scipy.integrate import quad
+from scipy.optimize import minimize_scalar
+
+from dbthermal import planck
+
+WAVELENGTHS = st.floats(1e-6, 1e-4)
+TEMPERATURES = st.floats(100.0, 3000.0)
+
+
+@pytest.mark.parametrize("temperature", [77.0, 300.0, 1000.0, 5800.0])
+def test_stefan_boltzmann(temperature: float) -> None:
+    """Over all wavelengths, pi L adds up to sigma T^4."""
+
+    def per_octave(logarithm: float) -> float:
+        wavelength = np.exp(logarithm)
+        return float(np.pi * wavelength * planck.spectral_radiance(wavelength, temperature))
+
+    centre = np.log(planck.SECOND_RADIATION_CONSTANT / temperature)
+    total = quad(per_octave, centre - 5.0, centre + 10.0, epsabs=0, epsrel=1e-11, limit=200)[0]
+    assert total / temperature**4 == pytest.approx(constants.Stefan_Boltzmann, rel=1e-9)
+
+
+@pytest.mark.parametrize("temperature", [77.0, 300.0, 5800.0])
+def test_wien_displacement(temperature: float) -> None:
+    """The maximum lies at Wien's displacement constant over T."""
+    peak = constants.Wien / temperature
+    found = minimize_scalar(
+        lambda wavelength: -float(planck.spectral_radiance(wavelength, temperature)),
+        bracket=(0.5 * peak, peak, 2.0 * peak),
+        tol=1e-9,
+    )
+    assert found.x * temperature == pytest.approx(constants.Wien, rel=1e-6)
+
+
+def test_radiance_at_ten_micrometres() -> None:
+    """A blackbody of 300 K has 9.924 W m^-2 sr^-1 um^-1 at 10 um."""
+    assert float(planck.spectral_radiance(10e-6, 300.0)) == pytest.approx(9.924e6, abs=500.0)
+
+
+def test_rayleigh_jeans_limit() -> None:
+    """At long wavelengths L is 2 c k T / lambda^4, less the relative x / 2."""
+    wavelength, temperature = 1.0, 300.0
+    classical = 2 * constants.c * constants.k * temperature / wavelength**4
+    exponent = planck.SECOND_RADIATION_CONSTANT / (wavelength * temperature)
+    radiance = float(planck.spectral_radiance(wavelength, temperature))
+    assert radiance / classical == pytest.approx(1.0 - 0.5 * exponent, abs=1e-9)
+
+
+def test_far_wien_side_does_not_overflow() -> None:
+    """Where exp(c2 / lambda T) is beyond a float, the radiance is zero and no warning is given."""
+    assert float(planck.spectral_radiance(1e-6, 4.0)) == 0.0
+
+
+@given(WAVELENGTHS, TEMPERATURES)
+def test_slope_is_the_derivative(wavelength: float, temperature: float) -> None:
+    """The slope is the central difference of the radiance."""
+    step = 1e-4 * temperature
+    above, below = planck.spectral_radiance(wavelength, [temperature + step, temperature - step])
+    difference = float(above - below) / (2.0 * step)
+    slope = float(planck.spectral_radiance_slope(wavelength, temperature))
+    assert slope == pytest.approx(difference, rel=1e-4)
+
+
+@given(WAVELENGTHS, TEMPERATURES)
+def test_brightness_temperature_inverts(wavelength: float, temperature: float) -> None:
+    """Temperature to radiance and back is the temperature."""
+    radiance = planck.spectral_radiance(wavelength, temperature)
+    back = float(planck.brightness_temperature(wavelength, radiance))
+    assert back == pytest.approx(temperature, rel=1e-12)
+
+
+def test_wavelength_and_temperature_broadcast() -> None:
+    """A column of wavelengths and a row of temperatures make a table."""
+    wavelengths = np.array([[8e-6], [10e-6], [12e-6]])
+    for function in (planck.spectral_radiance, planck.spectral_radiance_slope):
+        assert function(wavelengths, [280.0, 300.0]).shape == (3, 2)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize(
+    ("name", "function", "arguments"),
+    [
+        ("wavelength [m]", planck.spectral_radiance, (None, 300.0)),
+        ("temperature [K]", planck.spectral_radiance, (1e-5, None)),
+        ("temperature [K]", planck.spectral_radiance_slope, (1e-5, None)),
+        ("spectral radiance [W m^-2 sr^-1 m^-1]", planck.brightness_temperature, (1e-5, None)),
+    ],
+)
+def test_bad_value_is_named(
+    name: str, function: planck.Spectral, arguments: tuple[float | None, ...], bad: float
+) -> None:
+    """Each quantity must be finite and positive, and the error gives name, unit and value."""
+    first, second = ([1.0, bad] if value is None else value for value in arguments)
+    with pytest.raises(ValueError, match=re.escape(f"Invalid {name} {bad}. Must be finite")):
+        function(first, second)

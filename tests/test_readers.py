@@ -1,0 +1,351 @@
+"""The readers give what a file holds, in SI units, and refuse a file that is not what it says."""
+
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import av
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib import colormaps
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+
+from dbthermal import readers
+
+HEADER = """Name: Plate  Glass
+Type: manmade
+Class: Glass
+Sample No.: 7
+Description: a pane: clear, Na\xb7Ca
+Measurement: Directional (10 Degree) Hemispherical Reflectance
+X Units: Wavelength (micrometers)
+Y Units:Reflectence (percent)
+First X Value: {first:.4f}
+Last X Value: {last:.4f}
+Number of X Values: {number}
+Additional Information: none
+
+"""
+
+Floats = NDArray[np.float64]
+
+
+def library_file(
+    folder: Path, wavelength: Sequence[float], reflectance: Sequence[float], newline: str = "\n"
+) -> Path:
+    """Write a spectrum as the library does."""
+    path = folder / "glass.spectrum.txt"
+    rows = (f" {w:.4f}\t {r:.4f}\n" for w, r in zip(wavelength, reflectance, strict=True))
+    ends = {"first": wavelength[0], "last": wavelength[-1], "number": len(wavelength)}
+    text = HEADER.format(**ends) + "".join(rows)
+    path.write_bytes(text.replace("\n", newline).encode("latin-1"))
+    return path
+
+
+def film(path: Path, frames: NDArray[np.uint8]) -> Path:
+    """Encode RGB frames (time, y, x, 3) as the published videos are: H.264, 10 frames/s."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"crf": "18"})
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+def coloured(position: Floats, palette: str) -> NDArray[np.uint8]:
+    """Draw positions in a palette."""
+    colours: NDArray[np.uint8] = colormaps[palette](np.rint(position * 255).astype(int), bytes=True)
+    return colours[..., :3]
+
+
+def wave() -> Floats:
+    """Positions (time, y, x) of a smooth wave that moves."""
+    time, y, x = np.ogrid[:12, :48, :64]
+    return 0.5 + 0.35 * np.sin(y / 9 + time / 4) * np.cos(x / 11)
+
+
+@pytest.fixture(scope="module")
+def plasma(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Video of the wave in plasma."""
+    return film(tmp_path_factory.mktemp("film") / "plasma.mp4", coloured(wave(), "plasma"))
+
+
+@pytest.fixture(scope="module")
+def masked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Video of the wave in turbo in the left half, gray in the right half, then a bar in turbo."""
+    frames = np.full((12, 48, 80, 3), 90, dtype=np.uint8)
+    frames[:, :, :32] = coloured(wave(), "turbo")[:, :, :32]
+    frames[:, :, 64:] = coloured(np.linspace(0, 1, 48), "turbo")[:, None]
+    return film(tmp_path_factory.mktemp("film") / "masked.mp4", frames)
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("step", [1, -1])
+def test_ecostress_is_kirchhoff_over_increasing_metres(
+    tmp_path: Path, step: int, newline: str
+) -> None:
+    """Either order of wavelengths and either line end give 1 - R/100 over increasing metres."""
+    wavelength, reflectance = [8.0, 9.5, 14.0], [5.0, 20.0, 10.0]
+    path = library_file(tmp_path, wavelength[::step], reflectance[::step], newline)
+    spectrum = readers.ecostress(path)
+    assert_allclose(spectrum["wavelength"], [8e-6, 9.5e-6, 14e-6], rtol=0, atol=1e-12)
+    assert_allclose(spectrum["emissivity"], [0.95, 0.80, 0.90], rtol=0, atol=1e-12)
+    assert spectrum["wavelength"].attrs["units"] == "m"
+    assert spectrum["emissivity"].attrs["units"] == "1"
+
+
+@given(
+    reflectance=st.lists(st.floats(-5, 120), min_size=2, max_size=30),
+    start=st.floats(0.3, 15),
+)
+def test_ecostress_round_trip(reflectance: list[float], start: float) -> None:
+    """What is written is read, to the four digits of the file."""
+    wavelength = [start + 0.1 * step for step in range(len(reflectance))]
+    with TemporaryDirectory() as folder:
+        spectrum = readers.ecostress(library_file(Path(folder), wavelength, reflectance))
+    assert_allclose(spectrum["wavelength"] * 1e6, wavelength, rtol=0, atol=6e-5)
+    assert_allclose(100 - 100 * spectrum["emissivity"], reflectance, rtol=0, atol=6e-5)
+
+
+def test_ecostress_notes(tmp_path: Path) -> None:
+    """The header's text is kept, Latin-1 letters too; what it does not say is empty."""
+    notes = readers.ecostress(library_file(tmp_path, [8, 9], [5, 5])).attrs
+    assert notes["name"] == "Plate Glass"
+    assert notes["description"] == "a pane: clear, Na\xb7Ca"
+    assert notes["subclass"] == ""
+    assert notes["source"] == "glass.spectrum.txt"
+
+
+def test_ecostress_keeps_and_counts_values_outside_the_physical_range(tmp_path: Path) -> None:
+    """Reflectances of -1 % and 116 % are the instrument's calibration, neither clipped nor lost."""
+    spectrum = readers.ecostress(library_file(tmp_path, [8, 9, 10], [-1.0, 50.0, 116.0]))
+    assert_allclose(spectrum["emissivity"], [1.01, 0.5, -0.16], rtol=0, atol=1e-12)
+    assert spectrum.attrs["unphysical_values"] == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text[:-18], "Number of X Values is 2, declared '3'"),
+        (lambda text: text.replace("14.0000\t", "13.0000\t"), "Last X Value is 13, declared '14"),
+        (lambda text: text.replace("Values: 3", "Values: many"), "is 3, declared 'many'"),
+        (lambda text: text.replace("9.5000", "8.0000"), "8 micrometres is followed by one not"),
+        (lambda text: text.replace("9.5000", "15.000"), "15 micrometres is followed by one not"),
+        (lambda text: text.replace("Hemispherical Refl", "Bidirectional Refl"), "Measurement"),
+        (lambda text: text.replace("Hemispherical Reflectance", "Transmittance"), "Measurement"),
+        (lambda text: text.replace("(percent)", "(fraction)"), "Y Units 'Reflectence .fraction"),
+        (lambda text: text.replace("(micrometers)", "(nanometers)"), "X Units 'Wavelength .nano"),
+        (lambda text: text.replace(" 20.0000", " 2000.0000"), "emissivity -19 in 'Plate Glass'"),
+        (lambda text: text.replace(" 20.0000", " -6.0"), "emissivity 1.06 in 'Plate Glass'"),
+        (lambda text: text.replace(" 20.0000", " nan"), "emissivity nan in 'Plate Glass'"),
+        (lambda text: text.replace(" 20.0000", " x"), "could not convert string to float: 'x'"),
+        (lambda text: text.replace(" 20.0000", " 2 0"), "Must be 2 numbers"),
+        (lambda text: text[: text.index("\n\n")], "Empty table in 'glass.spectrum.txt'"),
+        (lambda _: "", "Invalid Measurement ''"),
+    ],
+)
+def test_ecostress_refuses(tmp_path: Path, change: Callable[[str], str], message: str) -> None:
+    """A file that is cut, or no reflectance in percent over micrometres, is named and refused."""
+    path = library_file(tmp_path, [8, 9.5, 14], [5, 20, 10])
+    path.write_text(change(path.read_text("latin-1")), encoding="latin-1")
+    with pytest.raises(ValueError, match=message) as error:
+        readers.ecostress(path)
+    assert "glass.spectrum.txt" in str(error.value)
+
+
+def test_slum(tmp_path: Path) -> None:
+    """Each column becomes a spectrum under its sample's code."""
+    path = tmp_path / "slum.csv"
+    path.write_text('"wavelength","A001","R002"\n8.0,0.94,0.41\n9.0,0.95,0.42\n')
+    spectra = readers.slum(path)
+    assert list(spectra) == ["A001", "R002"]
+    assert_allclose(spectra["R002"]["emissivity"], [0.41, 0.42], rtol=0, atol=0)
+    assert_allclose(spectra["R002"]["wavelength"], [8e-6, 9e-6], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "Invalid columns"),
+        ("nm,A001\n8,0.9\n", "Invalid columns"),
+        ("wavelength,A001,A001\n8,0.9,0.9\n", "distinct codes"),
+        ("wavelength,A001\n", "Empty table"),
+        ("wavelength,A001\n8,\n", "Must be numbers"),
+        ("wavelength,A001\n8\n", "Must be 2 numbers"),
+        ("wavelength,A001\n8,94\n", "emissivity 94 in 'A001'"),
+        ("wavelength,A001\n8000,0.94\n", "wavelength 8000 in 'A001'"),
+    ],
+)
+def test_slum_refuses(tmp_path: Path, text: str, message: str) -> None:
+    """A table with other columns, gaps or units is refused."""
+    path = tmp_path / "slum.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        readers.slum(path)
+
+
+def test_ucsb(tmp_path: Path) -> None:
+    """The falling wavelengths are turned to rise; the name is the third column's."""
+    path = tmp_path / "brick.csv"
+    path.write_text("x1,x2,y_brick\n12.5,800,0.97\n10,1000,0.95\n")
+    spectrum = readers.ucsb(path)
+    assert_allclose(spectrum["wavelength"], [10e-6, 12.5e-6], rtol=0, atol=1e-12)
+    assert_allclose(spectrum["emissivity"], [0.95, 0.97], rtol=0, atol=0)
+    assert spectrum.attrs["name"] == "brick"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x1,x2,z\n10,1000,0.95\n", "Must be x1, x2, y_<name>"),
+        ("x1,x2,y_b\n10,1100,0.95\n", "wavenumber 1100.0 1/cm at 10.0 micrometres"),
+    ],
+)
+def test_ucsb_refuses(tmp_path: Path, text: str, message: str) -> None:
+    """Other columns, or a wavenumber that contradicts the wavelength, are refused."""
+    path = tmp_path / "brick.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        readers.ucsb(path)
+
+
+@pytest.mark.parametrize(
+    "read", [readers.ecostress, readers.slum, readers.ucsb, readers.palette_video]
+)
+def test_missing_file(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    """A missing file is named."""
+    with pytest.raises(FileNotFoundError, match=r"absent\.txt"):
+        read(tmp_path / "absent.txt")
+
+
+def test_palette_video_gives_positions_and_times(plasma: Path) -> None:
+    """The wave comes back within 1 % of the palette, at 10 frames per second."""
+    movie = readers.palette_video(plasma)
+    assert movie.dims == ("time", "y", "x")
+    assert movie.dtype == np.float32
+    assert_allclose(np.sqrt(np.mean((movie - wave()) ** 2)), 0, atol=0.01)
+    assert_allclose(movie, wave(), rtol=0, atol=0.05)
+    assert_allclose(movie["time"], np.arange(12) / 10, rtol=0, atol=1e-9)
+
+
+def test_palette_video_says_that_it_is_not_radiometric(plasma: Path) -> None:
+    """Values of a video are marked, with the palette and how well it fits."""
+    attrs = readers.palette_video(plasma).attrs
+    assert attrs["radiometric"] == 0
+    assert attrs["palette"] == "plasma"
+    assert 0 < attrs["palette_residual"] < 10  # of 255
+    assert attrs["source"] == "plasma.mp4"
+    assert "not radiometric" in attrs["note"]
+
+
+@pytest.mark.parametrize("palette", ["turbo", "inferno", "viridis", "jet", "gray"])
+def test_palette_that_does_not_fit(plasma: Path, palette: str) -> None:
+    """Another palette than the video's is refused, with its distance and the limit."""
+    with pytest.raises(ValueError, match=rf"Palette '{palette}' does not fit.*at most 20"):
+        readers.palette_video(plasma, palette)
+
+
+@pytest.mark.parametrize("palette", ["plasmatic", "tab10"])
+def test_unknown_palette(plasma: Path, palette: str) -> None:
+    """A name that matplotlib does not know, or of a few separate colours, is refused."""
+    with pytest.raises(ValueError, match=f"Unknown palette '{palette}'"):
+        readers.palette_video(plasma, palette)
+
+
+def test_damaged_video(plasma: Path, tmp_path: Path) -> None:
+    """A file whose last frames are lost is refused, with the number of frames read and declared."""
+    path = tmp_path / "cut.mp4"
+    whole = plasma.read_bytes()
+    index = whole.index(b"moov") - 4  # the encoder writes it after the frames
+    path.write_bytes(whole[: index - 900] + bytes(900) + whole[index:])
+    with pytest.raises(ValueError, match=r"Damaged video 'cut\.mp4': [0-9]+ of 12 frames"):
+        readers.palette_video(path)
+
+
+def test_truncated_video(plasma: Path, tmp_path: Path) -> None:
+    """A file that ends its play before its last frame is refused, with both numbers."""
+    path = tmp_path / "short.mp4"
+    whole = plasma.read_bytes()
+    play = whole.index(b"elst") + 12  # the length of the play [ms]
+    path.write_bytes(whole[:play] + (500).to_bytes(4) + whole[play + 4 :])
+    with pytest.raises(ValueError, match=r"'short\.mp4': 5 frames decoded, 12 declared"):
+        readers.palette_video(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"no video", b"\0" * 5000])
+def test_no_video(tmp_path: Path, content: bytes) -> None:
+    """A file that is no video is refused by name."""
+    path = tmp_path / "text.mp4"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"Damaged video 'text\.mp4'"):
+        readers.palette_video(path)
+
+
+def test_masked_palette_video(masked: Path) -> None:
+    """The object's half is valid, the gray half is not, and the printed bar is cut off."""
+    movie = readers.masked_palette_video(masked, width=64)
+    assert dict(movie.sizes) == {"time": 12, "y": 48, "x": 64}
+    assert movie["valid"].isel(x=slice(30)).mean() > 0.99
+    assert_array_equal(movie["valid"].isel(x=slice(34, 62)), False)  # 2 pixels of bleeding colour
+    inside = movie["value"].isel(x=slice(30)) - wave()[:, :, :30]
+    assert_allclose(np.sqrt(np.mean(inside**2)), 0, atol=0.01)
+    assert movie["value"].attrs["radiometric"] == 0
+
+
+@pytest.mark.parametrize("width", [0, 81])
+def test_masked_palette_video_width(masked: Path, width: int) -> None:
+    """A width that the video does not have is refused."""
+    with pytest.raises(ValueError, match=f"Invalid width {width} .* from 1 to 80 pixels"):
+        readers.masked_palette_video(masked, width=width)
+
+
+def test_masked_palette_that_does_not_fit(masked: Path) -> None:
+    """Another palette than the object's is refused."""
+    with pytest.raises(ValueError, match=r"Palette 'plasma' does not fit.*at most 35"):
+        readers.masked_palette_video(masked, "plasma")
+
+
+def test_masked_palette_video_without_colour(tmp_path: Path) -> None:
+    """A gray video shows no object."""
+    path = film(tmp_path / "gray.mp4", np.full((3, 16, 16, 3), 90, dtype=np.uint8))
+    with pytest.raises(ValueError, match=r"No coloured pixel in 'gray\.mp4'"):
+        readers.masked_palette_video(path)
+
+
+def test_readers_load_no_video_codec() -> None:
+    """Reading spectra needs neither the video codec nor the drawing library."""
+    code = "import sys, dbthermal.readers; print({'av', 'matplotlib'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.data
+def test_every_spectrum_of_the_mirror(mirror: Path) -> None:
+    """All 993 spectra are read; only six hold values outside [0, 1]."""
+    spectra = [readers.ecostress(path) for path in (mirror / "ecostress").glob("*.spectrum.txt")]
+    spectra += readers.slum(mirror / "slum" / "LUMA_SLUM_IR.csv").values()
+    spectra += [
+        readers.ucsb(mirror / "ucsb" / f"{name}.csv")
+        for name in ("clybrkcm", "distd_wn", "oakface", "sndpgaz1")
+    ]
+    assert len(spectra) == 993
+    assert sum(spectrum.attrs["unphysical_values"] > 0 for spectrum in spectra) == 6
+    assert min(float(spectrum["wavelength"][-1]) for spectrum in spectra) > 12.39e-6
+
+
+@pytest.mark.data
+def test_published_scene(mirror: Path) -> None:
+    """The published coffee pot fits plasma closely, its separated video turbo on the object."""
+    movie = readers.palette_video(mirror / "scenes" / "coffeepot-0-bg.mp4")
+    assert dict(movie.sizes) == {"time": 350, "y": 240, "x": 262}
+    assert movie.attrs["palette_residual"] < 6  # of 255
+    path = mirror / "scenes" / "coffeepot_uncalib_Totemp_video.mp4"
+    separated = readers.masked_palette_video(path, width=movie.sizes["x"])
+    assert_allclose(separated["valid"].mean(), 0.356, rtol=0, atol=0.01)

@@ -1,0 +1,180 @@
+"""The camera's response: curve, slope, inverse and linearised signal, exact and linear."""
+
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dbthermal import planck, response, schema
+from dbthermal.response import Curve, Line
+
+TEMPERATURES = st.floats(250.0, 400.0)
+# Published constants of a laboratory's FLIR Boson: R / (exp(B / T) - F) + O with F = 1.
+BOSON = Curve(
+    "8-14", 1.08e6, planck.SECOND_RADIATION_CONSTANT / 1524.0, 0.0, 15500.0, 300.0, 250.0, 400.0
+)
+LINE = Line("8-14", 115.0, 0.0, 0.0, -12000.0, 300.0, 250.0, 400.0)
+CURVES = st.builds(
+    Curve,
+    band=st.just("9.5"),
+    amplitude=st.floats(1e4, 1e7),
+    wavelength=st.floats(7e-6, 14e-6),
+    shift=st.floats(-2e-4, 2e-4),
+    offset=st.floats(-2e4, 2e4),
+    reference=st.just(298.15),
+    lowest=st.just(250.0),
+    highest=st.just(400.0),
+)
+
+
+@pytest.fixture
+def two_bands() -> xr.Dataset:
+    """Response of a wide band and of a filter, with both its kinds of coefficient."""
+    band = {
+        "amplitude": [1.08e6, 1.5e5],
+        "effective_wavelength": [10.6e-6, 9.5e-6],
+        "wavelength_shift": [1e-5, 0.0],
+        "offset": [15500.0, 17000.0],
+        "linear_slope": [115.0, 11.0],
+        "linear_intercept": [-12000.0, 14000.0],
+    }
+    single = {"reference_temperature": 298.15, "temperature_min": 280.0, "temperature_max": 340.0}
+    return xr.Dataset(
+        {name: ("band", values) for name, values in band.items()} | single,
+        coords={"band": ["8-14", "9.5"]},
+    )
+
+
+def test_published_camera() -> None:
+    """The published constants give about 115 counts a kelvin near 300 K."""
+    assert float(BOSON.count_slope(300.0)) == pytest.approx(115.0, abs=0.5)
+
+
+@given(TEMPERATURES, st.floats(7e-6, 14e-6))
+def test_without_shift_it_is_planck(temperature: float, wavelength: float) -> None:
+    """With B = 0 the excess over the offset is Planck's law at the effective wavelength."""
+    curve = Curve("m", 1e6, wavelength, 0.0, 500.0, 300.0, 250.0, 400.0)
+    counts, reference = curve.counts([temperature, 300.0]) - 500.0
+    radiances = planck.spectral_radiance(wavelength, [temperature, 300.0])
+    assert counts / reference == pytest.approx(float(radiances[0] / radiances[1]), rel=1e-10)
+
+
+@given(CURVES, TEMPERATURES)
+def test_inverse_of_counts(curve: Curve, temperature: float) -> None:
+    """Temperature to counts and back is the temperature, to the counts' rounding."""
+    counts = curve.counts(temperature)
+    rounding = 4 * np.spacing(abs(float(counts)) + abs(curve.offset))
+    tolerance = rounding / float(curve.count_slope(temperature)) + 1e-10
+    assert float(curve.inverse(counts)) == pytest.approx(temperature, abs=tolerance)
+
+
+@given(CURVES, TEMPERATURES)
+def test_slope_is_the_derivative(curve: Curve, temperature: float) -> None:
+    """The slope is the central difference of the counts."""
+    above, below = curve.counts([temperature + 0.05, temperature - 0.05])
+    slope = float(curve.count_slope(temperature))
+    rounding = 20 * np.spacing(abs(curve.offset) + abs(float(above)))
+    assert slope == pytest.approx(float(above - below) / 0.1, rel=1e-6, abs=10 * rounding)
+
+
+@pytest.mark.parametrize("curve", [BOSON, LINE], ids=["exact", "linear"])
+def test_signal_at_the_reference(curve: Curve) -> None:
+    """The linearised signal is the temperature there, with a slope of 1."""
+    assert float(curve.signal(300.0)) == pytest.approx(300.0, abs=1e-12)
+    assert float(curve.slope(300.0)) == pytest.approx(1.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("curve", [BOSON, LINE], ids=["exact", "linear"])
+def test_linearise_is_the_signal(curve: Curve) -> None:
+    """A blackbody's counts, linearised, are its signal; the inverse is its temperature."""
+    temperatures = np.linspace(250.0, 400.0, 31).reshape(1, 31)
+    signal = curve.linearise(curve.counts(temperatures))
+    np.testing.assert_array_equal(signal, curve.signal(temperatures))
+    np.testing.assert_allclose(curve.temperature(signal), temperatures, rtol=0, atol=1e-9)
+
+
+@given(TEMPERATURES)
+def test_linear_kind_is_a_line(temperature: float) -> None:
+    """With the linear kind the signal of a blackbody is its temperature."""
+    assert float(LINE.signal(temperature)) == pytest.approx(temperature, abs=1e-10)
+    assert float(LINE.counts(temperature)) == pytest.approx(115.0 * temperature - 12000.0, abs=1e-9)
+
+
+def test_exact_kind_is_not() -> None:
+    """Linearised at 300 K, a blackbody of 330 K reads 4.79 K too high: 34.79 K above."""
+    excess = 1.0 / np.expm1(1524.0 / np.array([300.0, 330.0]))
+    slope = excess[0] ** 2 * np.exp(1524.0 / 300.0) * 1524.0 / 300.0**2
+    expected = 300.0 + (excess[1] - excess[0]) / slope
+    assert float(BOSON.signal(330.0)) == pytest.approx(expected, abs=1e-9)
+    assert expected == pytest.approx(334.79, abs=0.005)
+
+
+def test_no_temperature_has_such_counts() -> None:
+    """At or below the offset the inverse is NaN, elsewhere not."""
+    result = BOSON.inverse([15499.0, 15500.0, 15501.0])
+    assert np.isnan(result).tolist() == [True, True, False]
+
+
+def test_curve_of_a_response(two_bands: xr.Dataset) -> None:
+    """The coefficients of the asked band and kind arrive in the curve."""
+    exact, linear = (response.curve(two_bands, "9.5", kind) for kind in response.KINDS)
+    assert exact == Curve("9.5", 1.5e5, 9.5e-6, 0.0, 17000.0, 298.15, 280.0, 340.0)
+    assert isinstance(linear, Line)
+    assert float(linear.counts(300.0)) == pytest.approx(11.0 * 300.0 + 14000.0, abs=1e-9)
+
+
+def test_counts_of_every_band(two_bands: xr.Dataset) -> None:
+    """A map of temperatures gives counts in each band, in the response's order."""
+    temperature = xr.DataArray([[300.0, 310.0, 320.0]], dims=("y", "x"), attrs={"units": "K"})
+    counts = response.counts(two_bands, temperature)
+    assert (counts.dims, counts.attrs["units"]) == (("band", "y", "x"), "count")
+    for band in ("8-14", "9.5"):
+        expected = response.curve(two_bands, band).counts(temperature.values)
+        np.testing.assert_array_equal(counts.sel(band=band), expected)
+
+
+@pytest.mark.parametrize("temperature", [279.9, 340.1, np.nan, 25.0])
+def test_temperature_outside_the_calibration(two_bands: xr.Dataset, temperature: float) -> None:
+    """A temperature that was not calibrated is named, with the range."""
+    message = (
+        f"Invalid temperature {temperature} K in band '8-14'. Must lie in the response's range"
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        response.counts(two_bands, xr.DataArray([300.0, temperature], dims="x"))
+
+
+def test_range_holds_its_ends(two_bands: xr.Dataset) -> None:
+    """The ends of the range belong to it."""
+    curve = response.curve(two_bands, "8-14")
+    values = response.require_range([280.0, 340.0], curve, "temperature")
+    np.testing.assert_array_equal(values, [280.0, 340.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "band", "kind", "message"),
+    [
+        ({}, "10.6", "exact", "Missing band '10.6' in the response. Has ['8-14', '9.5']"),
+        ({}, "9.5", "cubic", "Unknown kind of response 'cubic'. Must be one of"),
+        ({"offset": np.nan}, "9.5", "exact", "Invalid offset of the response in band '9.5'"),
+        ({"amplitude": -1.0}, "9.5", "exact", "Invalid slope"),
+        ({"linear_slope": 0.0}, "9.5", "linear", "Invalid slope 0.0 count/K of the response"),
+    ],
+)
+def test_bad_response(
+    two_bands: xr.Dataset, change: dict[str, float], band: str, kind: str, message: str
+) -> None:
+    """Each way in which a response gives no curve is said."""
+    for name, value in change.items():
+        two_bands[name][1] = value
+    with pytest.raises(ValueError, match=re.escape(message)):
+        response.curve(two_bands, band, kind)
+
+
+def test_response_is_a_stage(two_bands: xr.Dataset) -> None:
+    """A response that lacks a coefficient is refused by its stage."""
+    schema.check(two_bands, "response")
+    with pytest.raises(ValueError, match="Missing variable 'offset' in the response"):
+        response.curve(two_bands.drop_vars("offset"), "9.5")

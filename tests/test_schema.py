@@ -1,0 +1,164 @@
+"""The glossary: what a stage takes, and each way in which it refuses."""
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import schema
+
+SIZES = {"band": 2, "time": 3, "temperature": 4, "wavelength": 5}
+
+
+def example(stage: str) -> xr.Dataset:
+    """Make the smallest dataset that a stage takes, by its own definitions."""
+    variables = schema.STAGES[stage]
+    dataset = xr.Dataset(
+        {
+            name: (
+                variable.dims,
+                np.ones([SIZES.get(dim, 2) for dim in variable.dims], dtype=variable.dtype),
+                variable.attrs,
+            )
+            for name, variable in variables.items()
+        }
+    )
+    coordinates = {
+        dim: np.arange(1.0, 1.0 + size) for dim, size in dataset.sizes.items() if dim != "band"
+    }
+    return dataset.assign_coords(
+        coordinates | ({"band": ["a", "b"]} if "band" in dataset.dims else {})
+    )
+
+
+@pytest.fixture
+def capture() -> xr.Dataset:
+    """Two bands of three frames of two by two pixels."""
+    return example("capture")
+
+
+@pytest.mark.parametrize("stage", schema.STAGES)
+def test_every_stage_takes_its_own(stage: str) -> None:
+    """A dataset made by the definitions passes, and is returned as it is."""
+    dataset = example(stage)
+    before = dataset.copy(deep=True)
+    assert schema.check(dataset, stage) is dataset
+    xr.testing.assert_identical(dataset, before)
+
+
+@pytest.mark.parametrize("stage", schema.STAGES)
+def test_every_variable_is_needed(stage: str) -> None:
+    """Each variable that is missing is named."""
+    for name in schema.STAGES[stage]:
+        with pytest.raises(ValueError, match=f"Missing variable '{name}' in the {stage}"):
+            schema.check(example(stage).drop_vars(name), stage)
+
+
+def test_absent_units_are_the_agreed_ones(capture: xr.Dataset) -> None:
+    """An array that says nothing of its unit passes; any real dtype does."""
+    counts = capture["counts"].drop_attrs(deep=False).astype(np.float32)
+    schema.check(capture.assign(counts=counts), "capture")
+
+
+Change = Callable[[xr.Dataset], xr.Dataset]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda ds: ds.transpose("time", "band", "y", "x"),
+            "Invalid dims ('time', 'band', 'y', 'x') of 'counts' of the capture",
+        ),
+        (lambda ds: ds.isel(time=0), "Invalid dims ('band', 'y', 'x') of 'counts'"),
+        (lambda ds: ds.isel(x=slice(0)), "Empty 'counts' of the capture: sizes {'band': 2"),
+        (
+            lambda ds: ds.assign(counts=ds["counts"].assign_attrs(units="K")),
+            "Invalid units 'K' of 'counts' of the capture. Must be 'count'",
+        ),
+        (lambda ds: ds.drop_vars("band"), "Missing coordinate 'band' of 'counts'"),
+        (lambda ds: ds.assign_coords(band=["a", "a"]), "Repeated band in ['a', 'a']"),
+        (lambda ds: ds.drop_vars("time"), "Missing coordinate 'time' of 'counts'"),
+        (
+            lambda ds: ds.assign_coords(time=("time", [1.0, 2.0, 3.0], {"units": "ms"})),
+            "Invalid units 'ms' of 'time' of 'counts' of the capture. Must be 's'",
+        ),
+        (
+            lambda ds: ds.assign_coords(time=[1.0, 2.0, np.nan]),
+            "Invalid 'time' of 'counts' of the capture: not finite",
+        ),
+        (
+            lambda ds: ds.assign_coords(time=[1.0, 3.0, 2.0]),
+            "Unordered 'time' of 'counts' of the capture: 3.0 s is followed by 2.0 s",
+        ),
+        (
+            lambda ds: ds.assign_coords(time=[1.0, 1.0, 2.0]),
+            "1.0 s is followed by 1.0 s. Must increase strictly",
+        ),
+    ],
+)
+def test_bad_capture(capture: xr.Dataset, change: Change, message: str) -> None:
+    """Each rule has its error, with the thing, the value and the rule."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        schema.check(change(capture), "capture")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda ds: ds.astype(complex), "Invalid dtype complex128 of 'counts'"),
+        (lambda ds: ds.astype(bool), "Invalid dtype bool of 'counts'"),
+        (lambda ds: ds.astype(str), "Invalid dtype <U5 of 'counts'"),
+        (lambda ds: ds.assign_coords(time=["0", "1", "2"]), "Invalid dtype <U1 of 'time'"),
+        (
+            lambda ds: ds.assign_coords(time=np.arange(3).astype("timedelta64[ms]")),
+            "Invalid dtype timedelta64[ms] of 'time' of 'counts' of the capture. Must be",
+        ),
+        (lambda ds: ds["counts"], "Invalid capture of type DataArray. Must be a Dataset"),
+    ],
+)
+def test_bad_types(capture: xr.Dataset, change: Change, message: str) -> None:
+    """What is not a real number, or not a dataset, is an error of type."""
+    with pytest.raises(TypeError, match=re.escape(message)):
+        schema.check(change(capture), "capture")
+
+
+def test_unknown_stage(capture: xr.Dataset) -> None:
+    """An unknown stage is told the known ones."""
+    with pytest.raises(ValueError, match=re.escape("Unknown stage 'raw'. Must be one of ['black")):
+        schema.check(capture, "raw")
+
+
+def test_coordinates_of_other_stages() -> None:
+    """Temperature and wavelength increase, too."""
+    for stage, name in (("blackbody", "temperature"), ("spectrum", "wavelength")):
+        turned = example(stage)
+        with pytest.raises(ValueError, match=f"Unordered '{name}' of"):
+            schema.check(turned.isel({name: slice(None, None, -1)}), stage)
+
+
+def test_units_are_si() -> None:
+    """Every variable and coordinate has a unit that the glossary allows."""
+    allowed = {"K", "count", "1", "m", "s", "m K", "count K-1"}
+    variables = [one for stage in schema.STAGES.values() for one in stage.values()]
+    assert {one.units for one in [*variables, *schema.COORDINATES.values()]} <= allowed
+
+
+def test_flags_are_bits() -> None:
+    """Each flag is a bit of its own in 16, with a sentence of its own."""
+    values = list(schema.FLAGS.values())
+    assert all(value.bit_count() == 1 for value in values)
+    assert len(set(values)) == len(values)
+    assert sum(values) <= np.iinfo(np.uint16).max
+    assert schema.FLAGS.keys() == schema.FLAG_MEANINGS.keys()
+
+
+def test_status_attributes_follow_cf() -> None:
+    """One mask a meaning, in the dtype of the status."""
+    attrs = schema.status_attrs()
+    masks, meanings = attrs["flag_masks"], str(attrs["flag_meanings"]).split()
+    assert isinstance(masks, np.ndarray)
+    assert masks.dtype == np.dtype(schema.STAGES["separated"]["status"].dtype)
+    assert dict(zip(meanings, masks.tolist(), strict=True)) == dict(schema.FLAGS)
