@@ -122,7 +122,8 @@ def run_case(
         )
     rng = np.random.default_rng(seed)
     response = rig.response()
-    emissivity = xr.DataArray(case["emissivity"], dims="band", coords={"band": list(rig.bands)})
+    pair = np.asarray(case["emissivity"], dtype=np.float64)
+    emissivity = xr.DataArray(pair, dims="band", coords={"band": list(rig.bands)})
     scene = simulation.independent_pixels(
         time,
         emissivity,

@@ -133,25 +133,31 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
     Returns
     -------
     Figure
-        Above, counts over temperature; below, residual counts of the Sakuma-Hattori curve and of
-        the line.
+        From above: counts over temperature, the line's residuals, and those of the
+        Sakuma-Hattori curve on a scale of their own, with the noise of one pixel and frame where
+        the response has it.
     """
     bands = response["band"].values
-    figure, axes = _canvas(2, len(bands), (4.2 * len(bands), 5.4))
+    figure, axes = _canvas(3, len(bands), (4.6 * len(bands), 7.2))
     celsius = response["temperature"] - ZERO_CELSIUS
     for column, band in enumerate(bands):
-        here, (top, bottom) = response.sel(band=band), axes[:, column]
+        here, (top, middle, bottom) = response.sel(band=band), axes[:, column]
         top.plot(fine["temperature"] - ZERO_CELSIUS, fine.sel(band=band), color=_COLORS[0])
         line = here["linear_slope"] * fine["temperature"] + here["linear_intercept"]
         top.plot(fine["temperature"] - ZERO_CELSIUS, line, "--", color=_COLORS[2])
         top.plot(celsius, here["counts"], ".", color=_COLORS[1])
         top.set(title=_band(band), ylabel="signal [count]")
-        top.legend(["Sakuma-Hattori", "linear", "blackbody"], frameon=False)
-        bottom.axhline(0.0, color="0.7", linewidth=0.8)
-        bottom.plot(celsius, here["linear_residual"], "s--", color=_COLORS[2], markersize=3)
+        top.legend(["Sakuma-Hattori", "linear", "blackbody"], frameon=False, fontsize=8)
+        middle.plot(celsius, here["linear_residual"], "s--", color=_COLORS[2], markersize=3)
+        middle.set(ylabel="residual of the line\n[count]")
         bottom.plot(celsius, here["residual"], "o-", color=_COLORS[0], markersize=3)
-        bottom.set(xlabel="blackbody temperature [\N{DEGREE SIGN}C]", ylabel="residual [count]")
-        bottom.legend(bottom.lines[1:], ["linear", "Sakuma-Hattori"], frameon=False)
+        bottom.set(ylabel="residual of the curve\n[count]")
+        bottom.set_xlabel("blackbody temperature [\N{DEGREE SIGN}C]")
+        if "noise" in here:
+            limit = float(here["noise"])
+            bottom.set_title(f"noise of one pixel and frame: {limit:.1f} count", fontsize=8)
+        for axis in (middle, bottom):
+            axis.axhline(0.0, color="0.7", linewidth=0.8)
     figure.suptitle("Camera response" + provenance_note(response))
     return figure
 
@@ -172,7 +178,7 @@ def emissivity_by_contact(measured: xr.Dataset, truth: xr.DataArray | None = Non
     Figure
         One point a band and material.
     """
-    figure, ((axis,),) = _canvas(1, 1, (7.0, 3.6))
+    figure, ((axis,),) = _canvas(1, 1, (8.4, 3.8))
     place = np.arange(measured.sizes["material"])
     bands = measured["band"].values
     for index, band in enumerate(bands):
@@ -191,9 +197,9 @@ def emissivity_by_contact(measured: xr.Dataset, truth: xr.DataArray | None = Non
         if truth is not None:
             label = "truth" if index == 0 else None
             axis.plot(shifted, truth.sel(band=band), "x", color="black", markersize=7, label=label)
-    axis.set_xticks(place, measured["material"].values)
+    axis.set_xticks(place, [str(name).replace(" ", "\n") for name in measured["material"].values])
     axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
-    axis.legend(frameon=False, ncols=len(bands) + 1, loc="lower left")
+    figure.legend(frameon=False, loc="outside right center", fontsize=8)
     axis.set_title("Emissivity by contact, one standard deviation" + provenance_note(measured))
     return figure
 
@@ -245,7 +251,7 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
     figure, ((axis,),) = _canvas(1, 1, (5.4, 4.6))
     values = np.where(np.isfinite(summary.values), summary.values, np.nan)
     drawn = axis.imshow(values, cmap="viridis_r")
-    middle = np.nanmean([np.nanmin(values), np.nanmax(values)])
+    middle = np.mean(_limits(summary.copy(data=values)))
     for row, column in np.ndindex(*values.shape):
         if np.isfinite(values[row, column]):
             color = "white" if values[row, column] > middle else "black"
@@ -258,6 +264,7 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
     statistic = summary.attrs.get("statistic", "average")
     axis.set_title(
         f"Condition number of band pairs\n({statistic} of {materials} materials; low is good)"
+        + provenance_note(summary)
     )
     return figure
 
@@ -298,7 +305,7 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
     return figure
 
 
-def accuracy(sweep: xr.Dataset, reference: xr.Dataset | None = None) -> Figure:
+def accuracy(sweep: xr.Dataset) -> Figure:
     """
     Errors of the object temperature and of the emissivities, case by case.
 
@@ -306,8 +313,6 @@ def accuracy(sweep: xr.Dataset, reference: xr.Dataset | None = None) -> Figure:
     ----------
     sweep : Dataset
         `object_temperature_rmse` [K], `emissivity_error` (band) [1], over `case`.
-    reference : Dataset, optional
-        The same variables to compare with, drawn as crosses.
 
     Returns
     -------
@@ -317,24 +322,16 @@ def accuracy(sweep: xr.Dataset, reference: xr.Dataset | None = None) -> Figure:
     figure, axes = _canvas(1, 2, (11.0, 0.34 * sweep.sizes["case"] + 1.8))
     place = np.arange(sweep.sizes["case"])
     left, right = axes[0]
-    left.barh(place, sweep["object_temperature_rmse"], color=_COLORS[0], label="this run")
+    left.barh(place, sweep["object_temperature_rmse"], color=_COLORS[0])
     bands = sweep["band"].values
     for index, band in enumerate(bands):
         shifted = place + 0.36 * (index - (len(bands) - 1) / 2)
         values = sweep["emissivity_error"].sel(band=band)
         right.barh(shifted, values, 0.34, color=_COLORS[index], label=_band(band))
-        if reference is not None:
-            label = "prototype" if index == 0 else None
-            mark = reference["emissivity_error"].sel(band=band)
-            right.plot(mark, shifted, "x", color="black", label=label)
-    if reference is not None:
-        left.plot(
-            reference["object_temperature_rmse"], place, "x", color="black", label="prototype"
-        )
     for axis in (left, right):
         axis.set_yticks(place, sweep["case"].values, fontsize=8)
         axis.invert_yaxis()
-        axis.legend(frameon=False, fontsize=8)
+    right.legend(frameon=False, fontsize=8)
     left.set_xlabel("median RMSE of the object temperature [K]")
     right.set_xlabel("median error of the emissivity [1]")
     right.set_yticklabels([])
@@ -451,12 +448,12 @@ def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.Da
     ours, theirs : DataArray
         Magnitude of the reflection at a few times (time, y, x), in units of their own.
     scores : DataArray
-        Correlation of the two maps (time) [1].
+        Correlation of the two maps (time) [1], of the frames that were compared.
 
     Returns
     -------
     Figure
-        Two maps a chosen time, and the correlation over all times.
+        Two maps a chosen time, and the correlations with their median.
     """
     columns = ours.sizes["time"]
     figure, axes = _canvas(3, columns, (3.2 * columns, 8.0))
@@ -480,8 +477,10 @@ def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.Da
     for axis in axes[2]:
         axis.remove()
     bottom = figure.add_subplot(grid[2, :])
-    bottom.plot(scores["time"], scores, color=_COLORS[0])
-    bottom.set(xlabel="time [s]", ylabel="correlation [1]", ylim=(-1, 1))
+    bottom.plot(scores["time"], scores, "o", color=_COLORS[0], markersize=4)
+    bottom.axhline(float(scores.median()), color="0.5", linewidth=1)
+    bottom.set(xlabel="time [s]", ylabel="correlation [1]", ylim=(min(0.0, float(scores.min())), 1))
+    bottom.set_title(f"{scores.size} frames, median {float(scores.median()):.2f}", fontsize=9)
     figure.suptitle("Magnitude of the reflection" + provenance_note(ours))
     return figure
 

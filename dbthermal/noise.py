@@ -57,6 +57,10 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 
     where D12 is significant, else the diagonal. The result is the median over the pixels.
 
+    With rests and pulses both noises come out within 2 %. Where every pixel's background walks
+    without rest, the quieter band's is too high by up to a half, worst at a memory near 10 s, for
+    a pixel alone then does not show what the bands share.
+
     Parameters
     ----------
     first, second : ndarray, shape (time, pixel)

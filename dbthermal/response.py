@@ -1,9 +1,9 @@
 r"""The camera's response per band: temperature <-> counts, and the linearised signal.
 
-A response is a Dataset (see `schema`), made by `calibration.fit_response` from blackbody
-measurements or by `from_band` from Planck's law. `curves` turns it into one `Curve` a band, in
-which everything downstream computes: the linearised signal :math:`z = T_r + (I - U(T_r)) / a`,
-in kelvin, and the blackbody's own signal :math:`u(T)` with :math:`u(T_r) = T_r` and slope 1 there.
+A response is a Dataset (see `schema`), made by `calibration.fit_response`. `curve` makes a `Curve`
+of one band of it, in which everything downstream computes: the linearised signal
+:math:`z = T_r + (I - U(T_r)) / a`, in kelvin, and the blackbody's own signal :math:`u(T)` with
+:math:`u(T_r) = T_r` and slope 1 there.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,8 @@ Array = npt.NDArray[np.float64]
 
 KINDS: Final = ("exact", "linear")
 """Kinds of response: the Sakuma-Hattori curve, and the paper's linear approximation."""
+
+_SLOPE_POINTS: Final = 16
 
 COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", "offset")
 """Variables of a response that hold the Sakuma-Hattori curve."""
@@ -268,10 +270,11 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     else:
         shape = (number["effective_wavelength"], number["wavelength_shift"], number["offset"])
         result = Curve(band, number["amplitude"], *shape, *common)
-    if not result.reference_slope > 0:
+    slopes = result.count_slope(np.linspace(result.lowest, result.highest, _SLOPE_POINTS))
+    if not np.all(slopes > 0):
         raise ValueError(
-            f"Invalid slope {result.reference_slope} count/K of the response in band '{band}'. "
-            "Must be positive."
+            f"Invalid slope {slopes.min()} count/K of the response in band '{band}'. "
+            "Must be positive over its whole range."
         )
     return result
 

@@ -42,11 +42,11 @@ def glass() -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
     flat = simulation.independent_pixels(
         TIME, emissivity_of(0.86, 0.72), Background(), 20, rng, start=293.15, stop=333.15
     )
-    parts = [
+    warm, cold = (
         flat[name].values.reshape(350, 4, 5)
         for name in ("object_temperature", "background_temperature")
-    ]
-    scene = simulation.scene(TIME, *parts, emissivity_of(0.86, 0.72))
+    )
+    scene = simulation.scene(TIME, warm, cold, emissivity_of(0.86, 0.72))
     response = RIG.response()
     return scene, simulation.observe(scene, response, rng), response
 

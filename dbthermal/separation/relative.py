@@ -96,12 +96,17 @@ def reflections(
     reflection /= 1.0 + pooled**2 / noise_ratio
     shape = signal.shape[1:]
     movie_dims, image_dims = ("time", "y", "x"), ("y", "x")
+    own = {"units": signal.attrs["units"]} if "units" in signal.attrs else {}
     return xr.Dataset(
         {
-            "ratio": (image_dims, ratio.reshape(shape[1:])),
-            "correlation": (image_dims, correlation.reshape(shape[1:])),
-            "reflection": (movie_dims, reflection.reshape(shape).astype(np.float32)),
-            "emission": (movie_dims, (values[0] - reflection).reshape(shape).astype(np.float32)),
+            "ratio": (image_dims, ratio.reshape(shape[1:]), {"units": "1"}),
+            "correlation": (image_dims, correlation.reshape(shape[1:]), {"units": "1"}),
+            "reflection": (movie_dims, reflection.reshape(shape).astype(np.float32), own),
+            "emission": (
+                movie_dims,
+                (values[0] - reflection).reshape(shape).astype(np.float32),
+                own,
+            ),
         },
         coords={name: signal[name] for name in movie_dims if name in signal.coords},
         attrs={

@@ -14,6 +14,7 @@ TUNING: Final = 4.685
 _MAD: Final = 1.482602218505602
 _ANNEALING: Final = 0.7
 _STARTING_STEPS: Final = 5
+_STARTING_POINTS: Final = 100
 _STEPS: Final = 3
 
 
@@ -24,8 +25,8 @@ class Line:
 
     Attributes
     ----------
-    slope, centre : ndarray, shape (pixel,)
-        Slope, and the ordinate at the weighted mean abscissa.
+    slope, intercept : ndarray, shape (pixel,)
+        Slope, and the ordinate where the abscissa is zero.
     scale : ndarray, shape (pixel,)
         Robust standard deviation of the residuals, at least the noise.
     residual : ndarray, shape (time, pixel)
@@ -39,7 +40,7 @@ class Line:
     """
 
     slope: Array
-    centre: Array
+    intercept: Array
     scale: Array
     residual: Array
     spread: Array
@@ -53,7 +54,7 @@ def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None =
 
     Iteratively reweighted least squares with :math:`w = (1 - (r / c s)^2)^2` inside
     :math:`c s` and 0 outside. The scale s is the median absolute deviation, renewed at every
-    step and never below the noise. A first fit tries several starts, see `_start`.
+    step and never below the noise. A first fit tries several starts, see `_first_residual`.
 
     Parameters
     ----------
@@ -78,15 +79,17 @@ def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None =
     ----------
     .. [1] Beaton, Tukey (1974), Technometrics 16, 147, doi:10.1080/00401706.1974.10489171
     """
-    weights = _start(abscissa, ordinate, noise) if start is None else start.weights
+    if start is None:
+        residual = _first_residual(abscissa, ordinate, noise)
+    else:
+        residual = _fit(abscissa, ordinate, start.weights)[2]
     for _ in range(_STEPS):
-        residual = _fit(abscissa, ordinate, weights)[2]
         scale = np.maximum(noise, _MAD * _median_magnitude(residual))
         weights = _tukey(residual, scale)
-    slope, centre, residual, spread = _fit(abscissa, ordinate, weights)
+        slope, intercept, residual, spread = _fit(abscissa, ordinate, weights)
     return Line(
         slope=slope,
-        centre=centre,
+        intercept=intercept,
         scale=scale,
         residual=residual,
         spread=spread,
@@ -112,41 +115,43 @@ def plain_slope(abscissa: Array, ordinate: Array) -> Array:
     return _fit(abscissa, ordinate, np.ones_like(abscissa))[0]
 
 
-def _start(abscissa: Array, ordinate: Array, noise: float) -> Array:
+def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
     """
-    Weights of the best of three starts: all points, those above, those below the plain line.
+    Residual from the best of three starts: all points, those above, those below the plain line.
 
     What disturbs a resting background lies mostly on one side of it, and one of the halves is
     then nearly free of it. Each start closes in on the densest half of the points by a scale that
-    is a fraction of the deviation; the one with the smallest deviation wins, pixel by pixel.
+    is a fraction of the deviation; the one with the smallest deviation wins, pixel by pixel. A
+    hundred points in single precision are enough to start from.
     """
-    plain = _fit(abscissa, ordinate, np.ones_like(abscissa))[2]
-    best: Array | None = None
-    for start in (np.ones_like(plain), (plain >= 0).astype(float), (plain <= 0).astype(float)):
-        weights = start
+    every = slice(None, None, max(1, abscissa.shape[0] // _STARTING_POINTS))
+    # About its mean, or single precision would not resolve a small spread.
+    across, up = abscissa - abscissa.mean(axis=0), ordinate - ordinate.mean(axis=0)
+    few = across[every].astype(np.float32), up[every].astype(np.float32)
+    plain = _fit(*few, np.ones_like(few[0]))[2]
+    slope, intercept, smallest = (np.full(plain.shape[1], np.inf) for _ in range(3))
+    for start in (np.ones_like(plain), plain >= 0, plain <= 0):
+        weights = start.astype(np.float32)
         for _ in range(_STARTING_STEPS):
-            residual = _fit(abscissa, ordinate, weights)[2]
-            deviation = _MAD * _median_magnitude(residual)
-            weights = _tukey(residual, np.maximum(noise, _ANNEALING * deviation))
-        if best is None:
-            best, smallest = weights, deviation
-        else:
-            best = np.where(deviation < smallest, weights, best)
-            smallest = np.minimum(deviation, smallest)
-    assert best is not None
-    return best
+            *line, residual, _ = _fit(*few, weights)
+            deviation = _median_magnitude(residual)
+            weights = _tukey(residual, np.maximum(noise, _ANNEALING * _MAD * deviation))
+        better = deviation < smallest
+        slope, intercept = np.where(better, line, (slope, intercept))
+        smallest = np.where(better, deviation, smallest)
+    return np.asarray(up - intercept - slope * across)
 
 
 def _fit(abscissa: Array, ordinate: Array, weights: Array) -> tuple[Array, Array, Array, Array]:
-    """Weighted least squares: slope, centre, residual (time, pixel), spread."""
+    """Weighted least squares: slope, intercept, residual (time, pixel), spread."""
     total = weights.sum(axis=0)
-    middle = np.einsum("tp,tp->p", weights, abscissa) / total
+    weighted = weights * abscissa
+    middle = weighted.sum(axis=0) / total
     centre = np.einsum("tp,tp->p", weights, ordinate) / total
-    across, up = abscissa - middle, ordinate - centre
-    weighted = weights * across
-    spread = np.einsum("tp,tp->p", weighted, across)
-    slope = np.einsum("tp,tp->p", weighted, up) / spread
-    return slope, centre, up - slope * across, spread
+    spread = np.einsum("tp,tp->p", weighted, abscissa) - total * middle**2
+    slope = (np.einsum("tp,tp->p", weighted, ordinate) - total * middle * centre) / spread
+    intercept = centre - slope * middle
+    return slope, intercept, ordinate - intercept - slope * abscissa, spread
 
 
 def _median_magnitude(residual: Array) -> Array:
@@ -157,9 +162,12 @@ def _median_magnitude(residual: Array) -> Array:
 
 
 def _tukey(residual: Array, scale: Array) -> Array:
-    ratio = residual / (TUNING * scale)
-    kept = np.maximum(1.0 - ratio * ratio, 0.0)
-    return np.asarray(kept * kept)
+    kept = residual * (1.0 / (TUNING * scale)).astype(residual.dtype)
+    kept *= kept
+    np.subtract(1.0, kept, out=kept)
+    np.maximum(kept, 0.0, out=kept)
+    kept *= kept
+    return np.asarray(kept)
 
 
 def _independent(residual: Array, weights: Array) -> Array:

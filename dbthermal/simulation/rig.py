@@ -128,6 +128,7 @@ def observe(
     emitted = _blackbody(response, scene["object_temperature"], "float64")
     reflected = _blackbody(response, scene["background_temperature"], "float64")
     names = [str(name) for name in response["band"].values]
+    _require_bands(names, scene, "scene")
     movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
     for index, name in enumerate(names):
         emissivity = scene["emissivity"].sel(band=name).values
@@ -201,19 +202,12 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     ValueError
-        If a count does not fit into 16 bits; a real detector would saturate, which a simulation
-        must ask for rather than meet by accident.
+        If the detector lacks a band, or a count does not fit into 16 bits; a real detector would
+        saturate, which a simulation must ask for rather than meet by accident.
     """
-    gain, offset, dead = (detector[name].values for name in ("gain", "offset", "dead"))
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
-    for index, movie in enumerate(corrected["counts"].values):
-        raw = np.rint(gain[index] * movie + offset[index])
-        if raw.min() < 0 or raw.max() > _FULL_SCALE:
-            raise ValueError(
-                f"Invalid counts {raw.min()} to {raw.max()} in band "
-                f"'{corrected['band'].values[index]}'. Must lie in [0, {_FULL_SCALE}]."
-            )
-        counts[index] = np.where(dead[index], 0, raw)
+    for index, movie in enumerate(corrected["counts"]):
+        counts[index] = _digitise(movie.values, detector, str(movie["band"].item()))
     return corrected.assign(counts=(corrected["counts"].dims, counts)).pipe(_describe, "capture")
 
 
@@ -244,6 +238,12 @@ def blackbody_movies(
     -------
     Dataset
         `counts` uint16 (band, temperature, frame, y, x) [count].
+
+    Raises
+    ------
+    ValueError
+        If a temperature lies outside the rig's range, the detector lacks a band, or a count does
+        not fit into 16 bits.
     """
     response = rig.response()
     shape = (frames, *detector["gain"].shape[1:])
@@ -252,9 +252,8 @@ def blackbody_movies(
     for index, counts in enumerate(_blackbody(response, level, "float64")):
         noise = float(response["noise"][index])
         for place, mean in enumerate(counts):
-            raw = detector["gain"].values[index] * (mean + rng.normal(0.0, noise, shape))
-            raw = np.rint(raw + detector["offset"].values[index])
-            movies[index, place] = np.where(detector["dead"].values[index], 0, raw)
+            frame = mean + rng.normal(0.0, noise, shape)
+            movies[index, place] = _digitise(frame, detector, rig.bands[index])
     return xr.Dataset(
         {"counts": (("band", "temperature", "frame", "y", "x"), movies, {"units": "count"})},
         coords={
@@ -315,6 +314,28 @@ def contact_measurements(
         coords={"band": response["band"].values},
         attrs={"origin": "simulated"},
     )
+
+
+def _digitise(counts: np.ndarray, detector: xr.Dataset, band: str) -> np.ndarray:
+    """Raw 16-bit counts (..., y, x) of one band: fixed pattern, rounding, dead pixels at 0."""
+    _require_bands([band], detector, "detector")
+    here = detector.sel(band=band)
+    raw = np.rint(here["gain"].values * counts + here["offset"].values)
+    if not (raw.min() >= 0 and raw.max() <= _FULL_SCALE):  # a NaN fails it, too
+        raise ValueError(
+            f"Invalid counts {raw.min()} to {raw.max()} in band '{band}'. "
+            f"Must lie in [0, {_FULL_SCALE}]."
+        )
+    return np.where(here["dead"].values, 0, raw).astype(np.uint16)
+
+
+def _require_bands(names: list[str], dataset: xr.Dataset, what: str) -> None:
+    """Refuse a dataset that lacks a band."""
+    missing = [name for name in names if name not in dataset["band"].values]
+    if missing:
+        raise ValueError(
+            f"Missing band '{missing[0]}' of the {what}. Has {dataset['band'].values.tolist()}."
+        )
 
 
 def _describe(dataset: xr.Dataset, stage: str) -> xr.Dataset:

@@ -1,0 +1,55 @@
+"""Time and memory, measured on request: `make bench`."""
+
+import resource
+import sys
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import experiments, separation, simulation
+from dbthermal.simulation import Rig
+
+ROWS, COLUMNS, FRAMES = 512, 640, 350
+UNIT = 2**20 if sys.platform == "darwin" else 2**10  # of ru_maxrss, per MiB
+
+
+def peak_memory() -> float:
+    """Largest resident memory of this process so far [MiB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / UNIT
+
+
+@pytest.fixture(scope="module")
+def capture() -> xr.Dataset:
+    """A full frame of plate glass: one simulated row of pixels, shuffled anew for each row."""
+    case = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
+    rig, clock = Rig(), np.arange(FRAMES) / 10.0
+    scene, _ = experiments.run_case(case, rig, clock, COLUMNS, seed=1)
+    row = simulation.observe(scene, rig.response(), np.random.default_rng(1))
+    movie = np.empty((2, FRAMES, ROWS, COLUMNS), dtype=np.float32)
+    for index in range(ROWS):
+        order = np.random.default_rng(index).permutation(COLUMNS)
+        movie[:, :, index] = row["counts"].values[:, :, 0, order]
+    return xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), movie, {"units": "count"})},
+        coords={"band": list(rig.bands), "time": clock},
+    )
+
+
+@pytest.mark.bench
+def test_full_frame(capture: xr.Dataset) -> None:
+    """640 x 512 pixels x 350 frames in under 30 s on two cores, in less than three captures."""
+    response = Rig().response().drop_vars(["noise", "netd"])
+    before, start = peak_memory(), time.perf_counter()
+    result = separation.solve(capture, response, workers=2)
+    seconds, added = time.perf_counter() - start, peak_memory() - before
+    size = capture["counts"].nbytes / 2**20
+    print(
+        f"\n{COLUMNS}x{ROWS}x{FRAMES}, noise unknown: {seconds:.1f} s, capture "
+        f"{size:.0f} MiB, result {result.nbytes / 2**20:.0f} MiB, peak memory added "
+        f"{added:.0f} MiB = {added / size:.2f} captures"
+    )
+    assert float((result["status"] == 0).mean()) > 0.95
+    assert seconds < 30
+    assert added < 3 * size
