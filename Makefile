@@ -35,7 +35,7 @@ unexport JUPYTER_PATH MPLBACKEND PYTHONHOME PYTHONPATH
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help install format check types pytest nbval test smoke reproduce verify data bench lock clean FORCE
+.PHONY: help install format check types pytest nbval test smoke reproduce verify record data bench lock clean FORCE
 
 help: ## list the tasks
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -67,6 +67,10 @@ reproduce: $(full) ## run the notebooks in order, with the values in params/, in
 
 verify: .venv/installed ## compare results/full with the stored reference numbers
 	$(python) -m dbthermal.verify
+
+record: .venv/installed ## keep the numbers of results/full as the reference, and its scene as the picture in the README
+	$(python) -m dbthermal.verify --record
+	cp results/full/04_separation_twin.png notebooks/separated_scene.png
 
 data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
 	$(python) -m dbthermal.manifest

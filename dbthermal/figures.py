@@ -299,7 +299,7 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
         axis.plot(time, value, color=_COLORS[0], linewidth=1)
         axis.plot(known["time"], known[name] - ZERO_CELSIUS, "--", color="black", linewidth=1)
         axis.set(ylabel=name.replace("_", " ") + " [\N{DEGREE SIGN}C]")
-        axis.legend(["two standard deviations", "estimate", "truth"], frameon=False, fontsize=8)
+    axes[0, 0].legend(["two standard deviations", "estimate", "truth"], frameon=False, fontsize=8)
     axes[-1, 0].set_xlabel("time [s]")
     figure.suptitle(f"Truth and estimate at pixel {pixel}" + provenance_note(truth))
     return figure

@@ -1,12 +1,13 @@
 """Robust straight-line regression of many pixels at once, by Tukey's redescending weights."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Precision = TypeVar("Precision", np.float32, np.float64)
 
 TUNING: Final = 4.685
 """Tukey's constant: 95 % efficiency for normal noise (Huber 1981, doi:10.1002/0471725250)."""
@@ -142,7 +143,13 @@ def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
     return np.asarray(up - intercept - slope * across)
 
 
-def _fit(abscissa: Array, ordinate: Array, weights: Array) -> tuple[Array, Array, Array, Array]:
+def _fit(
+    abscissa: npt.NDArray[Precision],
+    ordinate: npt.NDArray[Precision],
+    weights: npt.NDArray[Precision],
+) -> tuple[
+    npt.NDArray[Precision], npt.NDArray[Precision], npt.NDArray[Precision], npt.NDArray[Precision]
+]:
     """Weighted least squares: slope, intercept, residual (time, pixel), spread."""
     total = weights.sum(axis=0)
     weighted = weights * abscissa
@@ -154,14 +161,14 @@ def _fit(abscissa: Array, ordinate: Array, weights: Array) -> tuple[Array, Array
     return slope, intercept, ordinate - intercept - slope * abscissa, spread
 
 
-def _median_magnitude(residual: Array) -> Array:
+def _median_magnitude(residual: npt.NDArray[Precision]) -> Array:
     """Upper median over time of the absolute value; in single precision, which is much faster."""
     magnitude = np.abs(residual.T, dtype=np.float32, casting="same_kind")
     middle = residual.shape[0] // 2
     return np.asarray(np.partition(magnitude, middle, axis=1)[:, middle], dtype=np.float64)
 
 
-def _tukey(residual: Array, scale: Array) -> Array:
+def _tukey(residual: npt.NDArray[Precision], scale: Array) -> npt.NDArray[Precision]:
     kept = residual * (1.0 / (TUNING * scale)).astype(residual.dtype)
     kept *= kept
     np.subtract(1.0, kept, out=kept)

@@ -1,0 +1,333 @@
+"""Calibration: a response from blackbodies against Planck's law, an emissivity against truth."""
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from dbthermal import bands, calibration, response, schema, simulation
+
+Floats = NDArray[np.float64]
+Change = Callable[[xr.DataArray], xr.DataArray]
+LOWEST, HIGHEST = 283.15, 343.15  # 10 to 70 degrees Celsius [K]
+UNIT = 115.0 / float(bands.FILTERS["8-14"].slope(300.0))  # count per W m-2 sr-1
+OFFSET = 15500.0  # count
+GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
+STDS = (0.1, 0.05)  # of a thermocouple's and of a blackbody's reading [K]
+
+
+def planck_counts(name: str, temperature: Floats) -> Floats:
+    """Counts of an ideal camera: proportional to the band's radiance, and an offset."""
+    return OFFSET + UNIT * bands.FILTERS[name].radiance(temperature)
+
+
+def blackbody(number: int = 13, names: tuple[str, ...] = ("8-14", "9.5")) -> xr.DataArray:
+    """Exact counts (band, temperature) at a number of temperatures."""
+    temperature = np.linspace(LOWEST, HIGHEST, number)
+    return xr.DataArray(
+        [planck_counts(name, temperature) for name in names],
+        dims=("band", "temperature"),
+        coords={"band": list(names), "temperature": temperature},
+        attrs={"units": "count"},
+    )
+
+
+def noise_of(*values: float, **attrs: str) -> xr.DataArray:
+    """Noise of the two bands [count]."""
+    return xr.DataArray(list(values), dims="band", coords={"band": ["8-14", "9.5"]}, attrs=attrs)
+
+
+@pytest.fixture(scope="module")
+def two_bands() -> xr.Dataset:
+    """Response of two bands with 3 and 4 counts of noise."""
+    return calibration.fit_response(blackbody(), noise_of(3.0, 4.0))
+
+
+@pytest.mark.parametrize("name", bands.FILTERS)
+@pytest.mark.parametrize("number", [4, 13])
+def test_planck_is_met(name: str, number: int) -> None:
+    """From four temperatures the inverse is exact within 0.05 mK over 10-70 C in every filter."""
+    fitted = calibration.fit_response(blackbody(number, (name,)))
+    temperature = np.linspace(LOWEST, HIGHEST, 241)
+    found = response.curve(fitted, name).inverse(planck_counts(name, temperature))
+    np.testing.assert_allclose(found, temperature, rtol=0, atol=5e-5)  # K
+
+
+def test_response_is_a_stage(two_bands: xr.Dataset) -> None:
+    """The result is a response over what was measured, referred to 298.15 K and with its units."""
+    assert schema.check(two_bands, "response") is two_bands
+    assert float(two_bands["temperature_min"]) == LOWEST
+    assert float(two_bands["temperature_max"]) == HIGHEST
+    assert float(two_bands["reference_temperature"]) == 298.15
+    assert all("units" in variable.attrs for variable in two_bands.data_vars.values())
+
+
+def test_reference_is_a_measured_temperature() -> None:
+    """Without 298.15 K among the temperatures the nearest one is the reference."""
+    fitted = calibration.fit_response(blackbody(4))  # 283, 303, 323, 343 K
+    assert float(fitted["reference_temperature"]) == pytest.approx(303.15, abs=1e-9)
+
+
+@pytest.mark.parametrize(("span", "inside"), [(None, slice(None)), ((293.15, 303.15), slice(2, 5))])
+def test_line_is_polyfit(span: tuple[float, float] | None, inside: slice) -> None:
+    """The linear pair is numpy's least-squares line, over all temperatures or a range with ends."""
+    counts = blackbody()
+    fitted = calibration.fit_response(counts, linear_range=span)
+    for name in ("8-14", "9.5"):
+        chosen = counts.sel(band=name).isel(temperature=inside)
+        slope, intercept = np.polyfit(chosen["temperature"] - 300.0, chosen, 1)
+        here = fitted.sel(band=name)
+        assert float(here["linear_slope"]) == pytest.approx(slope, abs=1e-8)
+        assert float(here["linear_intercept"]) == pytest.approx(intercept - 300 * slope, abs=1e-5)
+
+
+def test_linear_response_misreads() -> None:
+    """A response linearised over 20-30 C reads 50 C as 52.8 C (8-14) and as 53.2 C (9.5)."""
+    fitted = calibration.fit_response(blackbody(), linear_range=(293.15, 303.15))
+    for name, expected in (("8-14", 52.8), ("9.5", 53.2)):
+        counts = planck_counts(name, np.array(323.15))
+        read = float(response.curve(fitted, name, "linear").inverse(counts)) - 273.15
+        assert read == pytest.approx(expected, abs=0.1)  # degree Celsius
+
+
+def test_residuals(two_bands: xr.Dataset) -> None:
+    """A residual is measured less fitted counts; a least-squares fit leaves a sum of zero."""
+    temperature = two_bands["temperature"].values
+    for kind, name in (("exact", "residual"), ("linear", "linear_residual")):
+        fitted = response.curve(two_bands, "9.5", kind).counts(temperature)
+        expected = planck_counts("9.5", temperature) - fitted
+        found = two_bands[name].sel(band="9.5")
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)  # count
+        assert float(found.sum()) == pytest.approx(0.0, abs=1e-8)
+    slope = two_bands["linear_residual"] @ (two_bands["temperature"] - 313.15)
+    np.testing.assert_allclose(slope, 0.0, rtol=0, atol=1e-5)  # count K
+    assert float(abs(two_bands["linear_residual"]).max()) > 10.0  # the line does not fit
+
+
+def test_netd_is_noise_over_slope(two_bands: xr.Dataset) -> None:
+    """NETD [K] is the noise over the slope of the radiance in counts at the reference."""
+    for name, noise in (("8-14", 3.0), ("9.5", 4.0)):
+        slope = UNIT * float(bands.FILTERS[name].slope(298.15))
+        assert float(two_bands["netd"].sel(band=name)) == pytest.approx(noise / slope, rel=1e-5)
+        assert float(two_bands["noise"].sel(band=name)) == noise
+
+
+def test_noise_goes_by_the_band_s_name(two_bands: xr.Dataset) -> None:
+    """Noise in another order, or of more bands, arrives at its own."""
+    noise = xr.DataArray([9.0, 4.0, 3.0], dims="band", coords={"band": ["10.6", "9.5", "8-14"]})
+    fitted = calibration.fit_response(blackbody(), noise)
+    np.testing.assert_array_equal(fitted["noise"], two_bands["noise"])
+    assert "noise" not in calibration.fit_response(blackbody())
+
+
+@settings(max_examples=25, deadline=None)
+@given(gain=st.floats(0.05, 50.0), shift=st.floats(-2e4, 2e4))
+def test_gain_and_offset_of_the_camera(gain: float, shift: float) -> None:
+    """Scaled and shifted counts change amplitude and offset alike, and no temperature."""
+    counts = blackbody(5, ("9.5",))
+    before = calibration.fit_response(counts).isel(band=0)
+    after = calibration.fit_response(gain * counts + shift)
+    np.testing.assert_allclose(
+        response.curve(after, "9.5").inverse(gain * counts[0] + shift),
+        counts["temperature"],
+        rtol=0,
+        atol=1e-6,  # K
+    )
+    there = after.isel(band=0)
+    assert float(there["amplitude"]) == pytest.approx(gain * float(before["amplitude"]), rel=1e-4)
+    assert float(there["effective_wavelength"]) == pytest.approx(
+        float(before["effective_wavelength"]), rel=1e-4
+    )
+
+
+def test_noisy_counts() -> None:
+    """Four parameters from 13 counts of error s: the curve is off by s sqrt(4/13), residuals 9."""
+    rng, error = np.random.default_rng(1), 0.3
+    exact = blackbody(13, ("9.5",)).isel(band=0, drop=True)
+    names = [f"repeat {index}" for index in range(60)]
+    noisy = exact + error * xr.DataArray(
+        rng.standard_normal((60, 13)), dims=("band", "temperature"), coords={"band": names}
+    )
+    fitted = calibration.fit_response(noisy.transpose("band", "temperature"))
+    off = (noisy - fitted["residual"] - exact) / error
+    assert float((off**2).mean() ** 0.5) == pytest.approx((4 / 13) ** 0.5, rel=0.15)
+    assert float(abs(off).max()) < 3.5
+    chi2 = (fitted["residual"] ** 2).sum("temperature") / error**2
+    assert float(chi2.mean()) == pytest.approx(9.0, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda counts: counts.T, "Invalid dims ('temperature', 'band') of the blackbody counts"),
+        (lambda counts: counts.assign_attrs(units="K"), "Invalid units 'K' of the blackbody"),
+        (lambda counts: counts.where(counts["temperature"] < 340), "in band '8-14': NaN or inf"),
+        (lambda counts: counts.where(counts["temperature"] < 340, 1.6e4), "Must grow with temp"),
+        (lambda counts: 0 * counts, "Invalid counts 0.0 at 288.15 K in band '8-14', after 0.0"),
+        (lambda counts: counts[:, :3], "Invalid number of blackbody temperatures 3"),
+        (lambda counts: counts[:, ::-1], "Unordered 'temperature'"),
+        (lambda counts: counts.isel(band=[0, 0]), "Repeated band"),
+        (lambda counts: counts.drop_vars("temperature"), "Missing coordinate 'temperature'"),
+        (
+            lambda counts: counts.assign_coords(temperature=np.linspace(-20.0, 40.0, 13)),
+            "Invalid temperature [K] -20.0",
+        ),
+    ],
+)
+def test_bad_counts(change: Change, message: str) -> None:
+    """Counts that are no blackbody's are refused."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        calibration.fit_response(change(blackbody()))
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        (noise_of(3.0, 4.0).isel(band=[0]), "Missing band '9.5' of the noise. Has ['8-14']"),
+        (noise_of(3.0, 4.0).drop_vars("band"), "Missing band '8-14' of the noise. Has []"),
+        (noise_of(3.0, 4.0).rename(band="filter"), "Invalid dims ('filter',) of the noise"),
+        (noise_of(0.03, 0.35, units="K"), "Invalid units 'K' of the noise"),
+        (noise_of(3.0, -4.0), "Must be finite and positive"),
+        (noise_of(3.0, 0.0), "Must be finite and positive"),
+        (noise_of(3.0, np.nan), "Must be finite and positive"),
+    ],
+)
+def test_bad_noise(noise: xr.DataArray, message: str) -> None:
+    """Noise of other bands, units or signs is refused."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        calibration.fit_response(blackbody(4), noise)
+
+
+@pytest.mark.parametrize("span", [(293.15, 294.0), (303.15, 293.15), (np.nan, 303.15)])
+def test_bad_linear_range(span: tuple[float, float]) -> None:
+    """A line needs two temperatures."""
+    with pytest.raises(ValueError, match=r"Invalid linear_range .* Must hold at least two"):
+        calibration.fit_response(blackbody(), linear_range=span)
+
+
+def test_not_a_data_array() -> None:
+    """Bare arrays have neither bands nor temperatures."""
+    counts, bare = blackbody(4), np.ones(2)
+    with pytest.raises(TypeError, match="Invalid counts of type ndarray"):
+        calibration.fit_response(counts.values)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="Invalid noise of type ndarray"):
+        calibration.fit_response(counts, bare)  # type: ignore[arg-type]
+
+
+WARM = np.linspace(303.15, 333.15, 8)
+COLD = np.linspace(323.15, 293.15, 8)
+
+
+def readings(
+    of: xr.Dataset, rng: np.random.Generator, stds: tuple[float, float] = STDS
+) -> xr.Dataset:
+    """Eight measurements of glass."""
+    return simulation.contact_measurements(of, GLASS, WARM, COLD, stds, rng)
+
+
+@pytest.fixture
+def measured(two_bands: xr.Dataset) -> xr.Dataset:
+    """Readings with errors."""
+    return readings(two_bands, np.random.default_rng(2))
+
+
+def test_emissivity_without_errors(two_bands: xr.Dataset) -> None:
+    """Exact readings give the exact emissivity, and residuals of zero."""
+    exact = two_bands.assign(noise=1e-9 * two_bands["noise"])
+    fitted = calibration.fit_emissivity(
+        readings(exact, np.random.default_rng(0), (0.0, 0.0)), exact, STDS
+    )
+    np.testing.assert_allclose(fitted["emissivity"], GLASS, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(fitted["residual"], 0.0, rtol=0, atol=1e-6)  # count
+
+
+def test_emissivity_is_the_weighted_slope(two_bands: xr.Dataset, measured: xr.Dataset) -> None:
+    """The result solves its own normal equation, with the weights of the docstring."""
+    fitted = calibration.fit_emissivity(measured, two_bands, STDS)
+    curve = response.curve(two_bands, "9.5")
+    warm, cold = measured["object_temperature"], measured["background_temperature"]
+    across = curve.counts(warm) - curve.counts(cold)
+    slope = float(fitted["emissivity"].sel(band="9.5"))
+    residual = measured["counts"].sel(band="9.5").values - curve.counts(cold) - slope * across
+    variance = (
+        4.0**2
+        + (slope * curve.count_slope(warm) * STDS[0]) ** 2
+        + ((1 - slope) * curve.count_slope(cold) * STDS[1]) ** 2
+    )
+    np.testing.assert_allclose(fitted["residual"].sel(band="9.5"), residual, rtol=0, atol=1e-9)
+    assert float(np.sum(across * residual / variance)) == pytest.approx(0.0, abs=1e-6)
+    assert float(fitted["emissivity_std"].sel(band="9.5")) == pytest.approx(
+        float(np.sum(across**2 / variance)) ** -0.5, rel=1e-9
+    )
+    assert float(fitted["reduced_chi2"].sel(band="9.5")) == pytest.approx(
+        float(np.sum(residual**2 / variance)) / 7, rel=1e-9
+    )
+
+
+def test_emissivity_s_error_bar_is_true(two_bands: xr.Dataset) -> None:
+    """Over 250 repeats error over deviation has variance 1 and no bias; reduced chi-square is 1."""
+    rng = np.random.default_rng(0)
+    fits = [
+        calibration.fit_emissivity(readings(two_bands, rng), two_bands, STDS) for _ in range(250)
+    ]
+    together = xr.concat(fits, dim="repeat")
+    score = (together["emissivity"] - GLASS) / together["emissivity_std"]
+    variance, bias = score.var("repeat"), score.mean("repeat")
+    chi2 = together["reduced_chi2"].mean("repeat")
+    print("variance", variance.values, "bias", bias.values, "chi2", chi2.values)
+    np.testing.assert_allclose(variance, 1.0, rtol=0, atol=0.15)
+    np.testing.assert_allclose(bias, 0.0, rtol=0, atol=0.2)  # 3 standard errors
+    np.testing.assert_allclose(chi2, 1.0, rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda it: it.transpose(), "Invalid dims ('measurement', 'band')"),
+        (lambda it: it.drop_vars("counts"), "Missing variable 'counts' in the contact"),
+        (lambda it: it.isel(measurement=[0]), "Invalid number of measurements 1"),
+        (lambda it: it.assign(counts=it["counts"] * np.nan), "Invalid counts: NaN or infinite"),
+        (
+            lambda it: it.assign(
+                object_temperature=it["object_temperature"].assign_attrs(units="C")
+            ),
+            "Invalid units 'C' of 'object_temperature'",
+        ),
+        (
+            lambda it: it.assign(object_temperature=it["object_temperature"] + 50),
+            "K in band '8-14'. Must lie in the response's range",
+        ),
+        (
+            lambda it: it.assign(background_temperature=it["background_temperature"] - 50),
+            "Invalid background temperature 2",
+        ),
+        (
+            lambda it: it.assign(background_temperature=it["object_temperature"] + 0.3),
+            "three standard deviations of the difference",
+        ),
+        (lambda it: it.assign_coords(band=["8-14", "10.6"]), "Missing band '10.6' in the resp"),
+    ],
+)
+def test_bad_measurements(
+    two_bands: xr.Dataset,
+    measured: xr.Dataset,
+    change: Callable[[xr.Dataset], xr.Dataset],
+    message: str,
+) -> None:
+    """Measurements that carry no emissivity are refused."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        calibration.fit_emissivity(change(measured), two_bands, STDS)
+
+
+def test_emissivity_needs_noise_and_deviations(two_bands: xr.Dataset, measured: xr.Dataset) -> None:
+    """Without them there is no weight and no error bar."""
+    with pytest.raises(ValueError, match="Missing noise of the response"):
+        calibration.fit_emissivity(measured, two_bands.drop_vars("noise"), STDS)
+    for stds in ((0.0, 0.05), (0.1, -0.05), (np.nan, 0.05)):
+        with pytest.raises(ValueError, match=r"Invalid reading_std \[K\]"):
+            calibration.fit_emissivity(measured, two_bands, stds)

@@ -1,0 +1,241 @@
+"""Figures: each draws what it is given, labels it with a unit, and says what the data are."""
+
+import inspect
+from collections.abc import Callable
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.figure import Figure
+
+from dbthermal import figures, schema
+
+BANDS = ["8-14", "9.5"]
+TIME = np.arange(2.0)
+DEGREE = "\N{DEGREE SIGN}C"
+
+
+def array(dims: str, *shape: int, **attrs: object) -> xr.DataArray:
+    """Random values from 300 to 301 with bands, times and materials named."""
+    values = 300.0 + np.random.default_rng(1).random(shape)
+    names = {"band": BANDS, "time": TIME, "material": ["glass", "slate"], "case": ["a", "b"]}
+    names |= {"first": BANDS, "second": BANDS}
+    coords = {dim: names[dim] for dim in dims.split() if dim in names}
+    return xr.DataArray(values, dims=dims.split(), coords=coords, attrs=attrs)
+
+
+def correction(fill: float = 1.0, **attrs: object) -> xr.Dataset:
+    """Gain and offset of two bands with one bad pixel, or all of them bad."""
+    maps = fill * array("band y x", 2, 5, 6)
+    bad = xr.zeros_like(maps, dtype=bool)
+    bad[0, 1, 2] = True
+    return xr.Dataset({"gain": maps, "offset": maps, "bad": bad}, attrs=attrs)
+
+
+def draw_response(**attrs: object) -> Figure:
+    """Draw a response at five temperatures."""
+    temperature = np.linspace(290.0, 330.0, 5)
+    counts = xr.DataArray(
+        [115 * temperature, 11 * temperature],
+        dims=("band", "temperature"),
+        coords={"band": BANDS, "temperature": temperature},
+    )
+    pair = {"linear_slope": ("band", [115.0, 11.0]), "linear_intercept": ("band", [0.0, 0.0])}
+    parts = {"counts": counts, "residual": 0 * counts, "linear_residual": 0 * counts}
+    return figures.response_fit(xr.Dataset(parts | pair, attrs=attrs), counts)
+
+
+def separated(fill: float = 1.0) -> xr.Dataset:
+    """Temperatures of a scene with their deviations."""
+    names = ("object_temperature", "background_temperature")
+    movie = fill * array("time y x", 2, 5, 6)
+    parts = dict.fromkeys(names, movie) | {f"{name}_std": movie - 300 for name in names}
+    return xr.Dataset(parts)
+
+
+def draw_accuracy(**attrs: object) -> Figure:
+    """Draw the errors of two cases."""
+    errors = {"object_temperature_rmse": array("case", 2)}
+    sweep = xr.Dataset(errors | {"emissivity_error": array("case band", 2, 2)}, attrs=attrs)
+    return figures.accuracy(sweep)
+
+
+def draw_contact(**attrs: object) -> Figure:
+    """Draw the emissivities of two materials beside their truth."""
+    value = array("material band", 2, 2) - 300
+    measured = xr.Dataset({"emissivity": value, "emissivity_std": 0.01 * value}, attrs=attrs)
+    return figures.emissivity_by_contact(measured, value)
+
+
+def draw_frames(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw the inputs, emission and reflection of two times."""
+    inputs = (fill * array("band time y x", 2, 2, 5, 6)).assign_attrs(attrs)
+    movie = fill * array("time y x", 2, 5, 6)
+    labels = ("input [1]", "emission [1]", "reflection [1]")
+    return figures.separated_frames(inputs, movie, movie - 300, title="scene", labels=labels)
+
+
+def draw_temperatures(**attrs: object) -> Figure:
+    """Draw the same as temperatures."""
+    movie = array("time y x", 2, 5, 6)
+    apparent = array("band time y x", 2, 2, 5, 6, **attrs)
+    return figures.separated_temperatures(apparent, movie, movie - 300, title="scene")
+
+
+def draw_compared(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw two maps of the reflection at two times."""
+    movie = (fill * array("time y x", 2, 5, 6)).assign_attrs(attrs)
+    return figures.compared_reflections(movie, movie, array("time", 2) - 300.5)
+
+
+def draw_status(**attrs: object) -> Figure:
+    """Draw a map with two flags."""
+    status = xr.DataArray([[0, 1, 4], [5, 0, 0]], dims=("y", "x"), attrs=attrs)
+    return figures.status_map(status, schema.FLAGS)
+
+
+def draw_bars(**attrs: object) -> Figure:
+    """Draw the band emissivities of two materials."""
+    table = {"emissivity": array("material band", 2, 2) - 300}
+    return figures.emissivity_bars(xr.Dataset(table, attrs=attrs))
+
+
+def draw_truth(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw the truth of a pixel beside its estimate."""
+    return figures.truth_and_estimate(separated().assign_attrs(attrs), separated(fill), (1, 2))
+
+
+def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw the condition number of a pair of bands, infinite on the diagonal."""
+    matrix = fill * array("first second", 2, 2, **attrs)
+    return figures.condition_matrix(matrix.where(matrix["first"] != matrix["second"], np.inf), 9)
+
+
+def draw_scores(**_: object) -> Figure:
+    """Draw the scores of two quantities."""
+    scores = {"object_temperature": array("pixel", 50) - 300, "k2": array("pixel", 50) - 301}
+    return figures.error_bar_calibration(scores)
+
+
+DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
+    "gain_offset_maps": (
+        lambda fill=1.0, **attrs: figures.gain_offset_maps(correction(fill, **attrs)),
+        {"gain [1]", "offset [count]"},
+    ),
+    "response_fit": (
+        draw_response,
+        {
+            "signal [count]",
+            "residual of the line [count]",
+            "residual of the curve [count]",
+            f"blackbody temperature [{DEGREE}]",
+        },
+    ),
+    "emissivity_by_contact": (draw_contact, {"emissivity [1]"}),
+    "emissivity_bars": (draw_bars, {"band emissivity [1]"}),
+    "condition_matrix": (draw_condition, {"condition number [1]"}),
+    "truth_and_estimate": (
+        draw_truth,
+        {f"object temperature [{DEGREE}]", f"background temperature [{DEGREE}]", "time [s]"},
+    ),
+    "accuracy": (
+        draw_accuracy,
+        {"median RMSE of the object temperature [K]", "median error of the emissivity [1]"},
+    ),
+    "error_bar_calibration": (draw_scores, {"density [1]", "error / standard deviation [1]"}),
+    "separated_frames": (draw_frames, {"input [1]", "emission [1]", "reflection [1]"}),
+    "separated_temperatures": (
+        draw_temperatures,
+        {f"apparent [{DEGREE}]", f"object [{DEGREE}]", "background [K]"},
+    ),
+    "compared_reflections": (draw_compared, {"own unit", "time [s]", "correlation [1]"}),
+    "status_map": (draw_status, set()),
+}
+"""Name of each function -> how to draw it, and the labels of its axes and bars."""
+
+
+def titles(figure: Figure) -> str:
+    """Everything that stands above a figure and its axes."""
+    return "\n".join([figure.get_suptitle(), *(axis.get_title() for axis in figure.axes)])
+
+
+def test_every_figure_is_tested() -> None:
+    """The list above is complete."""
+    functions = inspect.getmembers(figures, inspect.isfunction)
+    public = {name for name, it in functions if it.__module__ == figures.__name__}
+    drawing = {name for name in public if not name.startswith("_")} - {"provenance_note"}
+    assert drawing == DRAWN.keys()
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_figure(name: str) -> None:
+    """A figure of measured data is drawn without a warning, has units, and is its caller's."""
+    draw, labels = DRAWN[name]
+    figure = draw(origin="measured", radiometric=1)
+    figure.draw_without_rendering()
+    found = [text for axis in figure.axes for text in (axis.get_xlabel(), axis.get_ylabel())]
+    assert {" ".join(text.split()) for text in found if text} == labels
+    assert "simulated" not in titles(figure) or name == "error_bar_calibration"
+    assert "radiometric" not in titles(figure)
+    assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize("name", sorted(DRAWN.keys() - {"error_bar_calibration"}))
+def test_title_says_what_the_data_are(name: str) -> None:
+    """Simulated data and pictures are called so."""
+    draw, _ = DRAWN[name]
+    assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
+
+
+def test_error_bars_are_always_simulated() -> None:
+    """Errors are known in simulations only."""
+    assert "(simulated)" in titles(draw_scores())
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "gain_offset_maps",
+        "separated_frames",
+        "compared_reflections",
+        "truth_and_estimate",
+        "condition_matrix",
+    ],
+)
+def test_nothing_but_nan(name: str) -> None:
+    """Where no pixel has a value, the empty figure is drawn without a warning."""
+    figure = DRAWN[name][0](fill=np.nan)
+    figure.draw_without_rendering()
+    assert figure.axes
+
+
+def test_celsius_on_the_axes() -> None:
+    """Kelvin go in, degrees Celsius are drawn."""
+    kelvin = separated()["object_temperature"].isel(y=1, x=2)
+    estimate, truth = draw_truth().axes[0].lines
+    for line in (estimate, truth):
+        np.testing.assert_allclose(np.asarray(line.get_ydata()), kelvin - 273.15, rtol=0, atol=1e-9)
+    image = draw_temperatures().axes[0].images[0].get_array()
+    apparent = array("band time y x", 2, 2, 5, 6)[0, 0] - 273.15
+    np.testing.assert_allclose(np.asarray(image), apparent, rtol=0, atol=1e-9)
+
+
+def test_bad_pixels_are_marked() -> None:
+    """The bad pixel is blank, crossed at its column and row, and counted."""
+    axis = figures.gain_offset_maps(correction()).axes[0]
+    image = axis.images[0].get_array()
+    assert image is not None
+    assert np.argwhere(np.ma.getmaskarray(image)).tolist() == [[1, 2]]
+    np.testing.assert_array_equal(axis.lines[0].get_xydata(), [[2, 1]])
+    assert "1 bad pixel" in axis.get_title()
+
+
+def test_status_map_shows_the_flags_that_occur() -> None:
+    """The good pixels, and each flag with its share."""
+    found = [axis.get_title().split("\n") for axis in draw_status().axes]
+    assert found == [
+        ["good", "50.0 %"],
+        ["no background motion", "33.3 %"],
+        ["gray", "33.3 %"],
+    ]
