@@ -5,12 +5,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from scipy.constants import zero_Celsius
 
 from dbthermal import separation, simulation, smooth
 from dbthermal.separation import limits
 from dbthermal.simulation import Background, Rig
-
-ZERO_CELSIUS = 273.15
 
 
 def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
@@ -130,8 +129,8 @@ def run_case(
         Background(**case.get("background", {})),
         pixels,
         rng,
-        start=case["start"] + ZERO_CELSIUS,
-        stop=case["stop"] + ZERO_CELSIUS,
+        start=case["start"] + zero_Celsius,
+        stop=case["stop"] + zero_Celsius,
     )
     capture = simulation.observe(scene, response, rng)
     if not case.get("noise_known", True):

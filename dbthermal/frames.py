@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.special import ndtri
 from scipy.stats import chi2
 
 from dbthermal import schema
@@ -28,7 +29,7 @@ OUTLIER: Final = 6.0
 _PARAMETERS = ("blackbody_temperatures", "threshold", "detector_maximum")
 _PASSES = 2
 # Median absolute deviation -> standard deviation of a normal distribution.
-_MAD = 1.482602218505602
+_MAD = 1.0 / float(ndtri(0.75))
 # Below this a spread between pixels is rounding, and no pixel is an outlier [count].
 _ROUNDING = 0.01
 

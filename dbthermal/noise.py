@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtr, ndtri
 
 from dbthermal import smooth
 
@@ -21,9 +22,10 @@ _ORDER = 8
 _TRIM = 3.0
 _SIGNIFICANCE = 3.0
 # Median absolute deviation -> standard deviation of a normal distribution.
-_MAD = 1.482602218505602
-# Variance of a normal distribution cut at +-3 standard deviations, relative to the uncut one.
-_TRIMMED_VARIANCE = 0.973344
+_MAD = 1.0 / float(ndtri(0.75))
+# Variance of a normal distribution cut at +-_TRIM standard deviations, relative to the uncut one.
+_DENSITY = np.exp(-(_TRIM**2) / 2.0) / np.sqrt(2.0 * np.pi)
+_TRIMMED_VARIANCE = float(1.0 - 2.0 * _TRIM * _DENSITY / (1.0 - 2.0 * ndtr(-_TRIM)))
 # Standard deviation of a correlation of second differences, times sqrt(frames): their
 # autocorrelation is 1, -2/3, 1/6, so sqrt(1 + 2 (4/9 + 1/36)).
 _CORRELATION_STD = np.sqrt(35.0 / 18.0)

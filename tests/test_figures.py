@@ -1,6 +1,5 @@
 """Figures: each draws what it is given, labels it with a unit, and says what the data are."""
 
-import inspect
 from collections.abc import Callable
 
 import matplotlib.pyplot as plt
@@ -162,10 +161,7 @@ def titles(figure: Figure) -> str:
 
 def test_every_figure_is_tested() -> None:
     """The list above is complete."""
-    functions = inspect.getmembers(figures, inspect.isfunction)
-    public = {name for name, it in functions if it.__module__ == figures.__name__}
-    drawing = {name for name in public if not name.startswith("_")} - {"provenance_note"}
-    assert drawing == DRAWN.keys()
+    assert {*figures.__all__} - {"provenance_note"} == DRAWN.keys()
 
 
 @pytest.mark.parametrize("name", DRAWN)

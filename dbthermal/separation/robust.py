@@ -5,6 +5,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import ndtri
 
 Array = npt.NDArray[np.float64]
 Precision = TypeVar("Precision", np.float32, np.float64)
@@ -12,7 +13,8 @@ Precision = TypeVar("Precision", np.float32, np.float64)
 TUNING: Final = 4.685
 """Tukey's constant: 95 % efficiency for normal noise (Huber 1981, doi:10.1002/0471725250)."""
 
-_MAD: Final = 1.482602218505602
+# Median absolute deviation -> standard deviation of a normal distribution.
+_MAD: Final = 1.0 / float(ndtri(0.75))
 _ANNEALING: Final = 0.7
 _STARTING_STEPS: Final = 5
 _STARTING_POINTS: Final = 100

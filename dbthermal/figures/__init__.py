@@ -1,0 +1,33 @@
+"""Figures that a thermographer expects. A function draws what it is given and returns the figure.
+
+Nothing is computed here beyond units for the eye, nothing is saved. Temperatures are drawn in
+degrees Celsius. Every figure of data that are simulated or not radiometric says so in its title,
+from the `origin` and `radiometric` attributes of what it draws.
+"""
+
+from dbthermal.figures.accuracy import accuracy, error_bar_calibration, truth_and_estimate
+from dbthermal.figures.calibration import emissivity_by_contact, gain_offset_maps, response_fit
+from dbthermal.figures.canvas import provenance_note
+from dbthermal.figures.materials import condition_matrix, emissivity_bars
+from dbthermal.figures.scenes import (
+    compared_reflections,
+    separated_frames,
+    separated_temperatures,
+    status_map,
+)
+
+__all__ = [
+    "accuracy",
+    "compared_reflections",
+    "condition_matrix",
+    "emissivity_bars",
+    "emissivity_by_contact",
+    "error_bar_calibration",
+    "gain_offset_maps",
+    "provenance_note",
+    "response_fit",
+    "separated_frames",
+    "separated_temperatures",
+    "status_map",
+    "truth_and_estimate",
+]
