@@ -45,7 +45,13 @@ def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
         "good": (result["status"] == 0).mean(),
         "with_temperature": known.any("time").mean(),
     }
-    return xr.Dataset({name: value.reset_coords(drop=True) for name, value in found.items()})
+    units = {"object_temperature_rmse": "K"}
+    return xr.Dataset(
+        {
+            name: value.reset_coords(drop=True).assign_attrs(units=units.get(name, "1"))
+            for name, value in found.items()
+        }
+    )
 
 
 def efficiency(

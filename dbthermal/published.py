@@ -121,8 +121,11 @@ def agreement(reflection: xr.DataArray, theirs: xr.Dataset, strongest: int) -> x
             f"Must be {reflection.shape}."
         )
     theirs = theirs.assign_coords({dim: reflection[dim] for dim in ("time", "y", "x")})
-    smoothed = np.abs(gaussian_filter(reflection.values, (0.0, SMOOTHING, SMOOTHING)))
-    ours = reflection.copy(data=smoothed)
+    # Smoothed within the object alone: what lies beside it neither enters nor dims its edge.
+    inside, width = theirs["valid"].values.astype(np.float64), (0.0, SMOOTHING, SMOOTHING)
+    smoothed = gaussian_filter(reflection.values * inside, width)
+    weight = gaussian_filter(inside, width)
+    ours = reflection.copy(data=np.abs(np.divide(smoothed, weight, where=inside > 0, out=inside)))
     power = (reflection**2).where(theirs["valid"]).mean(("y", "x"))
     chosen = np.sort(np.argsort(power.values)[-strongest:])
     ours, theirs = ours.isel(time=chosen), theirs.isel(time=chosen)

@@ -165,8 +165,8 @@ def test_response_is_planck_s(rig: Rig, known: xr.Dataset) -> None:
     ("change", "error", "message"),
     [
         ({"bands": ("8-14", "9.6")}, KeyError, "Unknown band '9.6'"),
-        ({"noise": (0.03,)}, ValueError, "Invalid noise (0.03,) K. Must be positive, one for each"),
-        ({"noise": (0.03, 0.0)}, ValueError, "Invalid noise (0.03, 0.0) K"),
+        ({"noise": (0.03,)}, ValueError, "Invalid noise (0.03,) K. Must be one for each"),
+        ({"noise": (0.03, 0.0)}, ValueError, "Invalid noise [K] 0.0. Must be finite and positive"),
         ({"bad_fraction": 1.0}, ValueError, "Invalid bad_fraction 1.0. Must lie in [0, 1)"),
         ({"bad_fraction": -0.1}, ValueError, "Invalid bad_fraction -0.1"),
     ],

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import bands, calibration, mixing, schema
+from dbthermal import bands, calibration, mixing, planck, schema
 from dbthermal import response as responses
 
 _FULL_SCALE: Final = 65535
@@ -55,10 +55,9 @@ class Rig:
         """Refuse bands that do not exist and numbers that are no rig."""
         for name in self.bands:
             bands.get(name)
-        if len(self.noise) != len(self.bands) or not min(self.noise) > 0:
-            raise ValueError(
-                f"Invalid noise {self.noise} K. Must be positive, one for each of {self.bands}."
-            )
+        if len(self.noise) != len(self.bands):
+            raise ValueError(f"Invalid noise {self.noise} K. Must be one for each of {self.bands}.")
+        planck.require_positive("noise [K]", self.noise)
         if not 0 <= self.bad_fraction < 1:
             raise ValueError(f"Invalid bad_fraction {self.bad_fraction}. Must lie in [0, 1).")
 
@@ -300,9 +299,11 @@ def contact_measurements(
         for level, name in zip(true, ("object", "background"), strict=True)
     )
     noise = response["noise"].values
+    names = [str(name) for name in response["band"].values]
+    _require_bands(names, emissivity.to_dataset(name="emissivity"), "emissivity")
     counts = [
         mixing.leaving(value, warm[index], cold[index]) + rng.normal(0, noise[index], len(true[0]))
-        for index, value in enumerate(emissivity.sel(band=response["band"].values).values)
+        for index, value in enumerate(emissivity.sel(band=names).values)
     ]
     read = [level + rng.normal(0, std, len(level)) for level, std in zip(true, stds, strict=True)]
     return xr.Dataset(

@@ -49,9 +49,15 @@ class Background:
     drift: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse kinds that do not exist."""
+        """Refuse kinds that do not exist, and numbers that are no background."""
         if self.kind not in BACKGROUNDS:
             raise ValueError(f"Unknown background '{self.kind}'. Must be one of {BACKGROUNDS}.")
+        if not 0 <= self.count[0] <= self.count[1]:
+            raise ValueError(f"Invalid count {self.count} of pulses. Must be two, not falling.")
+        if not 0 < self.duration[0] <= self.duration[1]:
+            raise ValueError(f"Invalid duration {self.duration} s. Must be positive, not falling.")
+        if not self.memory > 0:
+            raise ValueError(f"Invalid memory {self.memory} s. Must be positive.")
 
     def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
         """
