@@ -11,9 +11,14 @@ from typing import Final
 import numpy as np
 
 from dbthermal.separation import limits
-from dbthermal.separation.problem import Array, Problem, Separated, flag, outside
+from dbthermal.separation.problem import Array, Problem, Separated, flag
 
-_STEPS: Final = 4
+_STEPS: Final = 5
+# Largest last step of a sample that is solved [K].
+_CONVERGED: Final = 1e-3
+# Bands that differ by less are gray, by so many standard deviations or by rounding.
+_GRAY_SIGMAS: Final = 4.0
+_LEAST_DIFFERENCE: Final = 1e-6
 
 
 def separate(problem: Problem) -> Separated:
@@ -42,37 +47,43 @@ def separate(problem: Problem) -> Separated:
         np.zeros_like(emissivity) if problem.emissivity_std is None else problem.emissivity_std
     )
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        temperatures = _newton(problem, emissivity)
+        temperatures, last_step = _newton(problem, emissivity)
         mixing = _mixing(problem, emissivity, temperatures)
         variances = limits.calibrated_variance(mixing, problem.noise, temperatures, emissivity_std)
-    gray = np.abs(emissivity[0] - emissivity[1]) <= 3.0 * np.hypot(*emissivity_std)
-    undefined = gray | ~np.all(np.isfinite(variances), axis=(0, 1))
-    values = np.where(undefined, np.nan, temperatures)
-    stds = np.where(undefined, np.nan, np.sqrt(variances))
-    beyond = outside(values[0], stds[0], problem.curves[0])
-    beyond |= outside(values[1], stds[1], problem.curves[0])
-    return Separated(
-        object_temperature=values[0],
-        object_temperature_std=stds[0],
-        background_temperature=values[1],
-        background_temperature_std=stds[1],
-        emissivity=emissivity,
-        emissivity_std=emissivity_std,
-        status=flag({"gray": gray, "outside_response": beyond | (undefined & ~gray)}),
+        stds = np.sqrt(variances)
+    apart = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * np.hypot(*emissivity_std))
+    gray = np.abs(emissivity[0] - emissivity[1]) <= apart
+    solved = np.all(np.abs(last_step) < _CONVERGED, axis=(0, 1))
+    solved &= np.all(np.isfinite(stds), axis=(0, 1))
+    undefined = gray | ~solved
+    none = np.zeros_like(gray)
+    return (
+        Separated(
+            object_temperature=temperatures[0],
+            object_temperature_std=stds[0],
+            background_temperature=temperatures[1],
+            background_temperature_std=stds[1],
+            emissivity=emissivity,
+            emissivity_std=emissivity_std,
+            status=flag({"gray": gray, "outside_response": ~solved & ~gray}),
+        )
+        .without(undefined, none, undefined)
+        .ranged(problem)
     )
 
 
-def _newton(problem: Problem, emissivity: Array) -> Array:
-    """Object and background temperature, (2, time, pixel)."""
+def _newton(problem: Problem, emissivity: Array) -> tuple[Array, Array]:
+    """Object and background temperature, (2, time, pixel), and the last change of both."""
     weights = np.stack([emissivity, 1.0 - emissivity], axis=1)[:, :, np.newaxis]
     temperatures = _invert(weights, problem.signals) + problem.reference
+    step = np.zeros_like(temperatures)
     for _ in range(_STEPS):
         residual = problem.signals - np.stack(
             [(weights[m] * problem.blackbody(m, temperatures)).sum(axis=0) for m in (0, 1)]
         )
         step = _invert(_mixing(problem, emissivity, temperatures), residual)
         temperatures = temperatures + step
-    return np.asarray(temperatures)
+    return np.asarray(temperatures), step
 
 
 def _mixing(problem: Problem, emissivity: Array, temperatures: Array) -> Array:

@@ -1,6 +1,7 @@
 """What every separation method is given and gives back: one tile of pixels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +11,9 @@ from dbthermal.response import Curve
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.uint16]
+Mask = npt.NDArray[np.bool_]
+
+_BEYOND: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -105,8 +109,77 @@ class Separated:
     emissivity_std: Array
     status: Flags
 
+    def without(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Separated":
+        """
+        Replace what is undefined by NaN, the standard deviations with the values.
 
-def flag(conditions: dict[str, npt.NDArray[np.bool_]]) -> Flags:
+        Parameters
+        ----------
+        no_object, no_emissivity, no_background : ndarray of bool, shape (pixel,)
+            Where the quantity is undefined.
+
+        Returns
+        -------
+        Separated
+            The same with NaN there.
+        """
+        undefined = {
+            "object_temperature": no_object,
+            "emissivity": no_emissivity,
+            "background_temperature": no_background,
+        }
+        return replace(
+            self,
+            **{
+                name + ending: np.where(where, np.nan, getattr(self, name + ending))
+                for name, where in undefined.items()
+                for ending in ("", "_std")
+            },
+        )
+
+    def updated(self, pixels: Mask, part: "Separated") -> "Separated":
+        """
+        Replace some pixels.
+
+        Parameters
+        ----------
+        pixels : ndarray of bool, shape (pixel,)
+            Which.
+        part : Separated
+            These pixels, in their order.
+
+        Returns
+        -------
+        Separated
+            The whole with the part put in.
+        """
+        values = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        for name, value in values.items():
+            value[..., pixels] = getattr(part, name)
+        return replace(self, **values)
+
+    def ranged(self, problem: Problem) -> "Separated":
+        """
+        Flag temperatures outside the response's range, and those that no temperature gives.
+
+        Parameters
+        ----------
+        problem : Problem
+            The tile, for its response.
+
+        Returns
+        -------
+        Separated
+            The same with `outside_response` added to the status.
+        """
+        beyond = np.zeros(self.status.shape, dtype=bool)
+        for name in ("object_temperature", "background_temperature"):
+            value, std = getattr(self, name), getattr(self, f"{name}_std")
+            beyond |= outside(value, std, problem.curves[0])
+        return replace(self, status=self.status | flag({"outside_response": beyond}))
+
+
+def flag(conditions: dict[str, Mask]) -> Flags:
     """
     Combine named conditions into status bits.
 
@@ -124,22 +197,25 @@ def flag(conditions: dict[str, npt.NDArray[np.bool_]]) -> Flags:
     return np.asarray(np.bitwise_or.reduce(parts), dtype=np.uint16)
 
 
-def outside(temperature: Array, std: Array, curve: Curve) -> npt.NDArray[np.bool_]:
+def outside(temperature: Array, std: Array, curve: Curve) -> Mask:
     """
     Where a temperature leaves the calibrated range by more than its noise explains.
 
     Parameters
     ----------
     temperature, std : ndarray, shape (time, pixel)
-        Temperature and standard deviation [K].
+        Temperature and standard deviation [K]; NaN in all frames where undefined.
     curve : Curve
         The response.
 
     Returns
     -------
     ndarray of bool, shape (pixel,)
-        True if any sample is more than five standard deviations outside.
+        True if any sample is more than five standard deviations outside, or if a defined pixel
+        has a sample without a finite temperature and deviation.
     """
-    margin = 5.0 * std
+    margin = _BEYOND * std
     below, above = temperature < curve.lowest - margin, temperature > curve.highest + margin
-    return np.asarray(np.any(below | above, axis=0))
+    finite = np.isfinite(temperature) & np.isfinite(std)
+    partly = np.any(finite, axis=0) & ~np.all(finite, axis=0)
+    return np.asarray(np.any(below | above, axis=0) | partly)
