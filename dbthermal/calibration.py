@@ -11,7 +11,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.optimize import least_squares
 
-from dbthermal import planck, schema
+from dbthermal import bands, planck, schema
 from dbthermal import response as responses
 
 Array = npt.NDArray[np.float64]
@@ -22,10 +22,15 @@ AMBIENT: Final = 298.15
 MINIMUM_TEMPERATURES: Final = 4
 """Fewest blackbody temperatures: the Sakuma-Hattori curve has four parameters."""
 
-_WAVELENGTH_BOUNDS: Final = (1e-6, 3e-5)
-_SHIFT_BOUNDS: Final = (-2e-3, 2e-3)
-_WAVELENGTH_SCALE: Final = 1e-6
-_SHIFT_SCALE: Final = 1e-4
+# Bounds of the two shape parameters: the scale A T + B at the middle temperature relative to
+# c2 / 5 (about 1 at 10 um and 300 K), and its relative growth A T / (A T + B), 1 at a single
+# wavelength. The largest scale is that of a straight line.
+_SHAPE_BOUNDS: Final = ((0.02, 0.3), (1e3, 2.0))
+_SHAPE_START: Final = (1.0, 1.0)
+_SHAPE_UNIT: Final = planck.SECOND_RADIATION_CONSTANT / 5.0
+# Counts may bend downward by so many standard deviations, plus this fraction of their span.
+_CURVATURE_SIGMAS: Final = 5.0
+_CURVATURE: Final = 0.003
 _ITERATIONS: Final = 50
 
 
@@ -113,6 +118,11 @@ def _check_blackbody(counts: xr.DataArray) -> None:
         raise TypeError(f"Invalid counts of type {type(counts).__name__}. Must be a DataArray.")
     schema.check_variable(counts, schema.STAGES["blackbody"]["counts"], "the blackbody counts")
     temperature = planck.require_positive("temperature [K]", counts["temperature"].values)
+    if temperature[0] < bands.TEMPERATURE_RANGE[0]:
+        raise ValueError(
+            f"Invalid temperature {temperature[0]} K of a blackbody. Must be at least "
+            f"{bands.TEMPERATURE_RANGE[0]} K; temperatures are in kelvin."
+        )
     if temperature.size < MINIMUM_TEMPERATURES:
         raise ValueError(
             f"Invalid number of blackbody temperatures {temperature.size}. "
@@ -128,6 +138,21 @@ def _check_blackbody(counts: xr.DataArray) -> None:
                 f"Invalid counts {row[place + 1]} at {temperature[place + 1]} K in band '{name}', "
                 f"after {row[place]} at {temperature[place]} K. Must grow with temperature."
             )
+        _check_curvature(str(name), temperature, row.astype(np.float64))
+
+
+def _check_curvature(band: str, temperature: Array, counts: Array) -> None:
+    """Refuse counts that bend downward by more than their scatter explains."""
+    middle, half = temperature.mean(), 0.5 * (temperature[-1] - temperature[0])
+    design = np.polynomial.legendre.legvander((temperature - middle) / half, 2)
+    found, *_ = np.linalg.lstsq(design, counts, rcond=None)
+    scatter = np.sqrt(np.sum((counts - design @ found) ** 2) / (counts.size - 3))
+    std = scatter * np.sqrt(np.linalg.inv(design.T @ design)[2, 2])
+    if -found[2] > _CURVATURE_SIGMAS * std + _CURVATURE * (counts[-1] - counts[0]):
+        raise ValueError(
+            f"Invalid counts in band '{band}': their slope falls with temperature. "
+            "That of a blackbody grows."
+        )
 
 
 def _linear_mask(
@@ -147,23 +172,23 @@ def _linear_mask(
 
 def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) -> tuple[float, ...]:
     """Amplitude, effective wavelength, shift, offset, linear slope and intercept of one band."""
+    middle = 0.5 * (temperature[0] + temperature[-1])
+    span = counts[-1] - counts[0]
 
     def linear_part(shape: Array) -> tuple[Array, Array]:
-        scale = shape[0] * _WAVELENGTH_SCALE * temperature + shape[1] * _SHIFT_SCALE
-        planckian = 1.0 / np.expm1(planck.SECOND_RADIATION_CONSTANT / scale)
-        # Centred and scaled columns: the amplitude is 1e5 or more, the offset any size.
+        scale = _SHAPE_UNIT * shape[0] * (1.0 + shape[1] * (temperature - middle) / middle)
+        exponent = planck.SECOND_RADIATION_CONSTANT / scale
+        planckian = np.exp(-exponent) / -np.expm1(-exponent)
+        # Centred columns: the amplitude is 1e5 or more, the offset any size.
         centred = planckian - planckian.mean()
-        slope = centred @ (counts - counts.mean()) / (centred @ centred)
-        amplitude, offset = slope, counts.mean() - slope * planckian.mean()
+        amplitude = centred @ (counts - counts.mean()) / (centred @ centred)
+        offset = counts.mean() - amplitude * planckian.mean()
         return np.array([amplitude, offset]), amplitude * planckian + offset - counts
 
-    lower = [_WAVELENGTH_BOUNDS[0] / _WAVELENGTH_SCALE, _SHIFT_BOUNDS[0] / _SHIFT_SCALE]
-    upper = [_WAVELENGTH_BOUNDS[1] / _WAVELENGTH_SCALE, _SHIFT_BOUNDS[1] / _SHIFT_SCALE]
-    span = counts[-1] - counts[0]
     found = least_squares(
         lambda shape: linear_part(shape)[1] / span,
-        [10.0, 0.0],
-        bounds=(lower, upper),
+        _SHAPE_START,
+        bounds=_SHAPE_BOUNDS,
         xtol=1e-15,
         ftol=1e-15,
         gtol=1e-15,
@@ -173,7 +198,8 @@ def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) ->
     slope, intercept = (
         np.polynomial.Polynomial.fit(temperature[line], counts[line], 1).convert().coef[::-1]
     )
-    wavelength, shift = found.x[0] * _WAVELENGTH_SCALE, found.x[1] * _SHIFT_SCALE
+    wavelength = _SHAPE_UNIT * found.x[0] * found.x[1] / middle
+    shift = _SHAPE_UNIT * found.x[0] * (1.0 - found.x[1])
     return (amplitude, wavelength, shift, offset, slope, intercept)
 
 
@@ -186,11 +212,8 @@ def _with_noise(response: xr.Dataset, noise: xr.DataArray) -> xr.Dataset:
         raise ValueError(f"Invalid dims {noise.dims} of the noise. Must be ('band',).")
     if noise.attrs.get("units", "count") != "count":
         raise ValueError(f"Invalid units '{noise.attrs['units']}' of the noise. Must be 'count'.")
-    known = [str(name) for name in noise["band"].values] if "band" in noise.coords else []
-    missing = [name for name in names if name not in known]
-    if missing:
-        raise ValueError(f"Missing band '{missing[0]}' of the noise. Has {known}.")
-    values = noise.values[[known.index(name) for name in names]].astype(np.float64)
+    places = schema.band_positions(noise, names, "the noise")
+    values = noise.values[places].astype(np.float64)
     if not np.all(np.isfinite(values) & (values > 0)):
         raise ValueError(f"Invalid noise {values} count. Must be finite and positive.")
     slopes = np.array([responses.curve(response, name).reference_slope for name in names])
@@ -243,7 +266,7 @@ def fit_emissivity(
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334
     .. [2] ISO 18434-1:2008, Condition monitoring and diagnostics of machines, Thermography
     """
-    _check_measurements(measured, response)
+    _check_measurements(measured)
     stds = planck.require_positive("reading_std [K]", reading_std)
     warm, cold = (
         measured[name].values.astype(np.float64)
@@ -256,14 +279,14 @@ def fit_emissivity(
             "three standard deviations of the difference, in some measurement."
         )
     names = [str(name) for name in measured["band"].values]
+    noises = responses.noise(response, names)
     fits = []
     for index, name in enumerate(names):
         curve = responses.curve(response, name)
         responses.require_range(warm, curve, "object temperature")
         responses.require_range(cold, curve, "background temperature")
-        noise = float(response["noise"].sel(band=name))
         counts = measured["counts"].values[index].astype(np.float64)
-        fits.append(_fit_one_emissivity(curve, counts, (warm, cold), stds, noise))
+        fits.append(_fit_one_emissivity(curve, counts, (warm, cold), stds, float(noises[index])))
     value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
     unit = {"units": "1"}
     return xr.Dataset(
@@ -277,15 +300,13 @@ def fit_emissivity(
     )
 
 
-def _check_measurements(measured: xr.Dataset, response: xr.Dataset) -> None:
+def _check_measurements(measured: xr.Dataset) -> None:
     schema.check(measured, "contact")
     if measured.sizes["measurement"] < 2:
         raise ValueError("Invalid number of measurements 1. Must be at least 2.")
     for name, variable in measured.data_vars.items():
         if not np.all(np.isfinite(variable.values)):
             raise ValueError(f"Invalid {name}: NaN or infinite. Must be finite.")
-    if "noise" not in response:
-        raise ValueError("Missing noise of the response. Must be given to fit_response.")
 
 
 def _fit_one_emissivity(

@@ -328,13 +328,10 @@ def _require_same_pixels(counts: xr.DataArray, correction: xr.Dataset) -> None:
 
 def _select(correction: xr.Dataset, names: list[str]) -> xr.Dataset:
     """Bands of a correction by name, with finite coefficients."""
-    known = [str(name) for name in correction["band"].values]
-    missing = [name for name in names if name not in known]
-    if missing:
-        raise ValueError(f"Missing band '{missing[0]}' in the correction. Has {known}.")
+    places = schema.band_positions(correction, names, "the correction")
     if "bad" not in correction or correction["bad"].dims != ("band", "y", "x"):
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
-    chosen = correction.assign_coords(band=known).sel(band=names)
+    chosen = correction.isel(band=places).assign_coords(band=names)
     for name in ("gain", "offset"):
         if not np.all(np.isfinite(chosen[name])):
             raise ValueError(f"Invalid {name} of the correction: not finite. Must be finite.")

@@ -255,10 +255,8 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     if kind not in KINDS:
         raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
     schema.check(response, "response")
-    names = [str(name) for name in response["band"].values]
-    if band not in names:
-        raise ValueError(f"Missing band '{band}' in the response. Has {names}.")
-    here = response.isel(band=names.index(band))
+    (place,) = schema.band_positions(response, [band], "the response")
+    here = response.isel(band=place)
     number = {str(name): float(here[name]) for name in schema.STAGES["response"]}
     bad = [name for name, value in number.items() if not np.isfinite(value)]
     if bad:
@@ -277,6 +275,35 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
             "Must be positive over its whole range."
         )
     return result
+
+
+def noise(response: xr.Dataset, bands: list[str]) -> Array:
+    """
+    Noise of some bands of a response.
+
+    Parameters
+    ----------
+    response : Dataset
+        Stage `response` of `schema`, with `noise` (band) [count].
+    bands : list of str
+        Names.
+
+    Returns
+    -------
+    ndarray, shape (band,)
+        Standard deviation of one pixel's counts [count].
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no noise, its dims or unit are others, a band is missing, or a value is not
+        finite and positive.
+    """
+    if "noise" not in response:
+        raise ValueError("Missing noise of the response. Must be given to fit_response.")
+    schema.check_variable(response["noise"], schema.NOISE, "'noise' of the response")
+    places = schema.band_positions(response, bands, "the response")
+    return planck.require_positive("noise [count]", response["noise"].values[places])
 
 
 def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact") -> xr.DataArray:

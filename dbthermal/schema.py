@@ -131,6 +131,15 @@ STAGES: Final = MappingProxyType(
 """Stage -> variable -> what it must be. A response and blackbody frames may also hold `noise`
 (band) [count]; a correction holds `bad` (band, y, x), bool, too."""
 
+NOISE: Final = Variable(("band",), "float64", "count", "noise of one pixel and frame")
+"""Optional variable `noise` of a response: standard deviation of one pixel's counts."""
+
+EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
+"""A spectral emissivity outside is no measurement, but a wrong unit or a damaged file [1].
+
+The extremes of the libraries are -0.16 (trona) and 1.014 (maple bark), from reflectances of 116 %
+and -1.4 % relative to the reference."""
+
 FLAGS: Final = MappingProxyType(
     {
         "no_background_motion": 1,
@@ -144,6 +153,7 @@ FLAGS: Final = MappingProxyType(
         "object_not_smooth": 256,
         "outside_response": 512,
         "dead_pixel": 1024,
+        "frozen_frames": 2048,
     }
 )
 """Bits of `status`, by name."""
@@ -155,15 +165,18 @@ FLAG_MEANINGS: Final = MappingProxyType(
         "constant_object": "object constant: emissivity and background are undefined, the object "
         "temperature holds",
         "gray": "the bands' emissivities do not differ: the system is singular",
-        "background_never_rests": "slow change beside the object's: emissivity may be biased "
-        "beyond its standard deviation",
+        "background_never_rests": "the background rests in few frames: emissivity may be biased "
+        "beyond its standard deviation; a drift parallel to the object's curve cannot be seen",
         "nonphysical_emissivity": "estimated emissivity outside (0, 1): no background temperature",
         "invalid_samples": "NaN or infinite counts: nothing is estimated",
         "constant_signal": "a band's signal never changes: nothing is estimated",
-        "saturated": "samples at the detector's limit",
+        "saturated": "samples at the detector's limit: whole-number counts at an end of their "
+        "type, or as marked by the frame correction",
         "object_not_smooth": "the object changes faster than the smooth subspace can follow",
         "outside_response": "a temperature lies outside the calibrated range of the response",
         "dead_pixel": "marked as bad by the frame correction",
+        "frozen_frames": "the same counts in both bands for several frames, as while a shutter is "
+        "closed: what stands still in them is read as signal",
     }
 )
 """A sentence for each bit of `status`."""
@@ -257,6 +270,38 @@ def check_variable(array: xr.DataArray, variable: Variable, what: str) -> None:
             _check_bands(array, what)
         elif dim in COORDINATES:
             _check_coordinate(array, str(dim), what)
+
+
+def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], what: str) -> list[int]:
+    """
+    Where each of some bands is, by its name as text.
+
+    Parameters
+    ----------
+    array : DataArray or Dataset
+        With a dimension `band`.
+    wanted : list of str
+        Names.
+    what : str
+        What it is, for the error.
+
+    Returns
+    -------
+    list of int
+        Positions on `band`, in the order of the names.
+
+    Raises
+    ------
+    ValueError
+        If there is no coordinate `band`, or a band is missing.
+    """
+    if "band" not in array.coords:
+        raise ValueError(f"Missing coordinate 'band' of {what}. Must name each band.")
+    names = [str(name) for name in np.atleast_1d(array["band"].values)]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise ValueError(f"Missing band '{missing[0]}' in {what}. Has {names}.")
+    return [names.index(name) for name in wanted]
 
 
 def _check_bands(array: xr.DataArray, what: str) -> None:

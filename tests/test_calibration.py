@@ -188,8 +188,8 @@ def test_bad_counts(change: Change, message: str) -> None:
 @pytest.mark.parametrize(
     ("noise", "message"),
     [
-        (noise_of(3.0, 4.0).isel(band=[0]), "Missing band '9.5' of the noise. Has ['8-14']"),
-        (noise_of(3.0, 4.0).drop_vars("band"), "Missing band '8-14' of the noise. Has []"),
+        (noise_of(3.0, 4.0).isel(band=[0]), "Missing band '9.5' in the noise. Has ['8-14']"),
+        (noise_of(3.0, 4.0).drop_vars("band"), "Missing coordinate 'band' of the noise"),
         (noise_of(3.0, 4.0).rename(band="filter"), "Invalid dims ('filter',) of the noise"),
         (noise_of(0.03, 0.35, units="K"), "Invalid units 'K' of the noise"),
         (noise_of(3.0, -4.0), "Must be finite and positive"),

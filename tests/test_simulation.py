@@ -210,7 +210,7 @@ def test_observe_refuses(twin: xr.Dataset, known: xr.Dataset, rng: np.random.Gen
         simulation.observe(
             twin.assign(object_temperature=twin["object_temperature"] + 30), known, rng
         )
-    with pytest.raises(ValueError, match=r"Missing band '9.5' of the scene. Has .'8-14'."):
+    with pytest.raises(ValueError, match=r"Missing band '9.5' in the scene. Has .'8-14'."):
         simulation.observe(twin.isel(band=[0]), known, rng)
 
 
@@ -248,7 +248,7 @@ def test_capture_that_does_not_fit(
     for wrong in (seen + 50000.0, seen - 40000.0, seen.where(seen["time"] > 1)):
         with pytest.raises(ValueError, match=r"band '8-14'. Must lie in \[0, 65535\]"):
             simulation.capture(wrong, detector)
-    with pytest.raises(ValueError, match=r"Missing band '9.5' of the detector"):
+    with pytest.raises(ValueError, match=r"Missing band '9.5' in the detector"):
         simulation.capture(seen, detector.isel(band=[0]))
     with pytest.raises(ValueError, match=r"band '8-14'. Must lie in \[0, 65535\]"):
         simulation.blackbody_movies(Rig(offset=60000.0), np.array([290.0, 330.0]), 2, detector, rng)

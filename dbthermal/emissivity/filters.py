@@ -237,8 +237,5 @@ def _noise_of(noise: xr.DataArray, names: list[str]) -> Array:
         raise ValueError(
             f"Invalid noise {noise.dims} [{noise.attrs.get('units')}]. Must be (band,) [K]."
         )
-    known = [str(name) for name in noise["band"].values]
-    missing = [name for name in names if name not in known]
-    if missing:
-        raise ValueError(f"Missing band '{missing[0]}' in the noise. Has {known}.")
-    return planck.require_positive("noise [K]", noise.values[[known.index(n) for n in names]])
+    places = schema.band_positions(noise, names, "the noise")
+    return planck.require_positive("noise [K]", noise.values[places])

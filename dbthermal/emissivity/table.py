@@ -72,6 +72,10 @@ def band_table(
         of a band than `minimum_coverage`.
     """
     chosen = require_bands(bands)
+    if not isinstance(spectra, Mapping):
+        raise TypeError(
+            f"Invalid spectra of type {type(spectra).__name__}. Must map material to spectrum."
+        )
     if not spectra:
         raise ValueError("Empty spectra. Must hold at least one material.")
     if not 0 < minimum_coverage <= 1:
@@ -145,10 +149,17 @@ def require_bands(bands: Mapping[str, Band] | Iterable[Band | str]) -> list[Band
     ------
     KeyError
         If a name is unknown.
+    TypeError
+        If one is neither a band nor a name.
     ValueError
         If there is no band, or one repeats.
     """
-    given = bands.values() if isinstance(bands, Mapping) else bands
+    if isinstance(bands, (str, Band)):
+        bands = [bands]
+    given = list(bands.values()) if isinstance(bands, Mapping) else list(bands)
+    odd = [band for band in given if not isinstance(band, (str, Band))]
+    if odd:
+        raise TypeError(f"Invalid band {odd[0]!r}. Must be a Band, or the name of a filter.")
     chosen = [get(band) if isinstance(band, str) else band for band in given]
     names = [band.name for band in chosen]
     if not chosen or len(set(names)) < len(names):
@@ -170,6 +181,13 @@ def _values(spectrum: xr.Dataset, material: str) -> tuple[Array, Array]:
         raise ValueError(
             f"Invalid emissivity {emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m. "
             "Must be finite."
+        )
+    lowest, highest = schema.EMISSIVITY_LIMITS
+    bad = (emissivity < lowest) | (emissivity > highest)
+    if bad.any():
+        raise ValueError(
+            f"Invalid emissivity {emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m. "
+            f"Must lie in [{lowest}, {highest}]; it is a fraction, not per cent."
         )
     return wavelength, emissivity
 

@@ -4,7 +4,7 @@ A spectrum is a Dataset with `emissivity` (wavelength) [1], wavelength [m] incre
 attributes what the library says of the sample (`NOTES`, empty where it is silent), the file's name
 (`source`) and the number of values outside [0, 1] (`unphysical_values`). Those come from the
 calibration of the library's spectrometers and are kept as they are. An emissivity outside
-`EMISSIVITY_LIMITS` is no measurement, but a wrong unit or a damaged file, and is refused.
+`schema.EMISSIVITY_LIMITS` is no measurement, but a wrong unit or a damaged file, and is refused.
 """
 
 import csv
@@ -21,11 +21,6 @@ from numpy.typing import NDArray
 from dbthermal import schema
 
 Floats = NDArray[np.float64]
-
-EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
-"""A spectrum may hold these [1]: the libraries' extremes are -0.16 (trona) and 1.014 (maple bark).
-
-They stem from reflectances of 116 % and -1.4 % relative to the reference."""
 
 NOTES: Final = MappingProxyType(
     {
@@ -220,7 +215,7 @@ def _spectrum(
     wavelength: Floats, emissivity: Floats, notes: Mapping[str, str], path: Path
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
-    name, (low, high) = f"'{notes['name']}' of '{path.name}'", EMISSIVITY_LIMITS
+    name, (low, high) = f"'{notes['name']}' of '{path.name}'", schema.EMISSIVITY_LIMITS
     for quantity, values, least, most in (
         ("wavelength", wavelength, 1e-3, 1e3),
         ("emissivity", emissivity, low, high),

@@ -6,13 +6,14 @@ fits in the processor's cache.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
-from dbthermal.separation.problem import Array, Flags, Problem, Separated
+from dbthermal.separation.problem import Array, Flags, Mask, Problem, Separated, flag
 
 Tile = tuple[slice, slice]
 """Rows and columns of a tile."""
@@ -21,6 +22,8 @@ Known = tuple[Array, Array] | None
 """Emissivity and its standard deviation, each (band, y, x), or none."""
 
 _PIXELS: Final = 320
+# Frames in a row that noise repeats by chance in less than one of 1e8 pixels.
+_FROZEN_FRAMES: Final = 4
 _ALL_UNDEFINED: Final = ("invalid_samples", "constant_signal", "dead_pixel")
 
 
@@ -65,16 +68,70 @@ def read(corrected: xr.Dataset, tile: Tile) -> tuple[Array, Flags]:
     """
     rows, columns = tile
     part = corrected.isel(y=rows, x=columns)
-    counts = part["counts"].values
-    counts = counts.reshape(*counts.shape[:2], -1).astype(np.float64)
+    raw = part["counts"].values
+    raw = raw.reshape(*raw.shape[:2], -1)
+    counts = raw.astype(np.float64)
     invalid = ~np.all(np.isfinite(counts), axis=(0, 1))
     counts[:, :, invalid] = 0.0
     constant = np.any(counts.max(axis=1) == counts.min(axis=1), axis=0) & ~invalid
-    status = invalid * np.uint16(schema.FLAGS["invalid_samples"])
-    status |= constant * np.uint16(schema.FLAGS["constant_signal"])
+    status = flag(
+        {
+            "invalid_samples": invalid,
+            "constant_signal": constant & (counts.shape[1] > 1),
+            "saturated": _saturated(raw),
+            "frozen_frames": _frozen(counts) & ~invalid & ~constant,
+        }
+    )
     if "status" in corrected:
         status |= part["status"].values.reshape(-1).astype(np.uint16)
     return counts, status
+
+
+def _saturated(raw: npt.NDArray[Any]) -> Mask:
+    """Where whole-number counts reach an end of their type."""
+    if raw.dtype.kind not in "ui":
+        return np.zeros(raw.shape[-1], dtype=bool)
+    ends = np.iinfo(raw.dtype)
+    return np.asarray(np.any((raw == ends.max) | (raw == max(ends.min, 0)), axis=(0, 1)))
+
+
+def _frozen(counts: Array) -> Mask:
+    """Where both bands repeat their counts in several frames in a row."""
+    if counts.shape[1] <= _FROZEN_FRAMES:
+        return np.zeros(counts.shape[2], dtype=bool)
+    same = np.all(counts[:, 1:] == counts[:, :-1], axis=0)
+    run = same[: same.shape[0] - _FROZEN_FRAMES + 1].copy()
+    for shift in range(1, _FROZEN_FRAMES):
+        run &= same[shift : shift + run.shape[0]]
+    return np.asarray(np.any(run, axis=0))
+
+
+def check_status(corrected: xr.Dataset) -> None:
+    """
+    Check a status that the capture brings along.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        The capture.
+
+    Raises
+    ------
+    ValueError
+        If its `status` is not (y, x) of unsigned integers with bits of `schema.FLAGS`.
+    """
+    if "status" not in corrected:
+        return
+    status = corrected["status"]
+    if status.dims != ("y", "x") or status.dtype.kind not in "ui":
+        raise ValueError(
+            f"Invalid status {status.dims} of {status.dtype}. Must be ('y', 'x') of whole numbers."
+        )
+    unknown = status.values & ~np.asarray(sum(schema.FLAGS.values()), dtype=status.dtype)
+    if np.any(unknown):
+        raise ValueError(
+            f"Unknown bits {int(unknown.max())} in the status. Must be of {dict(schema.FLAGS)}."
+        )
 
 
 def sample(corrected: xr.Dataset, pixels: int) -> Array:
@@ -91,13 +148,13 @@ def sample(corrected: xr.Dataset, pixels: int) -> Array:
     Returns
     -------
     ndarray, shape (band, time, pixel)
-        Counts [count] of pixels without any flag.
+        Counts [count] of pixels without any flag but that of frozen frames.
     """
     height, width = corrected.sizes["y"], corrected.sizes["x"]
     step = max(1, int(np.sqrt(height * width / pixels)))
     part = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
     counts, status = read(part, (slice(None), slice(None)))
-    return counts[:, :, status == 0]
+    return counts[:, :, (status & ~np.uint16(schema.FLAGS["frozen_frames"])) == 0]
 
 
 def known_emissivity(
@@ -158,14 +215,9 @@ def _spread(corrected: xr.Dataset, array: xr.DataArray, what: str) -> Array:
         )
     if array.attrs.get("units", "1") != "1":
         raise ValueError(f"Invalid units '{array.attrs['units']}' of {what}. Must be '1'.")
-    if "band" not in array.coords:
-        raise ValueError(f"Missing coordinate 'band' of {what}. Must name each band.")
-    names = [str(name) for name in array["band"].values]
     wanted = [str(name) for name in corrected["band"].values]
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        raise ValueError(f"Missing band '{missing[0]}' of {what}. Has {names}.")
-    values = array.values[[names.index(name) for name in wanted]].astype(np.float64)
+    places = schema.band_positions(array, wanted, what)
+    values = array.values[places].astype(np.float64)
     shape = (2, corrected.sizes["y"], corrected.sizes["x"])
     if values.ndim == 3 and values.shape != shape:
         raise ValueError(f"Invalid shape {values.shape} of {what}. Must be {shape}.")
@@ -217,19 +269,20 @@ def allocate(corrected: xr.Dataset, given: Known) -> xr.Dataset:
     coordinates = {
         name: corrected[name] for name in ("band", "time", "y", "x") if name in corrected.coords
     }
-    arrays = {}
-    for name, variable in schema.STAGES["separated"].items():
-        shape = tuple(corrected.sizes[dim] for dim in variable.dims)
-        attrs = schema.status_attrs() if name == "status" else variable.attrs
-        empty = np.empty(shape, dtype=variable.dtype)
-        arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs=attrs)
     kept = {
         name: value
         for name, value in corrected.attrs.items()
         if name in ("origin", "radiometric", "source")
     }
-    kept["emissivity_source"] = "capture" if given is None else "given"
-    return xr.Dataset(arrays, coords=coordinates, attrs=kept)
+    arrays = {}
+    for name, variable in schema.STAGES["separated"].items():
+        shape = tuple(corrected.sizes[dim] for dim in variable.dims)
+        attrs = schema.status_attrs() if name == "status" else variable.attrs
+        attrs = {**attrs, **kept}
+        empty = np.empty(shape, dtype=variable.dtype)
+        arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs=attrs)
+    source = "capture" if given is None else "given"
+    return xr.Dataset(arrays, coords=coordinates, attrs={**kept, "emissivity_source": source})
 
 
 def write(

@@ -127,7 +127,7 @@ def observe(
     emitted = _blackbody(response, scene["object_temperature"], "float64")
     reflected = _blackbody(response, scene["background_temperature"], "float64")
     names = [str(name) for name in response["band"].values]
-    _require_bands(names, scene, "scene")
+    schema.band_positions(scene, names, "the scene")
     movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
     for index, name in enumerate(names):
         emissivity = scene["emissivity"].sel(band=name).values
@@ -300,7 +300,7 @@ def contact_measurements(
     )
     noise = response["noise"].values
     names = [str(name) for name in response["band"].values]
-    _require_bands(names, emissivity.to_dataset(name="emissivity"), "emissivity")
+    schema.band_positions(emissivity.to_dataset(name="emissivity"), names, "the emissivity")
     counts = [
         mixing.leaving(value, warm[index], cold[index]) + rng.normal(0, noise[index], len(true[0]))
         for index, value in enumerate(emissivity.sel(band=names).values)
@@ -319,7 +319,7 @@ def contact_measurements(
 
 def _digitise(counts: np.ndarray, detector: xr.Dataset, band: str) -> np.ndarray:
     """Raw 16-bit counts (..., y, x) of one band: fixed pattern, rounding, dead pixels at 0."""
-    _require_bands([band], detector, "detector")
+    schema.band_positions(detector, [band], "the detector")
     here = detector.sel(band=band)
     raw = np.rint(here["gain"].values * counts + here["offset"].values)
     if not (raw.min() >= 0 and raw.max() <= _FULL_SCALE):  # a NaN fails it, too
@@ -328,15 +328,6 @@ def _digitise(counts: np.ndarray, detector: xr.Dataset, band: str) -> np.ndarray
             f"Must lie in [0, {_FULL_SCALE}]."
         )
     return np.where(here["dead"].values, 0, raw).astype(np.uint16)
-
-
-def _require_bands(names: list[str], dataset: xr.Dataset, what: str) -> None:
-    """Refuse a dataset that lacks a band."""
-    missing = [name for name in names if name not in dataset["band"].values]
-    if missing:
-        raise ValueError(
-            f"Missing band '{missing[0]}' of the {what}. Has {dataset['band'].values.tolist()}."
-        )
 
 
 def _describe(dataset: xr.Dataset, stage: str) -> xr.Dataset:
