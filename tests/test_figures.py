@@ -111,9 +111,10 @@ def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
     return figures.condition_matrix(matrix.where(matrix["first"] != matrix["second"], np.inf), 9)
 
 
-def draw_scores(**_: object) -> Figure:
+def draw_scores(**attrs: object) -> Figure:
     """Draw the scores of two quantities."""
-    scores = {"object_temperature": array("pixel", 50) - 300, "k2": array("pixel", 50) - 301}
+    parts = {"object_temperature": array("pixel", 50) - 300, "k2": array("pixel", 50) - 301}
+    scores = {name: part.assign_attrs(attrs) for name, part in parts.items()}
     return figures.error_bar_calibration(scores)
 
 
@@ -126,8 +127,8 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
         draw_response,
         {
             "signal [count]",
-            "residual of the line [count]",
-            "residual of the curve [count]",
+            "residual of the line [K]",
+            "residual of the curve [mK]",
             f"blackbody temperature [{DEGREE}]",
         },
     ),
@@ -146,7 +147,7 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     "separated_frames": (draw_frames, {"input [1]", "emission [1]", "reflection [1]"}),
     "separated_temperatures": (
         draw_temperatures,
-        {f"apparent [{DEGREE}]", f"object [{DEGREE}]", "background [K]"},
+        {f"apparent [{DEGREE}]", f"object [{DEGREE}]", "background change [K]"},
     ),
     "compared_reflections": (draw_compared, {"own unit", "time [s]", "correlation [1]"}),
     "status_map": (draw_status, set()),
@@ -182,11 +183,6 @@ def test_title_says_what_the_data_are(name: str) -> None:
     """Simulated data and pictures are called so."""
     draw, _ = DRAWN[name]
     assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
-
-
-def test_error_bars_are_always_simulated() -> None:
-    """Errors are known in simulations only."""
-    assert "(simulated)" in titles(draw_scores())
 
 
 @pytest.mark.parametrize(

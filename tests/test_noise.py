@@ -128,3 +128,11 @@ def test_frozen_signal_has_no_noise(white: Signals) -> None:
     """A signal that does not change is refused, not given a noise of zero."""
     with pytest.raises(ValueError, match="Must be positive: the signals vary"):
         noise.estimate(np.zeros_like(white[0]), white[1], TIME)
+
+
+def test_uneven_time_stamps(white: Signals, rng: np.random.Generator) -> None:
+    """A curved signal on uneven time stamps leaves the noise as it is."""
+    time = np.sort(rng.uniform(TIME[0], TIME[-1], TIME.size))
+    curved = 30.0 * (1.0 - np.exp(-time / 8.0))[:, np.newaxis]
+    found = noise.estimate(white[0] + curved, white[1] + curved, time)
+    assert found == pytest.approx(NOISE, rel=0.03)

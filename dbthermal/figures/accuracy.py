@@ -87,7 +87,8 @@ def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
     Parameters
     ----------
     scores : mapping of str to DataArray
-        Quantity, and its errors divided by their standard deviation [1].
+        Quantity, and its errors divided by their standard deviation [1]; the first one's
+        attributes say what the data are.
 
     Returns
     -------
@@ -102,5 +103,6 @@ def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
         axis.plot(grid, normal, color="black", linewidth=1)
         axis.set(title=name.replace("_", " "), xlabel="error / standard deviation [1]")
     axes[0, 0].set_ylabel("density [1]")
-    figure.suptitle("Error bars against errors (simulated)")
+    data = next(iter(scores.values()))
+    figure.suptitle("Error bars against errors" + provenance_note(data))
     return figure

@@ -61,7 +61,7 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
     Figure
         From above: counts over temperature, the line's residuals, and those of the
         Sakuma-Hattori curve on a scale of their own, with the noise of one pixel and frame where
-        the response has it.
+        the response has it; residuals and noise over the slope of the line.
     """
     bands = response["band"].values
     figure, axes = canvas(3, len(bands), (4.6 * len(bands), 7.2))
@@ -74,14 +74,16 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
         top.plot(celsius, here["counts"], ".", color=COLORS[1])
         top.set(title=band_label(band), ylabel="signal [count]")
         top.legend(["Sakuma-Hattori", "linear", "blackbody"], frameon=False, fontsize=8)
-        middle.plot(celsius, here["linear_residual"], "s--", color=COLORS[2], markersize=3)
-        middle.set(ylabel="residual of the line\n[count]")
-        bottom.plot(celsius, here["residual"], "o-", color=COLORS[0], markersize=3)
-        bottom.set(ylabel="residual of the curve\n[count]")
+        kelvin = 1.0 / here["linear_slope"]
+        middle.plot(celsius, here["linear_residual"] * kelvin, "s--", color=COLORS[2], markersize=3)
+        middle.set(ylabel="residual of the line\n[K]")
+        millikelvin = 1e3 * here["residual"] * kelvin
+        bottom.plot(celsius, millikelvin, "o-", color=COLORS[0], markersize=3)
+        bottom.set(ylabel="residual of the curve\n[mK]")
         bottom.set_xlabel("blackbody temperature [\N{DEGREE SIGN}C]")
         if "noise" in here:
-            limit = float(here["noise"])
-            bottom.set_title(f"noise of one pixel and frame: {limit:.1f} count", fontsize=8)
+            noise = 1e3 * float(here["noise"] * kelvin)
+            bottom.set_title(f"noise of one pixel and frame: {noise:.0f} mK", fontsize=8)
         for axis in (middle, bottom):
             axis.axhline(0.0, color="0.7", linewidth=0.8)
     figure.suptitle("Camera response" + provenance_note(response))

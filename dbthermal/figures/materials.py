@@ -28,6 +28,7 @@ def emissivity_bars(table: xr.Dataset) -> Figure:
         place = np.arange(len(materials)) + width * (index - (len(bands) - 1) / 2)
         values = table["emissivity"].sel(band=band)
         axis.bar(place, values, width, color=COLORS[index % len(COLORS)], label=band_label(band))
+    axis.margins(x=0.01)
     axis.set_xticks(np.arange(len(materials)), materials, rotation=45, ha="right", fontsize=8)
     axis.set(ylabel="band emissivity [1]", ylim=(0, 1.12))
     axis.legend(frameon=False, ncols=len(bands), loc="upper center", fontsize=8)

@@ -87,7 +87,7 @@ def separated_temperatures(
     Figure
         As many rows as there are times.
     """
-    labels = ("apparent [\N{DEGREE SIGN}C]", "object [\N{DEGREE SIGN}C]", "background [K]")
+    labels = ("apparent [\N{DEGREE SIGN}C]", "object [\N{DEGREE SIGN}C]", "background change [K]")
     inputs = (apparent - zero_Celsius).assign_attrs(apparent.attrs)
     return separated_frames(inputs, emission - zero_Celsius, change, title=title, labels=labels)
 
