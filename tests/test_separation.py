@@ -477,6 +477,17 @@ def test_frozen_frames_are_flagged(glass: Glass) -> None:
     assert not np.any(separation.solve(capture, response)["status"])
 
 
+def test_unlabelled_emissivity_goes_by_position(glass: Glass) -> None:
+    """An emissivity without band names is taken in the capture's order, as xarray aligns it."""
+    _, capture, response = glass
+    named = emissivity_of(0.86, 0.72)
+    results = [
+        separation.solve(capture.isel(time=[7]), response, "calibrated", emissivity=emissivity)
+        for emissivity in (named, named.drop_vars("band"))
+    ]
+    xr.testing.assert_identical(*results)
+
+
 def test_one_frame_can_be_calibrated(glass: Glass) -> None:
     """A single frame is enough with known emissivities, and is no constant signal."""
     scene, capture, response = glass

@@ -108,7 +108,7 @@ def estimate(signals: Array, functions: Array, noise: tuple[float, float]) -> Di
     kept = np.arange(orders)[:, np.newaxis] <= order
     return Direction(
         ratio=ratio,
-        variance=ratio_variance(ratio, energy, noise, frames - order - 1),
+        variance=estimated_variance(ratio, energy, noise, frames - order - 1),
         order=order + 1,
         contrast=contrast,
         misfit=smallest,
@@ -141,7 +141,7 @@ def choose_order(misfit: Array, frames: int) -> npt.NDArray[np.intp]:
     return np.asarray(best + 1)
 
 
-def ratio_variance(
+def estimated_variance(
     ratio: Array, energy: Array, noise: tuple[float, float], freedom: npt.ArrayLike
 ) -> Array:
     """

@@ -168,7 +168,8 @@ def known_emissivity(
     corrected : Dataset
         The capture.
     emissivity, std : DataArray, optional
-        Emissivity and its standard deviation, (band) or (band, y, x) [1].
+        Emissivity and its standard deviation, (band) or (band, y, x) [1]; without a coordinate
+        `band`, in the capture's order.
 
     Returns
     -------
@@ -216,7 +217,10 @@ def _spread(corrected: xr.Dataset, array: xr.DataArray, what: str) -> Array:
     if array.attrs.get("units", "1") != "1":
         raise ValueError(f"Invalid units '{array.attrs['units']}' of {what}. Must be '1'.")
     wanted = [str(name) for name in corrected["band"].values]
-    places = schema.band_positions(array, wanted, what)
+    if "band" not in array.coords and array.sizes["band"] == len(wanted):
+        places = list(range(len(wanted)))  # unlabelled dimensions align by position, as in xarray
+    else:
+        places = schema.band_positions(array, wanted, what)
     values = array.values[places].astype(np.float64)
     shape = (2, corrected.sizes["y"], corrected.sizes["x"])
     if values.ndim == 3 and values.shape != shape:

@@ -6,10 +6,9 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import bands, calibration, mixing, planck, schema
+from dbthermal import bands, calibration, frames, mixing, planck, schema
 from dbthermal import response as responses
 
-_FULL_SCALE: Final = 65535
 _CALIBRATION_POINTS: Final = 25
 _SLOPE_TEMPERATURE: Final = 300.0
 
@@ -322,10 +321,10 @@ def _digitise(counts: np.ndarray, detector: xr.Dataset, band: str) -> np.ndarray
     schema.band_positions(detector, [band], "the detector")
     here = detector.sel(band=band)
     raw = np.rint(here["gain"].values * counts + here["offset"].values)
-    if not (raw.min() >= 0 and raw.max() <= _FULL_SCALE):  # a NaN fails it, too
+    if not (raw.min() >= 0 and raw.max() <= frames.DETECTOR_MAXIMUM):  # a NaN fails it, too
         raise ValueError(
             f"Invalid counts {raw.min()} to {raw.max()} in band '{band}'. "
-            f"Must lie in [0, {_FULL_SCALE}]."
+            f"Must lie in [0, {frames.DETECTOR_MAXIMUM}]."
         )
     return np.where(here["dead"].values, 0, raw).astype(np.uint16)
 
