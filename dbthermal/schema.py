@@ -172,7 +172,8 @@ FLAG_MEANINGS: Final = MappingProxyType(
         "constant_signal": "a band's signal never changes: nothing is estimated",
         "saturated": "samples at the detector's limit: whole-number counts at an end of their "
         "type, or as marked by the frame correction",
-        "object_not_smooth": "the object changes faster than the smooth subspace can follow",
+        "object_not_smooth": "the combination of bands that holds no background is more than white "
+        "noise about a smooth curve: the object changes too fast, or the noise is another",
         "outside_response": "a temperature lies outside the calibrated range of the response",
         "dead_pixel": "marked as bad by the frame correction",
         "frozen_frames": "the same counts in both bands for several frames, as while a shutter is "

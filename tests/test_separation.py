@@ -151,6 +151,30 @@ def test_jump_of_the_object_is_flagged(
     assert np.all(separation.solve(capture, response)["status"].values != 0)
 
 
+def test_fast_object_is_mostly_flagged() -> None:
+    """An object that jumps in 0.2-0.4 s is flagged in nine pixels of ten, a slow one in none."""
+    shares = []
+    for constant in ((0.2, 0.4), (8.0, 20.0)):
+        rng = np.random.default_rng(2)
+        scene = simulation.independent_pixels(
+            TIME,
+            emissivity_of(0.86, 0.72),
+            Background(),
+            300,
+            rng,
+            start=293.15,
+            stop=333.15,
+            time_constant=constant,
+        )
+        status = separation.solve(simulation.observe(scene, RIG.response(), rng), RIG.response())[
+            "status"
+        ]
+        shares.append(float((status != 0).mean()))
+    print(f"flagged: fast object {shares[0]:.2f}, slow object {shares[1]:.3f}")
+    assert shares[0] > 0.9
+    assert shares[1] < 0.01
+
+
 def test_linear_response_costs_kelvins() -> None:
     """The paper's linear response is offered, and is off by more than a kelvin at 60 C."""
     errors = []

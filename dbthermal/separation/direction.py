@@ -15,6 +15,9 @@ from dbthermal import smooth
 
 Array = npt.NDArray[np.float64]
 
+MEMORY_LAGS: Final = 5
+"""Frames over which `memory` looks for a correlation."""
+
 LOWEST_ORDER: Final = 3
 HIGHEST_ORDER: Final = 14
 """Smallest and largest smooth subspace that the data may choose (number of functions)."""
@@ -114,6 +117,37 @@ def estimate(signals: Array, functions: Array, noise: tuple[float, float]) -> Di
         misfit=smallest,
         coefficients=np.stack([(functions.T @ signal) * kept for signal in signals]),
     )
+
+
+def memory(signals: Array, functions: Array, found: Direction) -> Array:
+    r"""
+    Mean autocorrelation of what is left of :math:`z_2 - k_2 z_1`, over a few frames.
+
+    White noise leaves nothing but scatter. A change of the object that the smooth functions do not
+    follow, or a background along another direction, leaves a correlation.
+
+    Parameters
+    ----------
+    signals : ndarray, shape (2, time, pixel)
+        Signals of the two bands.
+    functions : ndarray, shape (time, order)
+        Smooth functions.
+    found : Direction
+        From `estimate`.
+
+    Returns
+    -------
+    ndarray, shape (pixel,)
+        Mean over lags of 1 to `MEMORY_LAGS` frames, in standard deviations of white noise.
+    """
+    smooth_part = functions @ (found.coefficients[1] - found.ratio * found.coefficients[0])
+    left = signals[1] - found.ratio * signals[0] - smooth_part
+    energy = np.einsum("tp,tp->p", left, left)
+    lagged = np.zeros_like(energy)
+    for lag in range(1, MEMORY_LAGS + 1):
+        lagged += np.einsum("tp,tp->p", left[lag:], left[:-lag])
+    mean = np.divide(lagged, MEMORY_LAGS * energy, out=np.zeros_like(energy), where=energy > 0)
+    return np.asarray(mean * np.sqrt(MEMORY_LAGS * left.shape[0]))
 
 
 def choose_order(misfit: Array, frames: int) -> npt.NDArray[np.intp]:

@@ -14,6 +14,8 @@ Flags = npt.NDArray[np.uint16]
 Mask = npt.NDArray[np.bool_]
 
 _BEYOND: Final = 5.0
+# A temperature [K], emissivity [1] or deviation beyond is no result.
+_USELESS: Final = 1e6
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ class Separated:
 
     def ranged(self, problem: Problem) -> "Separated":
         """
-        Flag temperatures outside the response's range, and those that no temperature gives.
+        Flag temperatures outside the response's range, and what has no usable number.
 
         Parameters
         ----------
@@ -170,13 +172,21 @@ class Separated:
         Returns
         -------
         Separated
-            The same with `outside_response` added to the status.
+            The same with `outside_response` added to the status; samples that no temperature
+            gives, or whose deviation is beyond all use, are NaN.
         """
+        values: dict[str, Array] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
-        for name in ("object_temperature", "background_temperature"):
+        for name in ("object_temperature", "background_temperature", "emissivity"):
             value, std = getattr(self, name), getattr(self, f"{name}_std")
-            beyond |= outside(value, std, problem.curves[0])
-        return replace(self, status=self.status | flag({"outside_response": beyond}))
+            lost = ~((np.abs(value) < _USELESS) & (std < _USELESS))
+            beyond |= np.any(lost, axis=0) & ~np.all(np.isnan(value), axis=0)
+            values[name], values[f"{name}_std"] = (
+                np.where(lost, np.nan, part) for part in (value, std)
+            )
+            if name != "emissivity":
+                beyond |= outside(value, std, problem.curves[0])
+        return replace(self, **values, status=self.status | flag({"outside_response": beyond}))
 
 
 def flag(conditions: dict[str, Mask]) -> Flags:
@@ -204,18 +214,15 @@ def outside(temperature: Array, std: Array, curve: Curve) -> Mask:
     Parameters
     ----------
     temperature, std : ndarray, shape (time, pixel)
-        Temperature and standard deviation [K]; NaN in all frames where undefined.
+        Temperature and standard deviation [K].
     curve : Curve
         The response.
 
     Returns
     -------
     ndarray of bool, shape (pixel,)
-        True if any sample is more than five standard deviations outside, or if a defined pixel
-        has a sample without a finite temperature and deviation.
+        True if any sample is more than five standard deviations outside.
     """
     margin = _BEYOND * std
     below, above = temperature < curve.lowest - margin, temperature > curve.highest + margin
-    finite = np.isfinite(temperature) & np.isfinite(std)
-    partly = np.any(finite, axis=0) & ~np.all(finite, axis=0)
-    return np.asarray(np.any(below | above, axis=0) | partly)
+    return np.asarray(np.any(below | above, axis=0))

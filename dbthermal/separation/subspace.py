@@ -27,6 +27,7 @@ from dbthermal.separation.problem import Array, Problem, Separated, flag
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
 _MISFIT_SIGMAS: Final = 8.0
+_MEMORY_SIGMAS: Final = 3.5
 _GRAY_SIGMAS: Final = 4.0
 # Energy of the bend between the two responses, in units of the second band's noise, from which it
 # is worth taking out: it moves no linear function of the signal by more standard deviations.
@@ -41,6 +42,7 @@ class _Estimate:
     emission: emission.Emission
     background: Array
     background_variance: Array
+    memory: Array
 
 
 def separate(problem: Problem) -> Separated:
@@ -77,7 +79,9 @@ def _pass(problem: Problem, straight: Problem, functions: Array) -> _Estimate:
     """Steps 1 to 4; the first three on signals whose reflections are proportional."""
     found = direction.estimate(straight.signals, functions, problem.noise)
     object_found = emission.estimate(straight, functions, found)
-    return _Estimate(found, object_found, *background.estimate(problem, object_found, found))
+    reflected = background.estimate(problem, object_found, found)
+    memory = direction.memory(straight.signals, functions, found)
+    return _Estimate(found, object_found, *reflected, memory)
 
 
 def _report(problem: Problem, estimate: _Estimate) -> Separated:
@@ -106,7 +110,8 @@ def _report(problem: Problem, estimate: _Estimate) -> Separated:
                 "constant_object": ~undefined & fit.constant,
                 "background_never_rests": ~unidentified & fit.restless,
                 "nonphysical_emissivity": nonphysical,
-                "object_not_smooth": found.misfit > 1.0 + _MISFIT_SIGMAS * 2.0 / np.sqrt(spread),
+                "object_not_smooth": (estimate.memory > _MEMORY_SIGMAS)
+                | (found.misfit > 1.0 + _MISFIT_SIGMAS * 2.0 / np.sqrt(spread)),
             }
         ),
     )
