@@ -1,14 +1,16 @@
 """Time and memory, measured on request: `make bench`."""
 
 import resource
+import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import experiments, separation, simulation
+from dbthermal import experiments, provenance, separation, simulation, store
 from dbthermal.simulation import Rig
 
 ROWS, COLUMNS, FRAMES = 512, 640, 350
@@ -53,3 +55,27 @@ def test_full_frame(capture: xr.Dataset) -> None:
     assert float((result["status"] == 0).mean()) > 0.95
     assert seconds < 30
     assert added < 3 * size
+
+
+FROM_DISK = """
+import resource, sys, time
+from dbthermal import separation, store
+from dbthermal.simulation import Rig
+capture, response = store.open_dataset(sys.argv[1]), Rig().response()
+start = time.perf_counter()
+separation.solve(capture, response, workers=2)
+print(time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.bench
+def test_full_frame_from_disk(capture: xr.Dataset, tmp_path: Path) -> None:
+    """Read from disk block by block, the whole process takes less than three captures."""
+    path = tmp_path / "capture.zarr"
+    store.save(capture, path, provenance.record({}))
+    command = [sys.executable, "-c", FROM_DISK, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    seconds, peak = (float(number) for number in done.stdout.split())
+    copies = peak / UNIT / (capture["counts"].nbytes / 2**20)
+    print(f"\nfrom disk: {seconds:.1f} s, whole process {copies:.2f} captures")
+    assert copies < 3

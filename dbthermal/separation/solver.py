@@ -46,7 +46,8 @@ def solve(
     ----------
     corrected : Dataset
         `counts` (band, time, y, x) [count] of two bands, `time` [s]; optionally `status` (y, x)
-        from `frames.correct`. May be lazy: it is read tile by tile.
+        from `frames.correct`. May be lazy, as from `store.open_dataset`: it is read a few rows at
+        a time, and never whole.
     response : Dataset
         From `calibration.fit_response`, with both bands. Its `noise` (band) [count] is used
         where present, otherwise the noise is estimated from the capture.
@@ -100,14 +101,16 @@ def solve(
     # The quieter band comes first: the regression for the emissivity needs a quiet ordinate.
     bands = [int(band) for band in np.argsort(deviations, kind="stable")]
 
-    def work(tile: tiles.Tile) -> None:
-        counts, status = tiles.read(corrected, tile)
-        problem = _problem(counts, corrected, curves, deviations, bands)
-        problem = tiles.with_emissivity(problem, given, tile, bands)
-        tiles.write(result, tile, bands, METHODS[method](problem), status)
+    def work(rows: slice) -> None:
+        part, target = corrected.isel(y=rows).load(), result.isel(y=rows)
+        for tile in tiles.cover(part):
+            counts, status = tiles.read(part, tile)
+            problem = _problem(counts, part, curves, deviations, bands)
+            problem = tiles.with_emissivity(problem, tiles.rows_of(given, rows), tile, bands)
+            tiles.write(target, tile, bands, METHODS[method](problem), status)
 
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as pool:
-        for _ in pool.map(work, tiles.cover(corrected)):
+        for _ in pool.map(work, tiles.blocks(corrected)):
             pass
     slopes = [curve.reference_slope for curve in curves]
     result["noise"] = xr.DataArray(

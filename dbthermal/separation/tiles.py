@@ -1,4 +1,4 @@
-"""Tiles: a capture is read, separated and written back a few hundred pixels at a time.
+"""Tiles: a capture is read in blocks of rows, and separated a few hundred pixels at a time.
 
 So the memory beyond the result stays small, a lazy capture is never read whole, and every tile
 fits in the processor's cache.
@@ -22,9 +22,48 @@ Known = tuple[Array, Array] | None
 """Emissivity and its standard deviation, each (band, y, x), or none."""
 
 _PIXELS: Final = 320
+_BLOCK_ROWS: Final = 32
 # Frames in a row that noise repeats by chance in less than one of 1e8 pixels.
 _FROZEN_FRAMES: Final = 4
 _ALL_UNDEFINED: Final = ("invalid_samples", "constant_signal", "dead_pixel")
+
+
+def blocks(corrected: xr.Dataset) -> Iterator[slice]:
+    """
+    Blocks of rows, each read at once: a lazy capture is then decoded about once.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        The capture.
+
+    Yields
+    ------
+    slice
+        Rows.
+    """
+    height = corrected.sizes["y"]
+    for top in range(0, height, _BLOCK_ROWS):
+        yield slice(top, min(top + _BLOCK_ROWS, height))
+
+
+def rows_of(given: Known, rows: slice) -> Known:
+    """
+    Known emissivities of a block of rows.
+
+    Parameters
+    ----------
+    given : tuple of ndarray or None
+        From `known_emissivity`.
+    rows : slice
+        The block.
+
+    Returns
+    -------
+    tuple of ndarray or None
+        The same of these rows.
+    """
+    return None if given is None else (given[0][:, rows], given[1][:, rows])
 
 
 def cover(corrected: xr.Dataset) -> Iterator[Tile]:
