@@ -157,10 +157,14 @@ def status_map(status: xr.DataArray, meanings: Mapping[str, int]) -> Figure:
     masks = {"good": status == 0}
     masks |= {name: (status & bit) != 0 for name, bit in meanings.items()}
     shown = {name: mask for name, mask in masks.items() if bool(mask.any())}
-    figure, axes = canvas(1, len(shown), (2.5 * len(shown), 2.6))
-    for axis, (name, mask) in zip(axes[0], shown.items(), strict=True):
+    columns = min(len(shown), 4)
+    rows = -(-len(shown) // columns)
+    figure, axes = canvas(rows, columns, (2.9 * columns, 2.6 * rows))
+    for axis in list(axes.ravel())[len(shown) :]:
+        axis.remove()
+    for axis, (name, mask) in zip(axes.ravel(), shown.items(), strict=False):
         axis.imshow(mask.values, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        axis.set_title(f"{name.replace('_', ' ')}\n{100 * float(mask.mean()):.1f} %", fontsize=8)
+        axis.set_title(f"{name.replace('_', ' ')}\n{100 * float(mask.mean()):.1f} %", fontsize=9)
         axis.set_xticks([])
         axis.set_yticks([])
     figure.suptitle("Status, white where set" + provenance_note(status))
