@@ -11,7 +11,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.optimize import least_squares
 
-from dbthermal import bands, planck, schema
+from dbthermal import bands, curves, planck, schema
 from dbthermal import response as responses
 
 Array = npt.NDArray[np.float64]
@@ -283,8 +283,8 @@ def fit_emissivity(
     fits = []
     for index, name in enumerate(names):
         curve = responses.curve(response, name)
-        responses.require_range(warm, curve, "object temperature")
-        responses.require_range(cold, curve, "background temperature")
+        curves.require_range(warm, curve, "object temperature")
+        curves.require_range(cold, curve, "background temperature")
         counts = measured["counts"].values[index].astype(np.float64)
         fits.append(_fit_one_emissivity(curve, counts, (warm, cold), stds, float(noises[index])))
     value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
@@ -310,7 +310,7 @@ def _check_measurements(measured: xr.Dataset) -> None:
 
 
 def _fit_one_emissivity(
-    curve: responses.Curve,
+    curve: curves.Curve,
     counts: Array,
     temperatures: tuple[Array, Array],
     stds: Array,

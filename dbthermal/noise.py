@@ -59,8 +59,8 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     Noise of two bands from their signals.
 
     For each pixel, with D the covariance of the trimmed second differences (the smooth part taken
-    out before) and k the ratio of the
-    bands' rapid changes (from their covariance one frame apart, where noise does not enter),
+    out before) and k the ratio of the bands' rapid changes (from their covariance one frame apart,
+    where noise does not enter),
 
     .. math:: s_1^2 = D_{11} - D_{12} / k, \quad s_2^2 = D_{22} - k D_{12}
 

@@ -11,6 +11,7 @@ import dbthermal
 PACKAGE = Path(dbthermal.__file__).parent
 LAYERS = (
     "paths schema planck heat mixing smooth",
+    "curves",
     "response bands frames alignment noise metrics figures store provenance manifest readers",
     "calibration emissivity separation",
     "simulation verify published",

@@ -89,15 +89,17 @@ def test_pulses_do_not_enter(white: Signals, rng: np.random.Generator, share: fl
     assert noise.estimate(*moved, TIME) == pytest.approx(NOISE, rel=0.05)
 
 
-@pytest.mark.parametrize("memory", [0.3, 3.0, 30.0])
-def test_restless_background(white: Signals, rng: np.random.Generator, memory: float) -> None:
+@pytest.mark.parametrize(("memory", "tolerance"), [(0.3, 0.06), (3.0, 0.06), (30.0, 0.22)])
+def test_restless_background(
+    white: Signals, rng: np.random.Generator, memory: float, tolerance: float
+) -> None:
     """A background that never rests is told from noise by what the bands share.
 
     At 0.3 s it makes the quiet band's differences 6.6 times too large; 4 % are left. At 30 s a
     fifth is: one pixel does not show what the bands share.
     """
     first, second = noise.estimate(*reflect(white, walk(rng, memory)), TIME)
-    assert first == pytest.approx(NOISE[0], rel=0.22)
+    assert first == pytest.approx(NOISE[0], rel=tolerance)
     assert second == pytest.approx(NOISE[1], rel=TOLERANCE)
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal import planck, response, schema
-from dbthermal.response import Curve, Line
+from dbthermal.curves import Curve, Line, require_range
 
 TEMPERATURES = st.floats(250.0, 400.0)
 # Published constants of a laboratory's FLIR Boson: R / (exp(B / T) - F) + O with F = 1.
@@ -149,7 +149,7 @@ def test_temperature_outside_the_calibration(two_bands: xr.Dataset, temperature:
 def test_range_holds_its_ends(two_bands: xr.Dataset) -> None:
     """The ends of the range belong to it."""
     curve = response.curve(two_bands, "8-14")
-    values = response.require_range([280.0, 340.0], curve, "temperature")
+    values = require_range([280.0, 340.0], curve, "temperature")
     np.testing.assert_array_equal(values, [280.0, 340.0])
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import schema
-from dbthermal.response import Curve
+from dbthermal.curves import Curve
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.uint16]

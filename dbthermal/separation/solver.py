@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from dbthermal import noise as noise_of
 from dbthermal import response as responses
 from dbthermal import schema
-from dbthermal.response import Curve
+from dbthermal.curves import Curve
 from dbthermal.separation import calibrated, subspace, tiles
 from dbthermal.separation.problem import Array, Problem
 
@@ -100,9 +100,10 @@ def solve(
     result = tiles.allocate(corrected, given)
     # The quieter band comes first: the regression for the emissivity needs a quiet ordinate.
     bands = [int(band) for band in np.argsort(deviations, kind="stable")]
+    needed = corrected[[name for name in ("counts", "status") if name in corrected]]
 
     def work(rows: slice) -> None:
-        part, target = corrected.isel(y=rows).load(), result.isel(y=rows)
+        part, target = needed.isel(y=rows).load(), result.isel(y=rows)
         for tile in tiles.cover(part):
             counts, status = tiles.read(part, tile)
             problem = _problem(counts, part, curves, deviations, bands)

@@ -8,6 +8,7 @@ import xarray as xr
 
 from dbthermal import bands, calibration, frames, mixing, planck, schema
 from dbthermal import response as responses
+from dbthermal.curves import require_range
 
 _CALIBRATION_POINTS: Final = 25
 _SLOPE_TEMPERATURE: Final = 300.0
@@ -27,7 +28,7 @@ class Rig:
     bands : tuple of str
         Names in `bands.FILTERS`.
     noise : tuple of float
-        Noise of each band, as NETD at `noise_temperature` [K].
+        Noise of each band, as NETD near 25 degrees Celsius [K].
     counts_per_kelvin : float
         Slope of the 8-14 um band at 300 K [count/K].
     offset : float
@@ -86,11 +87,12 @@ class Rig:
         return result.assign_attrs(origin="simulated")
 
 
-def _blackbody(response: xr.Dataset, temperature: xr.DataArray, dtype: str) -> list[np.ndarray]:
+def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
+    """Counts of a blackbody in each band, the temperatures checked against the response."""
     names = [str(name) for name in response["band"].values]
     curves = [responses.curve(response, name) for name in names]
-    values = responses.require_range(temperature.values, curves[0], str(temperature.name))
-    return [curve.counts(values).astype(dtype) for curve in curves]
+    values = require_range(temperature.values, curves[0], str(temperature.name))
+    return [curve.counts(values) for curve in curves]
 
 
 def observe(
@@ -123,8 +125,8 @@ def observe(
     ValueError
         If a temperature lies outside the response, or a band is missing.
     """
-    emitted = _blackbody(response, scene["object_temperature"], "float64")
-    reflected = _blackbody(response, scene["background_temperature"], "float64")
+    emitted = _blackbody(response, scene["object_temperature"])
+    reflected = _blackbody(response, scene["background_temperature"])
     names = [str(name) for name in response["band"].values]
     schema.band_positions(scene, names, "the scene")
     movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
@@ -247,7 +249,7 @@ def blackbody_movies(
     shape = (frames, *detector["gain"].shape[1:])
     level = xr.DataArray(temperatures, dims="temperature", name="temperature")
     movies = np.empty((len(rig.bands), len(temperatures), *shape), dtype=np.uint16)
-    for index, counts in enumerate(_blackbody(response, level, "float64")):
+    for index, counts in enumerate(_blackbody(response, level)):
         noise = float(response["noise"][index])
         for place, mean in enumerate(counts):
             frame = mean + rng.normal(0.0, noise, shape)
@@ -294,7 +296,7 @@ def contact_measurements(
     """
     true = [object_temperature, background_temperature]
     warm, cold = (
-        _blackbody(response, xr.DataArray(level, dims="measurement", name=name), "float64")
+        _blackbody(response, xr.DataArray(level, dims="measurement", name=name))
         for level, name in zip(true, ("object", "background"), strict=True)
     )
     noise = response["noise"].values
