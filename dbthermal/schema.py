@@ -154,6 +154,7 @@ FLAGS: Final = MappingProxyType(
         "outside_response": 512,
         "dead_pixel": 1024,
         "frozen_frames": 2048,
+        "not_converged": 4096,
     }
 )
 """Bits of `status`, by name."""
@@ -178,6 +179,7 @@ FLAG_MEANINGS: Final = MappingProxyType(
         "dead_pixel": "marked as bad by the frame correction",
         "frozen_frames": "the same counts in both bands for several frames, as while a shutter is "
         "closed: what stands still in them is read as signal",
+        "not_converged": "the optimiser stopped at its limit of steps, or at no finite value",
     }
 )
 """A sentence for each bit of `status`."""

@@ -1,6 +1,6 @@
 """Separation of emission and reflection: one function, several methods of one signature."""
 
 from dbthermal.separation.relative import reflections
-from dbthermal.separation.solver import METHODS, MINIMUM_FRAMES, solve
+from dbthermal.separation.solver import METHODS, solve
 
-__all__ = ["METHODS", "MINIMUM_FRAMES", "reflections", "solve"]
+__all__ = ["METHODS", "reflections", "solve"]

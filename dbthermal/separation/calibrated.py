@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from dbthermal.separation import limits
-from dbthermal.separation.problem import Array, Problem, Separated, flag
+from dbthermal.separation.problem import Array, Method, Problem, Separated, flag
 
 _STEPS: Final = 5
 # Largest last step of a sample that is solved [K].
@@ -99,3 +99,7 @@ def _invert(mixing: Array, signals: Array) -> Array:
     determinant = a * d - b * c
     first, second = signals
     return np.asarray(np.stack([d * first - b * second, a * second - c * first]) / determinant)
+
+
+METHOD: Final = Method(separate, knows_emissivity=True)
+"""The closed form for known emissivities, for `solve`."""

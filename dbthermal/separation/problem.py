@@ -1,7 +1,8 @@
 """What every separation method is given and gives back: one tile of pixels."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -33,16 +34,25 @@ class Problem:
         Response of each band, with one reference temperature.
     noise : tuple of float
         Standard deviation of the signals' noise [K], at the reference temperature.
+    shape : tuple of int
+        Rows and columns of the tile; its pixels follow one another along the rows.
+    rng : Generator
+        The tile's own source of randomness, for random starts.
     emissivity, emissivity_std : ndarray, shape (2, pixel), optional
         Known emissivities and their standard deviations [1], for methods that need them.
+    truth : ndarray, shape (time, pixel), optional
+        True object temperature [K], for an oracle's choice.
     """
 
     signals: Array
     time: Array
     curves: tuple[Curve, Curve]
     noise: tuple[float, float]
+    shape: tuple[int, int]
+    rng: np.random.Generator
     emissivity: Array | None = None
     emissivity_std: Array | None = None
+    truth: Array | None = None
 
     @property
     def reference(self) -> float:
@@ -160,7 +170,7 @@ class Separated:
             value[..., pixels] = getattr(part, name)
         return replace(self, **values)
 
-    def ranged(self, problem: Problem) -> "Separated":
+    def ranged(self, problem: Problem, *, deviations: bool = True) -> "Separated":
         """
         Flag temperatures outside the response's range, and what has no usable number.
 
@@ -168,6 +178,8 @@ class Separated:
         ----------
         problem : Problem
             The tile, for its response.
+        deviations : bool
+            Whether the method estimates standard deviations: a value without one is then lost.
 
         Returns
         -------
@@ -179,7 +191,7 @@ class Separated:
         beyond = np.zeros(self.status.shape, dtype=bool)
         for name in ("object_temperature", "background_temperature", "emissivity"):
             value, std = getattr(self, name), getattr(self, f"{name}_std")
-            lost = ~((np.abs(value) < _USELESS) & (std < _USELESS))
+            lost = ~((np.abs(value) < _USELESS) & ((std < _USELESS) | (not deviations)))
             beyond |= np.any(lost, axis=0) & ~np.all(np.isnan(value), axis=0)
             values[name], values[f"{name}_std"] = (
                 np.where(lost, np.nan, part) for part in (value, std)
@@ -221,8 +233,38 @@ def outside(temperature: Array, std: Array, curve: Curve) -> Mask:
     Returns
     -------
     ndarray of bool, shape (pixel,)
-        True if any sample is more than five standard deviations outside.
+        True if any sample is more than five standard deviations outside; a deviation that is not
+        estimated counts as zero.
     """
-    margin = _BEYOND * std
+    margin = _BEYOND * np.where(np.isnan(std), 0.0, std)
     below, above = temperature < curve.lowest - margin, temperature > curve.highest + margin
     return np.asarray(np.any(below | above, axis=0))
+
+
+@dataclass(frozen=True)
+class Method:
+    """
+    A method of separation: what its module hands to `solve`.
+
+    Attributes
+    ----------
+    separate : callable
+        From a `Problem`, and the settings where there are any, to a `Separated`.
+    settings : type, optional
+        Frozen dataclass of the method's options; a field `batch` is the pixels in a tile.
+    minimum_frames : int
+        Fewest frames.
+    knows_emissivity : bool
+        Whether it must be given the emissivities.
+    whole_image : bool
+        Whether it looks at a pixel's neighbours, so that a tile is the whole image.
+    not_estimated : tuple of str
+        Names of `Separated` that it leaves NaN everywhere.
+    """
+
+    separate: Callable[..., Separated]
+    settings: type[Any] | None = None
+    minimum_frames: int = 1
+    knows_emissivity: bool = False
+    whole_image: bool = False
+    not_estimated: tuple[str, ...] = ()

@@ -1,41 +1,43 @@
 """The one entrance to all methods: checks, noise, tiles, threads."""
 
+import importlib
 import operator
 from concurrent.futures import ThreadPoolExecutor
-from types import MappingProxyType
-from typing import Final
+from dataclasses import fields
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
+from tqdm import tqdm
 
 from dbthermal import noise as noise_of
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.curves import Curve
-from dbthermal.separation import calibrated, subspace, tiles
-from dbthermal.separation.problem import Array, Problem
+from dbthermal.separation import given, tiles
+from dbthermal.separation.problem import Array, Method, Problem, Separated
 
-METHODS: Final = MappingProxyType(
-    {"subspace": subspace.separate, "calibrated": calibrated.separate}
-)
-"""Method -> function that separates one tile."""
-
-MINIMUM_FRAMES: Final = MappingProxyType({"subspace": 32, "calibrated": 1})
-"""Fewest frames for each method."""
+METHODS: Final = ("subspace", "calibrated", "dbvt", "naive", "ratio", "bcp")
+"""Names of the methods; each is a module of this package, imported when it is first used."""
 
 _NOISE_PIXELS: Final = 4096
 
 
-def solve(
+def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by name
     corrected: xr.Dataset,
     response: xr.Dataset,
     method: str = "subspace",
     *,
     emissivity: xr.DataArray | None = None,
     emissivity_std: xr.DataArray | None = None,
+    truth: xr.DataArray | None = None,
     response_kind: str = "exact",
     workers: int = 2,
+    seed: int = 0,
+    progress: bool = False,
+    **options: Any,
 ) -> xr.Dataset:
     r"""
     Separate emission and reflection in a two-band capture.
@@ -51,24 +53,34 @@ def solve(
     response : Dataset
         From `calibration.fit_response`, with both bands. Its `noise` (band) [count] is used
         where present, otherwise the noise is estimated from the capture.
-    method : {"subspace", "calibrated"}
-        Emissivities unknown, or known.
+    method : {"subspace", "calibrated", "dbvt", "naive", "ratio", "bcp"}
+        This project's separator; known emissivities; the paper's optimiser; and to compare with,
+        least squares, dual-wavelength pyrometry, the blackbody channel prior.
     emissivity : DataArray, optional
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional
         Its standard deviation, same dims.
+    truth : DataArray, optional
+        True object temperature (time, y, x) [K], for an oracle's choice (option of "naive").
     response_kind : {"exact", "linear"}
         Sakuma-Hattori response, or the paper's linear one.
     workers : int
         Threads.
+    seed : int
+        Of the random starts; the result depends on it and not on `workers`.
+    progress : bool
+        Show a bar.
+    **options
+        Options of the method, the fields of its module's `Settings`.
 
     Returns
     -------
     Dataset
         `object_temperature`, `background_temperature` (time, y, x) [K], `emissivity`
         (band, y, x) [1], each with `_std`; `status` (y, x), bits of `schema.FLAGS`; `noise`
-        (band) [count], as used. Values are NaN where a flag says that they are undefined; where
-        the status is 0, all are finite. A given emissivity without a deviation has deviation 0.
+        (band) [count], as used. Values are NaN where a flag says that they are undefined, and
+        those that a method never estimates (attribute `not_estimated`); where the status is 0, all
+        others are finite. A given emissivity without a deviation has deviation 0.
 
     Raises
     ------
@@ -92,70 +104,105 @@ def solve(
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        doi:10.48550/arXiv.2509.11334
     """
-    _check(corrected, method, workers, has_emissivity=emissivity is not None)
+    module = _method(method)
+    settings = _settings(method, module.settings, options)
+    _check(corrected, method, module, workers, has_emissivity=emissivity is not None)
     names = [str(name) for name in corrected["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
     deviations = _noise(corrected, response, curves)
-    given = tiles.known_emissivity(corrected, emissivity, emissivity_std)
-    result = tiles.allocate(corrected, given)
+    known = given.check(corrected, emissivity, emissivity_std, truth)
+    result = tiles.allocate(corrected)
     # The quieter band comes first: the regression for the emissivity needs a quiet ordinate.
     bands = [int(band) for band in np.argsort(deviations, kind="stable")]
     needed = corrected[[name for name in ("counts", "status") if name in corrected]]
+    separate = module.separate if settings is None else partial(module.separate, settings=settings)
+    pixels = corrected.sizes["y"] * corrected.sizes["x"]
+    batch = pixels if module.whole_image else getattr(settings, "batch", tiles.PIXELS)
 
     def work(rows: slice) -> None:
         part, target = needed.isel(y=rows).load(), result.isel(y=rows)
-        for tile in tiles.cover(part):
+        for tile in tiles.cover(part, batch):
             counts, status = tiles.read(part, tile)
-            problem = _problem(counts, part, curves, deviations, bands)
-            problem = tiles.with_emissivity(problem, tiles.rows_of(given, rows), tile, bands)
-            tiles.write(target, tile, bands, METHODS[method](problem), status)
+            place = tiles.moved(tile, rows.start)
+            problem = known.put_into(
+                Problem(
+                    signals=_signals(counts, curves, bands),
+                    time=part["time"].values.astype(np.float64),
+                    curves=(curves[bands[0]], curves[bands[1]]),
+                    noise=(float(deviations[bands[0]]), float(deviations[bands[1]])),
+                    shape=tiles.shape_of(tile),
+                    rng=np.random.default_rng([seed, place[0].start, place[1].start]),
+                ),
+                place,
+                bands,
+            )
+            found: Separated = separate(problem)
+            tiles.write(target, tile, bands, found, status)
+            bar.update(problem.signals.shape[-1])
 
-    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as pool:
-        for _ in pool.map(work, tiles.blocks(corrected)):
+    with (
+        threadpool_limits(limits=1, user_api="blas"),
+        ThreadPoolExecutor(workers) as pool,
+        tqdm(total=pixels, unit="pixel", desc=method, disable=not progress) as bar,
+    ):
+        for _ in pool.map(work, tiles.blocks(corrected, whole_image=module.whole_image)):
             pass
     slopes = [curve.reference_slope for curve in curves]
     result["noise"] = xr.DataArray(
         deviations * slopes, dims="band", attrs={"units": "count", "long_name": "noise, as used"}
     )
-    source = "response" if "noise" in response else "capture"
-    return result.assign_attrs(method=method, response_kind=response_kind, noise_source=source)
-
-
-def _problem(
-    counts: Array, corrected: xr.Dataset, curves: list[Curve], deviations: Array, bands: list[int]
-) -> Problem:
-    """Linearised signals (2, time, pixel), the quieter band first."""
-    first, second = bands
-    return Problem(
-        signals=np.stack(
-            [curves[band].linearise(counts[band]) - curves[band].reference for band in bands]
-        ),
-        time=corrected["time"].values.astype(np.float64),
-        curves=(curves[first], curves[second]),
-        noise=(float(deviations[first]), float(deviations[second])),
+    return result.assign_attrs(
+        method=method,
+        response_kind=response_kind,
+        noise_source="response" if "noise" in response else "capture",
+        emissivity_source="capture" if emissivity is None else "given",
+        not_estimated=" ".join(module.not_estimated),
+        **({} if settings is None else {"settings": repr(settings)}),
     )
 
 
-def _check(corrected: xr.Dataset, method: str, workers: int, *, has_emissivity: bool) -> None:
+def _method(name: str) -> Method:
+    if name not in METHODS:
+        raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}.")
+    found: Method = importlib.import_module(f"dbthermal.separation.{name}").METHOD
+    return found
+
+
+def _settings(method: str, kind: type[Any] | None, options: dict[str, Any]) -> Any:
+    """The method's own record of its options, or none."""
+    names = [] if kind is None else [field.name for field in fields(kind)]
+    unknown = sorted(options.keys() - set(names))
+    if unknown:
+        raise TypeError(f"Unknown option '{unknown[0]}' of method '{method}'. Has {names}.")
+    return None if kind is None else kind(**options)
+
+
+def _signals(counts: Array, curves: list[Curve], bands: list[int]) -> Array:
+    """Linearised signals less the reference temperature (2, time, pixel) [K], in this order."""
+    parts = [curves[band].linearise(counts[band]) - curves[band].reference for band in bands]
+    return np.stack(parts)
+
+
+def _check(
+    corrected: xr.Dataset, name: str, method: Method, workers: int, *, has_emissivity: bool
+) -> None:
     schema.check(corrected, "corrected")
     tiles.check_status(corrected)
-    if method not in METHODS:
-        raise ValueError(f"Unknown method '{method}'. Must be one of {list(METHODS)}.")
     if operator.index(workers) < 1:
         raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")
     if corrected.sizes["band"] != 2:
         names = [str(name) for name in corrected["band"].values]
         raise ValueError(f"Invalid bands {names} of the capture. Must be exactly two.")
     frames = corrected.sizes["time"]
-    if frames < MINIMUM_FRAMES[method]:
+    if frames < method.minimum_frames:
         raise ValueError(
-            f"Invalid capture of {frames} frames for method '{method}'. "
-            f"Must have at least {MINIMUM_FRAMES[method]}."
+            f"Invalid capture of {frames} frames for method '{name}'. "
+            f"Must have at least {method.minimum_frames}."
         )
-    if has_emissivity and method == "subspace":
-        raise ValueError("Invalid emissivity for method 'subspace', which estimates it. Omit it.")
-    if not has_emissivity and method == "calibrated":
-        raise ValueError("Missing emissivity. Method 'calibrated' must be given one.")
+    if has_emissivity and not method.knows_emissivity:
+        raise ValueError(f"Invalid emissivity for method '{name}', which estimates it. Omit it.")
+    if not has_emissivity and method.knows_emissivity:
+        raise ValueError(f"Missing emissivity. Method '{name}' must be given one.")
 
 
 def _noise(corrected: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Array:

@@ -22,7 +22,7 @@ import numpy as np
 
 from dbthermal import smooth
 from dbthermal.separation import background, direction, emission
-from dbthermal.separation.problem import Array, Problem, Separated, flag
+from dbthermal.separation.problem import Array, Method, Problem, Separated, flag
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -116,3 +116,7 @@ def _report(problem: Problem, estimate: _Estimate) -> Separated:
         ),
     )
     return result.without(undefined, unidentified, unidentified | nonphysical).ranged(problem)
+
+
+METHOD: Final = Method(separate, minimum_frames=32)
+"""The subspace separator, for `solve`."""

@@ -5,7 +5,6 @@ fits in the processor's cache.
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,22 +12,21 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
-from dbthermal.separation.problem import Array, Flags, Mask, Problem, Separated, flag
+from dbthermal.separation.problem import Array, Flags, Mask, Separated, flag
 
 Tile = tuple[slice, slice]
 """Rows and columns of a tile."""
 
-Known = tuple[Array, Array] | None
-"""Emissivity and its standard deviation, each (band, y, x), or none."""
+PIXELS: Final = 320
+"""Pixels in a tile, unless a method sets its own number."""
 
-_PIXELS: Final = 320
 _BLOCK_ROWS: Final = 32
 # Frames in a row that noise repeats by chance in less than one of 1e8 pixels.
 _FROZEN_FRAMES: Final = 4
 _ALL_UNDEFINED: Final = ("invalid_samples", "constant_signal", "dead_pixel")
 
 
-def blocks(corrected: xr.Dataset) -> Iterator[slice]:
+def blocks(corrected: xr.Dataset, *, whole_image: bool = False) -> Iterator[slice]:
     """
     Blocks of rows, each read at once: a lazy capture is then decoded about once.
 
@@ -36,6 +34,8 @@ def blocks(corrected: xr.Dataset) -> Iterator[slice]:
     ----------
     corrected : Dataset
         The capture.
+    whole_image : bool
+        All rows in one block.
 
     Yields
     ------
@@ -43,30 +43,12 @@ def blocks(corrected: xr.Dataset) -> Iterator[slice]:
         Rows.
     """
     height = corrected.sizes["y"]
-    for top in range(0, height, _BLOCK_ROWS):
-        yield slice(top, min(top + _BLOCK_ROWS, height))
+    rows = height if whole_image else _BLOCK_ROWS
+    for top in range(0, height, rows):
+        yield slice(top, min(top + rows, height))
 
 
-def rows_of(given: Known, rows: slice) -> Known:
-    """
-    Known emissivities of a block of rows.
-
-    Parameters
-    ----------
-    given : tuple of ndarray or None
-        From `known_emissivity`.
-    rows : slice
-        The block.
-
-    Returns
-    -------
-    tuple of ndarray or None
-        The same of these rows.
-    """
-    return None if given is None else (given[0][:, rows], given[1][:, rows])
-
-
-def cover(corrected: xr.Dataset) -> Iterator[Tile]:
+def cover(corrected: xr.Dataset, pixels: int = PIXELS) -> Iterator[Tile]:
     """
     Tiles that cover the image, along rows.
 
@@ -74,6 +56,8 @@ def cover(corrected: xr.Dataset) -> Iterator[Tile]:
     ----------
     corrected : Dataset
         The capture.
+    pixels : int
+        Pixels in a tile, at most.
 
     Yields
     ------
@@ -81,11 +65,47 @@ def cover(corrected: xr.Dataset) -> Iterator[Tile]:
         Rows and columns.
     """
     height, width = corrected.sizes["y"], corrected.sizes["x"]
-    columns = min(width, _PIXELS)
-    rows = max(1, _PIXELS // columns)
+    columns = min(width, pixels)
+    rows = max(1, pixels // columns)
     for top in range(0, height, rows):
         for left in range(0, width, columns):
             yield slice(top, min(top + rows, height)), slice(left, min(left + columns, width))
+
+
+def moved(tile: Tile, top: int) -> Tile:
+    """
+    Place of a block's tile in the whole image.
+
+    Parameters
+    ----------
+    tile : tuple of slice
+        Rows and columns in the block.
+    top : int
+        First row of the block.
+
+    Returns
+    -------
+    tuple of slice
+        Rows and columns in the image.
+    """
+    return slice(tile[0].start + top, tile[0].stop + top), tile[1]
+
+
+def shape_of(tile: Tile) -> tuple[int, int]:
+    """
+    Size of a tile.
+
+    Parameters
+    ----------
+    tile : tuple of slice
+        Rows and columns.
+
+    Returns
+    -------
+    tuple of int
+        Number of rows and of columns.
+    """
+    return tile[0].stop - tile[0].start, tile[1].stop - tile[1].start
 
 
 def read(corrected: xr.Dataset, tile: Tile) -> tuple[Array, Flags]:
@@ -196,104 +216,7 @@ def sample(corrected: xr.Dataset, pixels: int) -> Array:
     return counts[:, :, (status & ~np.uint16(schema.FLAGS["frozen_frames"])) == 0]
 
 
-def known_emissivity(
-    corrected: xr.Dataset, emissivity: xr.DataArray | None, std: xr.DataArray | None
-) -> Known:
-    """
-    Check known emissivities and spread them over the image.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture.
-    emissivity, std : DataArray, optional
-        Emissivity and its standard deviation, (band) or (band, y, x) [1]; without a coordinate
-        `band`, in the capture's order.
-
-    Returns
-    -------
-    tuple of ndarray or None
-        Both as (band, y, x), in the capture's order of bands; None where none is given.
-
-    Raises
-    ------
-    TypeError
-        If one is not a DataArray.
-    ValueError
-        If a band is missing, dims differ, a value is not in (0, 1), a deviation is negative, or
-        the bands have the same emissivity everywhere.
-    """
-    if emissivity is None:
-        if std is not None:
-            raise ValueError("Invalid emissivity_std without an emissivity. Give both.")
-        return None
-    values = _spread(corrected, emissivity, "emissivity")
-    bad = ~((values > 0) & (values < 1))
-    if np.any(bad):
-        band, y, x = np.argwhere(bad)[0]
-        raise ValueError(
-            f"Invalid emissivity {values[band, y, x]} in band "
-            f"'{corrected['band'].values[band]}', pixel ({y}, {x}). Must lie in (0, 1)."
-        )
-    if np.all(values[0] == values[1]):
-        raise ValueError(
-            f"Invalid emissivities {values[:, 0, 0]}: the same in both bands. Must differ; "
-            "a gray body cannot be separated."
-        )
-    deviations = np.zeros_like(values) if std is None else _spread(corrected, std, "emissivity_std")
-    if not np.all(deviations >= 0):
-        raise ValueError("Invalid emissivity_std. Must be zero or positive, not NaN.")
-    return values, deviations
-
-
-def _spread(corrected: xr.Dataset, array: xr.DataArray, what: str) -> Array:
-    if not isinstance(array, xr.DataArray):
-        raise TypeError(f"Invalid {what} of type {type(array).__name__}. Must be a DataArray.")
-    if array.dims not in (("band",), ("band", "y", "x")):
-        raise ValueError(
-            f"Invalid dims {array.dims} of {what}. Must be ('band',) or ('band', 'y', 'x')."
-        )
-    if array.attrs.get("units", "1") != "1":
-        raise ValueError(f"Invalid units '{array.attrs['units']}' of {what}. Must be '1'.")
-    wanted = [str(name) for name in corrected["band"].values]
-    if "band" not in array.coords and array.sizes["band"] == len(wanted):
-        places = list(range(len(wanted)))  # unlabelled dimensions align by position, as in xarray
-    else:
-        places = schema.band_positions(array, wanted, what)
-    values = array.values[places].astype(np.float64)
-    shape = (2, corrected.sizes["y"], corrected.sizes["x"])
-    if values.ndim == 3 and values.shape != shape:
-        raise ValueError(f"Invalid shape {values.shape} of {what}. Must be {shape}.")
-    return np.broadcast_to(values.reshape(2, *values.shape[1:] or (1, 1)), shape)
-
-
-def with_emissivity(problem: Problem, given: Known, tile: Tile, bands: list[int]) -> Problem:
-    """
-    Add a tile's known emissivities to its problem.
-
-    Parameters
-    ----------
-    problem : Problem
-        The tile's signals.
-    given : tuple of ndarray or None
-        From `known_emissivity`.
-    tile : tuple of slice
-        Rows and columns.
-    bands : list of int
-        Order of the problem's bands in the capture.
-
-    Returns
-    -------
-    Problem
-        The same problem, with `emissivity` and `emissivity_std` where given.
-    """
-    if given is None:
-        return problem
-    value, std = (array[(slice(None), *tile)].reshape(2, -1)[bands] for array in given)
-    return replace(problem, emissivity=value, emissivity_std=std)
-
-
-def allocate(corrected: xr.Dataset, given: Known) -> xr.Dataset:
+def allocate(corrected: xr.Dataset) -> xr.Dataset:
     """
     Make an empty result of the stage `separated`.
 
@@ -301,8 +224,6 @@ def allocate(corrected: xr.Dataset, given: Known) -> xr.Dataset:
     ----------
     corrected : Dataset
         The capture.
-    given : tuple of ndarray or None
-        Known emissivities, which the result's attributes mention.
 
     Returns
     -------
@@ -324,8 +245,7 @@ def allocate(corrected: xr.Dataset, given: Known) -> xr.Dataset:
         attrs = {**attrs, **kept}
         empty = np.empty(shape, dtype=variable.dtype)
         arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs=attrs)
-    source = "capture" if given is None else "given"
-    return xr.Dataset(arrays, coords=coordinates, attrs={**kept, "emissivity_source": source})
+    return xr.Dataset(arrays, coords=coordinates, attrs=kept)
 
 
 def write(
@@ -348,7 +268,7 @@ def write(
         From `read`; pixels that nothing can be computed of become NaN and keep only these bits.
     """
     rows, columns = tile
-    shape = (rows.stop - rows.start, columns.stop - columns.start)
+    shape = shape_of(tile)
     masks = sum(schema.FLAGS[name] for name in _ALL_UNDEFINED)
     unusable = (status & np.uint16(masks)) != 0
     for name in schema.STAGES["separated"]:
