@@ -166,6 +166,28 @@ def result(run: str, stem: str, ending: str) -> Path:
     return results(run) / f"{_stem(stem)}{ending}"
 
 
+def cells(stem: str) -> Path:
+    """Folder of the finished cells of a notebook's long experiment; it need not exist.
+
+    Parameters
+    ----------
+    stem : str
+        Such as ``"05_methods"``.
+
+    Returns
+    -------
+    Path
+        ``results/cells/<stem>`` below the root; all runs share it, for a cell's name tells what
+        made it.
+
+    Raises
+    ------
+    ValueError
+        If `stem` is not two digits and a lower-case name.
+    """
+    return root() / "results" / "cells" / _stem(stem)
+
+
 def _stem(stem: str) -> str:
     """Return `stem` if it is one, such as ``"03_simulation"``."""
     if not re.fullmatch(r"[0-9]{2}_[a-z0-9_]+", stem):

@@ -1,4 +1,4 @@
-"""Results on disk: datasets as zarr, headline numbers as JSON, figures as PNG.
+"""Results on disk: datasets as zarr, headline numbers as JSON, figures as PNG, films as MP4.
 
 Each function writes beside its goal and renames, so that what bears a result's name is whole,
 whatever happens on the way. Each result carries the record of what made it (see
@@ -8,13 +8,15 @@ input. No other module opens or writes zarr.
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 if TYPE_CHECKING:
@@ -186,6 +188,52 @@ def save_figure(
     metadata = {"Software": "dbthermal", "Comment": _json(provenance)}
     with _whole(path, ".png") as part:
         figure.savefig(part, dpi=dpi, metadata=metadata)
+
+
+def save_video(
+    frames: Iterable[npt.NDArray[np.uint8]],
+    path: str | Path,
+    provenance: Mapping[str, Any],
+    *,
+    rate: float,
+) -> None:
+    """Write a film as H.264 in MP4, as browsers play it.
+
+    Parameters
+    ----------
+    frames : iterable of ndarray of uint8, shape (rows, columns, 3)
+        Colours; at least one frame, all of one size, both sizes even.
+    path : str or Path
+        File to write, ``*.mp4``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.provenance.record`; becomes the file's comment, as JSON.
+    rate : float
+        Frame rate [Hz].
+
+    Raises
+    ------
+    ValueError
+        If `path` does not end in ``.mp4``, there is no frame, or a size is odd or changes.
+    """
+    import av  # noqa: PLC0415 - optional, and nothing else here needs it
+
+    with _whole(path, ".mp4") as part, av.open(part, "w") as film:
+        film.metadata["comment"] = _json(provenance)
+        stream = film.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
+        stream.pix_fmt, stream.width = "yuv420p", 0
+        for frame in frames:
+            height, width = frame.shape[:2]
+            if stream.width == 0:
+                stream.height, stream.width = height, width
+            if (stream.height, stream.width) != (height, width) or height % 2 or width % 2:
+                raise ValueError(
+                    f"Invalid frame of {height} x {width} pixels. Must be of even size, "
+                    f"as all others: {stream.height} x {stream.width}."
+                )
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        if stream.width == 0:
+            raise ValueError("Invalid film without frames. Must have at least one.")
+        film.mux(stream.encode())
 
 
 @contextmanager

@@ -118,6 +118,31 @@ def draw_scores(**attrs: object) -> Figure:
     return figures.error_bar_calibration(scores)
 
 
+def draw_noise(**attrs: object) -> Figure:
+    """Draw the errors of two methods on two materials, one of them missing once."""
+    errors = array("material noise variant", 2, 3, 2, **attrs).assign_coords(noise=[0.01, 0.1, 1.0])
+    errors[0, 2, 1] = np.nan
+    return figures.error_over_noise(errors, title="sweep")
+
+
+def draw_emissivity(**attrs: object) -> Figure:
+    """Draw the errors of two methods over emissivity and noise."""
+    errors = array("variant emissivity noise", 2, 2, 3, **attrs) - 300
+    coords = {"noise": [0.01, 0.1, 1.0], "emissivity": [0.3, 0.9], "variant": ["a", "b"]}
+    errors = errors.assign_coords(coords).assign_attrs(attrs)
+    return figures.emissivity_errors(errors, title="emissivity")
+
+
+def draw_reductions(**attrs: object) -> Figure:
+    """Draw what two loss terms are worth."""
+    return figures.reductions(array("term", 2, **attrs).assign_coords(term=["a", "b"]), [90.0, 5.0])
+
+
+def draw_sensitivity(**attrs: object) -> Figure:
+    """Draw the error with two settings changed."""
+    return figures.sensitivity(array("variant", 2, **attrs).assign_coords(variant=["a", "b"]), 0.5)
+
+
 DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     "gain_offset_maps": (
         lambda fill=1.0, **attrs: figures.gain_offset_maps(correction(fill, **attrs)),
@@ -151,6 +176,13 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     ),
     "compared_reflections": (draw_compared, {"own unit", "time [s]", "correlation [1]"}),
     "status_map": (draw_status, set()),
+    "error_over_noise": (draw_noise, {"median error [K]", "noise of the quieter band [K]"}),
+    "emissivity_errors": (
+        draw_emissivity,
+        {"error [1]", "noise of the quieter band [K]", "emissivity, 8-14 \N{MICRO SIGN}m [1]"},
+    ),
+    "reductions": (draw_reductions, {"reduction of the error by the term [%]"}),
+    "sensitivity": (draw_sensitivity, {"median error of the object temperature [K]"}),
 }
 """Name of each function -> how to draw it, and the labels of its axes and bars."""
 
@@ -162,7 +194,7 @@ def titles(figure: Figure) -> str:
 
 def test_every_figure_is_tested() -> None:
     """The list above is complete."""
-    assert {*figures.__all__} - {"provenance_note"} == DRAWN.keys()
+    assert {*figures.__all__} - {"provenance_note", "separated_film"} == DRAWN.keys()
 
 
 @pytest.mark.parametrize("name", DRAWN)
@@ -211,6 +243,18 @@ def test_celsius_on_the_axes() -> None:
     image = draw_temperatures().axes[0].images[0].get_array()
     apparent = array("band time y x", 2, 2, 5, 6)[0, 0] - 273.15
     np.testing.assert_allclose(np.asarray(image), apparent, rtol=0, atol=1e-9)
+
+
+def test_film() -> None:
+    """A frame a time, of even size, that says what the data are and changes only where it may."""
+    movie = array("time y x", 2, 5, 6)
+    apparent = array("band time y x", 2, 2, 5, 6, origin="simulated")
+    frames = list(figures.separated_film(apparent, movie, movie - 300, title="scene"))
+    assert len(frames) == 2
+    assert all(frame.dtype == np.uint8 and frame.shape == frames[0].shape for frame in frames)
+    assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
+    changed = np.any(frames[0] != frames[1], axis=-1)
+    assert 0.05 < changed.mean() < 0.6  # the images and the time, not the frame around them
 
 
 def test_bad_pixels_are_marked() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 import xarray as xr
@@ -233,3 +234,33 @@ def test_commit_is_unknown_without_git(tmp_path: Path, monkeypatch: pytest.Monke
     """A package outside a work tree has no commit."""
     monkeypatch.setattr(provenance, "__file__", str(tmp_path / "provenance.py"))
     assert provenance.commit() == "unknown"
+
+
+def film(*shapes: tuple[int, int]) -> list[np.ndarray]:
+    """Frames of one gray level each."""
+    return [np.full((*shape, 3), 40 * index, np.uint8) for index, shape in enumerate(shapes, 1)]
+
+
+def test_video_comes_back(tmp_path: Path) -> None:
+    """As many frames, at their rate, of nearly their colours, with the record as a comment."""
+    store.save_video(film((32, 48), (32, 48), (32, 48)), tmp_path / "a.mp4", RECORD, rate=10.0)
+    with av.open(tmp_path / "a.mp4") as video:
+        assert video.streams.video[0].average_rate == 10
+        assert json.loads(video.metadata["comment"]) == RECORD
+        levels = [frame.to_ndarray(format="rgb24").mean() for frame in video.decode(video=0)]
+    np.testing.assert_allclose(levels, [40, 80, 120], rtol=0, atol=3)  # of 255
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (film((32, 47)), "Invalid frame of 32 x 47 pixels. Must be of even size"),
+        (film((32, 48), (32, 46)), "as all others: 32 x 48"),
+        ([], "Invalid film without frames"),
+    ],
+)
+def test_no_video_of_nonsense(tmp_path: Path, frames: list[np.ndarray], message: str) -> None:
+    """What cannot be a video is refused, and leaves nothing behind."""
+    with pytest.raises(ValueError, match=message):
+        store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0)
+    assert not any(tmp_path.iterdir())

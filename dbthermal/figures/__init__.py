@@ -8,6 +8,13 @@ from the `origin` and `radiometric` attributes of what it draws.
 from dbthermal.figures.accuracy import accuracy, error_bar_calibration, truth_and_estimate
 from dbthermal.figures.calibration import emissivity_by_contact, gain_offset_maps, response_fit
 from dbthermal.figures.canvas import provenance_note
+from dbthermal.figures.comparison import (
+    emissivity_errors,
+    error_over_noise,
+    reductions,
+    sensitivity,
+)
+from dbthermal.figures.films import separated_film
 from dbthermal.figures.materials import condition_matrix, emissivity_bars
 from dbthermal.figures.scenes import (
     compared_reflections,
@@ -22,10 +29,15 @@ __all__ = [
     "condition_matrix",
     "emissivity_bars",
     "emissivity_by_contact",
+    "emissivity_errors",
     "error_bar_calibration",
+    "error_over_noise",
     "gain_offset_maps",
     "provenance_note",
+    "reductions",
     "response_fit",
+    "sensitivity",
+    "separated_film",
     "separated_frames",
     "separated_temperatures",
     "status_map",

@@ -1,6 +1,7 @@
 """Separation of emission and reflection: one function, several methods of one signature."""
 
+from dbthermal.separation.methods import METHODS
 from dbthermal.separation.relative import reflections
-from dbthermal.separation.solver import METHODS, solve
+from dbthermal.separation.solver import solve
 
 __all__ = ["METHODS", "reflections", "solve"]

@@ -1,9 +1,7 @@
 """The one entrance to all methods: checks, noise, tiles, threads."""
 
-import importlib
 import operator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
 from functools import partial
 from typing import Any, Final
 
@@ -16,11 +14,8 @@ from dbthermal import noise as noise_of
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.curves import Curve
-from dbthermal.separation import given, tiles
+from dbthermal.separation import given, methods, tiles
 from dbthermal.separation.problem import Array, Method, Problem, Separated
-
-METHODS: Final = ("subspace", "calibrated", "dbvt", "naive", "ratio", "bcp")
-"""Names of the methods; each is a module of this package, imported when it is first used."""
 
 _NOISE_PIXELS: Final = 4096
 
@@ -104,8 +99,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        doi:10.48550/arXiv.2509.11334
     """
-    module = _method(method)
-    settings = _settings(method, module.settings, options)
+    module, settings = methods.get(method), methods.settings(method, options)
     _check(corrected, method, module, workers, has_emissivity=emissivity is not None)
     names = [str(name) for name in corrected["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
@@ -159,22 +153,6 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         not_estimated=" ".join(module.not_estimated),
         **({} if settings is None else {"settings": repr(settings)}),
     )
-
-
-def _method(name: str) -> Method:
-    if name not in METHODS:
-        raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}.")
-    found: Method = importlib.import_module(f"dbthermal.separation.{name}").METHOD
-    return found
-
-
-def _settings(method: str, kind: type[Any] | None, options: dict[str, Any]) -> Any:
-    """The method's own record of its options, or none."""
-    names = [] if kind is None else [field.name for field in fields(kind)]
-    unknown = sorted(options.keys() - set(names))
-    if unknown:
-        raise TypeError(f"Unknown option '{unknown[0]}' of method '{method}'. Has {names}.")
-    return None if kind is None else kind(**options)
 
 
 def _signals(counts: Array, curves: list[Curve], bands: list[int]) -> Array:

@@ -1,0 +1,66 @@
+"""The methods by name; each is a module of this package, imported when it is first used."""
+
+import importlib
+from dataclasses import fields
+from typing import Any, Final
+
+from dbthermal.separation.problem import Method
+
+METHODS: Final = ("subspace", "calibrated", "dbvt", "naive", "ratio", "bcp")
+"""Names of the methods."""
+
+
+def get(name: str) -> Method:
+    """
+    Return a method's record.
+
+    Parameters
+    ----------
+    name : str
+        One of `METHODS`.
+
+    Returns
+    -------
+    Method
+        What the module of that name hands to `solve`.
+
+    Raises
+    ------
+    ValueError
+        If there is no such method.
+    """
+    if name not in METHODS:
+        raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}.")
+    found: Method = importlib.import_module(f"dbthermal.separation.{name}").METHOD
+    return found
+
+
+def settings(name: str, options: dict[str, Any]) -> Any:
+    """
+    Return a method's settings.
+
+    Parameters
+    ----------
+    name : str
+        One of `METHODS`.
+    options : dict
+        Fields of its settings, by name; the others have their defaults.
+
+    Returns
+    -------
+    object
+        Its frozen record, None for a method without any.
+
+    Raises
+    ------
+    TypeError
+        If it has no such option.
+    ValueError
+        If a value is not allowed, see the method's `Settings`.
+    """
+    kind = get(name).settings
+    names = [] if kind is None else [field.name for field in fields(kind)]
+    unknown = sorted(options.keys() - set(names))
+    if unknown:
+        raise TypeError(f"Unknown option '{unknown[0]}' of method '{name}'. Has {names}.")
+    return None if kind is None else kind(**options)
