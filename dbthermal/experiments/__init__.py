@@ -2,6 +2,16 @@
 
 from dbthermal.experiments.cases import efficiency, run_case, score, sweep
 from dbthermal.experiments.comparison import compare, judge, medians
-from dbthermal.experiments.memory import remembered
+from dbthermal.experiments.memory import gridded, remembered
 
-__all__ = ["compare", "efficiency", "judge", "medians", "remembered", "run_case", "score", "sweep"]
+__all__ = [
+    "compare",
+    "efficiency",
+    "gridded",
+    "judge",
+    "medians",
+    "remembered",
+    "run_case",
+    "score",
+    "sweep",
+]

@@ -6,8 +6,9 @@ runs on; so an interrupted run goes on where it stopped, and changed code starts
 
 import hashlib
 import json
+import math
 import multiprocessing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
@@ -95,3 +96,37 @@ def _name(function: Callable[..., xr.Dataset], cell: Cell, record: Mapping[str, 
 def _keep(function: Callable[..., xr.Dataset], path: Path, cell: Cell) -> None:
     """Run one cell and save it, whole or not at all."""
     store.save(function(**cell), path, provenance.record(cell))
+
+
+def gridded(parts: Sequence[xr.Dataset], coords: Mapping[str, Sequence[Any]]) -> xr.Dataset:
+    """
+    Put the results of cells together that run over the product of some values.
+
+    Parameters
+    ----------
+    parts : sequence of Dataset
+        One a cell; the last of `coords` varies fastest.
+    coords : mapping
+        New dimension -> its values.
+
+    Returns
+    -------
+    Dataset
+        All of them, over the new dimensions; attributes that differ are dropped.
+
+    Raises
+    ------
+    ValueError
+        If there are not as many parts as cells.
+    """
+    wanted = math.prod(len(values) for values in coords.values())
+    if len(parts) != wanted:
+        raise ValueError(f"Invalid number of results {len(parts)}. Must be {wanted}.")
+    rows = list(parts)
+    for dim, values in reversed(list(coords.items())):
+        index = xr.DataArray(list(values), dims=dim, name=dim)
+        rows = [
+            xr.concat(rows[place : place + len(values)], index, combine_attrs="drop_conflicts")
+            for place in range(0, len(rows), len(values))
+        ]
+    return rows[0]

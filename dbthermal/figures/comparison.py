@@ -34,12 +34,15 @@ def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
     rows = -(-panels.sizes["material"] // columns)
     width = 3.0 if panels.sizes["material"] > 1 else 5.5
     figure, axes = canvas(rows, columns, (width * columns + 1.6, 0.85 * width * rows + 0.5))
+    for axis in axes.ravel()[1:]:
+        axis.sharey(axes[0, 0])
     names = panels["material"].values
     for axis, name in zip(axes.ravel().tolist(), names, strict=False):
         _lines(axis, panels.sel(material=name))
         axis.set_title(str(name), fontsize=9)
     for axis in axes.flat[panels.sizes["material"] :]:
         axis.remove()
+    axes[0, 0].set_ylim(_decades(panels))
     for axis in axes[:, 0]:
         axis.set_ylabel("median error [K]")
     for axis in axes[-1]:
@@ -48,6 +51,12 @@ def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
     figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=8)
     figure.suptitle(title + provenance_note(errors))
     return figure
+
+
+def _decades(errors: xr.DataArray) -> tuple[float, float]:
+    """Limits a little beyond the least and the largest positive value."""
+    values = errors.values[errors.values > 0]
+    return (0.6 * float(values.min()), 1.6 * float(values.max())) if values.size else (0.1, 10.0)
 
 
 def _lines(axis: Axes, errors: xr.DataArray) -> None:
@@ -64,6 +73,9 @@ def _lines(axis: Axes, errors: xr.DataArray) -> None:
             label=str(name),
         )
     axis.grid(visible=True, which="major", color="0.9")
+    levels = errors["noise"].values
+    axis.set_xticks(levels, [f"{level:g}" for level in levels], fontsize=8)
+    axis.set_xticks([], minor=True)
 
 
 def emissivity_errors(errors: xr.DataArray, *, title: str) -> Figure:

@@ -118,21 +118,17 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         for tile in tiles.cover(part, batch):
             counts, status = tiles.read(part, tile)
             place = tiles.moved(tile, rows.start)
-            problem = known.put_into(
-                Problem(
-                    signals=_signals(counts, curves, bands),
-                    time=part["time"].values.astype(np.float64),
-                    curves=(curves[bands[0]], curves[bands[1]]),
-                    noise=(float(deviations[bands[0]]), float(deviations[bands[1]])),
-                    shape=tiles.shape_of(tile),
-                    rng=np.random.default_rng([seed, place[0].start, place[1].start]),
-                ),
-                place,
-                bands,
+            problem = Problem(
+                signals=_signals(counts, curves, bands),
+                time=part["time"].values.astype(np.float64),
+                curves=(curves[bands[0]], curves[bands[1]]),
+                noise=(float(deviations[bands[0]]), float(deviations[bands[1]])),
+                shape=tiles.shape_of(tile),
+                rng=np.random.default_rng([seed, place[0].start, place[1].start]),
             )
-            found: Separated = separate(problem)
+            found: Separated = separate(known.put_into(problem, place, bands))
             tiles.write(target, tile, bands, found, status)
-            bar.update(problem.signals.shape[-1])
+            bar.update(counts.shape[-1])
 
     with (
         threadpool_limits(limits=1, user_api="blas"),
@@ -141,10 +137,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     ):
         for _ in pool.map(work, tiles.blocks(corrected, whole_image=module.whole_image)):
             pass
-    slopes = [curve.reference_slope for curve in curves]
-    result["noise"] = xr.DataArray(
-        deviations * slopes, dims="band", attrs={"units": "count", "long_name": "noise, as used"}
-    )
+    counts_per_kelvin = np.array([curve.reference_slope for curve in curves])
+    attrs = {"units": "count", "long_name": "noise, as used"}
+    result["noise"] = xr.DataArray(deviations * counts_per_kelvin, dims="band", attrs=attrs)
     return result.assign_attrs(
         method=method,
         response_kind=response_kind,
