@@ -12,7 +12,7 @@ PACKAGE = Path(dbthermal.__file__).parent
 LAYERS = (
     "paths schema planck heat mixing smooth",
     "curves",
-    "response bands frames alignment noise metrics figures store provenance manifest readers",
+    "response bands frames alignment noise metrics figures store provenance manifest readers paper",
     "calibration emissivity separation",
     "simulation verify published",
     "experiments",

@@ -1,0 +1,276 @@
+"""What a shell exchanges with its surroundings, per area and at a time.
+
+Every exchange is, at one time, a flux a - b T - s T^4 into the shell, so any number of them add
+up to three numbers a vertex.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.constants import Stefan_Boltzmann
+
+Array = npt.NDArray[np.float64]
+Varying: TypeAlias = float | Array | Callable[[float], float | Array]
+"""A number, one for each vertex, or a function of time [s] that returns either."""
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """
+    Flux into a shell at one time, as a function of its temperature T: a - b T - s T^4.
+
+    Attributes
+    ----------
+    constant, linear, quartic : ndarray, shape (vertex,)
+        a [W m^-2], b [W m^-2 K^-1] and s [W m^-2 K^-4].
+    """
+
+    constant: Array
+    linear: Array
+    quartic: Array
+
+    def flux(self, temperature: Array) -> Array:
+        """Flux into the shell at temperatures [K], (vertex,) [W m^-2]."""
+        return self.constant - (self.linear + self.quartic * temperature**3) * temperature
+
+    def slope(self, temperature: Array) -> Array:
+        """How fast the flux falls with the temperature, (vertex,) [W m^-2 K^-1]."""
+        return self.linear + 4.0 * self.quartic * temperature**3
+
+
+class Exchange(ABC):
+    """One way in which a shell gains or loses heat: convection, radiation or given heating."""
+
+    @abstractmethod
+    def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
+        """
+        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
+
+        Raises
+        ------
+        ValueError
+            If an attribute does not fit the vertices or is not physical at that time.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Convection(Exchange):
+    """
+    Exchange with a fluid, or through a contact: h (T_fluid - T).
+
+    Attributes
+    ----------
+    coefficient : float, ndarray (vertex,) or function of time
+        Coefficient of heat transfer h, not negative [W m^-2 K^-1].
+    temperature : float, ndarray (vertex,) or function of time
+        Temperature of the fluid [K].
+    """
+
+    coefficient: Varying
+    temperature: Varying
+
+    def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
+        """
+        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
+
+        Raises
+        ------
+        ValueError
+            If an attribute does not fit the vertices, is not finite or negative.
+        """
+        coefficient = _not_negative("coefficient of convection", self.coefficient, time, vertices)
+        temperature = _not_negative("temperature of convection", self.temperature, time, vertices)
+        return coefficient * temperature, coefficient, np.zeros(vertices)
+
+
+@dataclass(frozen=True, eq=False)
+class Radiation(Exchange):
+    """
+    Exchange of one side with large surroundings: emissivity sigma (T_s^4 - T^4).
+
+    Attributes
+    ----------
+    emissivity : float, ndarray (vertex,) or function of time
+        Total hemispherical emissivity, in [0, 1].
+    temperature : float, ndarray (vertex,) or function of time
+        Radiant temperature T_s of the surroundings [K].
+    """
+
+    emissivity: Varying
+    temperature: Varying
+
+    def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
+        """
+        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
+
+        Raises
+        ------
+        ValueError
+            If an attribute does not fit the vertices or is not finite, a temperature is
+            negative, or an emissivity outside [0, 1].
+        """
+        emissivity = evaluate("emissivity of radiation", self.emissivity, time, vertices)
+        outside = (emissivity < 0) | (emissivity > 1)
+        if np.any(outside):
+            raise ValueError(
+                f"Invalid emissivity {emissivity[outside][0]} of radiation at {time:g} s. "
+                "Must lie in [0, 1]."
+            )
+        surroundings = _not_negative("temperature of radiation", self.temperature, time, vertices)
+        quartic = Stefan_Boltzmann * emissivity
+        return quartic * surroundings**4, np.zeros(vertices), quartic
+
+
+@dataclass(frozen=True, eq=False)
+class Heating(Exchange):
+    """
+    A given flux into the shell, such as absorbed light; negative if it cools.
+
+    Attributes
+    ----------
+    flux : float, ndarray (vertex,) or function of time
+        Heat per area and time q [W m^-2].
+    """
+
+    flux: Varying
+
+    def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
+        """
+        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
+
+        Raises
+        ------
+        ValueError
+            If the flux does not fit the vertices or is not finite.
+        """
+        nothing = np.zeros(vertices)
+        return evaluate("flux of heating", self.flux, time, vertices), nothing, nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """
+    Vertices whose temperature is given.
+
+    Attributes
+    ----------
+    vertices : ndarray of int, shape (held,), or of bool, shape (vertex,)
+        Which vertices.
+    temperature : float, ndarray (held,) or function of time
+        Their temperature [K].
+    """
+
+    vertices: npt.NDArray[np.int64] | npt.NDArray[np.bool_]
+    temperature: Varying
+
+    def indices(self, vertices: int) -> npt.NDArray[np.int64]:
+        """
+        Numbers of the held vertices of a shell that has so many, in the given order.
+
+        Raises
+        ------
+        ValueError
+            If a number does not exist or is repeated, or a mask has another size.
+        """
+        given = np.asarray(self.vertices)
+        if given.dtype == np.bool_ and given.shape == (vertices,):
+            return np.flatnonzero(given)
+        if given.ndim != 1 or not (np.issubdtype(given.dtype, np.integer) or given.size == 0):
+            raise ValueError(
+                f"Invalid held vertices of shape {given.shape} and type {given.dtype}. "
+                f"Must be numbers, or a mask of shape ({vertices},)."
+            )
+        numbers = given.astype(np.int64)
+        bad = (numbers < 0) | (numbers >= vertices)
+        if np.any(bad):
+            raise ValueError(f"Invalid held vertex {numbers[bad][0]}. Must lie in [0, {vertices}).")
+        if np.unique(numbers).size < numbers.size:
+            raise ValueError("Invalid held vertices: one is repeated. Must all differ.")
+        return numbers
+
+    def at(self, time: float) -> Array:
+        """Temperature of the held vertices at a time [s], (held,) [K]."""
+        given = np.asarray(self.vertices)
+        count = int(given.sum()) if given.dtype == np.bool_ else given.size
+        return _not_negative("temperature of held vertices", self.temperature, time, count)
+
+
+def combine(exchanges: Sequence[Exchange], time: float, vertices: int) -> Balance:
+    """
+    All exchanges at one time as one flux.
+
+    Parameters
+    ----------
+    exchanges : sequence of Exchange
+        Any number, none included.
+    time : float
+        Time [s].
+    vertices : int
+        Number of vertices.
+
+    Returns
+    -------
+    Balance
+        The sum.
+
+    Raises
+    ------
+    ValueError
+        If a value does not fit; see the exchanges.
+    """
+    total = np.zeros((3, vertices))
+    for exchange in exchanges:
+        total += np.stack(exchange.balance(time, vertices))
+    return Balance(*total)
+
+
+def evaluate(name: str, value: Varying, time: float, vertices: int) -> Array:
+    """
+    A varying quantity at one time and for every vertex.
+
+    Parameters
+    ----------
+    name : str
+        What it is, for the error.
+    value : float, ndarray (vertex,) or function of time
+        The quantity.
+    time : float
+        Time [s].
+    vertices : int
+        Number of vertices.
+
+    Returns
+    -------
+    ndarray, shape (vertex,)
+        Finite values.
+
+    Raises
+    ------
+    ValueError
+        If the value is neither a number nor one for each vertex, or is not finite.
+    """
+    array = np.asarray(value(time) if callable(value) else value, dtype=np.float64)
+    if array.shape not in {(), (vertices,)}:
+        raise ValueError(
+            f"Invalid shape {array.shape} of the {name} at {time:g} s. "
+            f"Must be a number or ({vertices},)."
+        )
+    if not np.all(np.isfinite(array)):
+        raise ValueError(
+            f"Invalid {name} {array[~np.isfinite(array)].flat[0]} at {time:g} s. Must be finite."
+        )
+    return np.broadcast_to(array, (vertices,))
+
+
+def _not_negative(name: str, value: Varying, time: float, vertices: int) -> Array:
+    """As `evaluate`, and refuse what is negative."""
+    array = evaluate(name, value, time, vertices)
+    if np.any(array < 0):
+        raise ValueError(
+            f"Invalid {name} {array[array < 0][0]} at {time:g} s. Must not be negative."
+        )
+    return array
