@@ -92,6 +92,13 @@ STAGES: Final = MappingProxyType(
                 ("measurement",), "float64", "K", "background temperature"
             ),
         },
+        "reflector": {
+            "counts": Variable(("band", "measurement"), "float64", "count", "signal"),
+            "reflected_counts": Variable(
+                ("band", "measurement"), "float64", "count", "signal of the reflector"
+            ),
+            "object_temperature": Variable(("measurement",), "float64", "K", "object temperature"),
+        },
         "response": {
             "amplitude": Variable(("band",), "float64", "count", "Sakuma-Hattori amplitude"),
             "effective_wavelength": Variable(

@@ -443,7 +443,7 @@ def test_bad_input_is_a_clear_error(glass: Glass, what: str) -> None:
     first=st.floats(0.05, 0.97),
     second=st.floats(0.05, 0.97),
     loudness=st.floats(0.1, 10.0),
-    method=st.sampled_from(["subspace", "calibrated"]),
+    method=st.sampled_from([name for name in separation.METHODS if name != "dbvt"]),
 )
 def test_good_means_complete(
     seed: int, frames: int, first: float, second: float, loudness: float, method: str
@@ -460,7 +460,7 @@ def test_good_means_complete(
         return
     result = separation.solve(capture, rig.response(), method, emissivity=given_emissivity)
     complete = np.ones((1, 40), dtype=bool)
-    for name in schema.STAGES["separated"]:
+    for name in schema.STAGES["separated"].keys() - result.attrs["not_estimated"].split():
         values = result[name].values.reshape(-1, 1, 40)
         complete &= np.all(np.isfinite(values), axis=0)
     assert np.all(complete[result["status"].values == 0])

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from dbthermal.separation.problem import Method
 
-METHODS: Final = ("subspace", "calibrated", "dbvt", "naive", "ratio", "bcp")
+METHODS: Final = ("subspace", "calibrated", "dbvt", "naive", "ratio", "bcp", "apparent")
 """Names of the methods."""
 
 

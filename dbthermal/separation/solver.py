@@ -48,9 +48,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     response : Dataset
         From `calibration.fit_response`, with both bands. Its `noise` (band) [count] is used
         where present, otherwise the noise is estimated from the capture.
-    method : {"subspace", "calibrated", "dbvt", "naive", "ratio", "bcp"}
+    method : {"subspace", "calibrated", "dbvt", "naive", "ratio", "bcp", "apparent"}
         This project's separator; known emissivities; the paper's optimiser; and to compare with,
-        least squares, dual-wavelength pyrometry, the blackbody channel prior.
+        least squares, dual-wavelength pyrometry, the blackbody channel prior, and the camera's
+        own reading.
     emissivity : DataArray, optional
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional

@@ -3,14 +3,15 @@
 Everything made here carries `origin = "simulated"`.
 """
 
-from dbthermal.simulation.rig import (
-    Rig,
-    blackbody_movies,
-    capture,
+from dbthermal.simulation.bench import (
+    Bench,
+    bench_series,
     contact_measurements,
-    observe,
-    pattern,
+    reflector_series,
 )
+from dbthermal.simulation.procedures import PROCEDURES, compare_procedures
+from dbthermal.simulation.rig import Rig, blackbody_movies, capture, observe, pattern
+from dbthermal.simulation.samples import OBJECTS, Sample, band_emissivity
 from dbthermal.simulation.scenes import (
     Background,
     independent_pixels,
@@ -20,14 +21,22 @@ from dbthermal.simulation.scenes import (
 )
 
 __all__ = [
+    "OBJECTS",
+    "PROCEDURES",
     "Background",
+    "Bench",
     "Rig",
+    "Sample",
+    "band_emissivity",
+    "bench_series",
     "blackbody_movies",
     "capture",
+    "compare_procedures",
     "contact_measurements",
     "independent_pixels",
     "observe",
     "pattern",
+    "reflector_series",
     "scene",
     "side_by_side",
     "walkers",

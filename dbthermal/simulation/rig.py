@@ -88,11 +88,23 @@ class Rig:
 
 
 def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
-    """Counts of a blackbody in each band, the temperatures checked against the response."""
+    """Counts of a blackbody in each band; a temperature may be one for each of the bands."""
     names = [str(name) for name in response["band"].values]
     curves = [responses.curve(response, name) for name in names]
-    values = require_range(temperature.values, curves[0], str(temperature.name))
-    return [curve.counts(values) for curve in curves]
+    parts = _of_bands(temperature, names)
+    checked = [
+        require_range(part.values, curve, str(temperature.name))
+        for part, curve in zip(parts, curves, strict=True)
+    ]
+    return [curve.counts(values) for curve, values in zip(curves, checked, strict=True)]
+
+
+def _of_bands(temperature: xr.DataArray, names: list[str]) -> list[xr.DataArray]:
+    """Temperature in each band: its own where there is a dimension band, else the same in all."""
+    if "band" not in temperature.dims:
+        return [temperature] * len(names)
+    places = schema.band_positions(temperature, names, str(temperature.name))
+    return [temperature.isel(band=place) for place in places]
 
 
 def observe(
@@ -106,8 +118,9 @@ def observe(
     Parameters
     ----------
     scene : Dataset
-        From `scenes`: object and background temperature (time, y, x) [K], emissivity
-        (band, y, x) [1].
+        From `scenes` or `twins`: object and background temperature (time, y, x) [K], emissivity
+        (band, y, x) [1]. The background may be one for each band, (band, time, y, x), as two
+        cameras see it that stand side by side.
     response : Dataset
         With `noise`, e.g. from `Rig.response`.
     rng : Generator
@@ -260,60 +273,6 @@ def blackbody_movies(
             "band": list(rig.bands),
             "temperature": ("temperature", temperatures, {"units": "K"}),
         },
-        attrs={"origin": "simulated"},
-    )
-
-
-def contact_measurements(
-    response: xr.Dataset,
-    emissivity: xr.DataArray,
-    object_temperature: np.ndarray,
-    background_temperature: np.ndarray,
-    stds: tuple[float, float],
-    rng: np.random.Generator,
-) -> xr.Dataset:
-    """
-    Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
-
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    emissivity : DataArray
-        True emissivity (band) [1].
-    object_temperature, background_temperature : ndarray, shape (measurement,)
-        True temperatures [K].
-    stds : tuple of float
-        Standard deviation of a reading of thermocouple and blackbody [K].
-    rng : Generator
-        Source of the errors.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
-        (measurement) [K], as read.
-    """
-    true = [object_temperature, background_temperature]
-    warm, cold = (
-        _blackbody(response, xr.DataArray(level, dims="measurement", name=name))
-        for level, name in zip(true, ("object", "background"), strict=True)
-    )
-    noise = response["noise"].values
-    names = [str(name) for name in response["band"].values]
-    schema.band_positions(emissivity.to_dataset(name="emissivity"), names, "the emissivity")
-    counts = [
-        mixing.leaving(value, warm[index], cold[index]) + rng.normal(0, noise[index], len(true[0]))
-        for index, value in enumerate(emissivity.sel(band=names).values)
-    ]
-    read = [level + rng.normal(0, std, len(level)) for level, std in zip(true, stds, strict=True)]
-    return xr.Dataset(
-        {
-            "counts": (("band", "measurement"), np.array(counts), {"units": "count"}),
-            "object_temperature": ("measurement", read[0], {"units": "K"}),
-            "background_temperature": ("measurement", read[1], {"units": "K"}),
-        },
-        coords={"band": response["band"].values},
         attrs={"origin": "simulated"},
     )
 

@@ -1,7 +1,6 @@
-"""Calibration: the camera's response per band from blackbodies, and emissivity by contact.
+"""The camera's response per band, from blackbodies.
 
-The response is the four-parameter Sakuma-Hattori curve beside the paper's linear pair. The
-emissivity of a material follows from thermocouple and blackbody readings, with its uncertainty.
+The four-parameter Sakuma-Hattori curve, beside the paper's linear pair.
 """
 
 from typing import Final
@@ -11,7 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.optimize import least_squares
 
-from dbthermal import bands, curves, planck, schema
+from dbthermal import bands, planck, schema
 from dbthermal import response as responses
 
 Array = npt.NDArray[np.float64]
@@ -31,7 +30,6 @@ _SHAPE_UNIT: Final = planck.SECOND_RADIATION_CONSTANT / 5.0
 # Counts may bend downward by so many standard deviations, plus this fraction of their span.
 _CURVATURE_SIGMAS: Final = 5.0
 _CURVATURE: Final = 0.003
-_ITERATIONS: Final = 50
 
 
 def fit_response(
@@ -221,115 +219,3 @@ def _with_noise(response: xr.Dataset, noise: xr.DataArray) -> xr.Dataset:
         noise=("band", values, {"units": "count", "long_name": "noise of one pixel and frame"}),
         netd=("band", values / slopes, {"units": "K", "long_name": "NETD"}),
     )
-
-
-def fit_emissivity(
-    measured: xr.Dataset, response: xr.Dataset, reading_std: tuple[float, float]
-) -> xr.Dataset:
-    r"""
-    Emissivity of a material per band, by contact thermometry and a reflected blackbody.
-
-    Each measurement i has counts :math:`I_i`, the object's temperature by thermocouple and the
-    reflected blackbody's temperature (equation 10 of the paper [1]_, by least squares):
-
-    .. math:: I_i - U(T_{b,i}) = e \, (U(T_{o,i}) - U(T_{b,i}))
-
-    weighted by the variance of both sides,
-    :math:`s_i^2 = s_I^2 + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2`, iterated in e.
-
-    Parameters
-    ----------
-    measured : Dataset
-        `counts` of the material (band, measurement) [count]; `object_temperature` by the
-        thermocouple and `background_temperature` of the blackbody (measurement) [K], within the
-        response's range.
-    response : Dataset
-        From `fit_response`, with its noise.
-    reading_std : tuple of float
-        Standard deviation of one reading of the thermocouple and of the blackbody [K].
-
-    Returns
-    -------
-    Dataset
-        `emissivity`, `emissivity_std` (band) [1]; `reduced_chi2` (band) [1], near 1 if the
-        uncertainties are honest; `residual` (band, measurement) [count].
-
-    Raises
-    ------
-    ValueError
-        If dims or sizes differ, a temperature lies outside the response, the response has no
-        noise, a deviation is not positive, or object and background never differ by more than
-        three standard deviations of their difference.
-
-    References
-    ----------
-    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334
-    .. [2] ISO 18434-1:2008, Condition monitoring and diagnostics of machines, Thermography
-    """
-    _check_measurements(measured)
-    stds = planck.require_positive("reading_std [K]", reading_std)
-    warm, cold = (
-        measured[name].values.astype(np.float64)
-        for name in ("object_temperature", "background_temperature")
-    )
-    contrast, least = np.abs(warm - cold).max(), 3.0 * float(np.hypot(*stds))
-    if not contrast > least:
-        raise ValueError(
-            f"Invalid contrast {contrast} K between object and background. Must exceed {least} K, "
-            "three standard deviations of the difference, in some measurement."
-        )
-    names = [str(name) for name in measured["band"].values]
-    noises = responses.noise(response, names)
-    fits = []
-    for index, name in enumerate(names):
-        curve = responses.curve(response, name)
-        curves.require_range(warm, curve, "object temperature")
-        curves.require_range(cold, curve, "background temperature")
-        counts = measured["counts"].values[index].astype(np.float64)
-        fits.append(_fit_one_emissivity(curve, counts, (warm, cold), stds, float(noises[index])))
-    value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
-    unit = {"units": "1"}
-    return xr.Dataset(
-        {
-            "emissivity": ("band", value, unit),
-            "emissivity_std": ("band", std, unit),
-            "reduced_chi2": ("band", chi2, unit),
-            "residual": (("band", "measurement"), residual, {"units": "count"}),
-        },
-        coords={"band": names},
-    )
-
-
-def _check_measurements(measured: xr.Dataset) -> None:
-    schema.check(measured, "contact")
-    if measured.sizes["measurement"] < 2:
-        raise ValueError("Invalid number of measurements 1. Must be at least 2.")
-    for name, variable in measured.data_vars.items():
-        if not np.all(np.isfinite(variable.values)):
-            raise ValueError(f"Invalid {name}: NaN or infinite. Must be finite.")
-
-
-def _fit_one_emissivity(
-    curve: curves.Curve,
-    counts: Array,
-    temperatures: tuple[Array, Array],
-    stds: Array,
-    noise: float,
-) -> tuple[float, float, float, Array]:
-    """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""
-    warm, cold = (curve.counts(temperature) for temperature in temperatures)
-    warm_std, cold_std = (
-        curve.count_slope(temperature) * std
-        for temperature, std in zip(temperatures, stds, strict=True)
-    )
-    across, up = warm - cold, counts - cold
-    emissivity = across @ up / (across @ across)
-    for _ in range(_ITERATIONS):
-        variance = noise**2 + (emissivity * warm_std) ** 2 + ((1 - emissivity) * cold_std) ** 2
-        weights = across / variance
-        previous, emissivity = emissivity, (weights @ up) / (weights @ across)
-        if abs(emissivity - previous) < 1e-12:
-            break
-    residual = up - emissivity * across
-    chi2 = np.sum(residual**2 / variance) / (counts.size - 1)
-    return float(emissivity), float((weights @ across) ** -0.5), float(chi2), residual

@@ -1,0 +1,123 @@
+"""Errors that all readings of one series have in common, for the emissivity of a material."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal import curves, planck
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bias:
+    r"""
+    Errors that all readings of one series have in common, each uniform in a range.
+
+    A range's middle is corrected for, and its standard deviation, the width over
+    :math:`\sqrt{12}`, is carried into the result: a rectangular distribution, clause 4.3.7 of the
+    Guide to the expression of uncertainty in measurement (JCGM 100:2008).
+
+    Attributes
+    ----------
+    object_tolerance : float
+        Largest offset of the thermocouple's readings, either way [K].
+    contact : tuple of float
+        Least and largest fraction of the object's excess over the air that the thermocouple
+        misses, because it conducts heat away [1].
+    air_temperature : float
+        Of the air, and of the room [K].
+    background_tolerance : float
+        Largest offset of the reflected body's temperature, either way [K].
+    stray : tuple of float
+        Least and largest fraction of the reflection that comes from the room and not from the
+        blackbody: a surface that is not quite smooth, a blackbody not quite black [1].
+    """
+
+    object_tolerance: float = 0.0
+    contact: tuple[float, float] = (0.0, 0.0)
+    air_temperature: float = 295.15
+    background_tolerance: float = 0.0
+    stray: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Refuse ranges that are none."""
+        for name in ("object_tolerance", "background_tolerance"):
+            value = getattr(self, name)
+            if not 0 <= value < np.inf:
+                raise ValueError(f"Invalid {name} {value} K. Must be zero or positive.")
+        for name in ("contact", "stray"):
+            least, largest = getattr(self, name)
+            if not 0 <= least <= largest < 1:
+                raise ValueError(
+                    f"Invalid {name} ({least}, {largest}). Must be a range within [0, 1)."
+                )
+        planck.require_positive("air_temperature [K]", self.air_temperature)
+
+    def corrected(self, reading: Array) -> Array:
+        """
+        Object temperature from the thermocouple's, by the middle of the contact error.
+
+        Parameters
+        ----------
+        reading : ndarray
+            As read [K].
+
+        Returns
+        -------
+        ndarray
+            Corrected [K].
+        """
+        missed = 0.5 * (self.contact[0] + self.contact[1])
+        return self.air_temperature + (reading - self.air_temperature) / (1.0 - missed)
+
+    def emitted(self, curve: curves.Curve, temperature: Array) -> Array:
+        """
+        Effect of the thermocouple's common errors on the object's own signal.
+
+        Parameters
+        ----------
+        curve : Curve
+            Response of the band.
+        temperature : ndarray, shape (measurement,)
+            Corrected object temperature [K].
+
+        Returns
+        -------
+        ndarray, shape (2, measurement)
+            What a standard deviation of the offset and of the contact error does [count].
+        """
+        offset = np.full_like(temperature, self.object_tolerance / 3.0**0.5)
+        contact = _std(self.contact) * (temperature - self.air_temperature)
+        return np.asarray(curve.count_slope(temperature) * np.stack([offset, contact]))
+
+    def reflected(self, curve: curves.Curve, temperature: Array) -> Array:
+        """
+        Effect of the common errors of the reflected body on its signal.
+
+        Parameters
+        ----------
+        curve : Curve
+            Response of the band.
+        temperature : ndarray, shape (measurement,)
+            Its temperature [K].
+
+        Returns
+        -------
+        ndarray, shape (2, measurement)
+            What a standard deviation of the offset and of the stray part does [count].
+        """
+        offset = curve.count_slope(temperature) * self.background_tolerance / 3.0**0.5
+        excess = curve.counts(temperature) - curve.counts(self.air_temperature)
+        return np.stack([offset, _std(self.stray) * excess])
+
+
+NO_BIAS: Final = Bias()
+"""Readings whose errors are independent."""
+
+
+def _std(span: tuple[float, float]) -> float:
+    """Standard deviation of a uniform distribution."""
+    return float((span[1] - span[0]) / np.sqrt(12.0))
