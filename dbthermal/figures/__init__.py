@@ -6,7 +6,12 @@ from the `origin` and `radiometric` attributes of what it draws.
 """
 
 from dbthermal.figures.accuracy import accuracy, error_bar_calibration, truth_and_estimate
-from dbthermal.figures.calibration import emissivity_by_contact, gain_offset_maps, response_fit
+from dbthermal.figures.calibration import (
+    emissivity_by_contact,
+    emissivity_procedures,
+    gain_offset_maps,
+    response_fit,
+)
 from dbthermal.figures.canvas import provenance_note
 from dbthermal.figures.comparison import (
     emissivity_errors,
@@ -30,6 +35,7 @@ __all__ = [
     "emissivity_bars",
     "emissivity_by_contact",
     "emissivity_errors",
+    "emissivity_procedures",
     "error_bar_calibration",
     "error_over_noise",
     "gain_offset_maps",

@@ -1,5 +1,7 @@
 """Figures of the calibration: gain and offset, response, emissivity by contact."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
@@ -129,4 +131,54 @@ def emissivity_by_contact(measured: xr.Dataset, truth: xr.DataArray | None = Non
     axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
     figure.legend(frameon=False, loc="outside right center", fontsize=8)
     axis.set_title("Emissivity by contact, one standard deviation" + provenance_note(measured))
+    return figure
+
+
+def emissivity_procedures(
+    compared: xr.Dataset, published: Mapping[str, Mapping[str, float]], band: str
+) -> Figure:
+    """
+    Emissivity of several objects by each procedure, beside the truth and the published values.
+
+    Parameters
+    ----------
+    compared : Dataset
+        `true` (object, band), `mean` and `spread` (object, procedure, band) [1].
+    published : mapping
+        Label -> object -> the paper's value [1].
+    band : str
+        The band that is drawn.
+
+    Returns
+    -------
+    Figure
+        A group of marks an object, lines of one standard deviation, and the truth as a bar.
+    """
+    here = compared.sel(band=band)
+    objects, procedures = here["object"].values, here["procedure"].values
+    figure, ((axis,),) = canvas(1, 1, (8.5, 3.8))
+    place = np.arange(objects.size)
+    axis.bar(place, here["true"], 0.85, color="0.88", label="truth")
+    marks = len(procedures) + len(published)
+    shifts = iter(0.14 * (np.arange(marks) - (marks - 1) / 2))
+    for index, name in enumerate(procedures):
+        part = here.sel(procedure=name)
+        axis.errorbar(
+            place + next(shifts),
+            part["mean"],
+            part["spread"],
+            fmt="o",
+            markersize=4,
+            color=COLORS[index],
+            label=str(name),
+        )
+    for index, (label, values) in enumerate(published.items()):
+        shown = [values[str(name)] for name in objects]
+        axis.plot(
+            place + next(shifts), shown, "sD"[index], color="0.3", label=label, fillstyle="none"
+        )
+    axis.set_xticks(place, list(objects))
+    axis.set(ylabel=f"emissivity, {band_label(band)} [1]", ylim=(0, 1.05))
+    axis.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
+    axis.set_title("Emissivity by each procedure" + provenance_note(compared))
     return figure

@@ -48,8 +48,8 @@ def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
     Parameters
     ----------
     data : Dataset or DataArray
-        With the attributes `origin` ("simulated", "measured", ...) and `radiometric` (0 if the
-        values are a picture's and not counts).
+        With the attributes `origin` ("simulated", "simulated twin", "measured", ...) and
+        `radiometric` (0 if the values are a picture's and not counts).
 
     Returns
     -------
@@ -57,8 +57,9 @@ def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
         E.g. " (simulated)" or " (not radiometric)"; empty for measured radiometric data.
     """
     notes = []
-    if data.attrs.get("origin") == "simulated":
-        notes.append("simulated")
+    origin = str(data.attrs.get("origin", ""))
+    if origin.startswith("simulated"):
+        notes.append(origin)
     if data.attrs.get("radiometric", 1) == 0:
         notes.append("not radiometric")
     return f" ({', '.join(notes)})" if notes else ""

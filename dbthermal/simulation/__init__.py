@@ -1,6 +1,7 @@
 """Simulated captures with known truth: scenes, and the rig that records them.
 
-Everything made here carries `origin = "simulated"`.
+Everything made here carries `origin = "simulated"`. What casts rays or needs meshes is imported by
+name: `simulation.twins` (the paper's scenes), `rays`, `surroundings`, `people`, `props`.
 """
 
 from dbthermal.simulation.bench import (
