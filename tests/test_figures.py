@@ -143,6 +143,33 @@ def draw_sensitivity(**attrs: object) -> Figure:
     return figures.sensitivity(array("variant", 2, **attrs).assign_coords(variant=["a", "b"]), 0.5)
 
 
+def draw_procedures(**attrs: object) -> Figure:
+    """Draw the emissivity of two objects by two procedures beside a published one."""
+    names = {"object": ["ball", "cup"], "procedure": ["bench", "reflector"], "band": BANDS}
+    value = array("object procedure band", 2, 2, 2).assign_coords(names) - 300
+    parts = {"true": value.isel(procedure=0, drop=True), "mean": value, "spread": 0.1 * value}
+    published = {"the paper": {"ball": 0.1, "cup": 0.2}}
+    return figures.emissivity_procedures(xr.Dataset(parts, attrs=attrs), published, "8-14")
+
+
+def draw_thermocouples(**attrs: object) -> Figure:
+    """Draw the reading and two methods in two scenes."""
+    names = {"scene": ["pot", "glass"], "variant": ["a", "b"]}
+    parts = {
+        "reading": array("scene time", 2, 2),
+        "temperature": array("scene variant time", 2, 2, 2),
+        "relative_error": array("scene variant", 2, 2) - 300,
+    }
+    scores = xr.Dataset(parts).assign_coords(names).assign_attrs(attrs)
+    return figures.thermocouples(scores)
+
+
+def draw_error_maps(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw the errors of two methods over an image."""
+    error = (fill * (array("y x", 5, 6) - 300)).assign_attrs(attrs)
+    return figures.error_maps(array("y x", 5, 6), {"a": error, "b": 2 * error})
+
+
 DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     "gain_offset_maps": (
         lambda fill=1.0, **attrs: figures.gain_offset_maps(correction(fill, **attrs)),
@@ -182,6 +209,12 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
         {"error [1]", "noise of the quieter band [K]", "emissivity, 8-14 \N{MICRO SIGN}m [1]"},
     ),
     "reductions": (draw_reductions, {"reduction of the error by the term [%]"}),
+    "emissivity_procedures": (
+        draw_procedures,
+        {"emissivity, 8-14 \N{MICRO SIGN}m [1]"},
+    ),
+    "thermocouples": (draw_thermocouples, {"time [s]", f"object temperature [{DEGREE}]"}),
+    "error_maps": (draw_error_maps, {f"apparent [{DEGREE}]", "mean error [K]"}),
     "sensitivity": (draw_sensitivity, {"median error of the object temperature [K]"}),
 }
 """Name of each function -> how to draw it, and the labels of its axes and bars."""

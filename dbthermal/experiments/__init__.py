@@ -3,15 +3,19 @@
 from dbthermal.experiments.cases import efficiency, run_case, score, sweep
 from dbthermal.experiments.comparison import compare, judge, medians
 from dbthermal.experiments.memory import gridded, remembered
+from dbthermal.experiments.twins import at_thermocouple, judge_twin, share
 
 __all__ = [
+    "at_thermocouple",
     "compare",
     "efficiency",
     "gridded",
     "judge",
+    "judge_twin",
     "medians",
     "remembered",
     "run_case",
     "score",
+    "share",
     "sweep",
 ]

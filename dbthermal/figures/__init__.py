@@ -27,6 +27,7 @@ from dbthermal.figures.scenes import (
     separated_temperatures,
     status_map,
 )
+from dbthermal.figures.twins import error_maps, thermocouples
 
 __all__ = [
     "accuracy",
@@ -37,6 +38,7 @@ __all__ = [
     "emissivity_errors",
     "emissivity_procedures",
     "error_bar_calibration",
+    "error_maps",
     "error_over_noise",
     "gain_offset_maps",
     "provenance_note",
@@ -47,5 +49,6 @@ __all__ = [
     "separated_frames",
     "separated_temperatures",
     "status_map",
+    "thermocouples",
     "truth_and_estimate",
 ]
