@@ -375,4 +375,6 @@ def test_bunny(mirror: Path) -> None:
     """The Stanford bunny has the vertices and faces that its source gives, in metres."""
     bunny = readers.mesh(mirror / "meshes" / "stanford-bunny.obj")
     assert (bunny.sizes["vertex"], bunny.sizes["face"]) == (35947, 69451)
-    assert float(np.ptp(bunny["vertices"].values, axis=0).max()) == pytest.approx(0.156, abs=1e-3)  # m
+    assert float(np.ptp(bunny["vertices"].values, axis=0).max()) == pytest.approx(
+        0.156, abs=1e-3
+    )  # m

@@ -36,7 +36,7 @@ def separated_film(
     emission : DataArray
         Object temperature (time, y, x) [K]; pixels without a value are gray.
     change : DataArray
-        Background temperature less its mean over time (time, y, x) [K].
+        What the reflection changes, `separation.reflected_change` (time, y, x) [K].
     title : str
         What the scene is.
 

@@ -66,7 +66,12 @@ def separated_frames(
 
 
 def separated_temperatures(
-    apparent: xr.DataArray, emission: xr.DataArray, change: xr.DataArray, *, title: str
+    apparent: xr.DataArray,
+    emission: xr.DataArray,
+    change: xr.DataArray,
+    *,
+    title: str,
+    label: str = "background change [K]",
 ) -> Figure:
     """
     `separated_frames` of temperatures, in degrees Celsius.
@@ -78,16 +83,19 @@ def separated_temperatures(
     emission : DataArray
         Object temperature (time, y, x) [K].
     change : DataArray
-        Background temperature less its mean over time (time, y, x) [K].
+        Background temperature less its mean over time, or `separation.reflected_change`
+        (time, y, x) [K].
     title : str
         What the scene is.
+    label : str
+        What the change is, with its unit.
 
     Returns
     -------
     Figure
         As many rows as there are times.
     """
-    labels = ("apparent [\N{DEGREE SIGN}C]", "object [\N{DEGREE SIGN}C]", "background change [K]")
+    labels = ("apparent [\N{DEGREE SIGN}C]", "object [\N{DEGREE SIGN}C]", label)
     inputs = (apparent - zero_Celsius).assign_attrs(apparent.attrs)
     return separated_frames(inputs, emission - zero_Celsius, change, title=title, labels=labels)
 

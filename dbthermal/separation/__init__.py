@@ -1,7 +1,8 @@
 """Separation of emission and reflection: one function, several methods of one signature."""
 
 from dbthermal.separation.methods import METHODS
+from dbthermal.separation.reflected import reflected_change
 from dbthermal.separation.relative import reflections
 from dbthermal.separation.solver import solve
 
-__all__ = ["METHODS", "reflections", "solve"]
+__all__ = ["METHODS", "reflected_change", "reflections", "solve"]
