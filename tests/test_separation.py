@@ -550,6 +550,7 @@ def test_reflected_change() -> None:
         true = 0.14 * (
             scene["background_temperature"] - scene["background_temperature"].mean("time")
         )
+        assert found.dims == ("time", "y", "x")
         assert float(found.notnull().all("time").mean()) > 0.95
         error = float(np.sqrt(((found - true) ** 2).mean()))
         print(f"object to {stop} K: {error:.3f} K")

@@ -41,7 +41,7 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     first = apparent.isel(band=0, drop=True)
     background = result["background_temperature"]
     share = 1.0 - result["emissivity"].isel(band=0, drop=True)
-    known = share * (background - background.mean("time"))
+    known = (background - background.mean("time")) * share
     constant = (result["status"] & schema.FLAGS["constant_object"]) != 0
     found = known.where(~constant, first - first.mean("time"))
     names = {"units": "K", "long_name": "reflection, change of the apparent temperature"}
