@@ -35,7 +35,7 @@ def separate(problem: Problem) -> Separated:
         background_temperature_std=unknown,
         emissivity=none,
         emissivity_std=none,
-        status=flag({"outside_response": np.isnan(temperature).any(axis=0)}),
+        status=flag({"outside_response": np.any(np.isnan(temperature), axis=0)}),
     )
 
 
