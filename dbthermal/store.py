@@ -164,6 +164,28 @@ def read_numbers(path: str | Path) -> dict[str, Number]:
     return {name: _number(name, value) for name, value in content["numbers"].items()}
 
 
+def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
+    """Write a text in Markdown, the record of what made it in a comment at its end.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+    path : str or Path
+        File to write, ``*.md``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.provenance.record`.
+
+    Raises
+    ------
+    ValueError
+        If `path` does not end in ``.md``, or `provenance` holds a number that is not finite.
+    """
+    comment = f"\n<!-- {_json(provenance)} -->\n"
+    with _whole(path, ".md") as part:
+        part.write_text(text + comment, encoding="utf-8")
+
+
 def save_figure(
     figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
 ) -> None:

@@ -13,12 +13,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from dbthermal import paths, store
+from dbthermal import paper, paths, store
 
 TOLERANCE: Final = 0.01
 """Largest difference of two numbers, relative to the larger of the two [1]."""
 
 _SOURCE: Final = ("02_emissivity", "libraries", "embedded")
+
+MARKS: Final = ("<!-- paper_vs_ours -->", "<!-- end of paper_vs_ours -->")
+"""What encloses the comparison with the paper in the README."""
 
 Numbers = dict[str, store.Number]
 
@@ -123,6 +126,34 @@ def agree(value: object, expected: object) -> bool:
     return value == expected and type(value) is type(expected)
 
 
+def with_table(readme: str, numbers: Mapping[str, Numbers]) -> str:
+    """
+    Put the comparison with the paper into the README.
+
+    Parameters
+    ----------
+    readme : str
+        Its text, with the two marks that the table stands between.
+    numbers : mapping
+        From `read_run`.
+
+    Returns
+    -------
+    str
+        The text with the table of these numbers.
+
+    Raises
+    ------
+    ValueError
+        If a mark is missing.
+    """
+    head, start, rest = readme.partition(MARKS[0])
+    _, stop, tail = rest.partition(MARKS[1])
+    if not (start and stop):
+        raise ValueError(f"Missing marks {MARKS} in the README. Must enclose its table.")
+    return f"{head}{start}\n\n{paper.markdown(numbers)}\n{stop}{tail}"
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """
     Print the comparison, or keep a run's numbers as the reference.
@@ -147,6 +178,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.record:
         text = json.dumps({**reference, kind: found}, indent=1, sort_keys=True)
         path.write_text(text + "\n", encoding="utf-8")
+        if kind == "with data":
+            readme = paths.root() / "README.md"
+            shown = with_table(readme.read_text(encoding="utf-8"), found)
+            readme.write_text(shown, encoding="utf-8")
         print(f"kept {sum(map(len, found.values()))} numbers, {kind}")
         return 0
     rows = list(compare(found, reference.get(kind, {})))

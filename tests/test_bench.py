@@ -83,3 +83,21 @@ def test_full_frame_from_disk(capture: xr.Dataset, tmp_path: Path) -> None:
     copies = peak / 2**10 / (capture["counts"].nbytes / 2**20)
     print(f"\nfrom disk: {seconds:.1f} s, whole process {copies:.2f} captures")
     assert copies < 3
+
+
+@pytest.mark.bench
+def test_other_methods() -> None:
+    """The other methods' time a pixel and core, 512 pixels of plate glass."""
+    case = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
+    scene, _ = experiments.run_case(case, Rig(), np.arange(FRAMES) / 10.0, 512, seed=1)
+    response = Rig().response()
+    capture = simulation.observe(scene, response, np.random.default_rng(1))
+    print()
+    for method in ("subspace", "dbvt", "naive", "ratio", "bcp"):
+        seconds = []
+        for _ in range(2):  # the first imports what the method needs
+            start = time.perf_counter()
+            separation.solve(capture, response, method, workers=1)
+            seconds.append(time.perf_counter() - start)
+        print(f"{method}: {1e3 * seconds[-1] / 512:.3g} ms a pixel")
+        assert seconds[-1] < 60

@@ -264,3 +264,11 @@ def test_no_video_of_nonsense(tmp_path: Path, frames: list[np.ndarray], message:
     with pytest.raises(ValueError, match=message):
         store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0)
     assert not any(tmp_path.iterdir())
+
+
+def test_text_keeps_its_record(tmp_path: Path) -> None:
+    """The text comes first, the record in a comment."""
+    store.save_text("| a |\n", tmp_path / "a.md", RECORD)
+    text, _, comment = (tmp_path / "a.md").read_text().partition("\n<!-- ")
+    assert text == "| a |\n"
+    assert json.loads(comment.removesuffix(" -->\n")) == RECORD
