@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import experiments, store
+from dbthermal.experiments import memory
 
 PLATE: dict[str, Any] = {"frames": 120, "shape": [10, 24], "crossings": 6}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -68,6 +69,9 @@ def test_changed_code_starts_anew(
     cells = [{"folder": str(marks), "value": 1.0, "seed": 1}]
     experiments.remembered(counted, cells, tmp_path / "cells")
     monkeypatch.setattr("dbthermal.provenance.source", lambda: "other")
+    with pytest.raises(RuntimeError, match=r"Changed source code\. Must be as it was imported"):
+        experiments.remembered(counted, cells, tmp_path / "cells")
+    monkeypatch.setattr("dbthermal.experiments.memory._SOURCE", "other")
     experiments.remembered(counted, cells, tmp_path / "cells")
     assert len(list(marks.iterdir())) == 2
 
@@ -97,20 +101,45 @@ def test_pixels_without_reflection_take_no_part() -> None:
 
 
 def test_medians_count_what_the_default_solves() -> None:
-    """A pixel that the default gives up is left out for all, and enters the share."""
-    rmse = [[0.1, 0.3, np.nan], [1.0, 2.0, 90.0]]
+    """A pixel that the default gives up is left out; one that another loses is its worst."""
+    rmse = [[0.1, 0.3, np.nan, 0.2], [1.0, np.nan, 90.0, 2.0]]
     comparison = xr.Dataset(
         {
             "object_temperature_rmse": (("variant", "pixel"), rmse, {"units": "K"}),
-            "emissivity_error": (("variant", "band", "pixel"), np.ones((2, 2, 3)), {"units": "1"}),
-            "status": (("variant", "pixel"), [[0, 0, 1], [0, 0, 0]]),
+            "emissivity_error": (
+                ("variant", "band", "pixel"),
+                np.full((2, 2, 4), 0.05),
+                {"units": "1"},
+            ),
+            "status": (("variant", "pixel"), [[0, 0, 1, 0], [0, 4, 0, 0]]),
         },
         coords={"variant": ["subspace", "other"]},
     )
     found = experiments.medians(comparison)
-    np.testing.assert_allclose(found["object_temperature_rmse"], [0.2, 1.5], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found["solved"], [2 / 3, 1.0], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found["good"], [2 / 3, 1.0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found["object_temperature_rmse"], [0.2, 2.0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found["solved"], [0.75, 0.75], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found["good"], [0.75, 0.75], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(found["wrong"], [0.0, 0.0])
+    lost = experiments.medians(comparison.isel(pixel=[1, 2]))
+    assert np.isnan(lost["object_temperature_rmse"].sel(variant="other"))
+
+
+def test_a_failure_begins_no_further_cell(tmp_path: Path, marks: Path) -> None:
+    """With several processes too, what waits is not begun."""
+    cells = [{"folder": str(marks), "value": value, "seed": 1} for value in (-1.0, *range(1, 40))]
+    with pytest.raises(ValueError, match="interrupted"):
+        experiments.remembered(counted, cells, tmp_path / "cells", workers=2)
+    assert len(list(marks.iterdir())) < 30
+
+
+def test_another_process_was_first(tmp_path: Path, marks: Path) -> None:
+    """A cell that another process has made meanwhile is not made again."""
+    cell = {"folder": str(marks), "value": 1.0, "seed": 1}
+    (first,) = experiments.remembered(counted, [cell], tmp_path / "cells")
+    (path,) = (tmp_path / "cells").iterdir()
+    memory._keep(counted, path, cell)
+    assert len(list(marks.iterdir())) == 1
+    xr.testing.assert_identical(store.open_dataset(path).load(), first)
 
 
 def test_a_cell_on_disk_says_what_made_it(tmp_path: Path, marks: Path) -> None:

@@ -42,6 +42,31 @@ def test_what_was_not_measured_says_so() -> None:
     assert row(1.0, "error").verdict({}) == "not measured"
 
 
+@pytest.mark.parametrize(("lowest", "verdict"), [(1.0, "differs"), (9.0, "agrees")])
+def test_lowest(lowest: float, verdict: str) -> None:
+    """The one that the paper names must be the lowest of all, and all must be there."""
+    part = Row(
+        "Fig.", "", "02_a", ("a", "b"), "", judged="lowest", note="9.5", labels=("8.5", "9.5")
+    )
+    assert part.verdict({"02_a": {"a": lowest, "b": 5.0}}) == verdict
+    assert part.verdict({"02_a": {"b": 5.0}}) == "not measured"
+
+
+@pytest.mark.parametrize(("second", "verdict"), [(1.5, "agrees"), (4.0, "differs")])
+def test_alike(second: float, verdict: str) -> None:
+    """The second must not be far above the first."""
+    part = Row("Fig.", "", "01_a", ("a", "b"), "", judged="alike", within=2.0)
+    assert part.verdict({"01_a": {"a": 1.0, "b": second}}) == verdict
+
+
+def test_half_a_row_is_shown() -> None:
+    """What of a row was measured is shown with its label, though the row is not judged."""
+    some = {"05_methods": {"naive: error at moderate noise [K]": 2.0}}
+    (line,) = [cells for cells in paper.compare(some) if cells[0] == "Figs. 2 left, 10"]
+    assert line[3] == "naive 2.00 K"
+    assert line[-1] == "not measured"
+
+
 def test_every_published_number_is_there() -> None:
     """As many rows with a number as the paper has: 10 emissivities, 4 terms, 10 of scenes, 4."""
     numbers = [part.published for part in paper.rows() if part.published is not None]

@@ -14,6 +14,9 @@ from dbthermal.simulation import Rig
 MOVING: Final = 0.5
 """Standard deviation of the background from which a pixel takes part [K]."""
 
+WRONG: Final = 0.1
+"""Error of an emissivity from which it is called wrong [1]."""
+
 Options = Mapping[str, Any]
 
 
@@ -78,7 +81,7 @@ def compare(
     Returns
     -------
     Dataset
-        `object_temperature_rmse` (variant, pixel) [K], over the frames with a value;
+        `object_temperature_rmse` (variant, pixel) [K], NaN where a frame has no value;
         `emissivity_error` (variant, band, pixel) [1], a magnitude; `status` (variant, pixel).
     """
     rng, settings = np.random.default_rng(seed), Plate(**plate)
@@ -117,13 +120,15 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `object_temperature_rmse` (pixel) [K], NaN without a value; `emissivity_error`
+        `object_temperature_rmse` (pixel) [K], NaN where a frame has no value; `emissivity_error`
         (band, pixel) [1]; `status` (pixel).
     """
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     of_emissivity = abs(result["emissivity"] - truth["emissivity"])
     found = {
-        "object_temperature_rmse": (squared.mean("time") ** 0.5).assign_attrs(units="K"),
+        "object_temperature_rmse": (squared.mean("time", skipna=False) ** 0.5).assign_attrs(
+            units="K"
+        ),
         "emissivity_error": of_emissivity.assign_attrs(units="1"),
         "status": result["status"],
     }
@@ -135,33 +140,38 @@ def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
     """
     Median errors over pixels, of every variant over the pixels that the default can solve.
 
+    A pixel that a variant loses there counts as its worst, and does not flatter it.
+
     Parameters
     ----------
     comparison : Dataset
-        Variables of `compare` over any further dims.
+        Variables of `compare` over any further dims; over `seed` too the median is taken.
     default : str
         The variant that decides which pixels count.
 
     Returns
     -------
     Dataset
-        `object_temperature_rmse` [K] and `emissivity_error` (band) [1]: medians over the pixels
-        in which both the variant and the default have a value, NaN where there is none; `solved`
-        [1]: share of pixels with an object temperature; `good` [1]: share without any flag.
+        `object_temperature_rmse` [K] and `emissivity_error` (band) [1]: medians, NaN where the
+        default has no pixel or the variant loses half of them; `wrong` [1]: share of these pixels
+        with an emissivity off by more than `WRONG`, or lost; `solved` [1]: share of all pixels with
+        an object temperature; `good` [1]: share of all without any flag.
     """
+    over = [dim for dim in ("pixel", "seed") if dim in comparison.dims]
     known = comparison["object_temperature_rmse"].notnull()
     counted = known.sel(variant=default)
-    names = ("object_temperature_rmse", "emissivity_error")
-    parts = {name: comparison[name].where(counted).median("pixel") for name in names}
-    parts |= {
-        "solved": known.mean("pixel").assign_attrs(units="1"),
-        "good": (comparison["status"] == 0).mean("pixel").assign_attrs(units="1"),
+    parts = {}
+    for name in ("object_temperature_rmse", "emissivity_error"):
+        worst = comparison[name].fillna(np.inf).where(counted)
+        median = worst.median(over)
+        parts[name] = median.where(np.isfinite(median)).assign_attrs(comparison[name].attrs)
+    off = ~(comparison["emissivity_error"].max("band", skipna=False) <= WRONG)
+    shares = {
+        "wrong": off.where(counted).mean(over),
+        "solved": known.mean(over),
+        "good": (comparison["status"] == 0).mean(over),
     }
-    parts = {
-        name: part.assign_attrs(comparison[name].attrs)
-        for name, part in parts.items()
-        if name in names
-    } | {name: parts[name] for name in ("solved", "good")}
+    parts |= {name: part.assign_attrs(units="1") for name, part in shares.items()}
     return xr.Dataset(parts, attrs=comparison.attrs)
 
 

@@ -8,16 +8,21 @@ import hashlib
 import json
 import math
 import multiprocessing
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import xarray as xr
 from tqdm import tqdm
 
 from dbthermal import provenance, store
+
+_OPTIONAL: Final = ("torch", "trimesh", "embreex", "robust-laplacian")
+# Of the code as it was imported, which is the code that runs.
+_SOURCE: Final = provenance.source()
 
 Cell = Mapping[str, Any]
 """Parameters of a cell: plain numbers, texts, lists and mappings."""
@@ -56,46 +61,76 @@ def remembered(
     Raises
     ------
     TypeError, ValueError
-        If a parameter is not plain, see `provenance.record`; and what the function raises.
+        If a parameter is not plain, see `provenance.record`; and what the function raises: then no
+        further cell is begun.
+    RuntimeError
+        If the package's source changed since it was imported, so that nobody could say which code
+        a result is of.
     """
+    if provenance.source() != _SOURCE:
+        raise RuntimeError("Changed source code. Must be as it was imported: restart the kernel.")
     cells = list(cells)
-    record = provenance.record({})
-    paths = [folder / f"{_name(function, cell, record)}.zarr" for cell in cells]
+    paths = [folder / f"{_name(function, cell)}.zarr" for cell in cells]
     missing = {path: cell for path, cell in zip(paths, cells, strict=True) if not path.exists()}
-    work = partial(_keep, function)
     with tqdm(total=len(cells), initial=len(cells) - len(missing), disable=not progress) as bar:
-        if workers == 1:
-            for path, cell in missing.items():
-                work(path, cell)
-                bar.update()
-        else:
-            with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-                for done in as_completed(_submit(pool, work, missing)):
-                    done.result()
-                    bar.update()
+        for _ in _run(partial(_keep, function), missing, workers):
+            bar.update()
     return [store.open_dataset(path).load() for path in paths]
 
 
-def _submit(
-    pool: Executor, work: Callable[[Path, Cell], None], missing: Mapping[Path, Cell]
-) -> list[Future[None]]:
-    return [pool.submit(work, path, cell) for path, cell in missing.items()]
+def _run(
+    work: Callable[[Path, Cell], None], missing: Mapping[Path, Cell], workers: int
+) -> Iterator[None]:
+    """Do what is missing, here or in several processes; stop at the first that fails."""
+    if workers == 1:
+        for path, cell in missing.items():
+            work(path, cell)
+            yield
+        return
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+    try:
+        pending = [pool.submit(work, path, cell) for path, cell in missing.items()]
+        for done in as_completed(pending):
+            done.result()
+            yield
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _name(function: Callable[..., xr.Dataset], cell: Cell, record: Mapping[str, Any]) -> str:
+def _versions() -> dict[str, str | None]:
+    """Versions of all that a cell's result may hang on; None where it is not installed."""
+    found: dict[str, str | None] = dict(provenance.record({})["versions"])
+    for package in _OPTIONAL:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def _name(function: Callable[..., xr.Dataset], cell: Cell) -> str:
     """Checksum of all that decides a cell's result."""
     identity = {
         "function": f"{function.__module__}.{function.__qualname__}",
         "cell": provenance.record(cell)["parameters"],
-        "versions": record["versions"],
-        "source": provenance.source(),
+        "versions": _versions(),
+        "source": _SOURCE,
     }
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _keep(function: Callable[..., xr.Dataset], path: Path, cell: Cell) -> None:
-    """Run one cell and save it, whole or not at all."""
-    store.save(function(**cell), path, provenance.record(cell))
+    """Run one cell and save it, whole or not at all, unless another process was first."""
+    if path.exists():
+        return
+    result = function(**cell)
+    if provenance.source() != _SOURCE:
+        raise RuntimeError("Changed source code during a run. Must stay until it ends.")
+    try:
+        store.save(result, path, provenance.record(cell))
+    except OSError:
+        if not path.exists():
+            raise
 
 
 def gridded(parts: Sequence[xr.Dataset], coords: Mapping[str, Sequence[Any]]) -> xr.Dataset:

@@ -146,7 +146,8 @@ def at_thermocouple(
     Returns
     -------
     Dataset
-        `relative_error` (variant) [percent of degrees Celsius], mean over the frames and probes;
+        `relative_error` (variant) [percent of degrees Celsius], mean over the frames and probes,
+        NaN where a pixel of the bead has no value in some frame;
         `temperature` (variant, time) and `reading` (time) of the last probe [K];
         `highest_reading` [degree Celsius], median over the probes.
     """
@@ -155,14 +156,18 @@ def at_thermocouple(
         twins.thermocouple_readings(scene, rng, bead=BEAD).isel(thermocouple=0)
         for _ in range(probes)
     ]
-    found = [_mean(corrected, response, square, variant) for variant in variants.values()]
+    seed = int(rng.integers(2**32))  # of random starts: each capture has its own
+    found = [
+        _mean(corrected, response, square, {"seed": seed, **variant})
+        for variant in variants.values()
+    ]
     label = xr.DataArray(list(variants), dims="variant", name="variant")
     temperature = xr.concat(found, dim=label)
     errors = [metrics.relative_error_celsius(temperature, reading) for reading in readings]
     highest = np.median([float(reading.max()) for reading in readings]) - zero_Celsius
     return xr.Dataset(
         {
-            "relative_error": xr.concat(errors, "probe").mean(("probe", "time")),
+            "relative_error": xr.concat(errors, "probe").mean(("probe", "time"), skipna=False),
             "temperature": temperature.assign_attrs(units="K"),
             "reading": readings[-1],
             "highest_reading": ((), highest, {"units": "degree_Celsius"}),
@@ -191,7 +196,7 @@ def _mean(
         seen = corrected.isel(square)
     found = separation.solve(seen, response, **options)["object_temperature"]
     part = found.isel(square) if found.sizes == corrected["counts"][0].sizes else found
-    return part.mean(("y", "x"))
+    return part.mean(("y", "x"), skipna=False)
 
 
 def share(found: xr.DataArray, cause: xr.DataArray) -> float:

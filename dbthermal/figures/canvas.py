@@ -48,8 +48,9 @@ def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
     Parameters
     ----------
     data : Dataset or DataArray
-        With the attributes `origin` ("simulated", "simulated twin", "measured", ...) and
-        `radiometric` (0 if the values are a picture's and not counts).
+        With the attributes `origin` ("simulated", "measured", ...), `twin` (name of the scene
+        that a simulation is a twin of) and `radiometric` (0 if the values are a picture's and
+        not counts).
 
     Returns
     -------
@@ -59,7 +60,7 @@ def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
     notes = []
     origin = str(data.attrs.get("origin", ""))
     if origin.startswith("simulated"):
-        notes.append(origin)
+        notes.append("simulated twin" if "twin" in data.attrs else origin)
     if data.attrs.get("radiometric", 1) == 0:
         notes.append("not radiometric")
     return f" ({', '.join(notes)})" if notes else ""

@@ -12,6 +12,7 @@ bands apart is taken out of the second band with the temperatures found, and the
 Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334.
 """
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -33,6 +34,11 @@ SIGNALS: Final = ("corrected", "measured")
 """What the temperatures may be computed from."""
 PRECISIONS: Final = ("float64", "float32")
 """Floating-point types."""
+# Largest departure of an interval from the median one, relative to it.
+_UNEVEN: Final = 0.5
+# torch's number of threads is the process's: what it was before the first of several tiles.
+_THREADS: Final = threading.Lock()
+_BEFORE: Final[list[int]] = []
 
 
 @dataclass(frozen=True)
@@ -88,6 +94,8 @@ class Settings(Weights, Limits):
                 raise ValueError(
                     f"Invalid {name} {getattr(self, name)} of method 'dbvt'. Must be at least 1."
                 )
+        if torch.device(self.device).type == "cuda" and not torch.cuda.is_available():
+            raise ValueError(f"Invalid device '{self.device}' of method 'dbvt'. None is here.")
         if not self.bend_updates >= 0:
             raise ValueError(
                 f"Invalid bend_updates {self.bend_updates} of method 'dbvt'. Must be at least 0."
@@ -110,6 +118,11 @@ def separate(problem: Problem, settings: Settings) -> Separated:
     Separated
         Temperatures and emissivities, without deviations; `not_converged` where the kept start was
         still improving at the last step, or has no finite objective, which leaves NaN.
+
+    Raises
+    ------
+    ValueError
+        If the frames are not evenly spaced in time, or the device is not there.
     """
     quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
     with quiet, torch.inference_mode(), _one_thread():
@@ -121,12 +134,29 @@ def separate(problem: Problem, settings: Settings) -> Separated:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Keep torch to the calling thread: tiles run side by side, and its threads would contend."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    with _THREADS:
+        _BEFORE.append(torch.get_num_threads())
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        with _THREADS:  # the first tile to begin found the number that the last to end leaves
+            first = _BEFORE[0] if len(_BEFORE) == 1 else 1
+            _BEFORE.pop()
+            torch.set_num_threads(first)
+
+
+def _even(time: Array) -> float:
+    """Interval of an even clock [s]."""
+    steps = np.diff(time)
+    interval = float(np.median(steps))
+    away = int(np.argmax(np.abs(steps - interval)))
+    if abs(steps[away] - interval) > _UNEVEN * interval:
+        raise ValueError(
+            f"Invalid interval {steps[away]:.3g} s after {time[away]:.3g} s for method 'dbvt'. "
+            f"Must be {interval:.3g} s throughout: its smoothness loss is of even frames."
+        )
+    return interval
 
 
 def images(problem: Problem, columns: int, settings: Settings) -> Images:
@@ -150,7 +180,7 @@ def images(problem: Problem, columns: int, settings: Settings) -> Images:
     like = _tensor(np.ones(columns), settings)
     signals = _tensor(problem.signals, settings).repeat(1, 1, columns // problem.signals.shape[-1])
     sigma = torch.stack([noise * like for noise in problem.noise])
-    interval = like * float(np.median(np.diff(problem.time)))
+    interval = like * _even(problem.time)
     none = torch.zeros_like(signals)
     deviation = objective.deviation(signals, none, sigma, settings.deviation_floor)
     return Images(signals, deviation, sigma, interval, like)

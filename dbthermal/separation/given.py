@@ -181,7 +181,7 @@ def true_temperature(corrected: xr.Dataset, truth: xr.DataArray | None) -> Array
     TypeError
         If it is not a DataArray.
     ValueError
-        If its dims, unit or sizes are not the capture's.
+        If its dims, unit or sizes are not the capture's, or a value is not finite.
     """
     if truth is None:
         return None
@@ -192,4 +192,7 @@ def true_temperature(corrected: xr.Dataset, truth: xr.DataArray | None) -> Array
         raise ValueError(
             f"Invalid shape {truth.shape} of the truth. Must be {corrected['counts'].shape[1:]}."
         )
-    return np.asarray(truth.values, dtype=np.float64)
+    values = np.asarray(truth.values, dtype=np.float64)
+    if not np.all(np.isfinite(values)):
+        raise ValueError("Invalid truth with NaN or infinite values. Must be finite.")
+    return values

@@ -54,7 +54,7 @@ def settings(name: str, options: dict[str, Any]) -> Any:
     Raises
     ------
     TypeError
-        If it has no such option.
+        If it has no such option, or one that is a number of things is not whole.
     ValueError
         If a value is not allowed, see the method's `Settings`.
     """
@@ -63,4 +63,10 @@ def settings(name: str, options: dict[str, Any]) -> Any:
     unknown = sorted(options.keys() - set(names))
     if unknown:
         raise TypeError(f"Unknown option '{unknown[0]}' of method '{name}'. Has {names}.")
+    for field in () if kind is None else fields(kind):
+        value = options.get(field.name, field.default)
+        if type(field.default) is int and type(value) is not int:
+            raise TypeError(
+                f"Invalid {field.name} {value!r} of method '{name}'. Must be a whole number."
+            )
     return None if kind is None else kind(**options)

@@ -101,7 +101,12 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
        doi:10.48550/arXiv.2509.11334
     """
     module, settings = methods.get(method), methods.settings(method, options)
-    _check(corrected, method, module, workers, has_emissivity=emissivity is not None)
+    _check(corrected, method, module, (workers, seed), has_emissivity=emissivity is not None)
+    if (truth is not None) != bool(getattr(settings, "oracle", False)):
+        raise ValueError(
+            f"Invalid truth for method '{method}'. Must be given with the option oracle=True of a "
+            "method that has it, and only then."
+        )
     names = [str(name) for name in corrected["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
     deviations = _noise(corrected, response, curves)
@@ -125,7 +130,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
                 curves=(curves[bands[0]], curves[bands[1]]),
                 noise=(float(deviations[bands[0]]), float(deviations[bands[1]])),
                 shape=tiles.shape_of(tile),
-                rng=np.random.default_rng([seed, place[0].start, place[1].start]),
+                rng=tiles.generator(seed, place),
             )
             found: Separated = separate(known.put_into(problem, place, bands))
             tiles.write(target, tile, bands, found, status)
@@ -158,12 +163,20 @@ def _signals(counts: Array, curves: list[Curve], bands: list[int]) -> Array:
 
 
 def _check(
-    corrected: xr.Dataset, name: str, method: Method, workers: int, *, has_emissivity: bool
+    corrected: xr.Dataset,
+    name: str,
+    method: Method,
+    whole: tuple[int, int],
+    *,
+    has_emissivity: bool,
 ) -> None:
+    workers, seed = whole
     schema.check(corrected, "corrected")
     tiles.check_status(corrected)
     if operator.index(workers) < 1:
         raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")
+    if operator.index(seed) < 0:
+        raise ValueError(f"Invalid seed {seed}. Must be zero or positive.")
     if corrected.sizes["band"] != 2:
         names = [str(name) for name in corrected["band"].values]
         raise ValueError(f"Invalid bands {names} of the capture. Must be exactly two.")

@@ -91,6 +91,26 @@ def moved(tile: Tile, top: int) -> Tile:
     return slice(tile[0].start + top, tile[0].stop + top), tile[1]
 
 
+def generator(seed: int, tile: Tile) -> np.random.Generator:
+    """
+    A tile's own source of randomness, independent of all others of this seed.
+
+    Parameters
+    ----------
+    seed : int
+        Seed.
+    tile : tuple of slice
+        Rows and columns in the image.
+
+    Returns
+    -------
+    Generator
+        The same for the same seed and place, and not that of the seed itself.
+    """
+    key = (tile[0].start, tile[1].start)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+
+
 def shape_of(tile: Tile) -> tuple[int, int]:
     """
     Size of a tile.
@@ -143,7 +163,14 @@ def read(corrected: xr.Dataset, tile: Tile) -> tuple[Array, Flags]:
     )
     if "status" in corrected:
         status |= part["status"].values.reshape(-1).astype(np.uint16)
+    counts[:, :, _unusable(status)] = 0.0
     return counts, status
+
+
+def _unusable(status: Flags) -> Mask:
+    """Where nothing can be computed."""
+    masks = sum(schema.FLAGS[name] for name in _ALL_UNDEFINED)
+    return np.asarray((status & np.uint16(masks)) != 0)
 
 
 def _saturated(raw: npt.NDArray[Any]) -> Mask:
@@ -236,7 +263,7 @@ def allocate(corrected: xr.Dataset) -> xr.Dataset:
     kept = {
         name: value
         for name, value in corrected.attrs.items()
-        if name in ("origin", "radiometric", "source")
+        if name in ("origin", "radiometric", "source", "twin")
     }
     arrays = {}
     for name, variable in schema.STAGES["separated"].items():
@@ -269,8 +296,7 @@ def write(
     """
     rows, columns = tile
     shape = shape_of(tile)
-    masks = sum(schema.FLAGS[name] for name in _ALL_UNDEFINED)
-    unusable = (status & np.uint16(masks)) != 0
+    unusable = _unusable(status)
     for name in schema.STAGES["separated"]:
         values = getattr(found, name)
         if name == "status":
