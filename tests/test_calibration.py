@@ -263,22 +263,20 @@ def test_emissivity_without_errors(two_bands: xr.Dataset) -> None:
 
 
 def test_emissivity_is_the_weighted_slope(two_bands: xr.Dataset, measured: xr.Dataset) -> None:
-    """The result solves its own normal equation, with the weights of the docstring."""
+    """The result solves York's normal equation, with the weights of the docstring."""
     fitted = calibration.fit_emissivity(measured, two_bands, STDS)
     curve = response.curve(two_bands, "9.5")
     warm, cold = measured["object_temperature"], measured["background_temperature"]
     across = curve.counts(warm) - curve.counts(cold)
     slope = float(fitted["emissivity"].sel(band="9.5"))
     residual = measured["counts"].sel(band="9.5").values - curve.counts(cold) - slope * across
-    variance = (
-        4.0**2
-        + (slope * curve.count_slope(warm) * STDS[0]) ** 2
-        + ((1 - slope) * curve.count_slope(cold) * STDS[1]) ** 2
-    )
+    own, other = (curve.count_slope(warm) * STDS[0]) ** 2, (curve.count_slope(cold) * STDS[1]) ** 2
+    variance = 4.0**2 + slope**2 * own + (1 - slope) ** 2 * other
+    adjusted = across + (slope * own - (1 - slope) * other) * residual / variance
     np.testing.assert_allclose(fitted["residual"].sel(band="9.5"), residual, rtol=0, atol=1e-9)
-    assert float(np.sum(across * residual / variance)) == pytest.approx(0.0, abs=1e-6)
+    assert float(np.sum(adjusted * residual / variance)) == pytest.approx(0.0, abs=1e-6)
     assert float(fitted["emissivity_std"].sel(band="9.5")) == pytest.approx(
-        float(np.sum(across**2 / variance)) ** -0.5, rel=1e-9
+        float(np.sum(adjusted**2 / variance)) ** -0.5, rel=1e-9
     )
     assert float(fitted["reduced_chi2"].sel(band="9.5")) == pytest.approx(
         float(np.sum(residual**2 / variance)) / 7, rel=1e-9

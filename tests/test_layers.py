@@ -24,7 +24,7 @@ PLACES = {
     "pooch": {"manifest"},
     "torch": {"separation"},
     "robust_laplacian": {"heat"},
-    "trimesh": {"readers", "simulation"},
+    "trimesh": {"simulation"},
 }
 
 

@@ -349,32 +349,3 @@ def test_published_scene(mirror: Path) -> None:
     path = mirror / "scenes" / "coffeepot_uncalib_Totemp_video.mp4"
     separated = readers.masked_palette_video(path, width=movie.sizes["x"])
     assert_allclose(separated["valid"].mean(), 0.356, rtol=0, atol=0.01)
-
-
-TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 5 5 5\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-
-
-def test_mesh(tmp_path: Path) -> None:
-    """Vertices and faces as they are in the file, an unused vertex among them."""
-    (tmp_path / "a.obj").write_text(TETRAHEDRON)
-    found = readers.mesh(tmp_path / "a.obj")
-    assert_array_equal(found["vertices"][:, 0], [0, 1, 0, 0, 5])
-    assert_array_equal(found["faces"], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-
-
-@pytest.mark.parametrize("text", ["v 0 0 0\nv 1 0 0\nv 0 1 0\n", TETRAHEDRON.replace("5", "nan")])
-def test_no_mesh(tmp_path: Path, text: str) -> None:
-    """A file without triangles, or with a coordinate that is no number, is refused."""
-    (tmp_path / "a.obj").write_text(text)
-    with pytest.raises(ValueError, match=r"Invalid mesh 'a\.obj'"):
-        readers.mesh(tmp_path / "a.obj")
-
-
-@pytest.mark.data
-def test_bunny(mirror: Path) -> None:
-    """The Stanford bunny has the vertices and faces that its source gives, in metres."""
-    bunny = readers.mesh(mirror / "meshes" / "stanford-bunny.obj")
-    assert (bunny.sizes["vertex"], bunny.sizes["face"]) == (35947, 69451)
-    assert float(np.ptp(bunny["vertices"].values, axis=0).max()) == pytest.approx(
-        0.156, abs=1e-3
-    )  # m

@@ -12,7 +12,7 @@ from dbthermal import calibration, response, schema
 from dbthermal.calibration import Bias
 from dbthermal.simulation import Rig
 from dbthermal.simulation.bench import Bench, bench_series, contact_measurements, reflector_series
-from dbthermal.simulation.procedures import compare_procedures
+from dbthermal.simulation.procedures import compare_procedures, reflector_sensitivity
 from dbthermal.simulation.samples import OBJECTS, Sample, band_emissivity
 
 STDS = (0.2, 0.3)  # of a contact reading and of the foil [K]
@@ -156,6 +156,17 @@ def test_reflector_method_fails_at_low_emissivity(table: xr.Dataset) -> None:
     np.testing.assert_allclose(mean.values[2:], [0.87, 0.95, 0.95], rtol=0, atol=0.03)
 
 
+def test_its_failure_is_the_mirrored_direction(known: xr.Dataset) -> None:
+    """In a room of one temperature it is right within 0.015; each kelvin mirrored adds to that."""
+    found = reflector_sensitivity(known, np.random.default_rng(1), (0.0, 5.0, 11.0), repeats=60)
+    print(found["mean"].sel(band="8-14").to_pandas())
+    assert found["mean"].dims == ("object", "excess", "band")
+    even = found["mean"].sel(excess=0.0)
+    np.testing.assert_allclose(even, found["true"], rtol=0, atol=0.015)
+    mirrors = found["mean"].isel(object=[0, 1])
+    assert float(mirrors.diff("excess").min()) > 0.03
+
+
 def test_other_bands_follow_the_kin() -> None:
     """Metals by the ratio of emissivities, dielectrics by that of reflectances, all in (0, 1)."""
     for sample in OBJECTS:
@@ -194,6 +205,46 @@ def test_common_errors_do_not_average_out(known: xr.Dataset) -> None:
     assert stated(4, common) / stated(64, common) == pytest.approx(1.0, rel=0.03)
 
 
+def test_scatter_does_not_pass_for_contrast(known: xr.Dataset) -> None:
+    """Readings that scatter by 0.5 K at a contrast of 2 K: no bias, and the spread is stated."""
+    rng, number = np.random.default_rng(3), 60
+    true = xr.DataArray([0.9, 0.8], dims="band", coords={"band": ["8-14", "9.5"]})
+    warm, stds = np.full(200, 300.0), (0.5, 0.05)
+    series = (contact_measurements(known, true, warm, warm - 2.0, stds, rng) for _ in range(number))
+    found = xr.concat([calibration.fit_emissivity(it, known, stds) for it in series], "repeat")
+    spread, stated = found["emissivity"].std("repeat"), found["emissivity_std"].mean("repeat")
+    np.testing.assert_allclose(found["emissivity"].mean("repeat"), true, rtol=0, atol=0.01)
+    np.testing.assert_allclose(spread / stated, 1.0, rtol=0, atol=0.25)
+
+
+def test_deviations_grow_with_the_correction(known: xr.Dataset) -> None:
+    """An offset counts 1 / (1 - m) times at the thermocouple, 1 - s times at the blackbody."""
+    bias = Bias(0.6, (0.1, 0.3), 295.0, 0.3, (0.05, 0.15))
+    curve, warm, step = response.curve(known, "9.5"), np.array([320.0]), 1e-3
+    reading = 295.0 + 0.8 * (warm - 295.0)
+    slopes = [
+        np.diff([curve.counts(bias.corrected(reading + it)) for it in (-step, step)], axis=0),
+        np.diff([bias.reflection(curve, warm + it) for it in (-step, step)], axis=0),
+    ]
+    effects = (bias.emitted(curve, warm, 0.2), bias.reflected(curve, warm, 0.2))
+    for tolerance, slope, (scatter, common) in zip((0.6, 0.3), slopes, effects, strict=True):
+        expected = slope[0] / (2 * step)  # count a kelvin of the reading
+        np.testing.assert_allclose(scatter, 0.2 * expected, rtol=1e-6)
+        np.testing.assert_allclose(common[0], tolerance / 3**0.5 * expected, rtol=1e-6)
+    wrong = [replace(bias, contact=(m, m)).corrected(reading) for m in (0.2 - step, 0.2 + step)]
+    contact = np.diff(wrong, axis=0)[0] / (2 * step) * 0.2 / 12**0.5 * curve.count_slope(warm)
+    np.testing.assert_allclose(effects[0][1][1], contact, rtol=1e-5)
+
+
+def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit that is stopped before it stands still names its band."""
+    monkeypatch.setattr("dbthermal.calibration.emissivity._ITERATIONS", 1)
+    rng = np.random.default_rng(0)
+    series = bench_series(known, OBJECTS[0], Bench(), rng)
+    with pytest.raises(ArithmeticError, match=r"No convergence in band '8-14': emissivity 0\."):
+        calibration.fit_emissivity(series, known, STDS)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -209,14 +260,36 @@ def test_bad_bias(options: dict[str, object], message: str) -> None:
         Bias(**options)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"contact": (0.1, 0.0)}, r"Invalid contact \(0\.1, 0\.0\) of the bench"),
+        ({"contact": (0.0, 1.0)}, r"Invalid contact .* in \[0\.0, 1\.0\)"),
+        ({"direction": (0.0, np.nan)}, r"Invalid direction \(0\.0, nan\)"),
+        ({"direction": (-np.inf, 0.0)}, r"Invalid direction \(-inf, 0\.0\)"),
+        ({"probe_tolerance": np.nan}, r"Invalid probe_tolerance nan of the bench"),
+        ({"logger_tolerance": -0.5}, r"Invalid logger_tolerance -0\.5"),
+        ({"blackbody_tolerance": np.inf}, r"Invalid blackbody_tolerance inf"),
+        ({"foil_emissivity": 2.0}, r"Invalid foil_emissivity 2\.0 .* in \[0, 1\.0\)"),
+        ({"foil_warming": -0.1}, r"Invalid foil_warming -0\.1"),
+        ({"least_excess": np.nan}, r"Invalid least_excess nan"),
+        ({"reading_std": 0.0}, r"Invalid reading_std \[K\] of the bench 0\.0"),
+        ({"object_temperatures": ()}, r"Invalid object_temperatures \(\) of the bench"),
+        ({"blackbody_temperatures": (np.nan,)}, r"Invalid blackbody_temperatures \[K\]"),
+    ],
+)
+def test_numbers_that_are_no_bench(options: dict[str, object], message: str) -> None:
+    """Each is refused by its name, with the rule."""
+    with pytest.raises(ValueError, match=message):
+        Bench(**options)  # type: ignore[arg-type]
+
+
 def test_bad_bench(known: xr.Dataset) -> None:
     """Objects, steps and repeats that are none are refused."""
     with pytest.raises(ValueError, match=r"Invalid emissivity 1\.2 of 'tin'"):
         Sample("tin", 1.2, "brass plate", 0.0)
     with pytest.raises(ValueError, match=r"Invalid stray 2\.0 of 'tin'"):
         Sample("tin", 0.2, "brass plate", 2.0)
-    with pytest.raises(ValueError, match=r"Invalid contact \(0\.1, 0\.0\)"):
-        Bench(contact=(0.1, 0.0))
     cold = Bench(object_temperatures=(300.0,))
     with pytest.raises(ValueError, match=r"One must be 10\.0 K above the air's 295\.15 K"):
         reflector_series(known, OBJECTS[0], cold, np.random.default_rng(0))

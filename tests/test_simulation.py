@@ -108,6 +108,23 @@ def test_random_walk(rng: np.random.Generator) -> None:
         assert found == pytest.approx(np.exp(-lag / 30.0), abs=0.02)
 
 
+@pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [0.0, np.nan, 2.0], [[0.0, 1.0]]])
+def test_times_that_are_no_capture(times: list[float], rng: np.random.Generator) -> None:
+    """A single time, one that stands still and a NaN are refused by backgrounds and heatings."""
+    rule = r"Must be (two or more|finite, and increase)"
+    with pytest.raises(ValueError, match=rule):
+        Background("still").draw(np.array(times), 3, rng)
+    with pytest.raises(ValueError, match=rule):
+        heating(np.array(times), 300.0, 320.0, 5.0)
+
+
+@pytest.mark.parametrize("constant", [0.0, -1.0, np.nan])
+def test_time_constants_are_positive(constant: float) -> None:
+    """Nothing heats with a time constant that is none."""
+    with pytest.raises(ValueError, match=r"Invalid time_constant \[s\]"):
+        heating(TIME, 300.0, 320.0, constant)
+
+
 def test_unknown_background() -> None:
     """A kind that does not exist is refused, with those that do."""
     with pytest.raises(ValueError, match=r"Unknown background 'waves'. Must be one of .*'pulses'"):
@@ -188,6 +205,15 @@ def test_observed_counts(twin: xr.Dataset, known: xr.Dataset, rng: np.random.Gen
     expected = GLASS * emitted + (1 - GLASS) * reflected
     np.testing.assert_allclose(seen["counts"], expected, rtol=0, atol=1e-6)  # count
     assert schema.check(seen, "corrected").attrs["origin"] == "simulated"
+
+
+def test_counts_say_of_what_they_are_a_twin(
+    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
+) -> None:
+    """Observed and raw counts keep the name of the twin; those of another scene have none."""
+    seen = simulation.observe(twin.assign_attrs(twin="bulb"), known, rng)
+    assert seen.attrs["twin"] == simulation.capture(seen, detector).attrs["twin"] == "bulb"
+    assert "twin" not in simulation.observe(twin, known, rng).attrs
 
 
 def test_noise_of_observed_counts(

@@ -56,26 +56,40 @@ class Bias:
                 )
         planck.require_positive("air_temperature [K]", self.air_temperature)
 
+    @property
+    def _felt(self) -> float:
+        """Fraction of the object's excess over the air that the thermocouple feels [1]."""
+        return 1.0 - 0.5 * (self.contact[0] + self.contact[1])
+
+    @property
+    def _mirrored(self) -> float:
+        """Fraction of the reflection that comes from the blackbody [1]."""
+        return 1.0 - 0.5 * (self.stray[0] + self.stray[1])
+
     def corrected(self, reading: Array) -> Array:
-        """
-        Object temperature from the thermocouple's, by the middle of the contact error.
+        r"""
+        Object temperature from the thermocouple's, by the middle m of the contact error.
+
+        .. math:: T = T_a + \frac{R - T_a}{1 - m}
 
         Parameters
         ----------
         reading : ndarray
-            As read [K].
+            R, as read [K].
 
         Returns
         -------
         ndarray
-            Corrected [K].
+            T, corrected [K].
         """
-        missed = 0.5 * (self.contact[0] + self.contact[1])
-        return self.air_temperature + (reading - self.air_temperature) / (1.0 - missed)
+        return self.air_temperature + (reading - self.air_temperature) / self._felt
 
-    def emitted(self, curve: curves.Curve, temperature: Array) -> Array:
-        """
-        Effect of the thermocouple's common errors on the object's own signal.
+    def emitted(self, curve: curves.Curve, temperature: Array, std: float) -> tuple[Array, Array]:
+        r"""
+        Effect of the thermocouple's errors on the object's own signal.
+
+        What the reading is off by, the corrected temperature is off by :math:`1 / (1 - m)` times
+        as much; so is it by the error of m, times the excess over the air.
 
         Parameters
         ----------
@@ -83,19 +97,44 @@ class Bias:
             Response of the band.
         temperature : ndarray, shape (measurement,)
             Corrected object temperature [K].
+        std : float
+            Standard deviation of one reading [K].
 
         Returns
         -------
-        ndarray, shape (2, measurement)
-            What a standard deviation of the offset and of the contact error does [count].
+        tuple of ndarray, (measurement,) and (2, measurement)
+            Deviation independent from reading to reading, and what a standard deviation of the
+            offset and of the contact error does [count].
         """
-        offset = np.full_like(temperature, self.object_tolerance / 3.0**0.5)
+        scale = curve.count_slope(temperature) / self._felt
         contact = _std(self.contact) * (temperature - self.air_temperature)
-        return np.asarray(curve.count_slope(temperature) * np.stack([offset, contact]))
+        offset = np.full_like(temperature, self.object_tolerance / 3.0**0.5)
+        return np.asarray(scale * std), np.asarray(scale * np.stack([offset, contact]))
 
-    def reflected(self, curve: curves.Curve, temperature: Array) -> Array:
+    def reflection(self, curve: curves.Curve, temperature: Array) -> Array:
+        r"""
+        Signal that the object reflects, by the middle s of the stray part.
+
+        .. math:: W_b = (1 - s) \, U(T_b) + s \, U(T_a)
+
+        Parameters
+        ----------
+        curve : Curve
+            Response of the band.
+        temperature : ndarray, shape (measurement,)
+            Temperature of the reflected blackbody, as it shows it [K].
+
+        Returns
+        -------
+        ndarray, shape (measurement,)
+            Reflected signal [count].
         """
-        Effect of the common errors of the reflected body on its signal.
+        room = curve.counts(self.air_temperature)
+        return np.asarray(room + self._mirrored * (curve.counts(temperature) - room))
+
+    def reflected(self, curve: curves.Curve, temperature: Array, std: float) -> tuple[Array, Array]:
+        """
+        Effect of the blackbody's errors on the reflected signal, of which it is 1 - s.
 
         Parameters
         ----------
@@ -103,15 +142,19 @@ class Bias:
             Response of the band.
         temperature : ndarray, shape (measurement,)
             Its temperature [K].
+        std : float
+            Standard deviation of one reading [K].
 
         Returns
         -------
-        ndarray, shape (2, measurement)
-            What a standard deviation of the offset and of the stray part does [count].
+        tuple of ndarray, (measurement,) and (2, measurement)
+            Deviation independent from reading to reading, and what a standard deviation of the
+            offset and of the stray part does [count].
         """
-        offset = curve.count_slope(temperature) * self.background_tolerance / 3.0**0.5
+        scale = self._mirrored * curve.count_slope(temperature)
+        offset = scale * self.background_tolerance / 3.0**0.5
         excess = curve.counts(temperature) - curve.counts(self.air_temperature)
-        return np.stack([offset, _std(self.stray) * excess])
+        return np.asarray(scale * std), np.stack([offset, _std(self.stray) * excess])
 
 
 NO_BIAS: Final = Bias()

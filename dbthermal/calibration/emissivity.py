@@ -70,11 +70,6 @@ class Mixture:
         noise = self.noise**2 * np.eye(self.counts.size)
         return noise + emissivity * own + (1.0 - emissivity) * other, own, other
 
-    @property
-    def common(self) -> bool:
-        """Whether the measurements have errors in common."""
-        return bool(np.any(self.emitted_bias) or np.any(self.reflected_bias))
-
 
 def fit_emissivity(
     measured: xr.Dataset,
@@ -92,9 +87,11 @@ def fit_emissivity(
 
     weighted by the covariance of both sides, of which the independent part is
     :math:`s_i^2 = s_I^2 + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2` and every common error of the
-    readings adds the outer product of its effects; iterated in e. Where the object is near the
-    air's temperature and the blackbody far from it, a thermocouple that conducts heat away does
-    little harm: knowing the bias, the fit leans on such measurements.
+    readings adds the outer product of its effects; iterated in e. As both sides have errors, the
+    differences on the right are weighed as the fit adjusts them [3]_, or their scatter would pass
+    for contrast, and e be too low. Where the object is near the air's temperature and the blackbody
+    far from it, a thermocouple that conducts heat away does little harm: knowing the bias, the fit
+    leans on such measurements.
 
     Parameters
     ----------
@@ -122,6 +119,8 @@ def fit_emissivity(
         If dims or sizes differ, a temperature lies outside the response, the response has no
         noise, a deviation is not positive, or object and background never differ by more than
         three standard deviations of their difference.
+    ArithmeticError
+        If the fit does not converge.
 
     References
     ----------
@@ -192,8 +191,13 @@ def fitted(mixtures: list[Mixture], names: list[str]) -> xr.Dataset:
     -------
     Dataset
         As `fit_emissivity`; `reduced_chi2` is NaN where there is a single measurement.
+
+    Raises
+    ------
+    ArithmeticError
+        If the fit of a band does not converge.
     """
-    fits = [_fit_one(mixture) for mixture in mixtures]
+    fits = [_fit_one(mixture, name) for mixture, name in zip(mixtures, names, strict=True)]
     value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
     unit = {"units": "1"}
     return xr.Dataset(
@@ -217,34 +221,40 @@ def _contact(
 ) -> Mixture:
     """Signals of one band, with the errors of thermocouple and blackbody."""
     warm, cold = temperatures
-    stray, room = 0.5 * (bias.stray[0] + bias.stray[1]), curve.counts(bias.air_temperature)
+    emitted_std, emitted_bias = bias.emitted(curve, warm, float(stds[0]))
+    reflected_std, reflected_bias = bias.reflected(curve, cold, float(stds[1]))
     return Mixture(
         counts=counts,
         emitted=curve.counts(warm),
-        reflected=(1.0 - stray) * curve.counts(cold) + stray * room,
+        reflected=bias.reflection(curve, cold),
         noise=noise,
-        emitted_std=curve.count_slope(warm) * stds[0],
-        reflected_std=curve.count_slope(cold) * stds[1],
-        emitted_bias=bias.emitted(curve, warm),
-        reflected_bias=bias.reflected(curve, cold),
+        emitted_std=emitted_std,
+        reflected_std=reflected_std,
+        emitted_bias=emitted_bias,
+        reflected_bias=reflected_bias,
     )
 
 
-def _fit_one(mixture: Mixture) -> tuple[float, float, float, Array]:
+def _fit_one(mixture: Mixture, name: str) -> tuple[float, float, float, Array]:
     """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""
     across, up = mixture.emitted - mixture.reflected, mixture.counts - mixture.reflected
-    emissivity, adjusted = float(across @ up / (across @ across)), across
+    emissivity = float(across @ up / (across @ across))
     for _ in range(_ITERATIONS):
         covariance, own, other = mixture.covariances(emissivity)
         force = np.linalg.solve(covariance, up - emissivity * across)
-        if mixture.common:
-            # Differences within the readings' scatter, which no common error touches, would pass
-            # for contrast: York et al. (2004) weigh by the abscissa as the fit adjusts it.
-            adjusted = across + own @ force - other @ force
+        # Scatter of the readings would pass for contrast and pull the slope down: York et al.
+        # (2004) weigh by the abscissa as the fit adjusts it.
+        adjusted = across + own @ force - other @ force
         weights = np.linalg.solve(covariance, adjusted)
         previous, emissivity = emissivity, float((weights @ up) / (weights @ across))
         if abs(emissivity - previous) < _CONVERGED:
             break
+    else:
+        raise ArithmeticError(
+            f"No convergence in band '{name}': emissivity {emissivity} after {_ITERATIONS} steps, "
+            f"{previous} before. Must change by less than {_CONVERGED}; readings of more contrast "
+            "converge."
+        )
     residual = up - emissivity * across
     squares = residual @ np.linalg.solve(mixture.covariances(emissivity)[0], residual)
     freedom = mixture.counts.size - 1

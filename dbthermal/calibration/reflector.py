@@ -58,6 +58,8 @@ def reflector_emissivity(
         If dims or sizes differ, a temperature lies outside the response, the response has no
         noise, a deviation is not positive, or object and reflection never differ by more than
         three standard deviations of their difference.
+    ArithmeticError
+        If the fit does not converge.
 
     References
     ----------
@@ -99,13 +101,14 @@ def _mixture(
             f"Invalid contrast {contrast} K between object and reflection in band '{curve.band}'. "
             f"Must exceed {least} K, three standard deviations of the difference."
         )
+    emitted_std, emitted_bias = bias.emitted(curve, warm, float(stds[0]))
     return Mixture(
         counts=of_object,
         emitted=curve.counts(warm),
         reflected=of_foil,
         noise=noise,
-        emitted_std=curve.count_slope(warm) * stds[0],
+        emitted_std=emitted_std,
         reflected_std=np.hypot(noise, curve.count_slope(cold) * stds[1]),
-        emitted_bias=bias.emitted(curve, warm),
+        emitted_bias=emitted_bias,
         reflected_bias=np.zeros((0, warm.size)),
     )

@@ -10,7 +10,11 @@ from dbthermal.simulation.bench import (
     contact_measurements,
     reflector_series,
 )
-from dbthermal.simulation.procedures import PROCEDURES, compare_procedures
+from dbthermal.simulation.procedures import (
+    PROCEDURES,
+    compare_procedures,
+    reflector_sensitivity,
+)
 from dbthermal.simulation.rig import Rig, blackbody_movies, capture, observe, pattern
 from dbthermal.simulation.samples import OBJECTS, Sample, band_emissivity
 from dbthermal.simulation.scenes import (
@@ -37,6 +41,7 @@ __all__ = [
     "independent_pixels",
     "observe",
     "pattern",
+    "reflector_sensitivity",
     "reflector_series",
     "scene",
     "side_by_side",

@@ -16,6 +16,7 @@ from dbthermal.simulation import surfaces
 from dbthermal.simulation.mesh import Surface
 from dbthermal.simulation.rays import Array
 from dbthermal.simulation.surroundings import Actor, Motion, Pose, hinged, painted
+from dbthermal.simulation.times import increasing
 
 _SPACING: Final = 0.03
 """Distance of the vertices of a body [m]."""
@@ -31,7 +32,7 @@ class Route:
     Attributes
     ----------
     times : ndarray, shape (stop,)
-        When each stop is passed [s], increasing.
+        When each stop is passed [s], increasing; two or more.
     places : ndarray, shape (stop, 2)
         Where it is: x and y [m].
     stride : float
@@ -43,9 +44,13 @@ class Route:
     stride: float = 0.7
 
     def __post_init__(self) -> None:
-        """Refuse a way back in time."""
-        if np.any(np.diff(self.times) <= 0):
-            raise ValueError(f"Invalid times {self.times} s of a route. Must increase strictly.")
+        """Refuse a way back in time, and places that are none or not one for each time."""
+        increasing(self.times, "a route")
+        if self.places.shape != (self.times.size, 2) or not np.all(np.isfinite(self.places)):
+            raise ValueError(
+                f"Invalid places of shape {self.places.shape} of a route. Must be finite, "
+                f"({self.times.size}, 2)."
+            )
 
     def place(self, time: float) -> Array:
         """Place (2,) at a time [s]: x and y [m]; before and after, that of the nearest stop."""

@@ -107,9 +107,16 @@ class Writing:
     stroke : float
         Width of a stroke [m].
     drop : float
-        How much colder than the board a fresh stroke is [K].
+        How much colder than the board a fresh stroke is [K]: nearly the wet-bulb depression, which
+        at 22 degrees Celsius is 8.2 K in air of 40 % and 6.6 K in air of 50 % humidity [1]_.
     drying : float
-        Time in which that falls to 1/e, as the water dries up and the board warms it [s].
+        Time in which that falls to 1/e, as the water dries up and the board warms it [s]. At a
+        coefficient of 10 W m^-2 K^-1 and 6 K, 1 um of water takes 41 s to evaporate.
+
+    References
+    ----------
+    .. [1] Stull (2011), Wet-Bulb Temperature from Relative Humidity and Air Temperature, Journal of
+       Applied Meteorology and Climatology 50, 2267, doi:10.1175/JAMC-D-11-0143.1
     """
 
     text: str = "CV"
@@ -119,8 +126,8 @@ class Writing:
     size: float = 0.10
     gap: float = 0.04
     stroke: float = 0.016
-    drop: float = 4.0
-    drying: float = 15.0
+    drop: float = 6.0
+    drying: float = 40.0
 
     def __post_init__(self) -> None:
         """Refuse letters that nobody has drawn."""

@@ -131,7 +131,7 @@ def observe(
     Returns
     -------
     Dataset
-        `counts` (band, time, y, x) [count], `origin = "simulated"`.
+        `counts` (band, time, y, x) [count], `origin = "simulated"`, and of a twin its `twin`.
 
     Raises
     ------
@@ -151,8 +151,13 @@ def observe(
     return xr.Dataset(
         {"counts": (schema.STAGES["corrected"]["counts"].dims, movie)},
         coords={"band": names, **{name: scene[name] for name in ("time", "y", "x")}},
-        attrs={"origin": "simulated"},
+        attrs={"origin": "simulated", **_twin(scene)},
     ).pipe(_describe, "corrected")
+
+
+def _twin(scene: xr.Dataset) -> dict[str, str]:
+    """Attribute that names what a scene is a simulated twin of, if it is one."""
+    return {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:

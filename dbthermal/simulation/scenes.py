@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import planck, schema
+from dbthermal.simulation.times import increasing
 
 Array = npt.NDArray[np.float64]
 
@@ -66,7 +67,7 @@ class Background:
         Parameters
         ----------
         time : ndarray, shape (time,)
-            Times [s].
+            Times [s], two or more.
         pixels : int
             Number of pixels.
         rng : Generator
@@ -76,7 +77,13 @@ class Background:
         -------
         ndarray, shape (time, pixels)
             Background temperature [K].
+
+        Raises
+        ------
+        ValueError
+            If there are fewer than two times, or they do not increase.
         """
+        increasing(time, "a background")
         change = np.zeros((time.size, pixels))
         if self.kind == "pulses":
             change = self._pulses(time, pixels, rng)
@@ -117,7 +124,7 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     Parameters
     ----------
     time : ndarray, shape (time,)
-        Times [s].
+        Times [s], two or more.
     start, stop : float
         First and last temperature [K].
     time_constant : array_like, shape (...)
@@ -127,8 +134,14 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     -------
     ndarray, shape (time, ...)
         Temperature [K].
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two times, they do not increase, or a time constant is not positive.
     """
-    constant = np.asarray(time_constant, dtype=np.float64)
+    increasing(time, "a heating")
+    constant = planck.require_positive("time_constant [s]", time_constant)
     elapsed = (time - time[0]).reshape(-1, *(1,) * constant.ndim)
     rise = np.expm1(-elapsed / constant) / np.expm1(-elapsed[-1] / constant)
     return np.asarray(start + (stop - start) * rise)

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from dbthermal.simulation.mesh import Surface, merge
 from dbthermal.simulation.rays import Array, Caster, Hits, Index
+from dbthermal.simulation.times import increasing
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
     Parameters
     ----------
     times : array_like, shape (stop,)
-        When each place is reached [s], increasing.
+        When each place is reached [s], increasing; two or more.
     places : array_like, shape (stop, 3)
         Places [m].
 
@@ -91,11 +92,14 @@ def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
     Raises
     ------
     ValueError
-        If the times do not increase.
+        If the times do not increase, or the places are not finite, or not one for each time.
     """
-    times, places = np.asarray(times, dtype=np.float64), np.asarray(places, dtype=np.float64)
-    if np.any(np.diff(times) <= 0):
-        raise ValueError(f"Invalid times {times} s of a motion. Must increase strictly.")
+    times, places = increasing(times, "a motion"), np.asarray(places, dtype=np.float64)
+    if places.shape != (times.size, 3) or not np.all(np.isfinite(places)):
+        raise ValueError(
+            f"Invalid places of shape {places.shape} of a motion. Must be finite, "
+            f"({times.size}, 3)."
+        )
     return lambda now: Pose(translation=[np.interp(now, times, along) for along in places.T])
 
 
@@ -112,15 +116,38 @@ class Actor:
         Temperature [K].
     motion : function of time, optional
         Its pose; without one it stands still, its own frame being the world's.
+
+    Raises
+    ------
+    ValueError
+        If a temperature is not finite, or there is not one for each vertex; of a function, when it
+        is asked.
     """
 
     surface: Surface
     temperature: Array | Warmth
     motion: Motion | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse a temperature that is not one for each vertex."""
+        if not callable(self.temperature):
+            self._checked(self.temperature)
+
     def warmth(self, time: float) -> Array:
         """Temperature of each vertex at a time [s], shape (vertex,) [K]."""
-        return self.temperature(time) if callable(self.temperature) else self.temperature
+        if not callable(self.temperature):
+            return self.temperature
+        return self._checked(self.temperature(time))
+
+    def _checked(self, temperature: Array) -> Array:
+        """Return the temperatures, if there is a finite one for each vertex."""
+        expected = (len(self.surface.vertices),)
+        if np.shape(temperature) != expected or not np.all(np.isfinite(temperature)):
+            raise ValueError(
+                f"Invalid temperature of shape {np.shape(temperature)} of an actor. "
+                f"Must be finite, {expected}."
+            )
+        return temperature
 
 
 @dataclass(frozen=True)

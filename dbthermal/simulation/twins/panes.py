@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from dbthermal import heat
 from dbthermal.simulation import surfaces
 from dbthermal.simulation.mesh import Surface
-from dbthermal.simulation.people import hand, imprint, pacing, person
+from dbthermal.simulation.people import FINGERS, hand, imprint, pacing, person
 from dbthermal.simulation.props import Writing, board
 from dbthermal.simulation.rays import Array, Camera
 from dbthermal.simulation.surroundings import Actor, Motion, Pose, Room, gliding
@@ -102,6 +102,12 @@ BOARD_DISTANCE: Final = 0.55
 """How far the board is from the plate's middle [m]."""
 BOARD_SPACING: Final = 0.004
 """Distance of the board's vertices [m]."""
+SLANT: Final = Rotation.from_euler("yx", (0.9, -0.6))
+"""How a hand is held that writes: slanted, so that its index is foremost, and tilted forward."""
+AWAY: Final = (0.0, -0.5)
+"""Where the hand comes from and goes to, from the stroke: x and z on the board [m]."""
+WITHDRAWAL: Final = 1.0
+"""How long it takes to come, and to go [s]."""
 
 
 def glass_plate(
@@ -160,13 +166,34 @@ def _written(writing: Writing, camera: Camera) -> list[Actor]:
     pose = Pose(turn, BOARD_DISTANCE * away)
     # Mirrored, the text reads from left to right.
     places = flat.vertices[:, [0, 2]] * (-1.0, 1.0)
+    strokes = board(flat, places, writing, AMBIENT, lambda _: pose)
+    return [strokes, *hand(lambda now: pose @ pointing(writing, now))]
+
+
+def pointing(writing: Writing, time: float) -> Pose:
+    """
+    Pose of a hand whose index writes on a board: it comes from below, writes, and goes.
+
+    Parameters
+    ----------
+    writing : Writing
+        What is written.
+    time : float
+        Time [s].
+
+    Returns
+    -------
+    Pose
+        In the frame of the board, whose plane is y = 0, seen from negative y, mirrored in x. The
+        tip's middle is a finger's radius in front of the stroke.
+    """
     times, path = writing.path()
-
-    def fingertip(time: float) -> Pose:
-        x, z = (np.interp(time, times, along) for along in path.T)
-        return pose @ Pose(Rotation.from_euler("x", 0.6), (-x - 0.03, -0.06, z - 0.10))
-
-    return [board(flat, places, writing, AMBIENT, lambda _: pose), *hand(fingertip)]
+    times = np.concatenate([[times[0] - WITHDRAWAL], times, [times[-1] + WITHDRAWAL]])
+    path = np.concatenate([path[:1] + AWAY, path, path[-1:] + AWAY])
+    x, z = (float(np.interp(time, times, along)) for along in path.T)
+    index = FINGERS[1]
+    tip = SLANT.apply((index.tip[0], 0.0, index.tip[1]))
+    return Pose(SLANT, np.array([-x, -index.radius, z]) - tip)
 
 
 NEAR: Final = 0.15

@@ -17,19 +17,18 @@ def on_wall(surface: Surface, height: float, angle: float) -> Point:
     surface : Surface
         Turned about the z axis.
     height : float
-        Height [m].
+        Height [m]; the nearest ring of vertices is taken.
     angle : float
         Angle about the axis, from negative y towards positive x [degrees].
 
     Returns
     -------
     tuple of float
-        x, y, z [m].
+        x, y, z [m], on that ring.
     """
-    away = np.abs(surface.vertices[:, 2] - height)
-    ring = surface.vertices[away <= away.min() + 1e-9]
-    radius, turn = float(np.hypot(ring[0, 0], ring[0, 1])), np.radians(angle)
-    return radius * float(np.sin(turn)), -radius * float(np.cos(turn)), height
+    x, y, ring = surface.vertices[np.argmin(np.abs(surface.vertices[:, 2] - height))]
+    radius, turn = float(np.hypot(x, y)), np.radians(angle)
+    return radius * float(np.sin(turn)), -radius * float(np.cos(turn)), float(ring)
 
 
 def thermocouple_readings(

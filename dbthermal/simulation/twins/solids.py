@@ -196,9 +196,10 @@ def bunny(
     lamp: Lamp | None = None,
 ) -> Stage:
     """
-    The Stanford bunny, or a built-in rabbit, under a lamp, before moving toys and people.
+    The Stanford bunny, which looks to the left, or a built-in rabbit, which looks at the camera.
 
-    A car runs to and fro, a toy is flown about by a hand, and two people walk near.
+    It is heated by a lamp. A car runs to and fro, a toy is flown about by a hand, and two people
+    walk near.
 
     Parameters
     ----------
@@ -207,7 +208,8 @@ def bunny(
     rng : Generator
         Source of all ways.
     scan : Surface, optional
-        The bunny as scanned: y up, looking along z, in any unit. Without one, `rabbit` is taken.
+        The bunny as scanned: y up, seen along -z, looking to negative x, in any unit. Without one,
+        `rabbit` is taken.
     lamp : Lamp, optional
         The lamp, and the shell that it heats.
 
@@ -222,14 +224,14 @@ def bunny(
         "bunny",
         surface,
         since(lamp.start, shell, capture.time, lamp.exchanges(surface)),
-        Camera((0.0, -0.48, 0.32), (0.0, 0.0, 0.065), capture.shape),
+        Camera((0.0, -0.54, 0.36), (0.0, 0.0, 0.07), capture.shape),
         [table(), *_toys(capture.time, rng), *passers_by(capture.time, rng)],
         Room(AMBIENT),
     )
 
 
 def _stood(scan: Surface) -> Surface:
-    """A scan (y up) on the table, z up, facing the camera, as high as the bunny."""
+    """A scan (y up) on the table, z up, its z towards the camera, as high as the bunny."""
     turned = surfaces.moved(surfaces.pruned(scan), Rotation.from_euler("x", 90.0, degrees=True))
     low, high = turned.vertices.min(axis=0), turned.vertices.max(axis=0)
     scale = BUNNY_HEIGHT / float(high[2] - low[2])
@@ -241,7 +243,7 @@ LANE: Final = -0.24
 """y of the lane of the car [m]."""
 LANE_HALF: Final = 0.45
 """How far it goes to either side [m]."""
-FLIGHT: Final = ((-0.40, -0.40, 0.30), (0.40, -0.05, 0.45))
+FLIGHT: Final = ((-0.40, -0.35, 0.30), (0.40, -0.05, 0.45))
 """Lowest and highest x, y and z between which a toy is flown about, above the line of sight [m]."""
 
 

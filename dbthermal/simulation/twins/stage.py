@@ -14,11 +14,10 @@ from dbthermal.simulation.mesh import Surface
 from dbthermal.simulation.people import pacing, person
 from dbthermal.simulation.rays import Array, Camera, Caster, Hits, Mask
 from dbthermal.simulation.surroundings import Actor, Room, distance, incident, painted
+from dbthermal.simulation.times import increasing
 
 AMBIENT: Final = 295.15
 """Temperature of the room, of its air, and of whatever is not heated [K]."""
-
-
 TABLE: Final = 0.75
 """Height of the table that the objects stand on [m]."""
 STEP: Final = 0.1
@@ -56,7 +55,7 @@ class Capture:
     shape : tuple of int
         Rows and columns.
     time : ndarray, shape (time,)
-        Times [s]; 350 frames at 10 Hz.
+        Times [s], two or more; 350 frames at 10 Hz.
     baseline : float
         How far the second camera is to the right of the first [m]. With 0 both see the same
         reflections. Otherwise the object's surface is taken as perfectly registered, and the
@@ -69,7 +68,8 @@ class Capture:
     baseline: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse an emissivity that is no list of bands, and a baseline without two of them."""
+        """Refuse an emissivity that is no list of bands, a baseline without two, a single frame."""
+        increasing(self.time, "a capture")
         if self.emissivity.dims != ("band",):
             raise ValueError(f"Invalid dims {self.emissivity.dims} of emissivity. Must be (band,).")
         if self.baseline and self.emissivity.sizes["band"] != 2:
@@ -153,7 +153,7 @@ def take(stage: Stage, capture: Capture) -> xr.Dataset:
     Raises
     ------
     ValueError
-        If a thermocouple is not in view.
+        If a thermocouple is not seen by the camera.
     """
     directions = stage.camera.directions()
     caster = Caster(stage.surface)
@@ -167,7 +167,7 @@ def take(stage: Stage, capture: Capture) -> xr.Dataset:
     scene["on_object"] = (("y", "x"), view.on_object.reshape(capture.shape), {"units": "1"})
     if capture.baseline:
         scene = _with_second(scene, stage, capture, view)
-    scene = _with_thermocouples(scene, stage)
+    scene = _with_thermocouples(scene, stage, caster)
     return scene.assign_attrs(twin=stage.name, baseline=capture.baseline)
 
 
@@ -270,15 +270,21 @@ def _with_second(scene: xr.Dataset, stage: Stage, capture: Capture, view: _View)
     return scene
 
 
-def _with_thermocouples(scene: xr.Dataset, stage: Stage) -> xr.Dataset:
+def _with_thermocouples(scene: xr.Dataset, stage: Stage, caster: Caster) -> xr.Dataset:
     """The scene with the pixels of the thermocouples."""
-    points = np.reshape(stage.thermocouples, (-1, 3))
+    points = np.reshape(stage.thermocouples, (-1, 3)).astype(np.float64)
     rows, columns = np.rint(stage.camera.project(points)).astype(np.int64).T
-    for row, column in zip(rows, columns, strict=True):
+    seen = caster.visible(points, stage.camera.position)
+    for row, column, lit in zip(rows, columns, seen, strict=True):
         if not (row in scene["y"] and column in scene["x"] and scene["on_object"][row, column]):
             raise ValueError(
                 f"Invalid thermocouple at row {row}, column {column}. Must be on the object, in "
                 f"an image of {stage.camera.shape}."
+            )
+        if not lit:
+            raise ValueError(
+                f"Invalid thermocouple at row {row}, column {column}, behind another part of the "
+                "object. Must be seen by the camera."
             )
     for name, places in (("thermocouple_y", rows), ("thermocouple_x", columns)):
         scene[name] = ("thermocouple", places, {"units": "1", "long_name": name})
