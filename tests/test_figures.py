@@ -161,6 +161,9 @@ def draw_thermocouples(**attrs: object) -> Figure:
         "relative_error": array("scene variant", 2, 2) - 300,
     }
     scores = xr.Dataset(parts).assign_coords(names).assign_attrs(attrs)
+    scores["relative_error"] = scores["relative_error"].where(
+        scores["variant"] != attrs.get("lost")
+    )
     return figures.thermocouples(scores)
 
 
@@ -288,6 +291,15 @@ def test_film() -> None:
     assert frames[0].shape[0] % 2 == frames[0].shape[1] % 2 == 0
     changed = np.any(frames[0] != frames[1], axis=-1)
     assert 0.05 < changed.mean() < 0.6  # the images and the time, not the frame around them
+
+
+def test_a_method_without_a_value_says_so() -> None:
+    """In the legend, in place of its error."""
+    legend = draw_thermocouples(lost="b").axes[0].get_legend()
+    assert legend is not None
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts[1] == "b, no value"
+    assert texts[0].endswith(" %")
 
 
 def test_bad_pixels_are_marked() -> None:

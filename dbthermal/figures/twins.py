@@ -1,6 +1,7 @@
 """Figures of twins: the thermocouple beside each method, and errors over the image."""
 
 from collections.abc import Mapping
+from math import isfinite
 
 import xarray as xr
 from matplotlib.figure import Figure
@@ -30,13 +31,14 @@ def thermocouples(scores: xr.Dataset) -> Figure:
         here = scores.sel(scene=name)
         for index, variant in enumerate(here["variant"].values):
             part = here.sel(variant=variant)
+            error = float(part["relative_error"])
             axis.plot(
                 part["time"],
                 part["temperature"] - zero_Celsius,
                 color=COLORS[index % len(COLORS)],
                 linewidth=1,
                 linestyle="-" if index < len(COLORS) else "--",
-                label=f"{variant}, {float(part['relative_error']):.2g} %",
+                label=f"{variant}, {error:.2g} %" if isfinite(error) else f"{variant}, no value",
             )
         reading = here["reading"] - zero_Celsius
         axis.plot(reading["time"], reading, color="black", linewidth=1.5, label="thermocouple")
