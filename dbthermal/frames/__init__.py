@@ -1,0 +1,40 @@
+"""Correction of one camera's frames: what its detector does to the counts, found and undone.
+
+In the order of use: `fit_correction` and `correct` (gain and offset of each pixel, from a
+blackbody; `correct_drifting` between two corrections), `mark_shutter` (frozen and repeated frames),
+`mark_bad` (pixels that turn bad in the capture), `undo_lag` (thermal lag of the pixels) and
+`undo_drift` (drift that all pixels share). A sample that is no measurement becomes NaN or is
+flagged, never filled.
+"""
+
+from dbthermal.frames.correction import (
+    DETECTOR_MAXIMUM,
+    OUTLIER,
+    Array,
+    Mask,
+    blackbody_statistics,
+    correct,
+    fit_correction,
+)
+from dbthermal.frames.drift import correct_drifting, renew_offset, undo_drift
+from dbthermal.frames.lag import noise_amplification, undo_lag
+from dbthermal.frames.pixels import mark_bad
+from dbthermal.frames.shutter import find_shutter, mark_shutter
+
+__all__ = [
+    "DETECTOR_MAXIMUM",
+    "OUTLIER",
+    "Array",
+    "Mask",
+    "blackbody_statistics",
+    "correct",
+    "correct_drifting",
+    "find_shutter",
+    "fit_correction",
+    "mark_bad",
+    "mark_shutter",
+    "noise_amplification",
+    "renew_offset",
+    "undo_drift",
+    "undo_lag",
+]
