@@ -11,8 +11,8 @@ import dbthermal
 PACKAGE = Path(dbthermal.__file__).parent
 LAYERS = (
     "paths schema planck heat mixing smooth",
-    "curves",
-    "response bands frames alignment noise metrics figures store provenance manifest readers paper",
+    "curves noise",
+    "response bands frames alignment metrics figures store provenance manifest readers paper",
     "calibration emissivity separation",
     "simulation verify published",
     "experiments",
@@ -25,6 +25,8 @@ PLACES = {
     "torch": {"separation"},
     "robust_laplacian": {"heat"},
     "trimesh": {"simulation"},
+    "cv2": {"alignment"},
+    "skimage": {"separation"},
 }
 
 

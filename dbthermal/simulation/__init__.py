@@ -10,6 +10,15 @@ from dbthermal.simulation.bench import (
     contact_measurements,
     reflector_series,
 )
+from dbthermal.simulation.clocks import drop_frames, expose, repeat_frames
+from dbthermal.simulation.nuisances import (
+    SPOILED,
+    drift_pattern,
+    fire_shutter,
+    lag,
+    lose_frames,
+    spoil_pixels,
+)
 from dbthermal.simulation.procedures import (
     PROCEDURES,
     compare_procedures,
@@ -28,6 +37,7 @@ from dbthermal.simulation.scenes import (
 __all__ = [
     "OBJECTS",
     "PROCEDURES",
+    "SPOILED",
     "Background",
     "Bench",
     "Rig",
@@ -38,12 +48,20 @@ __all__ = [
     "capture",
     "compare_procedures",
     "contact_measurements",
+    "drift_pattern",
+    "drop_frames",
+    "expose",
+    "fire_shutter",
     "independent_pixels",
+    "lag",
+    "lose_frames",
     "observe",
     "pattern",
     "reflector_sensitivity",
     "reflector_series",
+    "repeat_frames",
     "scene",
     "side_by_side",
+    "spoil_pixels",
     "walkers",
 ]
