@@ -5,6 +5,7 @@ twice: its rare steps by trimming, and what it moves all the time by the bands, 
 independent between them and the background is not.
 """
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -119,6 +120,44 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
             "the signals vary from frame to frame by less than they resolve; give the noise."
         )
     return float(np.sqrt(result[0])), float(np.sqrt(result[1]))
+
+
+def of_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
+    """
+    Noise of two bands or more: each beside the quietest, see `estimate`.
+
+    Parameters
+    ----------
+    signals : sequence of ndarray, shape (time, pixel)
+        Signals of the bands, each in a unit of its own.
+    time : array_like, shape (time,)
+        Times [s].
+
+    Returns
+    -------
+    ndarray, shape (band,)
+        Standard deviations, in the signals' units; that of the quietest band, the median of
+        those beside each other band.
+
+    Raises
+    ------
+    ValueError
+        As `estimate`.
+    """
+    if len(signals) == 2:
+        return np.array(estimate(signals[0], signals[1], time))
+    rough = [np.median(np.abs(second_difference(part, time))) for part in signals]
+    quiet = int(np.argmin(rough))
+    pairs = {
+        band: estimate(signals[quiet], part, time)
+        for band, part in enumerate(signals)
+        if band != quiet
+    }
+    result = np.empty(len(signals))
+    result[quiet] = np.median([pair[0] for pair in pairs.values()])
+    for band, pair in pairs.items():
+        result[band] = pair[1]
+    return result
 
 
 def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Array]:

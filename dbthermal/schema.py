@@ -131,6 +131,7 @@ STAGES: Final = MappingProxyType(
             **_with_std("object_temperature", _FRAMES, "K", "object temperature"),
             **_with_std("background_temperature", _FRAMES, "K", "background temperature"),
             **_with_std("emissivity", ("band", "y", "x"), "1", "band emissivity"),
+            **_with_std("reflection_ratio", ("band", "y", "x"), "1", "reflection ratio"),
             "status": Variable(_IMAGE, "uint16", "1", "validity flags, 0 is good"),
         },
     }
@@ -162,6 +163,9 @@ FLAGS: Final = MappingProxyType(
         "dead_pixel": 1024,
         "frozen_frames": 2048,
         "not_converged": 4096,
+        "object_jump": 8192,
+        "bands_apart": 16384,
+        "roles_may_be_swapped": 32768,
     }
 )
 """Bits of `status`, by name."""
@@ -186,6 +190,13 @@ FLAG_MEANINGS: Final = MappingProxyType(
         "dead_pixel": "marked as bad by the frame correction",
         "frozen_frames": "the same counts in both bands for several frames, as while a shutter is "
         "closed: what stands still in them is read as signal",
+        "object_jump": "the object jumped once: the jump was taken into its curve, the frames "
+        "around it are left out, and the values before and after hold",
+        "bands_apart": "the rapid changes of the bands are not simultaneous: a time offset "
+        "between the cameras, or a reflection seen from two places",
+        "roles_may_be_swapped": "emissivities sum to less than the bands' half: either a bright "
+        "reflector, or what moves smoothly is the background and object and background are "
+        "exchanged",
         "not_converged": "the optimiser stopped at its limit of steps, or at no finite value",
     }
 )

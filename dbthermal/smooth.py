@@ -4,10 +4,124 @@ An orthonormal basis of polynomials over the capture's own time stamps. The base
 the fit of every order follows from one set of coefficients.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Subspace:
+    """
+    Functions of time that are projected out of a signal, nested by order.
+
+    Attributes
+    ----------
+    functions : ndarray, shape (time, steps + order)
+        Orthonormal columns: the constant, then the steps, then polynomials of rising degree.
+    own : ndarray, shape (time, steps + order)
+        The object's part of each column: the column itself, less the camera's steps in it.
+    steps : int
+        Columns that are there at every order, beside the constant.
+    """
+
+    functions: Array
+    own: Array
+    steps: int
+
+    @property
+    def orders(self) -> int:
+        """Largest order."""
+        return int(self.functions.shape[1]) - self.steps
+
+    def leverage(self) -> Array:
+        r"""
+        Variance factor of the object's part of a fit at each time, for every order at once.
+
+        Returns
+        -------
+        ndarray, shape (time, order)
+            Column j holds :math:`\sum_i \Phi_i(t)^2` over the columns of order j + 1: the
+            variance of a fit to white noise of variance 1.
+        """
+        return np.asarray(np.cumsum(self.own**2, axis=1)[:, self.steps :])
+
+    def columns(self, order: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+        """
+        Which columns each order uses.
+
+        Parameters
+        ----------
+        order : ndarray of int, shape (pixel,)
+            Orders, 1 for the constant.
+
+        Returns
+        -------
+        ndarray of bool, shape (steps + order, pixel)
+            True for the columns in use.
+        """
+        places = np.arange(self.functions.shape[1])[:, np.newaxis]
+        return np.asarray(places < order + self.steps)
+
+
+def subspace(
+    time: npt.ArrayLike,
+    order: int,
+    *,
+    segment: npt.NDArray[np.integer] | None = None,
+    jump: int | None = None,
+) -> Subspace:
+    """
+    Smooth functions over given times, with steps of the camera or a jump of the object.
+
+    Parameters
+    ----------
+    time : array_like, shape (time,)
+        Times [s], strictly increasing.
+    order : int
+        Number of smooth functions.
+    segment : ndarray of int, shape (time,), optional
+        Number of shutter events before each frame. At each change every signal has a step of its
+        own, which is not the object's.
+    jump : int, optional
+        First frame after a jump of the object, in value and in slope.
+
+    Returns
+    -------
+    Subspace
+        The functions.
+
+    Raises
+    ------
+    ValueError
+        As `basis`, or if there are more functions than times.
+    """
+    plain = basis(time, order)
+    position = np.linspace(0.0, 1.0, len(plain))
+    steps = []
+    if segment is not None:
+        steps += [np.where(segment >= one, 1.0, 0.0) for one in np.unique(segment)[1:]]
+    of_camera = len(steps)
+    if jump is not None:
+        after = np.arange(len(plain)) >= jump
+        # A shutter event with no frame between it and the jump: one step, which is the object's.
+        steps = [step for step in steps if not np.array_equal(step, after)]
+        of_camera = len(steps)
+        steps += [np.where(after, 1.0, 0.0), np.where(after, position - position[jump], 0.0)]
+    if not steps:
+        return Subspace(plain, plain, 0)
+    if order + len(steps) > len(plain):
+        raise ValueError(
+            f"Invalid order {order} with {len(steps)} steps over {len(plain)} frames. "
+            "Must not be more functions than frames."
+        )
+    together = np.column_stack([plain[:, 0], *steps, plain[:, 1:]])
+    functions, triangle = np.linalg.qr(together)
+    together[:, 1 : 1 + of_camera] = 0.0
+    own = np.linalg.solve(triangle.T, together.T).T
+    return Subspace(functions, own, len(steps))
 
 
 def basis(time: npt.ArrayLike, order: int) -> Array:
@@ -41,24 +155,6 @@ def basis(time: npt.ArrayLike, order: int) -> Array:
     position = 2.0 * (time - time[0]) / span - 1.0
     columns, _ = np.linalg.qr(np.polynomial.legendre.legvander(position, order - 1))
     return np.asarray(columns)
-
-
-def leverage(functions: Array) -> Array:
-    r"""
-    Variance factor of a fit at each time, for every order at once.
-
-    Parameters
-    ----------
-    functions : ndarray, shape (time, order)
-        From `basis`.
-
-    Returns
-    -------
-    ndarray, shape (time, order)
-        Column j holds :math:`\sum_{i \le j} \Phi_i(t)^2`: the variance of a fit of order j + 1
-        to white noise of variance 1.
-    """
-    return np.asarray(np.cumsum(functions**2, axis=1))
 
 
 def residual_energy(functions: Array, first: Array, second: Array) -> Array:

@@ -59,7 +59,7 @@ def test_bad_order(order: int) -> None:
 def test_leverage_is_the_hat_matrix() -> None:
     """For each order the leverage is the diagonal of the projection, and adds up to the order."""
     time = np.cumsum(np.linspace(0.1, 0.5, 25))
-    result = smooth.leverage(smooth.basis(time, 5))
+    result = smooth.subspace(time, 5).leverage()
     for order in range(1, 6):
         design = np.vander(time - time.mean(), order)
         hat = design @ np.linalg.pinv(design)

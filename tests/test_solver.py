@@ -58,7 +58,7 @@ def test_random_starts_hang_on_the_seed_alone(capture: xr.Dataset, method: str) 
 
 BAD: dict[str, tuple[str, dict[str, Any], type[Exception], str]] = {
     "unknown option": ("naive", {"begins": 3}, TypeError, "Unknown option 'begins' of method"),
-    "option of none": ("subspace", {"starts": 3}, TypeError, r"'starts' .* Has \[\]"),
+    "option of none": ("apparent", {"starts": 3}, TypeError, r"'starts' .* Has \[\]"),
     "half a start": ("naive", {"starts": 2.5}, TypeError, r"Invalid starts 2\.5 of method 'naive'"),
     "half a batch": ("dbvt", {"batch": 2.5}, TypeError, "Must be a whole number"),
     "half an odd patch": ("bcp", {"patch": 5.0}, TypeError, r"Invalid patch 5\.0"),

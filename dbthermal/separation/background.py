@@ -8,8 +8,16 @@ from dbthermal.separation.problem import Array, Problem
 
 
 def estimate(problem: Problem, emission: Emission, found: Direction) -> tuple[Array, Array]:
-    """
-    Background temperature from both bands, weighted by their noise.
+    r"""
+    Background temperature from all bands, weighted by their noise.
+
+    Its variance comes from the noise, the direction, the smoothed object and the first
+    emissivity's own variance: with :math:`\epsilon` of `Emission`,
+
+    .. math:: \delta y = (y - x) \left( s_1 \delta v_1 - e_1 \epsilon
+              + \frac{\delta o}{1 - e_1} \right) - r \, \delta x
+
+    where r is the weighted mean of :math:`e_m / (1 - e_m)` and :math:`v = \kappa / s`.
 
     Parameters
     ----------
@@ -25,47 +33,50 @@ def estimate(problem: Problem, emission: Emission, found: Direction) -> tuple[Ar
     tuple of ndarray, shape (time, pixel)
         Background temperature [K], NaN where none gives such a signal, and its variance [K^2].
     """
+    bands = range(len(problem.noise))
+    noise = np.array(problem.noise)[:, np.newaxis]
     reflectivity = 1.0 - emission.emissivity
-    weights = (reflectivity / np.array(problem.noise)[:, np.newaxis]) ** 2
-    total = weights.sum(axis=0)
-    weights = weights / total
+    precision = (reflectivity / noise) ** 2
+    total = precision.sum(axis=0)
+    weights = precision / total
     reflected = [
         (problem.signals[m] - emission.emissivity[m] * problem.blackbody(m, emission.temperature))
         / reflectivity[m]
-        for m in (0, 1)
+        for m in bands
     ]
-    # Start from the mean signal, then one Gauss-Newton step on the two exact responses.
-    start = problem.temperature(0, weights[0] * reflected[0] + weights[1] * reflected[1])
+    # Start from the mean signal, then one Gauss-Newton step on the exact responses.
+    start = problem.temperature(0, np.asarray(sum(weights[m] * reflected[m] for m in bands)))
     slopes = [curve.slope(start) for curve in problem.curves]
-    curvature = weights[0] * slopes[0] ** 2 + weights[1] * slopes[1] ** 2
-    step = sum(
-        weights[m] * slopes[m] * (reflected[m] - problem.blackbody(m, start)) for m in (0, 1)
-    )
+    curvature = sum(weights[m] * slopes[m] ** 2 for m in bands)
+    step = sum(weights[m] * slopes[m] * (reflected[m] - problem.blackbody(m, start)) for m in bands)
     background = start + step / curvature
-    own = (weights * emission.emissivity / reflectivity).sum(axis=0)
+    first, first_noise = emission.emissivity[0], problem.noise[0]
+    emitted = (weights * emission.emissivity / reflectivity).sum(axis=0)
     contrast = background - emission.temperature
-    through_emissivity = (weights / reflectivity * emission.emissivity_per_ratio).sum(axis=0)
-    per_ratio = contrast * through_emissivity - own * emission.per_ratio
-    per_emissivity = contrast * (weights / reflectivity * [np.ones_like(own), found.ratio]).sum(
-        axis=0
+    through = contrast * first + emitted * emission.per_direction
+    of_first = first_noise**2 - 1.0 / ((found.ratio / noise) ** 2).sum(axis=0)
+    of_direction = (
+        through**2 * found.across
+        + contrast**2 * of_first
+        - 2.0 * through * contrast * first_noise**2 * found.weights[0]
     )
     variance = (
         1.0 / (total * curvature)
-        + per_ratio**2 * found.variance
-        + own**2 * emission.smooth_variance
-        + per_emissivity**2 * emission.own_variance
+        + of_direction * found.spread
+        + emitted**2 * emission.smooth_variance
+        + (contrast / (1.0 - first)) ** 2 * (emission.own_variance + emission.common_variance)
     )
-    return background, variance
+    return background, np.asarray(variance)
 
 
 def bend(problem: Problem, emission: Emission, background: Array) -> Array:
     r"""
-    What the two responses' difference adds to the second band's reflection.
+    What the responses' differences add to the reflections of the bands but the first.
 
-    .. math:: (1 - e_2) \, (u_2(y) - u_1(y))
+    .. math:: (1 - e_m) \, (u_m(y) - u_1(y))
 
-    Taken from the second band, it leaves the same signal :math:`u_1(y)` reflected in both, so
-    that the reflection ratio is one number for small and large changes of the background.
+    Taken from band m, it leaves the same signal :math:`u_1(y)` reflected in all, so that the
+    reflection ratios are one number for small and large changes of the background.
 
     Parameters
     ----------
@@ -78,10 +89,16 @@ def bend(problem: Problem, emission: Emission, background: Array) -> Array:
 
     Returns
     -------
-    ndarray, shape (time, pixel)
+    ndarray, shape (band - 1, time, pixel)
         Signal [K]; zero where a background or an emissivity is not physical.
     """
-    gap = problem.blackbody(1, background) - problem.blackbody(0, background)
-    signal = (1.0 - emission.emissivity[1]) * gap
+    first = problem.blackbody(0, background)
+    signal = np.stack(
+        [
+            (1.0 - emission.emissivity[m]) * (problem.blackbody(m, background) - first)
+            for m in range(1, len(problem.noise))
+        ]
+    )
     physical = np.all((emission.emissivity > 0) & (emission.emissivity < 1), axis=0)
-    return np.where(physical & np.all(np.isfinite(signal), axis=0), signal, 0.0)
+    physical &= np.all(np.isfinite(signal), axis=(0, 1))
+    return np.where(physical, signal, 0.0)

@@ -46,10 +46,11 @@ def separate(problem: Problem) -> Separated:
     emissivity_std = (
         np.zeros_like(emissivity) if problem.emissivity_std is None else problem.emissivity_std
     )
+    noise = (problem.noise[0], problem.noise[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         temperatures, last_step = _newton(problem, emissivity)
         mixing = _mixing(problem, emissivity, temperatures)
-        variances = limits.calibrated_variance(mixing, problem.noise, temperatures, emissivity_std)
+        variances = limits.calibrated_variance(mixing, noise, temperatures, emissivity_std)
         stds = np.sqrt(variances)
     apart = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * np.hypot(*emissivity_std))
     gray = np.abs(emissivity[0] - emissivity[1]) <= apart

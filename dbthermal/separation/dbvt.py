@@ -222,7 +222,7 @@ def start(problem: Problem, settings: Settings) -> tuple[Unknowns, Mask]:
 
 def _inform(problem: Problem, emissivity: Array, smooth: Array) -> Mask:
     """Overwrite a start with what the subspace separator finds, where it finds all of it."""
-    found = subspace.separate(problem)
+    found = subspace.separate(problem, subspace.Settings())
     emitted = problem.blackbody(0, found.object_temperature) * found.emissivity[0]
     known = np.all(np.isfinite(emitted), axis=0)
     known &= np.all((found.emissivity > 0) & (found.emissivity < 1), axis=0)

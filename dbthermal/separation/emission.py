@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import smooth
-from dbthermal.separation import robust
+from dbthermal.separation import robust, slow
 from dbthermal.separation.direction import Direction
 from dbthermal.separation.problem import Array, Problem
 
@@ -21,37 +21,43 @@ _RESTING: Final = 0.3
 
 @dataclass(frozen=True)
 class Emission:
-    """
+    r"""
     Object and emissivities, with the derivatives that carry their uncertainty.
+
+    The direction's error enters the object through one number, the error :math:`\epsilon` of
+    :math:`w \cdot \kappa`, of variance :math:`\sigma^2 \, \mathrm{across}`.
 
     Attributes
     ----------
     temperature : ndarray, shape (time, pixel)
         Object temperature [K].
-    per_ratio : ndarray, shape (time, pixel)
-        Its derivative with the reflection ratio [K].
+    per_direction : ndarray, shape (time, pixel)
+        Its derivative with :math:`\epsilon` [K].
     smooth_variance : ndarray, shape (time, pixel)
         Its variance from the smoothed noise [K^2].
-    emissivity, emissivity_per_ratio : ndarray, shape (2, pixel)
-        Emissivities [1] and their derivatives with the ratio.
-    own_variance : ndarray, shape (pixel,)
-        Variance of the first emissivity that does not come from the ratio [1].
+    emissivity : ndarray, shape (band, pixel)
+        Emissivities [1].
+    own_variance, common_variance : ndarray, shape (pixel,)
+        Variances of the first emissivity that do not come from the direction: from the noise of
+        the regression, and from the background's slow part [1].
     constant, restless : ndarray of bool, shape (pixel,)
         Where the object does not change enough to tell the emissivity, and where the background
         hardly rests.
     """
 
     temperature: Array
-    per_ratio: Array
+    per_direction: Array
     smooth_variance: Array
     emissivity: Array
-    emissivity_per_ratio: Array
     own_variance: Array
+    common_variance: Array
     constant: npt.NDArray[np.bool_]
     restless: npt.NDArray[np.bool_]
 
 
-def estimate(problem: Problem, functions: Array, found: Direction) -> Emission:
+def estimate(
+    problem: Problem, functions: smooth.Subspace, found: Direction, prior: slow.Prior
+) -> Emission:
     """
     Alternate the object temperature and the emissivity, steps 2 and 3 of `subspace`.
 
@@ -59,68 +65,132 @@ def estimate(problem: Problem, functions: Array, found: Direction) -> Emission:
     ----------
     problem : Problem
         The tile.
-    functions : ndarray, shape (time, order)
+    functions : Subspace
         Smooth functions.
     found : Direction
         Direction of the reflection.
+    prior : Prior
+        What is assumed of the background's slow part.
 
     Returns
     -------
     Emission
         Object and emissivities.
     """
-    ratio, (first, second) = found.ratio, found.coefficients
-    clean = functions @ (second - ratio * first)
-    across = problem.noise[1] ** 2 + (ratio * problem.noise[0]) ** 2
-    temperature = problem.temperature(1, clean / (1.0 - ratio))
-    middle = _middle(ratio)
+    smoothed = np.einsum("bp,bcp->cp", found.weights, found.coefficients)
+    clean = functions.own @ smoothed
+    temperature = problem.temperature(1, clean)
+    middle = _middle(found.ratio)
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
     guess = robust.plain_slope(problem.blackbody(0, temperature), problem.signals[0])
     emissivity = np.where((guess > 0) & (guess < 1), guess, middle)
-    temperature = _newton(problem, ratio, emissivity, clean, temperature)[0]
+    temperature = _newton(problem, found, emissivity, clean, temperature)[0]
     line: robust.Line | None = None
     for _ in range(_ROUNDS):
         own = problem.blackbody(0, temperature)
         line = robust.regress(own, problem.signals[0], problem.noise[0], start=line)
-        constant = line.spread < _OBJECT_TO_NOISE * found.order * across / (1.0 - ratio) ** 2
+        constant = line.spread < _OBJECT_TO_NOISE * found.order * found.across
         emissivity = np.where(constant, middle, line.slope)
-        temperature, steepness, emitted = _newton(problem, ratio, emissivity, clean, temperature)
+        if problem.shared is not None:
+            given = found.given & np.isfinite(problem.shared.emissivity)
+            constant = constant & ~given
+            emissivity = np.where(given, problem.shared.emissivity, emissivity)
+        temperature, steepness, emitted = _newton(problem, found, emissivity, clean, temperature)
     assert line is not None
-    per_ratio = (emitted - functions @ first) / steepness
-    smooth_variance = smooth.leverage(functions)[:, found.order - 1] * across / steepness**2
+    per_direction = (emitted - functions.own @ found.coefficients[0]) / steepness
+    leverage = functions.leverage()[:, found.order - 1]
+    smooth_variance = leverage * found.across / steepness**2
+    # What the criterion for the order leaves of the object's curve is as large as the noise that
+    # one more function would have cost, log N times.
+    left_out = smooth_variance * np.log(problem.time.size) / found.order
     expected = problem.noise[0] ** 2 + emissivity**2 * (
-        per_ratio**2 * found.variance + smooth_variance
+        per_direction**2 * found.spread * found.across + smooth_variance + left_out
     )
-    slope_per_ratio = -emissivity * (1.0 - emissivity) / (1.0 - ratio)
-    through_fit = emissivity**2 * across / ((1.0 - ratio) ** 2 * line.spread)
+    own_variance = line.variance + emissivity**2 * found.across / line.spread
+    drifting = slow.variance(line, own, 1.0 - emissivity, functions, problem.noise[0], prior)
+    if problem.shared is not None:
+        given = found.given & np.isfinite(problem.shared.emissivity)
+        own_variance = np.where(given, problem.shared.own_variance, own_variance)
+        drifting = np.where(given, problem.shared.common_variance, drifting)
     return Emission(
         temperature=temperature,
-        per_ratio=per_ratio,
+        per_direction=per_direction,
         smooth_variance=smooth_variance,
-        emissivity=np.stack([emissivity, 1.0 - ratio * (1.0 - emissivity)]),
-        emissivity_per_ratio=np.stack(
-            [slope_per_ratio, emissivity - 1.0 + ratio * slope_per_ratio]
-        ),
-        own_variance=line.variance + through_fit,
+        emissivity=1.0 - found.ratio * (1.0 - emissivity),
+        own_variance=own_variance,
+        common_variance=drifting,
         constant=constant,
         restless=np.mean(line.residual**2 < _WITHIN**2 * expected, axis=0) < _RESTING,
     )
 
 
+def emissivity_variance(found: Direction, first: Array, own: Array, noise: Array) -> Array:
+    r"""
+    Variance of the emissivities, from the direction and from the first one's own variance.
+
+    .. math:: \delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o, \quad
+              \delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m
+
+    Parameters
+    ----------
+    found : Direction
+        Direction of the reflection.
+    first : ndarray, shape (pixel,)
+        Emissivity of the first band [1].
+    own : ndarray, shape (pixel,)
+        Its own variance [1].
+    noise : ndarray, shape (band,)
+        Noise of the bands [K].
+
+    Returns
+    -------
+    ndarray, shape (band, pixel)
+        Variance [1].
+    """
+    ratio, weights = found.ratio, found.weights
+    squares = (noise**2)[:, np.newaxis]
+    of_ratio = squares + ratio**2 * squares[0]
+    of_ratio[0] = 0.0
+    common = squares * weights - ratio * squares[0] * weights[0]
+    common[0] = 0.0
+    dark = 1.0 - first
+    from_direction = (ratio * first * dark) ** 2 * found.across
+    from_direction = from_direction + dark**2 * of_ratio + 2.0 * ratio * first * dark**2 * common
+    return np.asarray(ratio**2 * own + from_direction * found.spread)
+
+
 def _middle(ratio: Array) -> Array:
-    """Middle of what k2 leaves possible for e1, for where the object does not tell."""
-    lowest = np.zeros_like(ratio)
-    np.divide(ratio - 1.0, ratio, out=lowest, where=ratio > 1.0)
+    """Middle of what the ratios leave possible for e1, for where the object does not tell."""
+    largest = ratio.max(axis=0)
+    lowest = np.zeros_like(largest)
+    np.divide(largest - 1.0, largest, out=lowest, where=largest > 1.0)
     return np.asarray(0.5 * (1.0 + lowest))
 
 
 def _newton(
-    problem: Problem, ratio: Array, emissivity: Array, clean: Array, temperature: Array
+    problem: Problem, found: Direction, emissivity: Array, clean: Array, temperature: Array
 ) -> tuple[Array, Array, Array]:
-    """One step towards h(x) = q: the new x, h'(x), and -dh/dk2 at the old x."""
-    own, other = (problem.blackbody(band, temperature) for band in (0, 1))
+    r"""
+    One step towards the object, :math:`h(x) = \sum w_m e_m u_m(x) = q`.
+
+    Returns the new x, h'(x), and what the first band holds of :math:`\partial h / \partial
+    \epsilon` beside its own signal, at the old x.
+    """
+    factors = found.weights * (1.0 - found.ratio * (1.0 - emissivity))
+    own = [problem.blackbody(band, temperature) for band in range(len(factors))]
     slopes = [curve.slope(temperature) for curve in problem.curves]
-    emitted = other - emissivity * (other - own)
-    steepness = (1.0 - ratio) * slopes[1] + ratio * emissivity * (slopes[1] - slopes[0])
-    value = other - ratio * emitted
-    return temperature + (clean - value) / steepness, steepness, emitted
+    value = sum(part * factor for part, factor in zip(own, factors, strict=True))
+    steepness = sum(part * factor for part, factor in zip(slopes, factors, strict=True))
+    shares = _shares(found, problem.noise)
+    other = sum(part * share for part, share in zip(own[1:], shares, strict=True))
+    emitted = other - emissivity * (other - own[0])
+    return temperature + (clean - value) / steepness, np.asarray(steepness), np.asarray(emitted)
+
+
+def _shares(found: Direction, noise: tuple[float, ...]) -> Array:
+    """Share (band - 1, pixel) of the ratios but the first in the variance of epsilon."""
+    if len(noise) == 2:
+        return np.ones_like(found.ratio[1:])
+    squares = (np.array(noise) ** 2)[:, np.newaxis]
+    parts = (found.weights**2 * (squares + found.ratio**2 * squares[0]))[1:]
+    return np.asarray(parts / parts.sum(axis=0))

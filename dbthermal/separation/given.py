@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
@@ -51,7 +52,7 @@ class Given:
         if self.emissivity is None or self.emissivity_std is None:
             return problem
         value, std = (
-            array[(slice(None), *tile)].reshape(2, -1)[bands]
+            array[(slice(None), *tile)].reshape(len(bands), -1)[bands]
             for array in (self.emissivity, self.emissivity_std)
         )
         return replace(problem, emissivity=value, emissivity_std=std)
@@ -154,7 +155,7 @@ def _spread(corrected: xr.Dataset, array: xr.DataArray, what: str) -> Array:
     else:
         places = schema.band_positions(array, wanted, what)
     values = array.values[places].astype(np.float64)
-    shape = (2, corrected.sizes["y"], corrected.sizes["x"])
+    shape = (len(wanted), corrected.sizes["y"], corrected.sizes["x"])
     if values.ndim == 3 and values.shape != shape:
         raise ValueError(f"Invalid shape {values.shape} of {what}. Must be {shape}.")
     return np.broadcast_to(values.reshape(2, *values.shape[1:] or (1, 1)), shape)
@@ -196,3 +197,86 @@ def true_temperature(corrected: xr.Dataset, truth: xr.DataArray | None) -> Array
     if not np.all(np.isfinite(values)):
         raise ValueError("Invalid truth with NaN or infinite values. Must be finite.")
     return values
+
+
+def labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> npt.NDArray[np.intp] | None:
+    """
+    Check labels of materials.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        The capture.
+    pool : DataArray, optional
+        (y, x), integer; negative for pixels that share nothing.
+
+    Returns
+    -------
+    ndarray of int or None
+        Labels (pixel), numbered from 0 without gaps, -1 for none.
+
+    Raises
+    ------
+    TypeError
+        If they are not a DataArray of integers.
+    ValueError
+        If their dims or sizes are not the capture's.
+    """
+    if pool is None:
+        return None
+    if not isinstance(pool, xr.DataArray):
+        raise TypeError(f"Invalid pool of type {type(pool).__name__}. Must be a DataArray.")
+    if pool.dtype.kind not in "iu":
+        raise TypeError(f"Invalid dtype {pool.dtype} of the pool. Must be whole numbers.")
+    sizes = {dim: corrected.sizes[dim] for dim in ("y", "x")}
+    if pool.dims != ("y", "x") or dict(pool.sizes) != sizes:
+        raise ValueError(f"Invalid pool {dict(pool.sizes)}. Must be {sizes}.")
+    flat = pool.values.ravel()
+    names = np.unique(flat[flat >= 0])
+    return np.where(flat >= 0, np.searchsorted(names, flat), -1).astype(np.intp)
+
+
+def with_mask(corrected: xr.Dataset, mask: xr.DataArray | None) -> xr.Dataset:
+    """
+    Check which samples to use, and the shutter's segments, beside the capture.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        The capture; a `segment` (time) counts the shutter events before each frame.
+    mask : DataArray, optional
+        (time), (y, x) or (time, y, x), true for the samples to use.
+
+    Returns
+    -------
+    Dataset
+        The capture with the variable `mask`, where one is given.
+
+    Raises
+    ------
+    TypeError
+        If the mask is not a DataArray of booleans.
+    ValueError
+        If its dims or sizes are others, or a segment is no count of events.
+    """
+    if "segment" in corrected:
+        segment = corrected["segment"]
+        falling = segment.dtype.kind in "iu" and np.any(np.diff(segment.values.astype(int)) < 0)
+        if segment.dims != ("time",) or segment.dtype.kind not in "iu" or falling:
+            raise ValueError(
+                f"Invalid segment {segment.dims} of {segment.dtype}. Must be ('time',) of whole "
+                "numbers that do not fall."
+            )
+    if mask is None:
+        return corrected.drop_vars("mask", errors="ignore")
+    if not isinstance(mask, xr.DataArray):
+        raise TypeError(f"Invalid mask of type {type(mask).__name__}. Must be a DataArray.")
+    if mask.dtype != bool:
+        raise TypeError(f"Invalid dtype {mask.dtype} of the mask. Must be bool.")
+    sizes = {str(dim): corrected.sizes.get(str(dim), 0) for dim in mask.dims}
+    allowed = (("time",), ("y", "x"), ("time", "y", "x"))
+    if mask.dims not in allowed or dict(mask.sizes) != sizes:
+        raise ValueError(
+            f"Invalid mask {dict(mask.sizes)}. Must have dims of {allowed} and the capture's sizes."
+        )
+    return corrected.assign(mask=(mask.dims, mask.values))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,16 +17,41 @@ Mask = npt.NDArray[np.bool_]
 _BEYOND: Final = 5.0
 # A temperature [K], emissivity [1] or deviation beyond is no result.
 _USELESS: Final = 1e6
+_RATIO: Final = "reflection_ratio"
+
+
+@dataclass(frozen=True)
+class Shared:
+    """
+    What the pixels of one material share, spread over a tile.
+
+    Attributes
+    ----------
+    ratio : ndarray, shape (band, pixel)
+        Reflection ratios [1]; NaN for a pixel that shares nothing.
+    spread : ndarray, shape (pixel,)
+        Their variance, see `direction.Direction` [1/K^2].
+    emissivity : ndarray, shape (pixel,)
+        Emissivity of the first band [1]; NaN for a pixel that has its own.
+    own_variance, common_variance : ndarray, shape (pixel,)
+        Its variances, as those of `Survey` [1].
+    """
+
+    ratio: Array
+    spread: Array
+    emissivity: Array
+    own_variance: Array
+    common_variance: Array
 
 
 @dataclass(frozen=True)
 class Problem:
     """
-    One tile of a corrected capture in two bands, the quieter band first.
+    One tile of a corrected capture, the quietest band first.
 
     Attributes
     ----------
-    signals : ndarray, shape (2, time, pixel)
+    signals : ndarray, shape (band, time, pixel)
         Linearised signals less the reference temperature [K]; finite.
     time : ndarray, shape (time,)
         Times [s].
@@ -38,7 +63,11 @@ class Problem:
         Rows and columns of the tile; its pixels follow one another along the rows.
     rng : Generator
         The tile's own source of randomness, for random starts.
-    emissivity, emissivity_std : ndarray, shape (2, pixel), optional
+    segment : ndarray of int, shape (time,), optional
+        Number of shutter events before each frame.
+    shared : Shared, optional
+        What the pixels of one material share.
+    emissivity, emissivity_std : ndarray, shape (band, pixel), optional
         Known emissivities and their standard deviations [1], for methods that need them.
     truth : ndarray, shape (time, pixel), optional
         True object temperature [K], for an oracle's choice.
@@ -46,10 +75,12 @@ class Problem:
 
     signals: Array
     time: Array
-    curves: tuple[Curve, Curve]
-    noise: tuple[float, float]
+    curves: tuple[Curve, ...]
+    noise: tuple[float, ...]
     shape: tuple[int, int]
     rng: np.random.Generator
+    segment: npt.NDArray[np.intp] | None = None
+    shared: Shared | None = None
     emissivity: Array | None = None
     emissivity_std: Array | None = None
     truth: Array | None = None
@@ -66,7 +97,7 @@ class Problem:
         Parameters
         ----------
         band : int
-            0 or 1.
+            Position of the band.
         temperature : ndarray
             Temperature [K].
 
@@ -84,7 +115,7 @@ class Problem:
         Parameters
         ----------
         band : int
-            0 or 1.
+            Position of the band.
         signal : ndarray
             Signal relative to the reference [K].
 
@@ -94,6 +125,53 @@ class Problem:
             Temperature [K]; NaN where there is none.
         """
         return self.curves[band].temperature(signal + self.reference)
+
+    def at(self, frames: Mask) -> "Problem":
+        """
+        Some of the frames.
+
+        Parameters
+        ----------
+        frames : ndarray of bool, shape (time,)
+            Which.
+
+        Returns
+        -------
+        Problem
+            The same problem with these frames alone.
+        """
+        return replace(
+            self,
+            signals=self.signals[:, frames],
+            time=self.time[frames],
+            segment=None if self.segment is None else self.segment[frames],
+            truth=None if self.truth is None else self.truth[frames],
+        )
+
+    def of(self, pixels: Mask) -> "Problem":
+        """
+        Some of the pixels.
+
+        Parameters
+        ----------
+        pixels : ndarray of bool, shape (pixel,)
+            Which.
+
+        Returns
+        -------
+        Problem
+            The same problem of these pixels alone, as one row.
+        """
+        shared = self.shared
+        if shared is not None:
+            values = (getattr(shared, field.name)[..., pixels] for field in fields(shared))
+            shared = Shared(*values)
+        given: dict[str, Any] = {
+            name: None if getattr(self, name) is None else getattr(self, name)[..., pixels]
+            for name in ("emissivity", "emissivity_std", "truth")
+        }
+        signals = self.signals[..., pixels]
+        return replace(self, signals=signals, shape=(1, signals.shape[2]), shared=shared, **given)
 
 
 @dataclass(frozen=True)
@@ -107,10 +185,13 @@ class Separated:
         Object temperature and its standard deviation [K].
     background_temperature, background_temperature_std : ndarray, shape (time, pixel)
         Background temperature and its standard deviation [K].
-    emissivity, emissivity_std : ndarray, shape (2, pixel)
+    emissivity, emissivity_std : ndarray, shape (band, pixel)
         Emissivities and their standard deviations [1].
     status : ndarray of uint16, shape (pixel,)
         Bits of `schema.FLAGS`.
+    reflection_ratio, reflection_ratio_std : ndarray, shape (band, pixel), optional
+        Reflections over that of the first band, and their standard deviations [1]; None for a
+        method that does not go through them.
     """
 
     object_temperature: Array
@@ -120,6 +201,8 @@ class Separated:
     emissivity: Array
     emissivity_std: Array
     status: Flags
+    reflection_ratio: Array | None = None
+    reflection_ratio_std: Array | None = None
 
     def without(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Separated":
         """
@@ -149,25 +232,46 @@ class Separated:
             },
         )
 
-    def updated(self, pixels: Mask, part: "Separated") -> "Separated":
+    def of(self, pixels: Mask) -> "Separated":
         """
-        Replace some pixels.
+        Some of the pixels.
 
         Parameters
         ----------
         pixels : ndarray of bool, shape (pixel,)
             Which.
-        part : Separated
-            These pixels, in their order.
 
         Returns
         -------
         Separated
-            The whole with the part put in.
+            These pixels alone.
         """
-        values = {field.name: getattr(self, field.name).copy() for field in fields(self)}
-        for name, value in values.items():
-            value[..., pixels] = getattr(part, name)
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        chosen: dict[str, Any] = {
+            name: None if v is None else v[..., pixels] for name, v in values.items()
+        }
+        return replace(self, **chosen)
+
+    def spread(self, frames: Mask) -> "Separated":
+        """
+        Put the frames of a part of the capture in their place.
+
+        Parameters
+        ----------
+        frames : ndarray of bool, shape (time,)
+            Frames that were used.
+
+        Returns
+        -------
+        Separated
+            All frames; the temperatures are NaN in those that were not used.
+        """
+        values = {}
+        for name in ("object_temperature", "background_temperature"):
+            for which in (name, f"{name}_std"):
+                part = getattr(self, which)
+                values[which] = np.full((frames.size, part.shape[1]), np.nan)
+                values[which][frames] = part
         return replace(self, **values)
 
     def ranged(self, problem: Problem, *, deviations: bool = True) -> "Separated":
@@ -189,16 +293,80 @@ class Separated:
         """
         values: dict[str, Array] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
-        for name in ("object_temperature", "background_temperature", "emissivity"):
+        for name in ("object_temperature", "background_temperature", "emissivity", _RATIO):
+            if getattr(self, name) is None:
+                continue
             value, std = getattr(self, name), getattr(self, f"{name}_std")
             lost = ~((np.abs(value) < _USELESS) & ((std < _USELESS) | (not deviations)))
             beyond |= np.any(lost, axis=0) & ~np.all(np.isnan(value), axis=0)
             values[name], values[f"{name}_std"] = (
                 np.where(lost, np.nan, part) for part in (value, std)
             )
-            if name != "emissivity":
+            if name.endswith("temperature"):
                 beyond |= outside(value, std, problem.curves[0])
         return replace(self, **values, status=self.status | flag({"outside_response": beyond}))
+
+
+@dataclass(frozen=True)
+class Survey:
+    """
+    What one tile's pixels tell of their materials.
+
+    Attributes
+    ----------
+    scatter : ndarray, shape (band, band, pixel)
+        Noise-whitened scatter of the rapid changes less that of the noise; zero where a pixel
+        tells nothing.
+    frames : ndarray, shape (pixel,)
+        Degrees of freedom that it stands on.
+    ratio : ndarray, shape (band, pixel)
+        Reflection ratios of the pixel alone [1].
+    weights : ndarray, shape (band, pixel)
+        Combination without background, see `direction.Direction`.
+    emissivity : ndarray, shape (pixel,)
+        First emissivity of the pixel alone [1]; NaN where it tells nothing.
+    own_variance, common_variance : ndarray, shape (pixel,)
+        Its variance that is the pixel's own, and that which all pixels may have in common, both
+        without what comes from the ratios [1].
+    """
+
+    scatter: Array
+    frames: Array
+    ratio: Array
+    weights: Array
+    emissivity: Array
+    own_variance: Array
+    common_variance: Array
+
+
+Record = TypeVar("Record", Separated, Survey)
+
+
+def updated(whole: Record, pixels: Mask, part: Record) -> Record:
+    """
+    Replace some pixels.
+
+    Parameters
+    ----------
+    whole : Separated or Survey
+        All pixels.
+    pixels : ndarray of bool, shape (pixel,)
+        Which to replace.
+    part : Separated or Survey
+        These pixels, in their order.
+
+    Returns
+    -------
+    Separated or Survey
+        The whole with the part put in.
+    """
+    values = {}
+    for field in fields(whole):
+        value = getattr(whole, field.name)
+        if value is not None:
+            values[field.name] = value.copy()
+            values[field.name][..., pixels] = getattr(part, field.name)
+    return replace(whole, **values)
 
 
 def flag(conditions: dict[str, Mask]) -> Flags:
@@ -258,6 +426,10 @@ class Method:
         Whether it must be given the emissivities.
     whole_image : bool
         Whether it looks at a pixel's neighbours, so that a tile is the whole image.
+    survey : callable, optional
+        For methods that pool the pixels of one material: from the same arguments to a `Survey`.
+    any_bands : bool
+        Whether it takes more than two bands.
     not_estimated : tuple of str
         Names of `Separated` that it leaves NaN everywhere.
     """
@@ -267,4 +439,6 @@ class Method:
     minimum_frames: int = 1
     knows_emissivity: bool = False
     whole_image: bool = False
+    survey: Callable[..., "Survey"] | None = None
+    any_bands: bool = False
     not_estimated: tuple[str, ...] = ()

@@ -88,7 +88,8 @@ def separate(problem: Problem, settings: Settings) -> Separated:
         If the ratio of the radiances is not monotonic over the response's range, as for 8-14 and
         10.6 um, which is stationary near 33 C; or there are fewer frames than polynomials.
     """
-    inverse = _inverse(problem.curves, settings.kind)
+    first, second = problem.curves
+    inverse = _inverse((first, second), settings.kind)
     radiances = _radiances(problem, settings)
     with np.errstate(invalid="ignore", divide="ignore"):
         temperature = inverse(np.log(radiances[0] / radiances[1]))

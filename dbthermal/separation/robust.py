@@ -13,8 +13,10 @@ Precision = TypeVar("Precision", np.float32, np.float64)
 TUNING: Final = 4.685
 """Tukey's constant: 95 % efficiency for normal noise (Huber 1981, doi:10.1002/0471725250)."""
 
-# Median absolute deviation -> standard deviation of a normal distribution.
-_MAD: Final = 1.0 / float(ndtri(0.75))
+# Share of the points that must lie on the line: the scale is taken from their deviation, as an
+# absolute deviation of that rank -> standard deviation of a normal distribution.
+_SHARE: Final = 0.3
+_TO_STD: Final = 1.0 / float(ndtri(0.5 * (1.0 + _SHARE)))
 _ANNEALING: Final = 0.7
 _STARTING_STEPS: Final = 5
 _STARTING_POINTS: Final = 100
@@ -87,7 +89,7 @@ def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None =
     else:
         residual = _fit(abscissa, ordinate, start.weights)[2]
     for _ in range(_STEPS):
-        scale = np.maximum(noise, _MAD * _median_magnitude(residual))
+        scale = np.maximum(noise, _TO_STD * _ranked_magnitude(residual))
         weights = _tukey(residual, scale)
         slope, intercept, residual, spread = _fit(abscissa, ordinate, weights)
     return Line(
@@ -137,8 +139,8 @@ def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
         weights = start.astype(np.float32)
         for _ in range(_STARTING_STEPS):
             *line, residual, _ = _fit(*few, weights)
-            deviation = _median_magnitude(residual)
-            weights = _tukey(residual, np.maximum(noise, _ANNEALING * _MAD * deviation))
+            deviation = _ranked_magnitude(residual)
+            weights = _tukey(residual, np.maximum(noise, _ANNEALING * _TO_STD * deviation))
         better = deviation < smallest
         slope, intercept = np.where(better, line, (slope, intercept))
         smallest = np.where(better, deviation, smallest)
@@ -163,10 +165,10 @@ def _fit(
     return slope, intercept, ordinate - intercept - slope * abscissa, spread
 
 
-def _median_magnitude(residual: npt.NDArray[Precision]) -> Array:
-    """Upper median over time of the absolute value; in single precision, which is much faster."""
+def _ranked_magnitude(residual: npt.NDArray[Precision]) -> Array:
+    """Absolute value of rank `_SHARE` over time; in single precision, which is much faster."""
     magnitude = np.abs(residual.T, dtype=np.float32, casting="same_kind")
-    middle = residual.shape[0] // 2
+    middle = int(_SHARE * residual.shape[0])
     return np.asarray(np.partition(magnitude, middle, axis=1)[:, middle], dtype=np.float64)
 
 

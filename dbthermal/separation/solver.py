@@ -1,11 +1,13 @@
 """The one entrance to all methods: checks, noise, tiles, threads."""
 
 import operator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
@@ -15,9 +17,13 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.curves import Curve
 from dbthermal.separation import given, methods, tiles
-from dbthermal.separation.problem import Array, Method, Problem, Separated
+from dbthermal.separation import pool as pool_of
+from dbthermal.separation.problem import Array, Flags, Mask, Method, Problem, Survey
+
+Places = npt.NDArray[np.intp]
 
 _NOISE_PIXELS: Final = 4096
+_READ: Final = ("counts", "status", "segment", "mask")
 
 
 def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by name
@@ -28,6 +34,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     emissivity: xr.DataArray | None = None,
     emissivity_std: xr.DataArray | None = None,
     truth: xr.DataArray | None = None,
+    mask: xr.DataArray | None = None,
+    pool: xr.DataArray | None = None,
     response_kind: str = "exact",
     workers: int = 2,
     seed: int = 0,
@@ -109,39 +117,39 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         )
     names = [str(name) for name in corrected["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
+    corrected = given.with_mask(corrected, mask)
     deviations = _noise(corrected, response, curves)
-    known = given.check(corrected, emissivity, emissivity_std, truth)
+    task = _Task(
+        needed=corrected[[name for name in _READ if name in corrected]],
+        curves=curves,
+        noise=deviations,
+        # The quieter band comes first: the regression for the emissivity needs a quiet ordinate.
+        bands=[int(band) for band in np.argsort(deviations, kind="stable")],
+        known=given.check(corrected, emissivity, emissivity_std, truth),
+        method=module,
+        settings=settings,
+        seed=seed,
+    )
+    labels = given.labels(corrected, pool)
     result = tiles.allocate(corrected)
-    # The quieter band comes first: the regression for the emissivity needs a quiet ordinate.
-    bands = [int(band) for band in np.argsort(deviations, kind="stable")]
-    needed = corrected[[name for name in ("counts", "status") if name in corrected]]
-    separate = module.separate if settings is None else partial(module.separate, settings=settings)
-    pixels = corrected.sizes["y"] * corrected.sizes["x"]
-    batch = pixels if module.whole_image else getattr(settings, "batch", tiles.PIXELS)
-
-    def work(rows: slice) -> None:
-        part, target = needed.isel(y=rows).load(), result.isel(y=rows)
-        for tile in tiles.cover(part, batch):
-            counts, status = tiles.read(part, tile)
-            place = tiles.moved(tile, rows.start)
-            problem = Problem(
-                signals=_signals(counts, curves, bands),
-                time=part["time"].values.astype(np.float64),
-                curves=(curves[bands[0]], curves[bands[1]]),
-                noise=(float(deviations[bands[0]]), float(deviations[bands[1]])),
-                shape=tiles.shape_of(tile),
-                rng=tiles.generator(seed, place),
-            )
-            found: Separated = separate(known.put_into(problem, place, bands))
-            tiles.write(target, tile, bands, found, status)
-            bar.update(counts.shape[-1])
-
     with (
         threadpool_limits(limits=1, user_api="blas"),
-        ThreadPoolExecutor(workers) as pool,
-        tqdm(total=pixels, unit="pixel", desc=method, disable=not progress) as bar,
+        ThreadPoolExecutor(workers) as threads,
+        tqdm(
+            total=corrected.sizes["y"] * corrected.sizes["x"] * (1 if labels is None else 2),
+            unit="pixel",
+            desc=method,
+            disable=not progress,
+        ) as bar,
     ):
-        for _ in pool.map(work, tiles.blocks(corrected, whole_image=module.whole_image)):
+        blocks = list(tiles.blocks(corrected, whole_image=module.whole_image))
+        if labels is not None:
+            if module.survey is None:
+                raise ValueError(f"Invalid pool for method '{method}', which does not pool.")
+            asked = pool_of.asked(labels)
+            found = threads.map(lambda rows: task.survey(rows, asked, bar), blocks)
+            task = task.pooled(labels, [part for block in found for part in block])
+        for _ in threads.map(lambda rows: task.separate(rows, result.isel(y=rows), bar), blocks):
             pass
     counts_per_kelvin = np.array([curve.reference_slope for curve in curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
@@ -151,15 +159,117 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         response_kind=response_kind,
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
-        not_estimated=" ".join(module.not_estimated),
+        not_estimated=" ".join(_not_estimated(module)),
+        reference_band=names[int(np.argmin(deviations))],
         **({} if settings is None else {"settings": repr(settings)}),
     )
 
 
-def _signals(counts: Array, curves: list[Curve], bands: list[int]) -> Array:
-    """Linearised signals less the reference temperature (2, time, pixel) [K], in this order."""
-    parts = [curves[band].linearise(counts[band]) - curves[band].reference for band in bands]
-    return np.stack(parts)
+@dataclass(frozen=True)
+class _Task:
+    """What every tile needs."""
+
+    needed: xr.Dataset
+    curves: list[Curve]
+    noise: Array
+    bands: list[int]
+    known: given.Given
+    method: Method
+    settings: Any
+    seed: int
+    materials: pool_of.Materials | None = None
+
+    def separate(self, rows: slice, result: xr.Dataset, bar: "tqdm[Any]") -> None:
+        """Separate a block of rows into its place in the result."""
+        for tile, status, problems in self._problems(rows):
+            parts = [
+                (frames, pixels, self._call(self.method.separate, problem))
+                for frames, pixels, problem in problems
+            ]
+            tiles.write(result, tile, self.bands, status, parts)
+            bar.update(status.size)
+
+    def survey(self, rows: slice, asked: Mask, bar: "tqdm[Any]") -> list[tuple[Places, Survey]]:
+        """What a block's pixels tell of their materials, and which pixels of the image they are."""
+        found = []
+        for tile, status, problems in self._problems(rows):
+            place = self._places(tile, rows)
+            for _, pixels, problem in problems:
+                chosen = asked[place[pixels]]
+                if np.any(chosen):
+                    part = problem if np.all(chosen) else problem.of(chosen)
+                    tells = self._call(self.method.survey, part)
+                    found.append((place[pixels][chosen], tells))
+            bar.update(status.size)
+        return found
+
+    def pooled(self, labels: Places, found: list[tuple[Places, Survey]]) -> "_Task":
+        """The same task with the pixels of one material sharing what they tell."""
+        places = np.concatenate([place for place, _ in found])
+        survey = pool_of.joined([part for _, part in found])
+        materials = pool_of.combine(labels[places], survey, self.noise[self.bands])
+        return replace(self, materials=replace(materials, label=labels))
+
+    def _call(self, function: Callable[..., Any] | None, problem: Problem) -> Any:
+        assert function is not None
+        return function(problem) if self.settings is None else function(problem, self.settings)
+
+    def _places(self, tile: tiles.Tile, rows: slice) -> Places:
+        """Numbers of a tile's pixels in the image."""
+        down, along = tiles.moved(tile, rows.start)
+        width = self.needed.sizes["x"]
+        lines = np.arange(down.start, down.stop)[:, np.newaxis] * width
+        return (lines + np.arange(along.start, along.stop)).ravel()
+
+    def _problems(
+        self, rows: slice
+    ) -> Iterator[tuple[tiles.Tile, Flags, list[tuple[Mask, Mask, Problem]]]]:
+        """Tiles of a block, the status of their pixels, and a problem for each set of frames."""
+        part = self.needed.isel(y=rows).load()
+        whole = part.sizes["y"] * part.sizes["x"]
+        size = whole if self.method.whole_image else getattr(self.settings, "batch", tiles.PIXELS)
+        for tile in tiles.cover(part, size):
+            counts, there, status = tiles.read(part, tile, self.method.minimum_frames)
+            bad = tiles.unusable(status)
+            problem = self._problem(part, counts, tile, rows)
+            if self.method.whole_image:
+                frames = np.all(there[:, ~bad], axis=1)
+                yield tile, status, [(frames, np.ones_like(bad), problem.at(frames))]
+                continue
+            problems = []
+            for frames, pixels in tiles.patterns(there, bad):
+                chosen = problem if np.all(frames) else problem.at(frames)
+                problems.append((frames, pixels, chosen if np.all(pixels) else chosen.of(pixels)))
+            yield tile, status, problems
+
+    def _problem(self, part: xr.Dataset, counts: Array, tile: tiles.Tile, rows: slice) -> Problem:
+        """All pixels and frames of a tile."""
+        place = tiles.moved(tile, rows.start)
+        curves = [self.curves[band] for band in self.bands]
+        signals = [
+            curve.linearise(counts[band]) - curve.reference
+            for band, curve in zip(self.bands, curves, strict=True)
+        ]
+        shared = None
+        if self.materials is not None:
+            shared = self.materials.shared(self._places(tile, rows))
+        problem = Problem(
+            signals=np.stack(signals),
+            time=part["time"].values.astype(np.float64),
+            curves=tuple(curves),
+            noise=tuple(float(self.noise[band]) for band in self.bands),
+            shape=tiles.shape_of(tile),
+            rng=tiles.generator(self.seed, place),
+            segment=part["segment"].values.astype(np.intp) if "segment" in part else None,
+            shared=shared,
+        )
+        return self.known.put_into(problem, place, self.bands)
+
+
+def _not_estimated(method: Method) -> tuple[str, ...]:
+    """Variables of the result that a method leaves NaN everywhere."""
+    ratios = ("reflection_ratio", "reflection_ratio_std")
+    return method.not_estimated + (() if method.survey else ratios)
 
 
 def _check(
@@ -177,9 +287,10 @@ def _check(
         raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")
     if operator.index(seed) < 0:
         raise ValueError(f"Invalid seed {seed}. Must be zero or positive.")
-    if corrected.sizes["band"] != 2:
-        names = [str(name) for name in corrected["band"].values]
-        raise ValueError(f"Invalid bands {names} of the capture. Must be exactly two.")
+    number, names = corrected.sizes["band"], [str(name) for name in corrected["band"].values]
+    if number < 2 or (number > 2 and not method.any_bands):
+        rule = "two or more" if method.any_bands else "exactly two"
+        raise ValueError(f"Invalid bands {names} for method '{name}'. Must be {rule}.")
     frames = corrected.sizes["time"]
     if frames < method.minimum_frames:
         raise ValueError(
@@ -197,6 +308,6 @@ def _noise(corrected: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> 
     if "noise" in response:
         slopes = np.array([curve.reference_slope for curve in curves])
         return np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
-    counts = tiles.sample(corrected, _NOISE_PIXELS)
+    counts, frames = tiles.sample(corrected, _NOISE_PIXELS)
     signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
-    return np.array(noise_of.estimate(signals[0], signals[1], corrected["time"].values))
+    return noise_of.of_bands(signals, corrected["time"].values[frames])

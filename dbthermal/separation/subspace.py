@@ -1,37 +1,93 @@
 r"""The subspace separator: closed forms for a smooth object before an abrupt background.
 
-1. The direction of the rapid changes gives the reflection ratio :math:`k_2` (`direction`).
-2. :math:`q = z_2 - k_2 z_1` holds no background. Smoothed in the subspace, it is inverted for the
-   object temperature: :math:`h(x) = (1 - k_2) u_2(x) + k_2 e_1 (u_2(x) - u_1(x)) = q`.
+1. The direction of the rapid changes gives the reflection ratios :math:`\kappa_m = (1 - e_m) /
+   (1 - e_1)` (`direction`).
+2. The combination of bands :math:`q = \sum w_m z_m` with :math:`w \cdot \kappa = 0` holds no
+   background. Smoothed in the subspace, it is inverted for the object temperature:
+   :math:`\sum w_m e_m u_m(x) = q`.
 3. The slope of a robust regression of :math:`z_1` on :math:`u_1(x)` is :math:`e_1`, if the
-   background rests now and then; :math:`e_2 = 1 - k_2 (1 - e_1)`. Steps 2 and 3 alternate
-   (`emission`).
-4. The background follows from both bands, weighted by their noise (`background`). Where it changes
-   by many kelvins its two signals are no longer proportional: what bends them apart is taken out
-   of the second band, and steps 1 to 4 are done again.
+   background rests now and then; :math:`e_m = 1 - \kappa_m (1 - e_1)`. Steps 2 and 3 alternate
+   (`emission`). What a slow part of the background can do to the slope is carried in its standard
+   deviation (`slow`).
+4. The background follows from all bands, weighted by their noise (`background`). Where it changes
+   by many kelvins its signals are no longer proportional: what bends them apart is taken out, and
+   steps 1 to 4 are done again, on the exact model.
+5. Where what is left is no noise, one jump of the object is looked for (`jumps`), and taken into
+   the subspace.
 
 Every output carries a standard deviation, propagated from the noise. Second-order blind source
 separation in the sense of Belouchrani et al. (1997), doi:10.1109/78.554307, for the image
 formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy.special import ndtri
 
-from dbthermal import smooth
-from dbthermal.separation import background, direction, emission
-from dbthermal.separation.problem import Array, Method, Problem, Separated, flag
+from dbthermal import schema, smooth
+from dbthermal.separation import background, direction, emission, jumps, residual, slow
+from dbthermal.separation.problem import (
+    Array,
+    Method,
+    Problem,
+    Record,
+    Separated,
+    Survey,
+    flag,
+    updated,
+)
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
 _MISFIT_SIGMAS: Final = 8.0
 _MEMORY_SIGMAS: Final = 3.5
 _GRAY_SIGMAS: Final = 4.0
+_APART_SIGMAS: Final = 4.0
+_BROKEN: Final = np.uint16(schema.FLAGS["object_not_smooth"] | schema.FLAGS["bands_apart"])
+# Flags of pixels in which a jump of the object is looked for.
+_SUSPECT: Final = np.uint16(
+    sum(
+        schema.FLAGS[name]
+        for name in (
+            "object_not_smooth",
+            "gray",
+            "nonphysical_emissivity",
+            "roles_may_be_swapped",
+            "background_never_rests",
+        )
+    )
+)
+# Bound of a 95 % interval of the normal distribution.
+_NORMAL95: Final = float(ndtri(0.975))
 # Energy of the bend between the two responses, in units of the second band's noise, from which it
 # is worth taking out: it moves no linear function of the signal by more standard deviations.
 _BEND: Final = 0.2
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    Options of the method.
+
+    Attributes
+    ----------
+    background_drift : float
+        Prior: standard deviation of the background's change along the object's own curve over
+        the capture [K]. No method can see that part; it only widens the error bars of emissivity
+        and background.
+    """
+
+    background_drift: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is no standard deviation."""
+        if not 0 <= self.background_drift < np.inf:
+            raise ValueError(
+                f"Invalid background_drift {self.background_drift} K. Must be zero or positive."
+            )
 
 
 @dataclass(frozen=True)
@@ -43,66 +99,141 @@ class _Estimate:
     background: Array
     background_variance: Array
     memory: Array
+    lateness: Array
 
 
-def separate(problem: Problem) -> Separated:
+def separate(problem: Problem, settings: Settings) -> Separated:
     """
     Separate one tile.
 
     Parameters
     ----------
     problem : Problem
-        Signals of two bands and what is known of them.
+        Signals of two bands or more, and what is known of them.
+    settings : Settings
+        Options.
 
     Returns
     -------
     Separated
         Temperatures, emissivities, standard deviations and flags.
     """
-    frames = problem.time.size
-    functions = smooth.basis(problem.time, min(direction.HIGHEST_ORDER, frames // 4))
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        estimate = _pass(problem, problem, functions)
-        result = _report(problem, estimate)
-        bend = background.bend(problem, estimate.emission, estimate.background)
-        energy = np.sum((bend - bend.mean(axis=0)) ** 2, axis=0)
-        bent = energy > (_BEND * problem.noise[1]) ** 2
-        if not np.any(bent):
-            return result
-        part = replace(problem, signals=problem.signals[:, :, bent])
-        first, second = part.signals
-        straight = replace(part, signals=np.stack([first, second - bend[:, bent]]))
-        return result.updated(bent, _report(part, _pass(part, straight, functions)))
+        result = _exact(problem, _functions(problem), settings, _report)
+        return _with_jumps(problem, result, settings)
 
 
-def _pass(problem: Problem, straight: Problem, functions: Array) -> _Estimate:
+def survey(problem: Problem, settings: Settings) -> Survey:
+    """
+    What the pixels of a tile tell of their materials, each alone.
+
+    Parameters
+    ----------
+    problem : Problem
+        The tile.
+    settings : Settings
+        Options.
+
+    Returns
+    -------
+    Survey
+        Scatter and emissivity of the pixels that have no flag; the others tell nothing.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        # Together the pixels see what is too small to be seen in each.
+        return _exact(problem, _functions(problem), settings, _tell, least=0.0)
+
+
+def _tell(problem: Problem, estimate: _Estimate) -> Survey:
+    """Only broken models are left out: a choice by the estimate itself would bias the sum."""
+    status = _report(problem, estimate).status
+    fit, found = estimate.emission, estimate.found
+    moving = (status & _BROKEN) == 0
+    return Survey(
+        scatter=np.where(moving, found.scatter, 0.0),
+        frames=moving * np.asarray(problem.time.size - found.order, dtype=np.float64),
+        ratio=found.ratio,
+        weights=found.weights,
+        emissivity=np.where(status == 0, fit.emissivity[0], np.nan),
+        own_variance=fit.own_variance,
+        common_variance=fit.common_variance,
+    )
+
+
+def _functions(problem: Problem, jump: int | None = None) -> smooth.Subspace:
+    order = min(direction.HIGHEST_ORDER, problem.time.size // 4)
+    return smooth.subspace(problem.time, order, segment=problem.segment, jump=jump)
+
+
+def _exact(
+    problem: Problem,
+    functions: smooth.Subspace,
+    settings: Settings,
+    finish: Callable[[Problem, _Estimate], Record],
+    least: float = _BEND,
+) -> Record:
+    """Steps 1 to 4, where it matters a second time on signals with proportional reflections."""
+    estimate = _pass(problem, problem, functions, settings)
+    result = finish(problem, estimate)
+    bend = background.bend(problem, estimate.emission, estimate.background)
+    apart = bend - bend.mean(axis=1, keepdims=True)
+    energy = np.einsum("btp,btp->bp", apart, apart)
+    bent = np.any(energy > (least * np.array(problem.noise[1:])[:, np.newaxis]) ** 2, axis=0)
+    if not np.any(bent):
+        return result
+    part = problem.of(bent)
+    straight = part.signals.copy()
+    straight[1:] -= bend[..., bent]
+    again = _pass(part, replace(part, signals=straight), functions, settings)
+    return updated(result, bent, finish(part, again))
+
+
+def _pass(
+    problem: Problem, straight: Problem, functions: smooth.Subspace, settings: Settings
+) -> _Estimate:
     """Steps 1 to 4; the first three on signals whose reflections are proportional."""
-    found = direction.estimate(straight.signals, functions, problem.noise)
-    object_found = emission.estimate(straight, functions, found)
+    noise, shared = np.array(problem.noise), problem.shared
+    known = None if shared is None else direction.Known(shared.ratio, shared.spread)
+    found = direction.estimate(straight.signals, functions, noise, known)
+    prior = slow.Prior(settings.background_drift)
+    object_found = emission.estimate(straight, functions, found, prior)
     reflected = background.estimate(problem, object_found, found)
-    memory = direction.memory(straight.signals, functions, found)
-    return _Estimate(found, object_found, *reflected, memory)
+    left = residual.of_combination(straight.signals, functions, found)
+    lateness = residual.lateness(left, straight.signals[0], functions, found, problem.noise[0])
+    return _Estimate(found, object_found, *reflected, residual.memory(left), lateness)
 
 
 def _report(problem: Problem, estimate: _Estimate) -> Separated:
     """Standard deviations, flags, and NaN where a quantity is undefined."""
-    found, fit = estimate.found, estimate.emission
-    frames = problem.time.size
+    found, fit, noise = estimate.found, estimate.emission, np.array(problem.noise)
+    frames, others = problem.time.size, len(noise) - 1
+    epsilon = found.spread * found.across
     still = found.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames)
-    still |= ~np.isfinite(found.variance)
-    gray = ~still & (np.abs(1.0 - found.ratio) < _GRAY_SIGMAS * np.sqrt(found.variance))
+    still &= ~found.given
+    still |= ~np.isfinite(found.spread)
+    gray = ~still & (epsilon > 1.0 / _GRAY_SIGMAS**2)
     undefined = still | gray
     unidentified = undefined | fit.constant
     nonphysical = ~unidentified & np.any((fit.emissivity <= 0) | (fit.emissivity >= 1), axis=0)
-    spread = 2.0 * (frames - found.order)
-    own = np.stack([fit.own_variance, found.ratio**2 * fit.own_variance])
+    swapped = ~unidentified & ~nonphysical & (fit.emissivity.mean(axis=0) < 0.5)
+    spread = 2.0 * others * (frames - found.order)
+    own = fit.own_variance + fit.common_variance
+    variance = emission.emissivity_variance(found, fit.emissivity[0], own, noise)
+    # The object is a ratio with an uncertain denominator: half the width of its 95 % interval by
+    # Fieller's theorem (1954), doi:10.1111/j.2517-6161.1954.tb00159.x
+    through = fit.per_direction**2 * epsilon / (1.0 - _NORMAL95**2 * epsilon) ** 2
+    squares = (noise**2)[:, np.newaxis]
+    of_ratio = found.spread * (squares + found.ratio**2 * squares[0])
+    of_ratio[0] = 0.0
     result = Separated(
         object_temperature=fit.temperature,
-        object_temperature_std=np.sqrt(fit.per_ratio**2 * found.variance + fit.smooth_variance),
+        object_temperature_std=np.sqrt(through + fit.smooth_variance),
         background_temperature=estimate.background,
         background_temperature_std=np.sqrt(estimate.background_variance),
         emissivity=fit.emissivity,
-        emissivity_std=np.sqrt(fit.emissivity_per_ratio**2 * found.variance + own),
+        emissivity_std=np.sqrt(variance),
+        reflection_ratio=np.where(still, np.nan, found.ratio),
+        reflection_ratio_std=np.where(still, np.nan, np.sqrt(of_ratio)),
         status=flag(
             {
                 "no_background_motion": still,
@@ -110,6 +241,8 @@ def _report(problem: Problem, estimate: _Estimate) -> Separated:
                 "constant_object": ~undefined & fit.constant,
                 "background_never_rests": ~unidentified & fit.restless,
                 "nonphysical_emissivity": nonphysical,
+                "roles_may_be_swapped": swapped,
+                "bands_apart": ~still & (np.abs(estimate.lateness) > _APART_SIGMAS),
                 "object_not_smooth": (estimate.memory > _MEMORY_SIGMAS)
                 | (found.misfit > 1.0 + _MISFIT_SIGMAS * 2.0 / np.sqrt(spread)),
             }
@@ -118,5 +251,27 @@ def _report(problem: Problem, estimate: _Estimate) -> Separated:
     return result.without(undefined, unidentified, unidentified | nonphysical).ranged(problem)
 
 
-METHOD: Final = Method(separate, minimum_frames=32)
+def _with_jumps(problem: Problem, result: Separated, settings: Settings) -> Separated:
+    """Step 5: pixels that do not fit are solved anew with a jump in the subspace."""
+    suspect = (result.status & _SUSPECT) != 0
+    inside = jumps.candidates(problem.time)
+    if inside.size == 0 or not np.any(suspect):
+        return result
+    noise = np.array(problem.noise)
+    frame, gain = jumps.find(problem.signals[..., suspect], _functions(problem), noise, inside)
+    first = np.full(suspect.shape, -1)
+    first[suspect] = np.where(gain > 0, frame, -1)
+    for jump in np.unique(first[first >= 0]):
+        kept = jumps.outside(problem.time, int(jump))
+        part = problem.of(first == jump).at(kept)
+        functions = _functions(part, jump=int(kept[:jump].sum()))
+        again = _exact(part, functions, settings, _report)
+        again = replace(again, status=again.status | np.uint16(schema.FLAGS["object_jump"]))
+        result = updated(result, first == jump, again.spread(kept))
+    return result
+
+
+METHOD: Final = Method(
+    separate, settings=Settings, minimum_frames=32, survey=survey, any_bands=True
+)
 """The subspace separator, for `solve`."""

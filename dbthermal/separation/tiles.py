@@ -20,6 +20,9 @@ Tile = tuple[slice, slice]
 PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
+MOST_MISSING: Final = 0.5
+"""Share of the frames without which a pixel is not solved."""
+
 _BLOCK_ROWS: Final = 32
 # Frames in a row that noise repeats by chance in less than one of 1e8 pixels.
 _FROZEN_FRAMES: Final = 4
@@ -128,47 +131,96 @@ def shape_of(tile: Tile) -> tuple[int, int]:
     return tile[0].stop - tile[0].start, tile[1].stop - tile[1].start
 
 
-def read(corrected: xr.Dataset, tile: Tile) -> tuple[Array, Flags]:
+def read(corrected: xr.Dataset, tile: Tile, fewest: int = 1) -> tuple[Array, Mask, Flags]:
     """
-    Counts of a tile, and what is wrong with its pixels.
+    Counts of a tile, which of them are there, and what is wrong with its pixels.
 
     Parameters
     ----------
     corrected : Dataset
-        The capture.
+        The capture; a variable `mask`, (time), (y, x) or (time, y, x), marks what to use.
     tile : tuple of slice
         Rows and columns.
+    fewest : int
+        Frames without which a pixel cannot be solved.
 
     Returns
     -------
     tuple of ndarray
-        Counts (band, time, pixel) [count], with the pixels that nothing can be computed of set
-        to zero; status (pixel).
+        Counts (band, time, pixel) [count], zero where they are missing and for pixels that
+        nothing can be computed of; which frames are there in all bands (time, pixel); status
+        (pixel).
     """
-    rows, columns = tile
-    part = corrected.isel(y=rows, x=columns)
+    part = corrected.isel(y=tile[0], x=tile[1])
     raw = part["counts"].values
     raw = raw.reshape(*raw.shape[:2], -1)
     counts = raw.astype(np.float64)
-    invalid = ~np.all(np.isfinite(counts), axis=(0, 1))
-    counts[:, :, invalid] = 0.0
-    constant = np.any(counts.max(axis=1) == counts.min(axis=1), axis=0) & ~invalid
+    there = np.all(np.isfinite(counts), axis=0)
+    if "mask" in part:
+        there &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(there.shape)
+    counts[:, ~there] = 0.0
+    frames = there.sum(axis=0)
+    invalid = frames < max(fewest, MOST_MISSING * len(there))
+    highest = counts.max(axis=1, where=there, initial=-np.inf)
+    lowest = counts.min(axis=1, where=there, initial=np.inf)
+    constant = np.any(highest == lowest, axis=0) & ~invalid
     status = flag(
         {
             "invalid_samples": invalid,
-            "constant_signal": constant & (counts.shape[1] > 1),
+            "constant_signal": constant & (frames > 1),
             "saturated": _saturated(raw),
-            "frozen_frames": _frozen(counts) & ~invalid & ~constant,
+            "frozen_frames": _frozen(counts, there) & ~invalid & ~constant,
         }
     )
     if "status" in corrected:
         status |= part["status"].values.reshape(-1).astype(np.uint16)
-    counts[:, :, _unusable(status)] = 0.0
-    return counts, status
+    counts[:, :, unusable(status)] = 0.0
+    return counts, there, status
 
 
-def _unusable(status: Flags) -> Mask:
-    """Where nothing can be computed."""
+def patterns(there: Mask, unusable: Mask) -> Iterator[tuple[Mask, Mask]]:
+    """
+    Pixels that have the same frames.
+
+    Parameters
+    ----------
+    there : ndarray of bool, shape (time, pixel)
+        Which frames each pixel has.
+    unusable : ndarray of bool, shape (pixel,)
+        Pixels that nothing can be computed of.
+
+    Yields
+    ------
+    tuple of ndarray of bool
+        Frames (time), and the pixels (pixel) that have these and no others.
+    """
+    if np.all(unusable):
+        return
+    if np.all(there[:, ~unusable]):
+        yield np.ones(there.shape[0], dtype=bool), ~unusable
+        return
+    packed = np.packbits(there, axis=0)
+    _, first, group = np.unique(packed, axis=1, return_index=True, return_inverse=True)
+    for index, pixel in enumerate(first):
+        pixels = (group.ravel() == index) & ~unusable
+        if np.any(pixels):
+            yield there[:, pixel], pixels
+
+
+def unusable(status: Flags) -> Mask:
+    """
+    Where nothing can be computed.
+
+    Parameters
+    ----------
+    status : ndarray of uint16
+        Bits.
+
+    Returns
+    -------
+    ndarray of bool
+        True for such a pixel.
+    """
     masks = sum(schema.FLAGS[name] for name in _ALL_UNDEFINED)
     return np.asarray((status & np.uint16(masks)) != 0)
 
@@ -181,11 +233,11 @@ def _saturated(raw: npt.NDArray[Any]) -> Mask:
     return np.asarray(np.any((raw == ends.max) | (raw == max(ends.min, 0)), axis=(0, 1)))
 
 
-def _frozen(counts: Array) -> Mask:
+def _frozen(counts: Array, there: Mask) -> Mask:
     """Where both bands repeat their counts in several frames in a row."""
     if counts.shape[1] <= _FROZEN_FRAMES:
         return np.zeros(counts.shape[2], dtype=bool)
-    same = np.all(counts[:, 1:] == counts[:, :-1], axis=0)
+    same = np.all(counts[:, 1:] == counts[:, :-1], axis=0) & there[1:] & there[:-1]
     run = same[: same.shape[0] - _FROZEN_FRAMES + 1].copy()
     for shift in range(1, _FROZEN_FRAMES):
         run &= same[shift : shift + run.shape[0]]
@@ -213,14 +265,14 @@ def check_status(corrected: xr.Dataset) -> None:
         raise ValueError(
             f"Invalid status {status.dims} of {status.dtype}. Must be ('y', 'x') of whole numbers."
         )
-    unknown = status.values & ~np.asarray(sum(schema.FLAGS.values()), dtype=status.dtype)
+    unknown = status.values.astype(np.int64) & ~sum(schema.FLAGS.values())
     if np.any(unknown):
         raise ValueError(
             f"Unknown bits {int(unknown.max())} in the status. Must be of {dict(schema.FLAGS)}."
         )
 
 
-def sample(corrected: xr.Dataset, pixels: int) -> Array:
+def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
     """
     Counts of usable pixels spread evenly over the image.
 
@@ -233,14 +285,18 @@ def sample(corrected: xr.Dataset, pixels: int) -> Array:
 
     Returns
     -------
-    ndarray, shape (band, time, pixel)
-        Counts [count] of pixels without any flag but that of frozen frames.
+    tuple of ndarray
+        Counts (band, time, pixel) [count] of pixels without any flag but that of frozen frames, at
+        the frames that most of them have; and which frames these are (time).
     """
     height, width = corrected.sizes["y"], corrected.sizes["x"]
     step = max(1, int(np.sqrt(height * width / pixels)))
     part = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
-    counts, status = read(part, (slice(None), slice(None)))
-    return counts[:, :, (status & ~np.uint16(schema.FLAGS["frozen_frames"])) == 0]
+    counts, there, status = read(part, (slice(None), slice(None)))
+    good = (status & ~np.uint16(schema.FLAGS["frozen_frames"])) == 0
+    frames = np.mean(there[:, good], axis=1) > MOST_MISSING if np.any(good) else good[:0]
+    good &= np.all(there[frames], axis=0) if np.any(good) else False
+    return counts[:, frames][:, :, good], frames
 
 
 def allocate(corrected: xr.Dataset) -> xr.Dataset:
@@ -276,7 +332,11 @@ def allocate(corrected: xr.Dataset) -> xr.Dataset:
 
 
 def write(
-    result: xr.Dataset, tile: Tile, bands: list[int], found: Separated, status: Flags
+    result: xr.Dataset,
+    tile: Tile,
+    bands: list[int],
+    status: Flags,
+    parts: list[tuple[Mask, Mask, Separated]],
 ) -> None:
     """
     Put a tile's result in its place.
@@ -289,22 +349,37 @@ def write(
         Rows and columns.
     bands : list of int
         Order of the problem's bands in the capture.
-    found : Separated
-        What the method found.
     status : ndarray of uint16, shape (pixel,)
-        From `read`; pixels that nothing can be computed of become NaN and keep only these bits.
+        From `read`; pixels of no part become NaN and keep only these bits.
+    parts : list of tuple
+        Frames (time), pixels (pixel), and what the method found there; NaN in other frames.
     """
     rows, columns = tile
     shape = shape_of(tile)
-    unusable = _unusable(status)
-    for name in schema.STAGES["separated"]:
-        values = getattr(found, name)
+    for name, variable in schema.STAGES["separated"].items():
+        target = result[name].values[..., rows, columns]
         if name == "status":
-            values = np.where(unusable, status, status | values)
+            target[...] = status.reshape(shape)
         else:
-            values[..., unusable] = np.nan
-        values = values.reshape(*values.shape[:-1], *shape)
-        target = result[name].values
-        for index in range(2) if name.startswith("emissivity") else (...,):
-            place = bands[index] if isinstance(index, int) else ...
-            target[(place, rows, columns)] = values[index]
+            target[...] = np.nan
+        for frames, pixels, found in parts:
+            values = getattr(found, name)
+            if values is None:
+                continue
+            where = pixels.reshape(shape)
+            if name == "status":
+                target[where] |= values
+            elif "band" in variable.dims:
+                for index, band in enumerate(bands):
+                    target[band][where] = values[index]
+            else:
+                _put(target, frames, where, values)
+
+
+def _put(target: npt.NDArray[np.floating], frames: Mask, where: Mask, values: Array) -> None:
+    """Put values (time, pixel) at some frames and pixels of (time, y, x), in place."""
+    if np.all(frames) and np.all(where):
+        target[...] = values.reshape(target.shape)
+        return
+    rows, columns = np.nonzero(where)
+    target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values

@@ -1,0 +1,104 @@
+"""Tests of what the model leaves: white noise, if the model holds."""
+
+from typing import Final
+
+import numpy as np
+
+from dbthermal import smooth
+from dbthermal.separation.direction import Direction
+from dbthermal.separation.problem import Array
+
+MEMORY_LAGS: Final = 5
+"""Frames over which `memory` looks for a correlation."""
+
+
+def of_combination(signals: Array, functions: smooth.Subspace, found: Direction) -> Array:
+    """
+    What is left of the combination of bands without background, smooth part taken out.
+
+    Parameters
+    ----------
+    signals : ndarray, shape (band, time, pixel)
+        Signals.
+    functions : Subspace
+        Smooth functions.
+    found : Direction
+        From `direction.estimate`.
+
+    Returns
+    -------
+    ndarray, shape (time, pixel)
+        Residual [K], of variance `found.across` where the model holds.
+    """
+    left = np.einsum("bp,btp->tp", found.weights, signals)
+    left -= functions.functions @ np.einsum("bp,bcp->cp", found.weights, found.coefficients)
+    return np.asarray(left)
+
+
+def memory(left: Array) -> Array:
+    """
+    Mean autocorrelation over a few frames.
+
+    White noise leaves nothing but scatter. A change of the object that the smooth functions do not
+    follow, or a background along another direction, leaves a correlation.
+
+    Parameters
+    ----------
+    left : ndarray, shape (time, pixel)
+        From `of_combination`.
+
+    Returns
+    -------
+    ndarray, shape (pixel,)
+        Mean over lags of 1 to `MEMORY_LAGS` frames, in standard deviations of white noise.
+    """
+    energy = np.einsum("tp,tp->p", left, left)
+    lagged = np.zeros_like(energy)
+    for lag in range(1, MEMORY_LAGS + 1):
+        lagged += np.einsum("tp,tp->p", left[lag:], left[:-lag])
+    mean = np.divide(lagged, MEMORY_LAGS * energy, out=np.zeros_like(energy), where=energy > 0)
+    return np.asarray(mean * np.sqrt(MEMORY_LAGS * left.shape[0]))
+
+
+def lateness(
+    left: Array, first: Array, functions: smooth.Subspace, found: Direction, noise: float
+) -> Array:
+    r"""
+    Whether the bands' rapid changes are not simultaneous, from a matched filter.
+
+    A band that is a frame late, or early, leaves the difference between two frames of what the
+    others show. The residual r is therefore held against both differences of the first band,
+
+    .. math:: \sum_t r(t) \, (z_1(t \pm 1) - z_1(t)) + n \, w_1 s_1^2
+
+    where the last term takes out that the residual holds the noise of :math:`z_1(t)`.
+
+    Parameters
+    ----------
+    left : ndarray, shape (time, pixel)
+        From `of_combination`.
+    first : ndarray, shape (time, pixel)
+        Signal of the first band [K].
+    functions : Subspace
+        Smooth functions.
+    found : Direction
+        From `direction.estimate`.
+    noise : float
+        Noise of the first band [K].
+
+    Returns
+    -------
+    ndarray, shape (pixel,)
+        The larger score in magnitude, in standard deviations of white noise.
+    """
+    rapid = first - functions.functions @ found.coefficients[0]
+    change = np.diff(rapid, axis=0)
+    own = (left.shape[0] - found.order - functions.steps) * found.weights[0] * noise**2
+    late = np.einsum("tp,tp->p", left[:-1], change) + own
+    early = np.einsum("tp,tp->p", left[1:], change) - own
+    strongest = np.where(np.abs(late) > np.abs(early), late, early)
+    variance = found.across * np.einsum("tp,tp->p", change, change)
+    score = np.divide(
+        strongest, np.sqrt(variance), out=np.zeros_like(strongest), where=variance > 0
+    )
+    return np.asarray(score)
