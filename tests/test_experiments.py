@@ -8,6 +8,8 @@ import pytest
 import xarray as xr
 
 from dbthermal import experiments, simulation
+from dbthermal import response as responses
+from dbthermal.experiments.cases import simulate
 from dbthermal.simulation import Background, Rig
 
 TIME = np.arange(350) / 10.0  # s
@@ -101,6 +103,92 @@ def test_options_of_a_case() -> None:
     ]
     exact, linear = (float(experiments.score(*one)["object_temperature_rmse"]) for one in kinds)
     assert linear > 1.5 > exact + 1.0  # K: the line is no response of 60 degrees
+
+
+def drawn(**changes: Any) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
+    """Scene, capture and response of glass with something else in the case."""
+    return simulate(GLASS | changes, Rig(), TIME, 20, seed=4)
+
+
+def test_jump_of_the_object() -> None:
+    """Sudden or not, it begins where the case says, stays, and changes nothing else."""
+    plain = drawn()[0]
+    for duration, partly in ((0.0, 0), (2.0, 19)):
+        jump = {"height": 6.0, "between": [12.0, 15.0], "duration": duration}
+        scene = drawn(jump=jump)[0]
+        added = (scene["object_temperature"] - plain["object_temperature"]).values[:, 0]
+        np.testing.assert_allclose(added[TIME < 12.0], 0.0, rtol=0, atol=1e-9)  # K
+        np.testing.assert_allclose(added[TIME > 17.0], 6.0, rtol=0, atol=1e-9)
+        between = np.sum((added > 1e-9) & (added < 6.0 - 1e-9), axis=0)
+        assert set(between) <= {partly, partly + 1}  # frames
+        assert len({*np.argmax(added > 1e-9, axis=0)}) > 10  # of 20 pixels, each at its own time
+        name = "background_temperature"
+        xr.testing.assert_identical(scene[name], plain[name])
+
+
+def test_background_that_follows() -> None:
+    """It drifts by a share of what the object changes."""
+    plain, scene = drawn()[0], drawn(following=0.2)[0]
+    added = scene["background_temperature"] - plain["background_temperature"]
+    rise = plain["object_temperature"] - plain["object_temperature"][0]
+    np.testing.assert_allclose(added, 0.2 * rise, rtol=0, atol=1e-9)  # K
+    assert scene["background_temperature"].attrs == plain["background_temperature"].attrs
+
+
+def test_swapped_roles() -> None:
+    """The object moves as the background did, and the other way round."""
+    plain, scene = drawn()[0], drawn(swapped=True)[0]
+    names = ("object_temperature", "background_temperature")
+    for here, there in zip(names, reversed(names), strict=True):
+        np.testing.assert_array_equal(scene[here], plain[there])
+
+
+def test_fewer_frames_and_another_noise() -> None:
+    """The first frames of the times, and the noise of the case in place of the rig's."""
+    scene, capture, response = drawn(frames=100, noise=[0.1, 0.2])
+    assert scene.sizes["time"] == capture.sizes["time"] == 100
+    np.testing.assert_array_equal(capture["time"], TIME[:100])
+    np.testing.assert_allclose(response["netd"], [0.1, 0.2], rtol=0, atol=0.002)  # K
+
+
+@pytest.mark.parametrize("offset", [0.5, 1.0, 2.0])
+def test_bands_apart(offset: float) -> None:
+    """The second band, exposed so much later, sees each pulse begin so many frames sooner."""
+    quiet = {"noise": [1e-4, 1e-4], "start": 20, "stop": 20}
+    pulses = {"level": 293.15, "count": [1, 1]}
+    scene, capture, response = drawn(offset=offset, background=pulses, **quiet)
+    np.testing.assert_allclose(capture["time"], TIME, rtol=0, atol=1e-9)  # s
+    assert "exposure_time" not in capture
+    seen = responses.apparent_temperature(response, capture["counts"]) - 293.15
+    first, second = (seen.isel(band=place).values[:, 0] > 0.2 for place in (0, 1))
+    np.testing.assert_array_equal(first, scene["background_temperature"][:, 0] > 294.15)
+    inside = (np.argmax(first, axis=0) > 5) & first.any(axis=0) & ~first[-5:].any(axis=0)
+    later = (np.argmax(second, axis=0) - np.argmax(first, axis=0))[inside]
+    assert inside.sum() > 10
+    assert set(later) <= {int(np.floor(-offset)), int(np.ceil(-offset))}  # frames
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"offset": 0.33}, r"Invalid offset 0.33 frames. Must be zero or positive, a multiple"),
+        ({"offset": -1.0}, r"Invalid offset -1.0 frames. Must be zero or positive"),
+        ({"frames": 351}, r"Invalid number of frames 351. Must lie in \[2, 350\]"),
+        ({"jump": {"between": [5.0, 4.0]}}, r"Invalid between \[5.0, 4.0\] s of a jump"),
+        ({"jump": {"duration": -1.0}}, r"Invalid duration -1.0 s of a jump"),
+    ],
+)
+def test_values_of_a_case(change: dict[str, Any], message: str) -> None:
+    """What cannot be simulated as it is said is not simulated."""
+    with pytest.raises(ValueError, match=message):
+        drawn(**change)
+
+
+def test_uneven_times_have_no_finer_clock() -> None:
+    """Bands that are exposed apart need even times."""
+    uneven = np.append(TIME[:-1], TIME[-1] + 0.05)
+    with pytest.raises(ValueError, match="Invalid times of bands that are exposed apart"):
+        simulate(GLASS | {"offset": 1.0}, Rig(), uneven, 5, 0)
 
 
 @pytest.mark.parametrize("change", [{"emisivity": [0.9, 0.8]}, {"method": "naive"}])

@@ -1,6 +1,6 @@
 """Seeded experiments that print what they measure, and go on where an interruption left them."""
 
-from dbthermal.experiments.cases import efficiency, run_case, score, sweep
+from dbthermal.experiments.cases import efficiency, run_case, score, simulate, sweep
 from dbthermal.experiments.comparison import compare, judge, medians
 from dbthermal.experiments.memory import gridded, remembered
 from dbthermal.experiments.twins import at_thermocouple, judge_twin, share
@@ -17,5 +17,6 @@ __all__ = [
     "run_case",
     "score",
     "share",
+    "simulate",
     "sweep",
 ]

@@ -20,6 +20,7 @@ from dbthermal.figures.comparison import (
     sensitivity,
 )
 from dbthermal.figures.films import separated_film
+from dbthermal.figures.limits import error_over_bound, plan
 from dbthermal.figures.materials import condition_matrix, emissivity_bars
 from dbthermal.figures.scenes import (
     compared_reflections,
@@ -28,6 +29,7 @@ from dbthermal.figures.scenes import (
     status_map,
 )
 from dbthermal.figures.twins import error_maps, thermocouples
+from dbthermal.figures.validity import status, validity
 
 __all__ = [
     "accuracy",
@@ -39,8 +41,10 @@ __all__ = [
     "emissivity_procedures",
     "error_bar_calibration",
     "error_maps",
+    "error_over_bound",
     "error_over_noise",
     "gain_offset_maps",
+    "plan",
     "provenance_note",
     "reductions",
     "response_fit",
@@ -48,7 +52,9 @@ __all__ = [
     "separated_film",
     "separated_frames",
     "separated_temperatures",
+    "status",
     "status_map",
     "thermocouples",
     "truth_and_estimate",
+    "validity",
 ]
