@@ -175,12 +175,13 @@ FLAG_MEANINGS: Final = MappingProxyType(
         "no_background_motion": "no rapid change: the direction of the reflection is undefined; "
         "no temperature and no emissivity",
         "constant_object": "object constant: emissivity and background are undefined, the object "
-        "temperature holds",
+        "temperature holds, if it is the object that is constant",
         "gray": "the bands' emissivities do not differ: the system is singular",
         "background_never_rests": "the background rests in few frames: emissivity may be biased "
         "beyond its standard deviation; a drift parallel to the object's curve cannot be seen",
         "nonphysical_emissivity": "estimated emissivity outside (0, 1): no background temperature",
-        "invalid_samples": "NaN or infinite counts: nothing is estimated",
+        "invalid_samples": "more than half of the samples, or more than the method can spare, are "
+        "NaN, infinite or masked: nothing is estimated",
         "constant_signal": "a band's signal never changes: nothing is estimated",
         "saturated": "samples at the detector's limit: whole-number counts at an end of their "
         "type, or as marked by the frame correction",
@@ -194,9 +195,8 @@ FLAG_MEANINGS: Final = MappingProxyType(
         "around it are left out, and the values before and after hold",
         "bands_apart": "the rapid changes of the bands are not simultaneous: a time offset "
         "between the cameras, or a reflection seen from two places",
-        "roles_may_be_swapped": "emissivities sum to less than the bands' half: either a bright "
-        "reflector, or what moves smoothly is the background and object and background are "
-        "exchanged",
+        "roles_may_be_swapped": "mean emissivity below a half: a bright reflector, or what moves "
+        "smoothly is the background, and object and background are exchanged",
         "not_converged": "the optimiser stopped at its limit of steps, or at no finite value",
     }
 )

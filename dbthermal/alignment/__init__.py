@@ -1,6 +1,6 @@
 """Two cameras or more onto one clock and one grid.
 
-Registration needs scikit-image and is imported by name: `alignment.registration`.
+Registration needs OpenCV and is imported by name: `alignment.registration`.
 """
 
 from dbthermal.alignment.offset import time_offset

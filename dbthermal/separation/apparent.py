@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from dbthermal.separation.problem import Method, Problem, Separated, flag
+from dbthermal.separation.problem import Method, Problem
+from dbthermal.separation.separated import Separated, flag
 
 
 def separate(problem: Problem) -> Separated:

@@ -4,7 +4,8 @@ import numpy as np
 
 from dbthermal.separation.direction import Direction
 from dbthermal.separation.emission import Emission
-from dbthermal.separation.problem import Array, Problem
+from dbthermal.separation.problem import Problem
+from dbthermal.separation.separated import Array
 
 
 def estimate(problem: Problem, emission: Emission, found: Direction) -> tuple[Array, Array]:

@@ -27,7 +27,8 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from dbthermal import planck
 from dbthermal.curves import require_range
-from dbthermal.separation.problem import Array, Method, Problem, Separated
+from dbthermal.separation.problem import Method, Problem
+from dbthermal.separation.separated import Array, Separated
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
         emissivity=transmissions,
         emissivity_std=np.full_like(transmissions, np.nan),
         status=np.zeros(warm.shape[1], dtype=np.uint16),
-    ).ranged(problem, deviations=False)
+    ).ranged(problem.curves[0], deviations=False)
 
 
 def _movie(problem: Problem, settings: Settings, band: int) -> tuple[Array, Array, Array]:

@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 
 from dbthermal.separation import limits
-from dbthermal.separation.problem import Array, Method, Problem, Separated, flag
+from dbthermal.separation.problem import Method, Problem
+from dbthermal.separation.separated import Array, Separated, flag
 
 _STEPS: Final = 5
 # Largest last step of a sample that is solved [K].
@@ -69,7 +70,7 @@ def separate(problem: Problem) -> Separated:
             status=flag({"gray": gray, "outside_response": ~solved & ~gray}),
         )
         .without(undefined, none, undefined)
-        .ranged(problem)
+        .ranged(problem.curves[0])
     )
 
 

@@ -26,7 +26,8 @@ from dbthermal.separation import calibrated, objective, subspace
 from dbthermal.separation.continuation import Minimum, minimise
 from dbthermal.separation.descent import Limits
 from dbthermal.separation.objective import Images, Unknowns, Weights
-from dbthermal.separation.problem import Array, Mask, Method, Problem, Separated, flag
+from dbthermal.separation.problem import Method, Problem
+from dbthermal.separation.separated import Array, Mask, Separated, flag
 
 STARTS: Final = ("random", "subspace")
 """Where the search may start."""

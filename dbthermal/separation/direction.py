@@ -269,6 +269,28 @@ def choose_order(across: Array, frames: int) -> Whole:
     return np.asarray(best + 1)
 
 
+def ratio_variance(found: Direction, noise: Array) -> Array:
+    r"""
+    Variance of the reflection ratios, :math:`\sigma^2 (s_m^2 + \kappa_m^2 s_1^2)`.
+
+    Parameters
+    ----------
+    found : Direction
+        The direction.
+    noise : ndarray, shape (band,)
+        Noise of the bands.
+
+    Returns
+    -------
+    ndarray, shape (band, pixel)
+        Variance [1], 0 in the first band.
+    """
+    squares = (noise**2)[:, np.newaxis]
+    result = found.spread * (squares + found.ratio**2 * squares[0])
+    result[0] = 0.0
+    return np.asarray(result)
+
+
 def estimated_spread(energy: Array, length: Array, freedom: npt.ArrayLike) -> Array:
     """
     Variance of the direction, given the background's energy; see `estimate`.

@@ -8,8 +8,9 @@ import numpy.typing as npt
 
 from dbthermal import smooth
 from dbthermal.separation import robust, slow
-from dbthermal.separation.direction import Direction
-from dbthermal.separation.problem import Array, Problem
+from dbthermal.separation.direction import Direction, ratio_variance
+from dbthermal.separation.problem import Problem
+from dbthermal.separation.separated import Array
 
 _ROUNDS: Final = 2
 # Energy of the object's change over that of its noise, below which its emissivity is not told.
@@ -124,7 +125,7 @@ def estimate(
     )
 
 
-def emissivity_variance(found: Direction, first: Array, own: Array, noise: Array) -> Array:
+def variance(found: Direction, fit: Emission, noise: Array) -> Array:
     r"""
     Variance of the emissivities, from the direction and from the first one's own variance.
 
@@ -135,10 +136,8 @@ def emissivity_variance(found: Direction, first: Array, own: Array, noise: Array
     ----------
     found : Direction
         Direction of the reflection.
-    first : ndarray, shape (pixel,)
-        Emissivity of the first band [1].
-    own : ndarray, shape (pixel,)
-        Its own variance [1].
+    fit : Emission
+        Emissivities and the first one's own variance.
     noise : ndarray, shape (band,)
         Noise of the bands [K].
 
@@ -147,16 +146,14 @@ def emissivity_variance(found: Direction, first: Array, own: Array, noise: Array
     ndarray, shape (band, pixel)
         Variance [1].
     """
-    ratio, weights = found.ratio, found.weights
-    squares = (noise**2)[:, np.newaxis]
-    of_ratio = squares + ratio**2 * squares[0]
-    of_ratio[0] = 0.0
-    common = squares * weights - ratio * squares[0] * weights[0]
+    ratio, first = found.ratio, fit.emissivity[0]
+    dark, squares = 1.0 - first, (noise**2)[:, np.newaxis]
+    # Covariance of the ratios with epsilon, over the direction's variance.
+    common = squares * found.weights - ratio * squares[0] * found.weights[0]
     common[0] = 0.0
-    dark = 1.0 - first
-    from_direction = (ratio * first * dark) ** 2 * found.across
-    from_direction = from_direction + dark**2 * of_ratio + 2.0 * ratio * first * dark**2 * common
-    return np.asarray(ratio**2 * own + from_direction * found.spread)
+    through = (ratio * first * dark) ** 2 * found.across + 2.0 * ratio * first * dark**2 * common
+    own = ratio**2 * (fit.own_variance + fit.common_variance)
+    return np.asarray(own + through * found.spread + dark**2 * ratio_variance(found, noise))
 
 
 def _middle(ratio: Array) -> Array:

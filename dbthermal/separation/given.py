@@ -7,7 +7,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
-from dbthermal.separation.problem import Array, Problem
+from dbthermal.separation.problem import Problem
+from dbthermal.separation.separated import Array
 from dbthermal.separation.tiles import Tile
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import smooth
-from dbthermal.separation.problem import Array, Mask
+from dbthermal.separation.separated import Array, Mask
 
 Whole = npt.NDArray[np.intp]
 
@@ -20,6 +20,8 @@ _ORDER: Final = 7
 AROUND: Final = 1.0
 """Time before and after a jump that is left out [s]: what is not sudden about it."""
 
+# A change from frame to frame stands alone if it is so many times the third largest.
+_ALONE: Final = 3.0
 # Fewest frames before and after a jump.
 _MARGIN: Final = 24
 
@@ -67,6 +69,27 @@ def find(
     lowest = np.maximum(across[best, np.arange(best.size)], np.finfo(np.float64).tiny)
     gain = frames * np.log(before / lowest) - 4.0 * np.log(frames)
     return inside[best], gain
+
+
+def alone(signal: Array) -> Mask:
+    """
+    Whether one change from frame to frame is far larger than all others.
+
+    A background comes and goes: its largest changes come in pairs at least.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (time, pixel)
+        Signal of a band.
+
+    Returns
+    -------
+    ndarray of bool, shape (pixel,)
+        True for such a pixel.
+    """
+    change = np.abs(np.diff(signal.T, axis=1)).astype(np.float32)
+    largest = np.partition(change, -3, axis=1)[:, -3:]
+    return np.asarray(largest.max(axis=1) > _ALONE * largest[:, 0])
 
 
 def candidates(time: Array) -> Whole:

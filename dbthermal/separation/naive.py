@@ -23,7 +23,8 @@ import numpy.typing as npt
 from scipy.special import expit, logit
 
 from dbthermal import planck
-from dbthermal.separation.problem import Array, Mask, Method, Problem, Separated, flag
+from dbthermal.separation.problem import Method, Problem
+from dbthermal.separation.separated import Array, Mask, Separated, flag
 
 # Damping of the first step, relative to the diagonal of the normal equations, and its range; the
 # Schur complement is proportional to the damping, and is rounding below the least.
@@ -133,7 +134,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
             status=flag({"not_converged": kept.going | lost}),
         )
         .without(lost, lost, lost)
-        .ranged(problem, deviations=False)
+        .ranged(problem.curves[0], deviations=False)
     )
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal.separation import direction
-from dbthermal.separation.problem import Array, Mask, Shared, Survey
+from dbthermal.separation.problem import Shared
+from dbthermal.separation.separated import Array, Mask, Survey
 
 Labels = npt.NDArray[np.intp]
 

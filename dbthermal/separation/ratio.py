@@ -19,7 +19,8 @@ from scipy.interpolate import CubicSpline
 
 from dbthermal import bands, planck, smooth
 from dbthermal.curves import Curve
-from dbthermal.separation.problem import Array, Method, Problem, Separated, flag
+from dbthermal.separation.problem import Method, Problem
+from dbthermal.separation.separated import Array, Separated, flag
 
 KINDS: Final = ("wide", "narrow")
 r"""Kinds of radiance: in the whole band, or spectral at the band's centre; both by Planck's law.

@@ -6,7 +6,7 @@ import numpy as np
 
 from dbthermal import smooth
 from dbthermal.separation.direction import Direction
-from dbthermal.separation.problem import Array
+from dbthermal.separation.separated import Array
 
 MEMORY_LAGS: Final = 5
 """Frames over which `memory` looks for a correlation."""

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from dbthermal import smooth
-from dbthermal.separation.problem import Array
 from dbthermal.separation.robust import Line
+from dbthermal.separation.separated import Array
 
 # Degrees of the polynomials over which a spectrum is averaged: from, and up to, not including;
 # and degrees of freedom: of the first three, one is along the object's curve.
@@ -92,7 +92,7 @@ def variance(
     seen = seen - unit * (unit * seen).sum(axis=0)
     walk = degree**2 * (seen**2 - noise**2 / share)
     octaves = [
-        walk[low - 1 : high - 1].mean(axis=0) * (stdtrit(freedom, 0.975) / _NORMAL95) ** 2
+        walk[low - 1 : high - 1].sum(axis=0) / freedom * (stdtrit(freedom, 0.975) / _NORMAL95) ** 2
         for low, high, freedom in _OCTAVES
         if low <= len(walk)
     ]

@@ -16,9 +16,10 @@ from dbthermal import noise as noise_of
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.curves import Curve
-from dbthermal.separation import given, methods, tiles
+from dbthermal.separation import given, methods, samples, tiles
 from dbthermal.separation import pool as pool_of
-from dbthermal.separation.problem import Array, Flags, Mask, Method, Problem, Survey
+from dbthermal.separation.problem import Method, Problem
+from dbthermal.separation.separated import Array, Flags, Mask, Survey
 
 Places = npt.NDArray[np.intp]
 
@@ -43,16 +44,17 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     **options: Any,
 ) -> xr.Dataset:
     r"""
-    Separate emission and reflection in a two-band capture.
+    Separate emission and reflection in a capture of two bands or more.
 
     .. math:: I_m(t) = e_m U_m(x(t)) + (1 - e_m) U_m(y(t)) + \mathrm{noise}
 
     Parameters
     ----------
     corrected : Dataset
-        `counts` (band, time, y, x) [count] of two bands, `time` [s]; optionally `status` (y, x)
-        from `frames.correct`. May be lazy, as from `store.open_dataset`: it is read a few rows at
-        a time, and never whole.
+        `counts` (band, time, y, x) [count], `time` [s]; optionally `status` (y, x) from
+        `frames.correct` and `segment` (time) from `frames.mark_shutter`. Samples that are NaN are
+        left out. May be lazy, as from `store.open_dataset`: it is read a few rows at a time, and
+        never whole. "subspace" takes two bands or more, the other methods two.
     response : Dataset
         From `calibration.fit_response`, with both bands. Its `noise` (band) [count] is used
         where present, otherwise the noise is estimated from the capture.
@@ -66,6 +68,12 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         Its standard deviation, same dims.
     truth : DataArray, optional
         True object temperature (time, y, x) [K], for an oracle's choice (option of "naive").
+    mask : DataArray, optional
+        Which samples to use: (time), (y, x) or (time, y, x), boolean.
+    pool : DataArray, optional
+        Materials (y, x), integer: the pixels of one label share their emissivities, which makes
+        all of them more certain; a negative one shares nothing. Known to the user, or found by
+        `materials`. For "subspace" only.
     response_kind : {"exact", "linear"}
         Sakuma-Hattori response, or the paper's linear one.
     workers : int
@@ -81,10 +89,12 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     -------
     Dataset
         `object_temperature`, `background_temperature` (time, y, x) [K], `emissivity`
-        (band, y, x) [1], each with `_std`; `status` (y, x), bits of `schema.FLAGS`; `noise`
-        (band) [count], as used. Values are NaN where a flag says that they are undefined, and
-        those that a method never estimates (attribute `not_estimated`); where the status is 0, all
-        others are finite. A given emissivity without a deviation has deviation 0.
+        (band, y, x) [1] and `reflection_ratio` (band, y, x) [1], the reflectivity over that of the
+        quietest band (attribute `reference_band`), each with `_std`; `status` (y, x), bits of
+        `schema.FLAGS`; `noise` (band) [count], as used. Values are NaN where a flag says that they
+        are undefined, at samples that the capture lacks or the mask leaves out, and where a method
+        never estimates them (attribute `not_estimated`); where the status is 0, all others are
+        finite. A given emissivity without a deviation has deviation 0.
 
     Raises
     ------
@@ -97,11 +107,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
 
     Notes
     -----
-    What no flag of `subspace` tells, because nothing in two bands tells it: an object that jumps
-    as fast as a background; a background that drifts along with the object's curve (the
-    temperature holds, the emissivity does not); bands that are a frame or more apart in time
-    (0.6 K for glass at 60 C and 10 frames/s). With fewer than 100 frames the standard deviations
-    are up to twice too small.
+    What no flag of `subspace` tells, because nothing in the bands tells it: that object and
+    background have exchanged their roles, but for emissivities below a half, which are flagged as
+    a suspicion; and a background that drifts along with the object's curve: the temperature holds,
+    and the emissivity's deviation carries a drift that the option `background_drift` states.
 
     References
     ----------
@@ -229,15 +238,15 @@ class _Task:
         whole = part.sizes["y"] * part.sizes["x"]
         size = whole if self.method.whole_image else getattr(self.settings, "batch", tiles.PIXELS)
         for tile in tiles.cover(part, size):
-            counts, there, status = tiles.read(part, tile, self.method.minimum_frames)
-            bad = tiles.unusable(status)
+            counts, there, status = samples.read(part, tile, self.method.minimum_frames)
+            bad = samples.unusable(status)
             problem = self._problem(part, counts, tile, rows)
             if self.method.whole_image:
                 frames = np.all(there[:, ~bad], axis=1)
                 yield tile, status, [(frames, np.ones_like(bad), problem.at(frames))]
                 continue
             problems = []
-            for frames, pixels in tiles.patterns(there, bad):
+            for frames, pixels in samples.patterns(there, bad):
                 chosen = problem if np.all(frames) else problem.at(frames)
                 problems.append((frames, pixels, chosen if np.all(pixels) else chosen.of(pixels)))
             yield tile, status, problems
@@ -282,7 +291,7 @@ def _check(
 ) -> None:
     workers, seed = whole
     schema.check(corrected, "corrected")
-    tiles.check_status(corrected)
+    samples.check_status(corrected)
     if operator.index(workers) < 1:
         raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")
     if operator.index(seed) < 0:
@@ -308,6 +317,6 @@ def _noise(corrected: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> 
     if "noise" in response:
         slopes = np.array([curve.reference_slope for curve in curves])
         return np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
-    counts, frames = tiles.sample(corrected, _NOISE_PIXELS)
+    counts, frames = samples.sample(corrected, _NOISE_PIXELS)
     signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
     return noise_of.of_bands(signals, corrected["time"].values[frames])

@@ -29,16 +29,8 @@ from scipy.special import ndtri
 
 from dbthermal import schema, smooth
 from dbthermal.separation import background, direction, emission, jumps, residual, slow
-from dbthermal.separation.problem import (
-    Array,
-    Method,
-    Problem,
-    Record,
-    Separated,
-    Survey,
-    flag,
-    updated,
-)
+from dbthermal.separation.problem import Method, Problem
+from dbthermal.separation.separated import Array, Mask, Record, Separated, Survey, flag, updated
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -80,7 +72,7 @@ class Settings:
         and background.
     """
 
-    background_drift: float = 2.0
+    background_drift: float = 1.5
 
     def __post_init__(self) -> None:
         """Refuse what is no standard deviation."""
@@ -205,55 +197,64 @@ def _pass(
 
 def _report(problem: Problem, estimate: _Estimate) -> Separated:
     """Standard deviations, flags, and NaN where a quantity is undefined."""
-    found, fit, noise = estimate.found, estimate.emission, np.array(problem.noise)
-    frames, others = problem.time.size, len(noise) - 1
-    epsilon = found.spread * found.across
-    still = found.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames)
-    still &= ~found.given
-    still |= ~np.isfinite(found.spread)
-    gray = ~still & (epsilon > 1.0 / _GRAY_SIGMAS**2)
-    undefined = still | gray
+    found, fit = estimate.found, estimate.emission
+    flags = _flags(problem, estimate)
+    still, undefined = flags["no_background_motion"], flags["no_background_motion"] | flags["gray"]
     unidentified = undefined | fit.constant
-    nonphysical = ~unidentified & np.any((fit.emissivity <= 0) | (fit.emissivity >= 1), axis=0)
-    swapped = ~unidentified & ~nonphysical & (fit.emissivity.mean(axis=0) < 0.5)
-    spread = 2.0 * others * (frames - found.order)
-    own = fit.own_variance + fit.common_variance
-    variance = emission.emissivity_variance(found, fit.emissivity[0], own, noise)
-    # The object is a ratio with an uncertain denominator: half the width of its 95 % interval by
-    # Fieller's theorem (1954), doi:10.1111/j.2517-6161.1954.tb00159.x
-    through = fit.per_direction**2 * epsilon / (1.0 - _NORMAL95**2 * epsilon) ** 2
-    squares = (noise**2)[:, np.newaxis]
-    of_ratio = found.spread * (squares + found.ratio**2 * squares[0])
-    of_ratio[0] = 0.0
+    of_ratio = direction.ratio_variance(found, np.array(problem.noise))
     result = Separated(
         object_temperature=fit.temperature,
-        object_temperature_std=np.sqrt(through + fit.smooth_variance),
+        object_temperature_std=_object_std(estimate),
         background_temperature=estimate.background,
         background_temperature_std=np.sqrt(estimate.background_variance),
         emissivity=fit.emissivity,
-        emissivity_std=np.sqrt(variance),
+        emissivity_std=np.sqrt(emission.variance(found, fit, np.array(problem.noise))),
         reflection_ratio=np.where(still, np.nan, found.ratio),
         reflection_ratio_std=np.where(still, np.nan, np.sqrt(of_ratio)),
-        status=flag(
-            {
-                "no_background_motion": still,
-                "gray": gray,
-                "constant_object": ~undefined & fit.constant,
-                "background_never_rests": ~unidentified & fit.restless,
-                "nonphysical_emissivity": nonphysical,
-                "roles_may_be_swapped": swapped,
-                "bands_apart": ~still & (np.abs(estimate.lateness) > _APART_SIGMAS),
-                "object_not_smooth": (estimate.memory > _MEMORY_SIGMAS)
-                | (found.misfit > 1.0 + _MISFIT_SIGMAS * 2.0 / np.sqrt(spread)),
-            }
-        ),
+        status=flag(flags),
     )
-    return result.without(undefined, unidentified, unidentified | nonphysical).ranged(problem)
+    no_background = unidentified | flags["nonphysical_emissivity"]
+    return result.without(undefined, unidentified, no_background).ranged(problem.curves[0])
+
+
+def _object_std(estimate: _Estimate) -> Array:
+    """
+    Standard deviation of the object temperature (time, pixel) [K].
+
+    The object is a ratio with an uncertain denominator: half the width of its 95 % interval by
+    Fieller's theorem (1954), doi:10.1111/j.2517-6161.1954.tb00159.x
+    """
+    found, fit = estimate.found, estimate.emission
+    epsilon = found.spread * found.across
+    through = fit.per_direction**2 * epsilon / (1.0 - _NORMAL95**2 * epsilon) ** 2
+    return np.asarray(np.sqrt(through + fit.smooth_variance))
+
+
+def _flags(problem: Problem, estimate: _Estimate) -> dict[str, Mask]:
+    """What is wrong with each pixel."""
+    found, fit = estimate.found, estimate.emission
+    frames, others = problem.time.size, len(problem.noise) - 1
+    still = ~found.given & (found.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames))
+    still |= ~np.isfinite(found.spread)
+    gray = ~still & (found.spread * found.across > 1.0 / _GRAY_SIGMAS**2)
+    told = ~still & ~gray & ~fit.constant
+    nonphysical = told & np.any((fit.emissivity <= 0) | (fit.emissivity >= 1), axis=0)
+    misfit = 2.0 * _MISFIT_SIGMAS / np.sqrt(2.0 * others * (frames - found.order))
+    return {
+        "no_background_motion": still,
+        "gray": gray,
+        "constant_object": ~still & ~gray & fit.constant,
+        "background_never_rests": told & fit.restless,
+        "nonphysical_emissivity": nonphysical,
+        "roles_may_be_swapped": told & ~nonphysical & (fit.emissivity.mean(axis=0) < 0.5),
+        "bands_apart": ~still & (np.abs(estimate.lateness) > _APART_SIGMAS),
+        "object_not_smooth": (estimate.memory > _MEMORY_SIGMAS) | (found.misfit > 1.0 + misfit),
+    }
 
 
 def _with_jumps(problem: Problem, result: Separated, settings: Settings) -> Separated:
     """Step 5: pixels that do not fit are solved anew with a jump in the subspace."""
-    suspect = (result.status & _SUSPECT) != 0
+    suspect = ((result.status & _SUSPECT) != 0) | jumps.alone(problem.signals[0])
     inside = jumps.candidates(problem.time)
     if inside.size == 0 or not np.any(suspect):
         return result
