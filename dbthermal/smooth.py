@@ -106,9 +106,6 @@ def subspace(
     of_camera = len(steps)
     if jump is not None:
         after = np.arange(len(plain)) >= jump
-        # A shutter event with no frame between it and the jump: one step, which is the object's.
-        steps = [step for step in steps if not np.array_equal(step, after)]
-        of_camera = len(steps)
         steps += [np.where(after, 1.0, 0.0), np.where(after, position - position[jump], 0.0)]
     if not steps:
         return Subspace(plain, plain, 0)

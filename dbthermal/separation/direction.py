@@ -173,11 +173,18 @@ def estimate(
     )
 
 
-def _fits(largest: Array, along: Array, total: Array, frames: int, freedom: int) -> Mask:
-    """Where less energy lies off the known direction than chance leaves; false for NaN."""
+def _fits(largest: Array, along: Array, total: Array, frames: int, others: int) -> Mask:
+    """
+    Where less energy lies off the known direction than chance leaves; false for NaN.
+
+    A direction of little energy is itself uncertain, and takes up noise: what it gains by turning
+    is scaled by its share of energy that is no noise.
+    """
     order = choose_order(total - largest, frames)
     rows = np.arange(order.size)
-    return np.asarray((largest - along)[order, rows] < chi2.isf(_CHANCE, freedom))
+    found, gain = largest[order, rows], (largest - along)[order, rows]
+    own = 1.0 - (total[order, rows] - found) / (others * found)
+    return np.asarray(gain * own < chi2.isf(_CHANCE, others))
 
 
 def combination(ratio: Array, noise: Array) -> tuple[Array, Array]:

@@ -113,7 +113,7 @@ def candidates(time: Array) -> Whole:
     return np.asarray(1 + np.flatnonzero(good))
 
 
-def outside(time: Array, jump: int) -> Mask:
+def outside(time: Array, jump: int, segment: Whole | None = None) -> Mask:
     """
     Frames that are not close to a jump.
 
@@ -123,11 +123,18 @@ def outside(time: Array, jump: int) -> Mask:
         Times [s].
     jump : int
         First frame after it.
+    segment : ndarray of int, shape (time,), optional
+        Number of shutter events before each frame.
 
     Returns
     -------
     ndarray of bool, shape (time,)
-        True for the frames to use.
+        True for the frames to use: those before and after; or, where a shutter event as close
+        hides how far it jumped, the more numerous of the two.
     """
     between = 0.5 * (time[jump - 1] + time[jump])
-    return np.asarray(np.abs(time - between) > AROUND)
+    kept = np.abs(time - between) > AROUND
+    before, after = kept & (time < between), kept & (time > between)
+    if segment is not None and segment[before].max() != segment[after].min():
+        return np.asarray(before if before.sum() >= after.sum() else after)
+    return np.asarray(kept)

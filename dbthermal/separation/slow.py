@@ -5,8 +5,8 @@ The emissivity is the slope of the first band's signal against the object's own,
 does, :math:`y = \ldots + c \, u_1(x)`, changes the slope by :math:`(1 - e_1) c`, and nothing in the
 data tells the two apart. So its size is assumed, in two ways that add:
 
-- a drift: over the capture, the background's change along the object's curve has a standard
-  deviation that the user states (`Prior.drift`);
+- a drift: over the capture, the background's change along the object's curve lies anywhere within
+  a limit that the user states (`Prior.drift`);
 - an extrapolation: the part of the resting background's change that is *not* along the object's
   curve is seen. Its spectrum over the smooth functions is continued to the curve, as that of a
   random walk, whose energy falls with the square of the degree.
@@ -38,7 +38,7 @@ class Prior:
     Attributes
     ----------
     drift : float
-        Standard deviation of its change along the object's curve over the capture [K].
+        Largest change along the object's curve over the capture, up or down [K]; uniform.
     """
 
     drift: float
@@ -55,11 +55,11 @@ def variance(
     r"""
     Variance of the slope from the background's slow part.
 
-    With unit coefficients :math:`\xi_j` of the object's curve of norm :math:`|u|` and range
-    :math:`\Delta`, and the energy A of a random walk in the residual's spectrum, the largest of
-    those of three octaves,
+    With the largest drift d, unit coefficients :math:`\xi_j` of the object's curve of norm
+    :math:`|u|` and range :math:`\Delta`, and the energy A of a random walk in the residual's
+    spectrum, the larger of those of two octaves at the upper end of their 95 % interval,
 
-    .. math:: \mathrm{var}(e_1) = \frac{(1 - e_1)^2 d^2}{\Delta^2}
+    .. math:: \mathrm{var}(e_1) = \frac{(1 - e_1)^2 d^2}{3 \Delta^2}
               + \frac{A}{|u|^2} \sum_j \frac{\xi_j^2}{j^2}
 
     Parameters
@@ -98,5 +98,5 @@ def variance(
     ]
     strongest = np.maximum(np.max(octaves, axis=0), 0.0)
     extrapolated = strongest * (unit**2 / degree**2).sum(axis=0) / energy
-    drift = (reflectivity * prior.drift / np.ptp(own, axis=0)) ** 2
+    drift = (reflectivity * prior.drift / np.ptp(own, axis=0)) ** 2 / 3.0
     return np.asarray(drift + extrapolated)

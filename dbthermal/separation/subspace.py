@@ -67,12 +67,12 @@ class Settings:
     Attributes
     ----------
     background_drift : float
-        Prior: standard deviation of the background's change along the object's own curve over
-        the capture [K]. No method can see that part; it only widens the error bars of emissivity
-        and background.
+        Prior: the background drifts along with the object's own curve by at most this, up or
+        down, over the capture [K], each drift as likely. No method can see that part; it only
+        widens the error bars of emissivity and background.
     """
 
-    background_drift: float = 1.5
+    background_drift: float = 3.0
 
     def __post_init__(self) -> None:
         """Refuse what is no standard deviation."""
@@ -263,9 +263,10 @@ def _with_jumps(problem: Problem, result: Separated, settings: Settings) -> Sepa
     first = np.full(suspect.shape, -1)
     first[suspect] = np.where(gain > 0, frame, -1)
     for jump in np.unique(first[first >= 0]):
-        kept = jumps.outside(problem.time, int(jump))
+        kept = jumps.outside(problem.time, int(jump), problem.segment)
+        before = int(kept[:jump].sum())
         part = problem.of(first == jump).at(kept)
-        functions = _functions(part, jump=int(kept[:jump].sum()))
+        functions = _functions(part, jump=before if 0 < before < part.time.size else None)
         again = _exact(part, functions, settings, _report)
         again = replace(again, status=again.status | np.uint16(schema.FLAGS["object_jump"]))
         result = updated(result, first == jump, again.spread(kept))
