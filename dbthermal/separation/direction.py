@@ -139,8 +139,10 @@ def estimate(
     largest = np.asarray(np.linalg.eigvalsh(scatter)[..., -1], dtype=np.float64)
     given = np.zeros(signals.shape[2], dtype=bool)
     if known is not None:
-        along = _along(scatter, known.ratio / noise[:, np.newaxis])
-        given = _fits(largest, along, total, frames, len(noise) - 1)
+        unit = known.ratio / noise[:, np.newaxis]
+        unit = unit / np.sqrt(np.einsum("bp,bp->p", unit, unit))
+        along = np.einsum("bp,opbc,cp->op", unit, scatter, unit)
+        given = _fits(scatter, choose_order(total - along, frames), unit)
         largest = np.where(given, along, largest)
     across = total - largest
     order = choose_order(across, frames)
@@ -173,18 +175,18 @@ def estimate(
     )
 
 
-def _fits(largest: Array, along: Array, total: Array, frames: int, others: int) -> Mask:
+def _fits(scatter: Array, order: Whole, unit: Array) -> Mask:
     """
-    Where less energy lies off the known direction than chance leaves; false for NaN.
+    Where the scatter does not contradict a known direction; false for NaN.
 
-    A direction of little energy is itself uncertain, and takes up noise: what it gains by turning
-    is scaled by its share of energy that is no noise.
+    Of a background along the unit vector v and white noise, what is across is not correlated with
+    what is along: :math:`|S v|^2 / (v^T S v) - v^T S v` is a chi-square variable.
     """
-    order = choose_order(total - largest, frames)
-    rows = np.arange(order.size)
-    found, gain = largest[order, rows], (largest - along)[order, rows]
-    own = 1.0 - (total[order, rows] - found) / (others * found)
-    return np.asarray(gain * own < chi2.isf(_CHANCE, others))
+    chosen = scatter[order, np.arange(order.size)]
+    turned = np.einsum("pbc,cp->bp", chosen, unit)
+    along = np.einsum("bp,bp->p", unit, turned)
+    across = np.einsum("bp,bp->p", turned, turned) / along - along
+    return np.asarray(across < chi2.isf(_CHANCE, len(unit) - 1))
 
 
 def combination(ratio: Array, noise: Array) -> tuple[Array, Array]:
@@ -244,12 +246,6 @@ def _scatter(whitened: Array, coefficients: Array, steps: int) -> Array:
             held = np.cumsum(coefficients[one] * coefficients[other], axis=0)[steps:]
             result[:, :, one, other] = result[:, :, other, one] = total - held
     return result
-
-
-def _along(scatter: Array, whitened: Array) -> Array:
-    """Scatter (order, pixel) along given whitened ratios (band, pixel)."""
-    length = np.einsum("bp,bp->p", whitened, whitened)
-    return np.asarray(np.einsum("bp,opbc,cp->op", whitened, scatter, whitened) / length)
 
 
 def choose_order(across: Array, frames: int) -> Whole:

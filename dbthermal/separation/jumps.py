@@ -27,7 +27,7 @@ _MARGIN: Final = 24
 
 
 def find(
-    signals: Array, functions: smooth.Subspace, noise: Array, inside: Whole
+    signals: Array, functions: smooth.Subspace, noise: Array, inside: Whole, ramp: Whole
 ) -> tuple[Whole, Array]:
     r"""
     Frame of the step that lowers what is across the direction most.
@@ -46,6 +46,8 @@ def find(
         Noise of the bands [K].
     inside : ndarray of int
         Frames that may be the first after the step, from `candidates`; one or more.
+    ramp : ndarray of int
+        Frames beside it over which the same change may be spread evenly.
 
     Returns
     -------
@@ -57,23 +59,31 @@ def find(
     basis = functions.functions[:, : functions.steps + _ORDER]
     left = signals / noise[:, np.newaxis, np.newaxis]
     left = left - np.einsum("tc,bcp->btp", basis, np.einsum("tc,btp->bcp", basis, left))
+    # Inner products of a step at each frame with the residual, with the functions and with itself.
     after = np.cumsum(left[:, ::-1], axis=1)[:, ::-1]
     held = np.cumsum(basis[::-1], axis=0)[::-1]
-    energy = np.arange(frames, 0.0, -1.0) - np.sum(held**2, axis=1)
+    own = np.arange(frames, 0.0, -1.0)
     scatter = np.einsum("btp,ctp->pbc", left, left)
-    part = np.einsum("btp,ctp->tpbc", after[:, inside], after[:, inside])
-    part /= energy[inside, np.newaxis, np.newaxis, np.newaxis]
-    across = np.linalg.eigvalsh(scatter - part)[..., :-1].sum(axis=-1)
-    best = np.argmin(across, axis=0)
     before = np.linalg.eigvalsh(scatter)[..., :-1].sum(axis=-1)
-    lowest = np.maximum(across[best, np.arange(best.size)], np.finfo(np.float64).tiny)
-    gain = frames * np.log(before / lowest) - 4.0 * np.log(frames)
-    return inside[best], gain
+    first, lowest = np.zeros(before.size, dtype=np.intp), np.full(before.size, np.inf)
+    for offsets in (np.zeros(1, dtype=np.intp), ramp):
+        places = inside[:, np.newaxis] + offsets
+        energy = own[places].mean(axis=1) - np.abs(offsets[:, np.newaxis] - offsets).mean() / 2.0
+        energy -= np.sum(held[places].mean(axis=1) ** 2, axis=1)
+        mean = np.stack([after[:, inside + offset] for offset in offsets]).mean(axis=0)
+        part = np.einsum("btp,ctp->tpbc", mean, mean) / energy[:, None, None, None]
+        across = np.linalg.eigvalsh(scatter - part)[..., :-1].sum(axis=-1)
+        best = np.argmin(across, axis=0)
+        found = across[best, np.arange(best.size)]
+        first = np.where(found < lowest, inside[best], first)
+        lowest = np.minimum(found, lowest)
+    gain = frames * np.log(before / np.maximum(lowest, np.finfo(np.float64).tiny))
+    return first, gain - 4.0 * np.log(frames)
 
 
-def alone(signal: Array) -> Mask:
+def alone(signal: Array, functions: smooth.Subspace, ramp: Whole) -> Mask:
     """
-    Whether one change from frame to frame is far larger than all others.
+    Whether one change, from frame to frame or in about a second, is far larger than all others.
 
     A background comes and goes: its largest changes come in pairs at least.
 
@@ -81,13 +91,28 @@ def alone(signal: Array) -> Mask:
     ----------
     signal : ndarray, shape (time, pixel)
         Signal of a band.
+    functions : Subspace
+        Smooth functions, taken out first.
+    ramp : ndarray of int
+        From `spread`.
 
     Returns
     -------
     ndarray of bool, shape (pixel,)
         True for such a pixel.
     """
+    basis = functions.functions[:, : functions.steps + _ORDER]
+    left = signal - basis @ (basis.T @ signal)
+    blocks = left.shape[0] // ramp.size
+    slow = left[: blocks * ramp.size].reshape(blocks, ramp.size, -1).mean(axis=1)
+    return _outstanding(left) | _outstanding(slow)
+
+
+def _outstanding(signal: Array) -> Mask:
+    """Where the largest change is several times the third largest; false for few samples."""
     change = np.abs(np.diff(signal.T, axis=1)).astype(np.float32)
+    if change.shape[1] < 3:
+        return np.zeros(change.shape[0], dtype=bool)
     largest = np.partition(change, -3, axis=1)[:, -3:]
     return np.asarray(largest.max(axis=1) > _ALONE * largest[:, 0])
 
@@ -111,6 +136,24 @@ def candidates(time: Array) -> Whole:
     after = np.searchsorted(time, between + AROUND, side="right")
     good = np.minimum(before, time.size - after) >= _MARGIN
     return np.asarray(1 + np.flatnonzero(good))
+
+
+def spread(time: Array) -> Whole:
+    """
+    Frames, relative to its middle, of a jump that takes as long as is left out on one side.
+
+    Parameters
+    ----------
+    time : ndarray, shape (time,)
+        Times [s].
+
+    Returns
+    -------
+    ndarray of int
+        From minus a half to a half of that time.
+    """
+    half = int(0.5 * AROUND / np.median(np.diff(time)))
+    return np.arange(-half, half + 1)
 
 
 def outside(time: Array, jump: int, segment: Whole | None = None) -> Mask:

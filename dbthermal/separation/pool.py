@@ -12,7 +12,7 @@ from dbthermal.separation.separated import Array, Mask, Survey
 
 Labels = npt.NDArray[np.intp]
 
-MOST: Final = 4096
+MOST: Final = 2048
 """Pixels of one material that are asked: more would not lower what is left of systematic error."""
 
 # Deviations beyond which a pixel is not of the material, and rounds of leaving such ones out.
@@ -81,13 +81,13 @@ def asked(labels: Labels) -> Mask:
     of = labels[order]
     first = np.searchsorted(of, of)
     count = np.bincount(of[of >= 0], minlength=1)
-    stride = -(-count // MOST)
+    stride = np.maximum(1, -(-count // MOST))
     result = np.zeros(labels.shape, dtype=bool)
     result[order] = (of >= 0) & ((np.arange(of.size) - first) % stride[of] == 0)
     return result
 
 
-def combine(labels: Labels, survey: Survey, noise: Array) -> Materials:
+def combine(labels: Labels, count: int, survey: Survey, noise: Array) -> Materials:
     r"""
     Ratios and emissivity of each material from its pixels.
 
@@ -100,9 +100,11 @@ def combine(labels: Labels, survey: Survey, noise: Array) -> Materials:
     Parameters
     ----------
     labels : ndarray of int, shape (pixel,)
-        Material of each pixel, -1 for none.
+        Material of each pixel that was asked, -1 for none.
+    count : int
+        Number of materials in the image; of some, no pixel may have been asked.
     survey : Survey
-        All pixels.
+        These pixels.
     noise : ndarray, shape (band,)
         Noise of the bands [K].
 
@@ -111,7 +113,6 @@ def combine(labels: Labels, survey: Survey, noise: Array) -> Materials:
     Materials
         The materials; NaN for one of which no pixel tells anything.
     """
-    count = int(labels.max(initial=0)) + 1
     label = labels
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for _ in range(_ROUNDS):

@@ -214,9 +214,12 @@ class _Task:
 
     def pooled(self, labels: Places, found: list[tuple[Places, Survey]]) -> "_Task":
         """The same task with the pixels of one material sharing what they tell."""
+        if not found:
+            return self
         places = np.concatenate([place for place, _ in found])
         survey = pool_of.joined([part for _, part in found])
-        materials = pool_of.combine(labels[places], survey, self.noise[self.bands])
+        count = int(labels.max()) + 1
+        materials = pool_of.combine(labels[places], count, survey, self.noise[self.bands])
         return replace(self, materials=replace(materials, label=labels))
 
     def _call(self, function: Callable[..., Any] | None, problem: Problem) -> Any:

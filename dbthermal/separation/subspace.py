@@ -254,12 +254,13 @@ def _flags(problem: Problem, estimate: _Estimate) -> dict[str, Mask]:
 
 def _with_jumps(problem: Problem, result: Separated, settings: Settings) -> Separated:
     """Step 5: pixels that do not fit are solved anew with a jump in the subspace."""
-    suspect = ((result.status & _SUSPECT) != 0) | jumps.alone(problem.signals[0])
-    inside = jumps.candidates(problem.time)
+    functions, inside = _functions(problem), jumps.candidates(problem.time)
+    ramp = jumps.spread(problem.time)
+    suspect = ((result.status & _SUSPECT) != 0) | jumps.alone(problem.signals[0], functions, ramp)
     if inside.size == 0 or not np.any(suspect):
         return result
     noise = np.array(problem.noise)
-    frame, gain = jumps.find(problem.signals[..., suspect], _functions(problem), noise, inside)
+    frame, gain = jumps.find(problem.signals[..., suspect], functions, noise, inside, ramp)
     first = np.full(suspect.shape, -1)
     first[suspect] = np.where(gain > 0, frame, -1)
     for jump in np.unique(first[first >= 0]):
