@@ -256,8 +256,10 @@ def _with_jumps(problem: Problem, result: Separated, settings: Settings) -> Sepa
     """Step 5: pixels that do not fit are solved anew with a jump in the subspace."""
     functions, inside = _functions(problem), jumps.candidates(problem.time)
     ramp = jumps.spread(problem.time)
+    if inside.size == 0:
+        return result
     suspect = ((result.status & _SUSPECT) != 0) | jumps.alone(problem.signals[0], functions, ramp)
-    if inside.size == 0 or not np.any(suspect):
+    if not np.any(suspect):
         return result
     noise = np.array(problem.noise)
     frame, gain = jumps.find(problem.signals[..., suspect], functions, noise, inside, ramp)
