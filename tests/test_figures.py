@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
-from dbthermal import figures, schema
+from dbthermal import figures
 
 BANDS = ["8-14", "9.5"]
 TIME = np.arange(2.0)
@@ -86,12 +86,6 @@ def draw_compared(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw two maps of the reflection at two times."""
     movie = (fill * array("time y x", 2, 5, 6)).assign_attrs(attrs)
     return figures.compared_reflections(movie, movie, array("time", 2) - 300.5)
-
-
-def draw_status(**attrs: object) -> Figure:
-    """Draw a map with two flags."""
-    status = xr.DataArray([[0, 1, 4], [5, 0, 0]], dims=("y", "x"), attrs=attrs)
-    return figures.status_map(status, schema.FLAGS)
 
 
 def draw_bars(**attrs: object) -> Figure:
@@ -173,6 +167,103 @@ def draw_error_maps(fill: float = 1.0, **attrs: object) -> Figure:
     return figures.error_maps(array("y x", 5, 6), {"a": error, "b": 2 * error})
 
 
+def draw_over_bound(**attrs: object) -> Figure:
+    """Draw errors at three noise levels beside two bounds, one of which is missing once."""
+    over = {"noise": [0.01, 0.03, 0.1], "case": ["free", "known"]}
+    parts = {}
+    for name in ("reflection_ratio", "object_temperature"):
+        parts[f"{name}_error"] = array("noise", 3) - 299
+        parts[f"{name}_bound"] = array("case noise", 2, 3).assign_coords(case=over["case"]) - 299
+    measured = xr.Dataset(parts).assign_coords(over).assign_attrs(attrs)
+    measured["object_temperature_bound"][1, 0] = np.nan
+    return figures.error_over_bound(measured)
+
+
+def draw_over_bands(**attrs: object) -> Figure:
+    """Draw the errors of two and three bands beside two bounds."""
+    bound = array("case bands", 2, 2) - 300
+    parts = {"object_temperature_error": bound.isel(case=0, drop=True)}
+    measured = xr.Dataset(parts | {"object_temperature_bound": bound}, attrs=attrs)
+    return figures.error_over_bands(measured.assign_coords(bands=["a + b", "a + b + c"]))
+
+
+def draw_pooling(**attrs: object) -> Figure:
+    """Draw the errors of groups of three sizes."""
+    kinds = ("reflection_ratio_error", "reflection_ratio_bound", "stated")
+    parts = dict.fromkeys((*kinds, "object_temperature_error"), array("size", 3) - 299)
+    return figures.pooling(xr.Dataset(parts, {"size": [1, 4, 25]}, attrs))
+
+
+def draw_pooled(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw the ratios of two materials, one pixel without a label."""
+    ratio = (fill * array("y x", 5, 6)).assign_attrs(attrs)
+    panels = xr.DataArray(np.indices((5, 6))[1] // 3, dims=("y", "x"))
+    labels = panels.copy()
+    labels[0, 0] = -1
+    return figures.pooled_materials(ratio, ratio, labels, panels)
+
+
+def draw_plan(**attrs: object) -> Figure:
+    """Draw what two materials let expect behind two filters, and of two lengths."""
+    names = {"material": ["glass", "slate"], "filter": ["9.5", "10.6"]}
+    std = array("material filter", 2, 2).assign_coords(names) - 300
+    best = xr.DataArray(["9.5", "none"], dims="material", coords={"material": names["material"]})
+    expected = xr.Dataset({"object_temperature_std": std, "best": best})
+    longer = std.expand_dims(seconds=[10.0, 20.0]).to_dataset(name="object_temperature_std")
+    return figures.plan(expected.assign_attrs(beside="8-14", **attrs), longer, names["material"])
+
+
+def draw_validity(**attrs: object) -> Figure:
+    """Draw two cases, one of which has no flag and nothing wrong."""
+    stress = xr.Dataset(
+        {
+            "status": (("case", "pixel"), [[0, 0, 4], [0, 0, 0]]),
+            "bad": (("case", "kind", "pixel"), [[[False, True, True]], [[False] * 3]]),
+            "object_coverage": (("case", "among"), [[0.95], [0.2]]),
+            "emissivity_coverage": (("case", "among", "band"), [[[0.95, 0.9]], [[1.0, 0.97]]]),
+        },
+        {"case": ["a", "b"], "kind": ["any"], "band": BANDS},
+        attrs,
+    )
+    labels = {"object_coverage": ["unflagged"], "emissivity_coverage": ["all"]}
+    parts = {name: stress[name].assign_coords(among=label) for name, label in labels.items()}
+    both = {name: part.reindex(among=["unflagged", "all"]) for name, part in parts.items()}
+    return figures.validity(stress.drop_dims("among").assign(both))
+
+
+def draw_reasons(**attrs: object) -> Figure:
+    """Draw a map of two flags in words."""
+    flags = {"status": (("y", "x"), [[0, 1, 4], [5, 0, 0]])}
+    return figures.status(xr.Dataset(flags, attrs=attrs))
+
+
+def treated(over: str, *names: str, **attrs: object) -> xr.Dataset:
+    """Errors of two treatments over two values."""
+    values = {"delay": [0.0, 1.0], "parallax": [0.0, 2.0], "nuisance": ["lost", "shutter"]}
+    here = array(f"{over} treatment", 2, 2) - 299
+    coords = {over: values[over], "treatment": ["as recorded", "undone"]}
+    parts = dict.fromkeys(("object_temperature_rmse", *names), here - 0.5)
+    return xr.Dataset(parts).assign_coords(coords).assign_attrs(attrs)
+
+
+def draw_offsets(**attrs: object) -> Figure:
+    """Draw two offsets as found, and what undoing them is worth."""
+    measured = treated("delay", "flagged", **attrs)
+    return figures.offsets(measured.assign(found=("delay", [0.01, 0.98])))
+
+
+def draw_disturbances(**attrs: object) -> Figure:
+    """Draw two nuisances."""
+    return figures.disturbances(treated("nuisance", "flagged", **attrs))
+
+
+def draw_parallax(**attrs: object) -> Figure:
+    """Draw two views, one of which has nothing to judge once."""
+    measured = treated("parallax", "flagged", "covered", **attrs)
+    measured["covered"][1, 0] = np.nan
+    return figures.parallax(measured)
+
+
 DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     "gain_offset_maps": (
         lambda fill=1.0, **attrs: figures.gain_offset_maps(correction(fill, **attrs)),
@@ -205,7 +296,6 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
         {f"apparent [{DEGREE}]", f"object [{DEGREE}]", "background change [K]"},
     ),
     "compared_reflections": (draw_compared, {"own unit", "time [s]", "correlation [1]"}),
-    "status_map": (draw_status, set()),
     "error_over_noise": (draw_noise, {"median error [K]", "noise of the quieter band [K]"}),
     "emissivity_errors": (
         draw_emissivity,
@@ -219,6 +309,56 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     "thermocouples": (draw_thermocouples, {"time [s]", f"object temperature [{DEGREE}]"}),
     "error_maps": (draw_error_maps, {f"apparent [{DEGREE}]", "mean error [K]"}),
     "sensitivity": (draw_sensitivity, {"median error of the object temperature [K]"}),
+    "error_over_bound": (
+        draw_over_bound,
+        {
+            "error of the reflection ratio [1]",
+            "error of the object temperature [K]",
+            "error / bound [1]",
+            "noise of the quieter band [K]",
+        },
+    ),
+    "error_over_bands": (
+        draw_over_bands,
+        {"error of the object temperature [K]", "error / bound [1]", "bands [\N{MICRO SIGN}m]"},
+    ),
+    "pooling": (
+        draw_pooling,
+        {
+            "error of the reflection ratio [1]",
+            "error of the object temperature [K]",
+            "pixels of one material [1]",
+        },
+    ),
+    "pooled_materials": (draw_pooled, {"reflection ratio [1]"}),
+    "plan": (
+        draw_plan,
+        {"filter beside 8-14 [\N{MICRO SIGN}m]", "length of the film [s]", "expected std [K]"},
+    ),
+    "validity": (
+        draw_validity,
+        {"share of the pixels [%]", "95 % intervals that hold the truth [%]"},
+    ),
+    "status": (draw_reasons, set()),
+    "offsets": (
+        draw_offsets,
+        {
+            "error of the offset [frame]",
+            "RMSE of the object temperature [K]",
+            "flagged [%]",
+            "offset of the second band [frame]",
+        },
+    ),
+    "disturbances": (draw_disturbances, {"RMSE of the object temperature [K]"}),
+    "parallax": (
+        draw_parallax,
+        {
+            "RMSE of the object temperature [K]",
+            "flagged [%]",
+            "95 % intervals that hold, no flag [%]",
+            "parallax of the reflection [pixel]",
+        },
+    ),
 }
 """Name of each function -> how to draw it, and the labels of its axes and bars."""
 
@@ -261,6 +401,7 @@ def test_title_says_what_the_data_are(name: str) -> None:
         "compared_reflections",
         "truth_and_estimate",
         "condition_matrix",
+        "pooled_materials",
     ],
 )
 def test_nothing_but_nan(name: str) -> None:
@@ -279,6 +420,24 @@ def test_celsius_on_the_axes() -> None:
     image = draw_temperatures().axes[0].images[0].get_array()
     apparent = array("band time y x", 2, 2, 5, 6)[0, 0] - 273.15
     np.testing.assert_allclose(np.asarray(image), apparent, rtol=0, atol=1e-9)
+
+
+def test_errors_without_a_case_are_drawn_once() -> None:
+    """Two bounds, and one row of errors above; two rows in units of them, and 1, below."""
+    above, _, below, _ = draw_over_bound().axes
+    assert [line.get_label() for line in above.lines] == ["free, bound", "known, bound", "measured"]
+    assert len(below.lines) == 3
+
+
+def test_bars_say_what_is_flagged() -> None:
+    """Each treatment of each nuisance has its error and its share as text."""
+    (axis,) = draw_disturbances().axes
+    found = treated("nuisance", "flagged").transpose("treatment", "nuisance")
+    pairs = zip(
+        found["object_temperature_rmse"].values.flat, found["flagged"].values.flat, strict=True
+    )
+    expected = [f"{error:.2f} K\n{100 * share:.0f} % flagged" for error, share in pairs]
+    assert [text.get_text() for text in axis.texts] == expected
 
 
 def test_film() -> None:
@@ -310,13 +469,3 @@ def test_bad_pixels_are_marked() -> None:
     assert np.argwhere(np.ma.getmaskarray(image)).tolist() == [[1, 2]]
     np.testing.assert_array_equal(axis.lines[0].get_xydata(), [[2, 1]])
     assert "1 bad pixel" in axis.get_title()
-
-
-def test_status_map_shows_the_flags_that_occur() -> None:
-    """The good pixels, and each flag with its share."""
-    found = [axis.get_title().split("\n") for axis in draw_status().axes]
-    assert found == [
-        ["good", "50.0 %"],
-        ["no background motion", "33.3 %"],
-        ["gray", "33.3 %"],
-    ]

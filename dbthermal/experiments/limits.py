@@ -9,7 +9,6 @@ import xarray as xr
 from scipy.ndimage import distance_transform_edt
 
 from dbthermal import alignment, separation
-from dbthermal import response as responses
 from dbthermal.experiments import cases, stress
 from dbthermal.separation import limits
 from dbthermal.simulation import Rig
@@ -23,6 +22,12 @@ BEFOREHAND: Final = 0.29
 
 BORDER: Final = 2.0
 """Distance from a border of two materials within which no label is judged [pixel]."""
+
+_BOUNDED: Final = {
+    "reflection_ratio": "reflection_ratio_std",
+    "object_temperature": "object_temperature_std",
+}
+_UNITS: Final = {"object_temperature": "K"}
 
 
 def near_bound(
@@ -44,8 +49,8 @@ def near_bound(
     - "nothing": `limits.bounds` with one free number a frame and emissivities anywhere in (0, 1).
       At low noise it is loose, for the data tell the emissivities, and with them the level of
       the background and the ratio of the bands' slopes there, which this bound does not know;
-    - "slope": `limits.ratio_variance`, one free number a frame, but the slopes are known. It is the
-      bound of the reflection ratio by which `theory` measures, and says nothing of the object;
+    - "slope": the closed form `limits.ratio_variance`, one free number a frame, but the slopes are
+      known: of the three the one that fits the reflection ratio. It says nothing of the object;
     - "rest": `limits.bounds` told in which frames the background rests, which the method is not.
 
     Parameters
@@ -164,8 +169,8 @@ def pooled(
     Returns
     -------
     Dataset
-        `reflection_ratio_error` [1], root mean square over the groups, and
-        `reflection_ratio_bound`, that of a single pixel ("slope") over :math:`\sqrt{n}`;
+        `reflection_ratio_error` [1], of the median of a group's pixels, root mean square over the
+        groups, and `reflection_ratio_bound`, a single pixel's ("slope") over :math:`\sqrt{n}`;
         `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
         separation's own standard deviation of the ratio, root mean square; `flagged` [1].
 
@@ -187,8 +192,9 @@ def pooled(
         - limits.reflection_ratio(list(emissivity)).item(),
         "stated": result["reflection_ratio_std"],
     }
+    # The median, for a pixel that the separation leaves out of its group keeps a ratio of its own.
     found = {
-        name: _rms(_row(part.isel(band=1, x=slice(None, None, size)), "reflection_ratio"))
+        name: _rms(_row(part.isel(band=1).coarsen(x=size).median(), "reflection_ratio"))
         for name, part in of_groups.items()
     }
     single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
@@ -289,8 +295,7 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
     for panel in panels:
         distance += distance_transform_edt(truth.values == panel)
     inner = [found[(truth.values == panel) & (distance > BORDER)] for panel in panels]
-    main = [np.bincount(part[part >= 0]).argmax() for part in inner]
-    right = sum(int(np.sum(part == label)) for part, label in zip(inner, main, strict=True))
+    right = sum(int(np.bincount(part[part >= 0], minlength=1).max()) for part in inner)
     sides = [set(np.unique(part[part >= 0])) for part in inner]
     bleeding = sum(sum(label in side for side in sides) > 1 for label in set().union(*sides))
     units = {"units": "1"}
@@ -301,13 +306,6 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
             "distance": (("y", "x"), distance, {"units": "pixel"}),
         }
     )
-
-
-_BOUNDED: Final = {
-    "reflection_ratio": "reflection_ratio_std",
-    "object_temperature": "object_temperature_std",
-}
-_UNITS: Final = {"object_temperature": "K"}
 
 
 def _times(clock: Sequence[float]) -> npt.NDArray[np.float64]:

@@ -20,13 +20,13 @@ from dbthermal.figures.comparison import (
     sensitivity,
 )
 from dbthermal.figures.films import separated_film
-from dbthermal.figures.limits import error_over_bound, plan
-from dbthermal.figures.materials import condition_matrix, emissivity_bars
+from dbthermal.figures.limits import error_over_bands, error_over_bound, plan, pooling
+from dbthermal.figures.materials import condition_matrix, emissivity_bars, pooled_materials
+from dbthermal.figures.nuisances import disturbances, offsets, parallax
 from dbthermal.figures.scenes import (
     compared_reflections,
     separated_frames,
     separated_temperatures,
-    status_map,
 )
 from dbthermal.figures.twins import error_maps, thermocouples
 from dbthermal.figures.validity import status, validity
@@ -35,16 +35,22 @@ __all__ = [
     "accuracy",
     "compared_reflections",
     "condition_matrix",
+    "disturbances",
     "emissivity_bars",
     "emissivity_by_contact",
     "emissivity_errors",
     "emissivity_procedures",
     "error_bar_calibration",
     "error_maps",
+    "error_over_bands",
     "error_over_bound",
     "error_over_noise",
     "gain_offset_maps",
+    "offsets",
+    "parallax",
     "plan",
+    "pooled_materials",
+    "pooling",
     "provenance_note",
     "reductions",
     "response_fit",
@@ -53,7 +59,6 @@ __all__ = [
     "separated_frames",
     "separated_temperatures",
     "status",
-    "status_map",
     "thermocouples",
     "truth_and_estimate",
     "validity",

@@ -81,7 +81,7 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
         Over `noise` (that of the quieter band [K]): `reflection_ratio_error` [1] and
         `object_temperature_error` [K], root mean square over the pixels, and their bounds
         `reflection_ratio_bound` and `object_temperature_bound`. A further dimension `case` gives
-        lines of several colours.
+        lines of several colours; where the bounds alone have it, the errors are drawn once.
 
     Returns
     -------
@@ -93,14 +93,18 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
     for (above, below), name, unit in zip(
         axes.T, ("reflection_ratio", "object_temperature"), ("1", "K"), strict=True
     ):
+        once = "case" not in cases[f"{name}_error"].dims
         for index, case in enumerate(cases["case"].values):
             here, color = cases.sel(case=case), COLORS[index % len(COLORS)]
             error, bound = here[f"{name}_error"], here[f"{name}_bound"]
             mark = {"color": color, "marker": _MARKERS[index % len(_MARKERS)], "markersize": 5}
             label = f"{case}, " if str(case) else ""
             above.plot(here["noise"], bound, color=color, linewidth=1, label=f"{label}bound")
-            above.plot(here["noise"], error, linestyle="", label=f"{label}measured", **mark)
             below.plot(here["noise"], error / bound, linewidth=1, **mark)
+            if not once:
+                above.plot(here["noise"], error, linestyle="", label=f"{label}measured", **mark)
+        if once:
+            above.plot(cases["noise"], cases[f"{name}_error"], "ko", markersize=4, label="measured")
         above.set(xscale="log", yscale="log", ylabel=f"error of the {_words(name)} [{unit}]")
         below.set(xscale="log", ylabel="error / bound [1]", xlabel="noise of the quieter band [K]")
         below.axhline(1.0, color="black", linewidth=0.6)
@@ -109,6 +113,76 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
             _plain_ticks(axis, cases["noise"])
     axes[0, 0].legend(frameon=False, fontsize=8)
     figure.suptitle("Errors at the statistical limit" + provenance_note(measured))
+    return figure
+
+
+def pooling(measured: xr.Dataset) -> Figure:
+    """
+    What pixels gain that are known to be of one material.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Over `size`, pixels in a group: `reflection_ratio_error`, its bound
+        `reflection_ratio_bound` and the separation's own deviation `stated` [1];
+        `object_temperature_error` [K].
+
+    Returns
+    -------
+    Figure
+        Left, the error of the ratio beside its bound and what is stated; right, the object's.
+    """
+    figure, ((left, right),) = canvas(1, 2, (9.0, 3.6))
+    size = measured["size"]
+    left.plot(size, measured["reflection_ratio_bound"], color="black", linewidth=0.8, label="bound")
+    left.plot(size, measured["stated"], color=COLORS[3], linewidth=1.2, label="stated")
+    left.plot(size, measured["reflection_ratio_error"], "o", color=COLORS[0], label="measured")
+    right.plot(size, measured["object_temperature_error"], "o-", color=COLORS[1], linewidth=1)
+    left.set(ylabel="error of the reflection ratio [1]")
+    right.set(ylabel="error of the object temperature [K]")
+    for axis in (left, right):
+        axis.set(xscale="log", yscale="log", xlabel="pixels of one material [1]")
+        _plain_ticks(axis, size)
+        _plain_decades(axis)
+    left.legend(frameon=False, fontsize=8)
+    figure.suptitle("Pixels that share a material" + provenance_note(measured))
+    return figure
+
+
+def error_over_bands(measured: xr.Dataset) -> Figure:
+    """
+    What a third and a fourth band gain.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Over `bands`, names of the bands in use: `object_temperature_error` [K] and, over `case`
+        too, `object_temperature_bound` [K].
+
+    Returns
+    -------
+    Figure
+        Left, the error beside its bounds; right, in units of them.
+    """
+    figure, ((left, right),) = canvas(1, 2, (9.0, 3.8))
+    error, place = measured["object_temperature_error"], np.arange(measured.sizes["bands"])
+    for index, case in enumerate(measured["case"].values):
+        bound = measured["object_temperature_bound"].sel(case=case)
+        mark = {"color": COLORS[index], "marker": _MARKERS[index], "markersize": 5, "linewidth": 1}
+        left.plot(place, bound, color=COLORS[index], linewidth=1, label=f"{case}, bound")
+        right.plot(place, error / bound, **mark)
+    left.plot(place, error, "ko", markersize=5, label="measured")
+    left.set(ylabel="error of the object temperature [K]")
+    left.set_ylim(bottom=0)
+    right.set(ylabel="error / bound [1]")
+    right.axhline(1.0, color="black", linewidth=0.6)
+    for axis in (left, right):
+        axis.set(xlabel=f"bands [{_MICRO}]")
+        names = [str(name).replace(" + ", "\n") for name in measured["bands"].values]
+        axis.set_xticks(place, names, fontsize=8)
+        axis.grid(visible=True, color="0.9")
+    left.legend(frameon=False, fontsize=8)
+    figure.suptitle("More bands" + provenance_note(measured))
     return figure
 
 

@@ -4,7 +4,14 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from dbthermal.figures.canvas import COLORS, band_label, canvas, limits_of, provenance_note
+from dbthermal.figures.canvas import (
+    COLORS,
+    band_label,
+    canvas,
+    draw_image,
+    limits_of,
+    provenance_note,
+)
 
 
 def emissivity_bars(table: xr.Dataset) -> Figure:
@@ -70,4 +77,43 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
         f"Condition number of band pairs\n({statistic} of {materials} materials; low is good)"
         + provenance_note(summary)
     )
+    return figure
+
+
+def pooled_materials(
+    single: xr.DataArray, pooled: xr.DataArray, labels: xr.DataArray, panels: xr.DataArray
+) -> Figure:
+    """
+    The reflection ratio pixel by pixel, and pooled over the materials found.
+
+    Parameters
+    ----------
+    single, pooled : DataArray
+        Reflection ratio (y, x) [1] without and with pooling.
+    labels : DataArray
+        Materials found (y, x), -1 for none.
+    panels : DataArray
+        True materials (y, x), whose borders are drawn.
+
+    Returns
+    -------
+    Figure
+        Three maps, with the true borders as lines.
+    """
+    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.4))
+    limits = limits_of(single)
+    for axis, ratio, title in ((left, single, "pixel by pixel"), (middle, pooled, "pooled")):
+        draw_image(
+            figure, axis, ratio, title, "reflection ratio [1]", cmap="viridis", limits=limits
+        )
+    found = labels.where(labels >= 0)
+    title = f"materials found: {np.unique(found.values[found.notnull().values]).size}"
+    right.imshow(found % 10, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
+    right.set_facecolor("0.8")
+    right.set_title(title, fontsize=9)
+    for axis in (left, middle, right):
+        for one in np.unique(panels.values)[1:]:
+            axis.contour(panels.values >= one, levels=[0.5], colors="white", linewidths=0.8)
+        axis.set(xticks=[], yticks=[])
+    figure.suptitle("Pixels of one material share their ratio" + provenance_note(single))
     return figure

@@ -1,7 +1,5 @@
 """Figures of separated scenes: frames, comparison with a published separation, status."""
 
-from collections.abc import Mapping
-
 import xarray as xr
 from matplotlib.figure import Figure
 from scipy.constants import zero_Celsius
@@ -143,37 +141,4 @@ def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.Da
     bottom.set(xlabel="time [s]", ylabel="correlation [1]", ylim=(min(0.0, float(scores.min())), 1))
     bottom.set_title(f"{scores.size} frames, median {float(scores.median()):.2f}", fontsize=9)
     figure.suptitle("Magnitude of the reflection" + provenance_note(ours))
-    return figure
-
-
-def status_map(status: xr.DataArray, meanings: Mapping[str, int]) -> Figure:
-    """
-    Where each flag of a separation is set.
-
-    Parameters
-    ----------
-    status : DataArray
-        (y, x), bits.
-    meanings : mapping
-        Name of each flag and its bit, e.g. `schema.FLAGS`.
-
-    Returns
-    -------
-    Figure
-        One map for each flag that occurs, and one of the good pixels.
-    """
-    masks = {"good": status == 0}
-    masks |= {name: (status & bit) != 0 for name, bit in meanings.items()}
-    shown = {name: mask for name, mask in masks.items() if bool(mask.any())}
-    columns = min(len(shown), 4)
-    rows = -(-len(shown) // columns)
-    figure, axes = canvas(rows, columns, (2.9 * columns, 2.6 * rows))
-    for axis in list(axes.ravel())[len(shown) :]:
-        axis.remove()
-    for axis, (name, mask) in zip(axes.ravel(), shown.items(), strict=False):
-        axis.imshow(mask.values, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-        axis.set_title(f"{name.replace('_', ' ')}\n{100 * float(mask.mean()):.1f} %", fontsize=9)
-        axis.set_xticks([])
-        axis.set_yticks([])
-    figure.suptitle("Status, white where set" + provenance_note(status))
     return figure
