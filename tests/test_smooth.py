@@ -81,3 +81,80 @@ def test_residual_energy_against_least_squares() -> None:
         ]
         expected = np.sum(residuals[0] * residuals[1], axis=0)
         np.testing.assert_allclose(result[order - 1], expected, rtol=0, atol=1e-10)
+
+
+def segmented(frames: int, *events: int) -> np.ndarray:
+    """Number of events before each frame."""
+    return np.searchsorted(events, np.arange(frames), side="right")
+
+
+@given(TIMES, st.integers(2, 4), st.data())
+def test_steps_and_a_jump_are_in_the_subspace(
+    time: smooth.Array, order: int, data: st.DataObject
+) -> None:
+    """Steps of the camera and a jump of the object are their own projection."""
+    event, jump = (data.draw(st.integers(2, time.size - 3)) for _ in range(2))
+    if abs(event - jump) < 2:
+        return
+    functions = smooth.subspace(time, order, segment=segmented(time.size, event), jump=jump)
+    assert (functions.orders, functions.steps) == (order, 3)
+    after = np.arange(time.size) >= jump
+    signal = 2.0 * segmented(time.size, event) + after * (3.0 + np.arange(time.size)) + 1.0
+    smoothed = functions.functions @ (functions.functions.T @ signal)
+    np.testing.assert_allclose(smoothed, signal, rtol=0, atol=1e-9 * np.abs(signal).max())
+    np.testing.assert_allclose(
+        functions.functions.T @ functions.functions, np.eye(order + 3), rtol=0, atol=1e-12
+    )
+
+
+@given(
+    st.floats(-50, 50),
+    st.lists(st.integers(5, 55), min_size=1, max_size=3, unique=True).map(sorted),
+)
+def test_own_part_is_without_the_steps_of_the_camera(height: float, events: list[int]) -> None:
+    """A curve with steps of the camera on it: the object's part is the curve alone."""
+    time = np.arange(60.0)
+    curve = 0.01 * (time - 20.0) ** 2
+    signal = curve + height * segmented(60, *events)
+    functions = smooth.subspace(time, 4, segment=segmented(60, *events))
+    own = functions.own @ (functions.functions.T @ signal)
+    np.testing.assert_allclose(own, curve, rtol=0, atol=1e-9)
+
+
+def test_own_part_keeps_a_jump() -> None:
+    """What the object does is its own, a jump included; what the camera does is not."""
+    time = np.arange(60.0)
+    jump, shutter = 5.0 * (time >= 40), 3.0 * (time >= 15)
+    functions = smooth.subspace(time, 3, segment=segmented(60, 15), jump=40)
+    own = functions.own @ (functions.functions.T @ (0.1 * time + jump + shutter))
+    np.testing.assert_allclose(own, 0.1 * time + jump, rtol=0, atol=1e-9)
+
+
+def test_leverage_with_steps_is_the_variance_of_the_own_part() -> None:
+    """White noise through the fit scatters as the leverage says, at every order."""
+    rng = np.random.default_rng(5)
+    time, noise = np.arange(80.0), rng.standard_normal((80, 4000))
+    functions = smooth.subspace(time, 5, segment=segmented(80, 30), jump=60)
+    for order in (1, 3, 5):
+        used = functions.columns(np.array([order]))[:, 0]
+        assert used.sum() == order + 3
+        own = functions.own[:, used] @ (functions.functions[:, used].T @ noise)
+        np.testing.assert_allclose(
+            own.var(axis=1), functions.leverage()[:, order - 1], rtol=0.15, atol=0
+        )
+
+
+def test_without_steps_the_subspace_is_the_basis() -> None:
+    """No event and no jump: the polynomials, all of them the object's own."""
+    time = np.arange(30.0)
+    for segment in (None, np.zeros(30, int), np.full(30, 7)):
+        found = smooth.subspace(time, 5, segment=segment)
+        np.testing.assert_array_equal(found.functions, smooth.basis(time, 5))
+        np.testing.assert_array_equal(found.own, found.functions)
+        assert found.steps == 0
+
+
+def test_more_steps_than_frames() -> None:
+    """Functions that outnumber the frames are refused, with both numbers."""
+    with pytest.raises(ValueError, match="Invalid order 6 with 19 steps over 20 frames"):
+        smooth.subspace(np.arange(20.0), 6, segment=np.arange(20))
