@@ -318,6 +318,7 @@ METHOD: Final = Method(
     separate,
     settings=Settings,
     minimum_frames=8,
+    every_frame=True,
     not_estimated=("object_temperature_std", "background_temperature_std", "emissivity_std"),
 )
 """The paper's optimiser, for `solve`."""

@@ -185,5 +185,7 @@ def _emissivities(
     mean = _sum(where, weight * value, count) / total
     residual = np.where(known, (value - mean[where]) ** 2, 0.0)
     pixels = _sum(where, np.ones_like(value), count)
-    own = _sum(where, weight**2 * residual, count) / total**2 * pixels / np.maximum(pixels - 1, 1)
-    return mean, own, _sum(where, weight * common, count) / total
+    scatter = _sum(where, weight**2 * residual, count) / total**2
+    scatter *= pixels / np.maximum(pixels - 1, 1)
+    stated = _sum(where, weight**2 * np.where(known, survey.own_variance, 0.0), count) / total**2
+    return mean, np.maximum(scatter, stated), _sum(where, weight * common, count) / total

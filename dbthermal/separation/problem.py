@@ -182,6 +182,8 @@ class Method:
         Whether it must be given the emissivities.
     whole_image : bool
         Whether it looks at a pixel's neighbours, so that a tile is the whole image.
+    every_frame : bool
+        Whether all pixels must have the same frames: one that lacks any of them is not solved.
     survey : callable, optional
         For methods that pool the pixels of one material: from the same arguments to a `Survey`.
     any_bands : bool
@@ -195,6 +197,7 @@ class Method:
     minimum_frames: int = 1
     knows_emissivity: bool = False
     whole_image: bool = False
+    every_frame: bool = False
     survey: Callable[..., Survey] | None = None
     any_bands: bool = False
     not_estimated: tuple[str, ...] = ()

@@ -95,6 +95,28 @@ def patterns(there: Mask, unusable: Mask) -> Iterator[tuple[Mask, Mask]]:
             yield there[:, pixel], pixels
 
 
+def common(there: Mask, unusable: Mask) -> tuple[Mask, Mask]:
+    """
+    Frames that most of the pixels have, for methods that need the same of all.
+
+    Parameters
+    ----------
+    there : ndarray of bool, shape (time, pixel)
+        Which frames each pixel has.
+    unusable : ndarray of bool, shape (pixel,)
+        Pixels that nothing can be computed of.
+
+    Returns
+    -------
+    tuple of ndarray of bool
+        These frames (time), and the usable pixels (pixel) that lack any of them.
+    """
+    if np.all(unusable):
+        return np.ones(there.shape[0], dtype=bool), np.zeros_like(unusable)
+    frames = np.mean(there[:, ~unusable], axis=1) > MOST_MISSING
+    return frames, ~unusable & ~np.all(there[frames], axis=0)
+
+
 def unusable(status: Flags) -> Mask:
     """
     Where nothing can be computed.

@@ -19,7 +19,7 @@ from dbthermal.curves import Curve
 from dbthermal.separation import given, methods, samples, tiles
 from dbthermal.separation import pool as pool_of
 from dbthermal.separation.problem import Method, Problem
-from dbthermal.separation.separated import Array, Flags, Mask, Survey
+from dbthermal.separation.separated import Array, Flags, Mask, Separated, Survey
 
 Places = npt.NDArray[np.intp]
 
@@ -191,10 +191,11 @@ class _Task:
     def separate(self, rows: slice, result: xr.Dataset, bar: "tqdm[Any]") -> None:
         """Separate a block of rows into its place in the result."""
         for tile, status, problems in self._problems(rows):
-            parts = [
-                (frames, pixels, self._call(self.method.separate, problem))
-                for frames, pixels, problem in problems
-            ]
+            parts = []
+            for frames, pixels, problem in problems:
+                found: Separated = self._call(self.method.separate, problem)
+                whole = found.status.size == pixels.size
+                parts.append((frames, pixels, found.of(pixels) if whole else found))
             tiles.write(result, tile, self.bands, status, parts)
             bar.update(status.size)
 
@@ -243,15 +244,20 @@ class _Task:
         for tile in tiles.cover(part, size):
             counts, there, status = samples.read(part, tile, self.method.minimum_frames)
             bad = samples.unusable(status)
+            if self.method.whole_image or self.method.every_frame:
+                frames, lacking = samples.common(there, bad)
+                status[lacking] |= np.uint16(schema.FLAGS["invalid_samples"])
+                counts[:, :, lacking] = 0.0
+                usable = ~bad & ~lacking
+                sets = [(frames, usable)] if np.any(usable) else []
+            else:
+                sets = list(samples.patterns(there, bad))
             problem = self._problem(part, counts, tile, rows)
-            if self.method.whole_image:
-                frames = np.all(there[:, ~bad], axis=1)
-                yield tile, status, [(frames, np.ones_like(bad), problem.at(frames))]
-                continue
             problems = []
-            for frames, pixels in samples.patterns(there, bad):
-                chosen = problem if np.all(frames) else problem.at(frames)
-                problems.append((frames, pixels, chosen if np.all(pixels) else chosen.of(pixels)))
+            for frames, pixels in sets:
+                one = problem if np.all(frames) else problem.at(frames)
+                alone = not (self.method.whole_image or np.all(pixels))
+                problems.append((frames, pixels, one.of(pixels) if alone else one))
             yield tile, status, problems
 
     def _problem(self, part: xr.Dataset, counts: Array, tile: tiles.Tile, rows: slice) -> Problem:
