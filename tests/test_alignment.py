@@ -306,3 +306,14 @@ def test_lost_frames_of_the_simulation(scene: xr.Dataset) -> None:
     np.testing.assert_array_equal(copied["counts"][0], capture["counts"][0])
     with pytest.raises(ValueError, match="Must increase and lie in"):
         recorded(scene, 20)
+
+
+def test_nothing_is_left_on_the_clocks_before(scene: xr.Dataset) -> None:
+    """What was told frame by frame is not handed on beside other times; an offset is in seconds."""
+    capture = simulation.observe(scene, Rig().response(), np.random.default_rng(0))
+    told = (("band", "time"), np.zeros(capture["counts"].shape[:2]), {"units": "count"})
+    aligned = alignment.align(capture.assign(drift=told), offset=0.02)
+    assert set(aligned.data_vars) == {"counts"}
+    offset = xr.DataArray([0.0, 20.0], dims="band", coords={"band": capture["band"]})
+    with pytest.raises(ValueError, match="Invalid unit 'ms' of the offset"):
+        alignment.align(capture, offset=offset.assign_attrs(units="ms"))

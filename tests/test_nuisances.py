@@ -550,3 +550,22 @@ def test_simulated_nuisances_refuse_nonsense(clean: xr.Dataset) -> None:
         nuisances.fire_shutter(clean, 99.0, rng)
     with pytest.raises(ValueError, match=re.escape("Missing band '10.6'")):
         nuisances.fire_shutter(clean, 9.0, rng, bands=("10.6",))
+
+
+@pytest.mark.parametrize("name", ["fire_shutter", "drift_pattern", "spoil_pixels", "lag"])
+def test_whole_numbers_are_refused(name: str) -> None:
+    """Raw counts would wrap around: a lagging pixel of 1000 counts would show 57,580."""
+    counts = np.full((2, 5, 2, 2), 1000, dtype=np.uint16)
+    raw = xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts)},
+        coords={"band": ["8-14", "9.5"], "time": np.arange(5) / 10.0},
+    )
+    rng = np.random.default_rng(0)
+    arguments = {
+        "fire_shutter": ([0.2], rng),
+        "drift_pattern": (rng,),
+        "spoil_pixels": (0.1, rng),
+        "lag": (0.05,),
+    }
+    with pytest.raises(TypeError, match="uint16 of the counts"):
+        getattr(simulation, name)(raw, *arguments[name])

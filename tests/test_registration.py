@@ -164,3 +164,36 @@ def test_parallax_looks_like_a_time_offset() -> None:
     offset = alignment.time_offset(capture)
     print(f"reflection 2 pixels apart: {offset / 0.1:.2f} frames")
     assert 0.1 < abs(offset) / 0.1 < 0.5
+
+
+def test_the_offset_is_that_of_registered_views() -> None:
+    """Of views 3 pixels and 4/3 frames apart, the offset is found after they are registered."""
+    value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    fine, rng, response = np.arange(1056) / 30.0, np.random.default_rng(3), RIG.response()
+    wide = simulation.walkers(fine, (56, 72), value, rng)
+    views = [wide.isel(y=slice(4, 52), x=slice(4, 68)), wide.isel(y=slice(2, 50), x=slice(7, 71))]
+    places = {"x": np.arange(64), "y": np.arange(48)}
+    parts = [
+        simulation.expose(
+            view.assign_coords(places),
+            response.isel(band=[band]),
+            rng,
+            every=3,
+            offsets=[4 * band],
+            frames=350,
+        ).drop_vars("exposure_time")
+        for band, view in enumerate(views)
+    ]
+    time = parts[0]["time"]
+    capture = xr.concat(
+        [part.assign_coords(time=time) for part in parts], "band", combine_attrs="override"
+    )
+    transform = registration.register(capture, model="translation")
+    aligned = alignment.align(capture, transform=transform)
+    errors = [
+        10.0 * found - 4.0 / 3.0
+        for found in (alignment.time_offset(capture), aligned.attrs["time_offset"][1])
+    ]
+    print(f"error of the offset: {errors[0]:.3f} frames as seen, {errors[1]:.3f} registered")
+    assert abs(errors[1]) < 0.05  # [frame]
+    assert abs(errors[0]) > 0.2  # [frame]: else the scene would not tell

@@ -136,6 +136,9 @@ def time_offset(
     -----
     The standard deviation is a jackknife's, over 16 groups of pixels.
 
+    The views must show the same at the same pixel: `align` registers them before it calls this.
+    The standard deviation says nothing of it, for all pixels err alike.
+
     Cameras side by side see a reflection at different pixels. Where most of what is reflected moves
     one way, it comes to a pixel of one view earlier, and this looks like an offset; what moves
     either way cancels. Where there is such a parallax, measure the offset otherwise and give it.

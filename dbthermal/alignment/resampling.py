@@ -55,7 +55,8 @@ def align(
         (time), which counts shutter events; `status` (y, x).
     offset : float or DataArray, optional
         How much later than the first band the others were exposed, beyond what stamps say [s]: a
-        number for two bands, or (band), 0 in the first. Estimated by `time_offset` unless given.
+        number for two bands, or (band), 0 in the first. Estimated by `time_offset` unless given,
+        from the views as registered by `transform`.
     transform : DataArray, optional
         (band, row, column), from `registration.register`: the views are warped by bilinear
         interpolation. Pixels outside a view are NaN.
@@ -69,7 +70,8 @@ def align(
         the exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
         `status` is that of all the pixels that it may be made of. Attributes tell what was done:
         `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band), `transform` (the
-        matrices, row by row). `exposure_time` is gone.
+        matrices, row by row). `exposure_time` is gone, and what else was told frame by frame on the
+        clocks before, as `drift` is; other maps are handed on, not warped.
 
     Raises
     ------
@@ -81,11 +83,13 @@ def align(
     Interpolation makes the noise of a band smaller, by up to 0.7, and correlates neighbouring
     frames; in the quieter of two bands it hardly counts.
     """
-    counts = schema.check(corrected, "corrected")["counts"]
-    names = [str(name) for name in counts["band"].values]
-    offsets = _offsets(corrected, offset, names)
-    stamps = clocks.exposures(corrected) + offsets[:, np.newaxis]
+    names = [str(name) for name in schema.check(corrected, "corrected")["band"].values]
     matrices = None if transform is None else _matrices(transform, names)
+    if matrices is not None:
+        # First of all: what moves passes an unregistered view earlier or later.
+        corrected = _registered(corrected, matrices)
+    counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
+    stamps = clocks.exposures(corrected) + offsets[:, np.newaxis]
     kept = _noisiest(corrected, stamps) if clock is None else names.index(_known(clock, names))
     times, segment = clocks.filled(stamps[kept]), clocks.segments(corrected)
     aligned = np.empty(counts.shape, dtype=np.float32)
@@ -93,11 +97,9 @@ def align(
         movie = np.asarray(counts.isel(band=band).values, dtype=np.float32)
         plan = clocks.interpolation(own, ~clocks.missing(movie), times).within(segment)
         plan = replace(plan, known=plan.known & (plan.labels(segment) == segment))
-        if matrices is not None and not np.array_equal(matrices[band], np.eye(3)):
-            movie = warp(movie, matrices[band])
         plan.apply(movie, aligned[band])
     lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
-    result = _assembled(corrected, aligned, times, matrices)
+    result = _assembled(corrected, aligned, times)
     return result.assign_attrs(
         clock=names[kept],
         time_offset=offsets.tolist(),
@@ -167,6 +169,8 @@ def _offsets(corrected: xr.Dataset, given: float | xr.DataArray | None, names: l
         return np.array([0.0, *found])
     if isinstance(given, xr.DataArray):
         places = schema.band_positions(given, names, "the time offset")
+        if given.attrs.get("units", "s") != "s":
+            raise ValueError(f"Invalid unit '{given.attrs['units']}' of the offset. Must be 's'.")
         values = given.values[places].astype(np.float64)
     else:
         if len(names) != 2:
@@ -212,18 +216,28 @@ def _noisiest(corrected: xr.Dataset, stamps: Array) -> int:
     return int(np.argmax(levels))
 
 
-def _assembled(
-    corrected: xr.Dataset, aligned: Movie, times: Array, matrices: Array | None
-) -> xr.Dataset:
+def _registered(corrected: xr.Dataset, matrices: Array) -> xr.Dataset:
+    """All views, and the status, on the first one's grid."""
+    counts = corrected["counts"]
+    views = np.empty(counts.shape, dtype=np.float32)
+    for band, matrix in enumerate(matrices):
+        movie = counts.isel(band=band).values
+        views[band] = movie if np.array_equal(matrix, np.eye(3)) else warp(movie, matrix)
+    result = corrected.assign(counts=counts.copy(data=views))
+    if "status" in corrected:
+        status = _warped_status(corrected["status"], matrices)
+        result = result.assign(status=corrected["status"].copy(data=status))
+    return result
+
+
+def _assembled(corrected: xr.Dataset, aligned: Movie, times: Array) -> xr.Dataset:
     counts = corrected["counts"]
     attrs = schema.STAGES["corrected"]["counts"].attrs
-    result = corrected.drop_vars("exposure_time", errors="ignore").assign(
+    old = [name for name, part in corrected.data_vars.items() if "time" in part.dims]
+    result = corrected.drop_vars(set(old) - {"counts", "segment"}).assign(
         counts=(counts.dims, aligned, {**counts.attrs, **attrs})
     )
     result = result.assign_coords(time=("time", times, corrected["time"].attrs))
-    if matrices is not None and "status" in corrected:
-        status = _warped_status(corrected["status"], matrices)
-        result = result.assign(status=corrected["status"].copy(data=status))
     return schema.check(result, "corrected")
 
 

@@ -18,7 +18,7 @@ REASONS: Final = MappingProxyType(
     {
         "dead_pixel": ("dead pixel", "#000000"),
         "saturated": ("saturated", "#4d4d4d"),
-        "invalid_samples": ("counts are not numbers", "#737373"),
+        "invalid_samples": ("no samples, as outside a view", "#737373"),
         "constant_signal": ("signal never changes", "#969696"),
         "frozen_frames": ("frozen frames, as by a shutter", "#bdbdbd"),
         "object_jump": ("object jumps", "#7f3b08"),

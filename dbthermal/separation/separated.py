@@ -134,7 +134,8 @@ class Separated:
         -------
         Separated
             The same with `outside_response` added to the status; samples that no temperature
-            gives, or whose deviation is beyond all use, are NaN.
+            gives, or whose deviation is beyond all use, are NaN. A quantity that is NaN in all
+            samples needs no further flag where there is one already.
         """
         values: dict[str, Array] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
@@ -143,7 +144,8 @@ class Separated:
                 continue
             value, std = getattr(self, name), getattr(self, f"{name}_std")
             lost = ~((np.abs(value) < _USELESS) & ((std < _USELESS) | (not deviations)))
-            beyond |= np.any(lost, axis=0) & ~np.all(np.isnan(value), axis=0)
+            explained = np.all(np.isnan(value), axis=0) & (self.status != 0)
+            beyond |= np.any(lost, axis=0) & ~explained
             values[name], values[f"{name}_std"] = (
                 np.where(lost, np.nan, part) for part in (value, std)
             )

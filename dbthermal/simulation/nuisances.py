@@ -56,7 +56,7 @@ def fire_shutter(
         If the capture is not as `schema` has it, a time does not lie in it, the duration is not
         positive, or a band is missing.
     """
-    counts = schema.check(corrected, "corrected")["counts"].copy(deep=True)
+    counts = _floating(corrected).copy(deep=True)
     planck.require_positive("duration [s]", duration)
     clock = counts["time"].values.astype(np.float64)
     names = [str(name) for name in counts["band"].values] if bands is None else list(bands)
@@ -137,7 +137,7 @@ def drift_pattern(
     TypeError, ValueError
         If the capture is not as `schema` has it, or has one frame.
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = _floating(corrected)
     time = counts["time"].values.astype(np.float64)
     planck.require_positive("length of the capture [s]", time[-1] - time[0])
     share = ((time - time[0]) / (time[-1] - time[0])).astype(counts.dtype)
@@ -189,7 +189,7 @@ def spoil_pixels(
         If the capture is not as `schema` has it, the share does not lie in [0, 1), or the time
         between steps is not positive.
     """
-    counts = schema.check(corrected, "corrected")["counts"].copy(deep=True)
+    counts = _floating(corrected).copy(deep=True)
     if not 0 <= share < 1:
         raise ValueError(f"Invalid share {share} of bad pixels. Must lie in [0, 1).")
     planck.require_positive("dwell [s]", dwell)
@@ -238,7 +238,7 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
         If the capture is not as `schema` has it, or a time constant is not finite and positive or
         a band has none.
     """
-    counts = schema.check(corrected, "corrected")["counts"].copy(deep=True)
+    counts = _floating(corrected).copy(deep=True)
     interval = np.diff(counts["time"].values.astype(np.float64))
     for band, constant in enumerate(lags.time_constants(time_constant, counts)):
         _, new = lags.memory(interval, constant)
@@ -248,6 +248,14 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
             step = movie[frame] - movie[frame - 1]
             movie[frame] = movie[frame - 1] + new[frame - 1] * step
     return corrected.assign(counts=counts)
+
+
+def _floating(corrected: xr.Dataset) -> xr.DataArray:
+    """Counts of a capture, which whole numbers would round and wrap around."""
+    counts = schema.check(corrected, "corrected")["counts"]
+    if counts.dtype.kind != "f":
+        raise TypeError(f"Invalid dtype {counts.dtype} of the counts. Must be floating.")
+    return counts
 
 
 def _telegraph(time: Array, dwell: float, rng: np.random.Generator) -> Array:
