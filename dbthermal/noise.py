@@ -129,7 +129,7 @@ def of_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
     Parameters
     ----------
     signals : sequence of ndarray, shape (time, pixel)
-        Signals of the bands, each in a unit of its own.
+        Signals of the bands; of more than two all in one unit, for the quietest to be found.
     time : array_like, shape (time,)
         Times [s].
 

@@ -99,14 +99,16 @@ def subspace(
         As `basis`, or if there are more functions than times.
     """
     plain = basis(time, order)
-    position = np.linspace(0.0, 1.0, len(plain))
     steps = []
     if segment is not None:
         steps += [np.where(segment >= one, 1.0, 0.0) for one in np.unique(segment)[1:]]
     of_camera = len(steps)
     if jump is not None:
         after = np.arange(len(plain)) >= jump
-        steps += [np.where(after, 1.0, 0.0), np.where(after, position - position[jump], 0.0)]
+        stamps = np.asarray(time, dtype=np.float64)
+        times = np.asarray(time, dtype=np.float64)
+        since = (times - times[jump]) / (times[-1] - times[0])
+        steps += [np.where(after, 1.0, 0.0), np.where(after, since, 0.0)]
     if not steps:
         return Subspace(plain, plain, 0)
     if order + len(steps) > len(plain):

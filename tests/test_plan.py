@@ -82,6 +82,7 @@ def test_gray_table_has_no_filter(materials: Materials) -> None:
     gray["emissivity"][:] = 0.8
     expected = limits.plan(gray, noise)
     assert expected["best"].values.tolist() == [limits.NO_FILTER]
+    assert expected["best_of_all"] == limits.NO_FILTER
     assert np.isinf(expected["condition_number"]).all()
 
 

@@ -99,7 +99,7 @@ def test_steps_and_a_jump_are_in_the_subspace(
     functions = smooth.subspace(time, order, segment=segmented(time.size, event), jump=jump)
     assert (functions.orders, functions.steps) == (order, 3)
     after = np.arange(time.size) >= jump
-    signal = 2.0 * segmented(time.size, event) + after * (3.0 + np.arange(time.size)) + 1.0
+    signal = 2.0 * segmented(time.size, event) + after * (3.0 + time - time[jump]) + 1.0
     smoothed = functions.functions @ (functions.functions.T @ signal)
     np.testing.assert_allclose(smoothed, signal, rtol=0, atol=1e-9 * np.abs(signal).max())
     np.testing.assert_allclose(
@@ -158,3 +158,12 @@ def test_more_steps_than_frames() -> None:
     """Functions that outnumber the frames are refused, with both numbers."""
     with pytest.raises(ValueError, match="Invalid order 6 with 19 steps over 20 frames"):
         smooth.subspace(np.arange(20.0), 6, segment=np.arange(20))
+
+
+def test_jump_in_slope_over_uneven_times() -> None:
+    """A new slope after the jump is straight in time, over a gap in the frames as well."""
+    time = np.concatenate([np.arange(150), np.arange(250, 350)]) / 10.0
+    bent = np.maximum(time - time[80], 0.0) + 5.0 * (time >= time[80])
+    functions = smooth.subspace(time, 4, jump=80)
+    own = functions.own @ (functions.functions.T @ bent)
+    np.testing.assert_allclose(own, bent, rtol=0, atol=1e-9)

@@ -259,6 +259,18 @@ def test_saturated_counts_are_flagged(glass: Glass) -> None:
     assert flagged.sum() == 1
 
 
+def test_masked_samples_do_not_saturate_a_pixel(glass: Glass) -> None:
+    """Frames at the detector's limit that the mask leaves out leave no flag."""
+    _, capture, response = glass
+    counts = np.rint(capture["counts"].values).astype(np.uint16)
+    counts[:, 100:110] = 65535
+    used = xr.DataArray((TIME < 10.0) | (TIME >= 11.0), dims="time")
+    whole = capture.assign(counts=(capture["counts"].dims, counts, capture["counts"].attrs))
+    result = separation.solve(whole, response, mask=used)
+    assert not np.any(result["status"].values & schema.FLAGS["saturated"])
+    assert np.all(separation.solve(whole, response)["status"] & schema.FLAGS["saturated"])
+
+
 def test_frozen_frames_are_flagged(glass: Glass) -> None:
     """Frames that repeat while a shutter is closed are flagged in every pixel."""
     _, capture, response = glass

@@ -70,7 +70,10 @@ def find(
         places = inside[:, np.newaxis] + offsets
         energy = own[places].mean(axis=1) - np.abs(offsets[:, np.newaxis] - offsets).mean() / 2.0
         energy -= np.sum(held[places].mean(axis=1) ** 2, axis=1)
-        mean = np.stack([after[:, inside + offset] for offset in offsets]).mean(axis=0)
+        # A running sum: side by side, the offsets of a fast film would need a gigabyte.
+        mean = np.zeros((len(after), inside.size, after.shape[2]))
+        for offset in offsets:
+            mean += after[:, inside + offset] / offsets.size
         part = np.einsum("btp,ctp->tpbc", mean, mean) / energy[:, None, None, None]
         across = np.linalg.eigvalsh(scatter - part)[..., :-1].sum(axis=-1)
         best = np.argmin(across, axis=0)

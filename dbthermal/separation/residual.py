@@ -11,6 +11,9 @@ from dbthermal.separation.separated import Array
 MEMORY_LAGS: Final = 5
 """Frames over which `memory` looks for a correlation."""
 
+# Deviations of noise from which a difference between frames is a change.
+_CHANGE: Final = 5.0
+
 
 def of_combination(signals: Array, functions: smooth.Subspace, found: Direction) -> Array:
     """
@@ -64,14 +67,17 @@ def lateness(
     left: Array, first: Array, functions: smooth.Subspace, found: Direction, noise: float
 ) -> Array:
     r"""
-    Whether the bands' rapid changes are not simultaneous, from a matched filter.
+    Whether the bands' rapid changes are not simultaneous.
 
     A band that is a frame late, or early, leaves the difference between two frames of what the
-    others show. The residual r is therefore held against both differences of the first band,
+    others show. The residual r is therefore held against both differences of the first band, a
+    matched filter,
 
     .. math:: \sum_t r(t) \, (z_1(t \pm 1) - z_1(t)) + n \, w_1 s_1^2
 
-    where the last term takes out that the residual holds the noise of :math:`z_1(t)`.
+    where the last term takes out that the residual holds the noise of :math:`z_1(t)`. What comes
+    now late, now early, as after an interpolation between frames, is seen in the energy of the
+    residual in the frames at a change, over that of the noise.
 
     Parameters
     ----------
@@ -89,16 +95,30 @@ def lateness(
     Returns
     -------
     ndarray, shape (pixel,)
-        The larger score in magnitude, in standard deviations of white noise.
+        The largest score in magnitude, in standard deviations of white noise.
     """
     rapid = first - functions.functions @ found.coefficients[0]
     change = np.diff(rapid, axis=0)
     own = (left.shape[0] - found.order - functions.steps) * found.weights[0] * noise**2
     late = np.einsum("tp,tp->p", left[:-1], change) + own
     early = np.einsum("tp,tp->p", left[1:], change) - own
-    strongest = np.where(np.abs(late) > np.abs(early), late, early)
+    strongest = np.maximum(np.abs(late), np.abs(early))
     variance = found.across * np.einsum("tp,tp->p", change, change)
     score = np.divide(
         strongest, np.sqrt(variance), out=np.zeros_like(strongest), where=variance > 0
     )
-    return np.asarray(score)
+    return np.asarray(np.maximum(score, _excess(left, change, found.across, noise)))
+
+
+def _excess(left: Array, change: Array, across: Array, noise: float) -> Array:
+    """Energy beyond that of the noise in frames at a change, in standard deviations."""
+    steps = np.abs(change) > _CHANGE * np.sqrt(2.0) * noise
+    at = np.zeros(left.shape, dtype=bool)
+    at[1:] |= steps
+    at[:-1] |= steps
+    count = at.sum(axis=0)
+    energy = np.einsum("tp,tp->p", left * at, left) / across
+    excess = np.divide(
+        energy - count, np.sqrt(2.0 * count), out=np.zeros_like(energy), where=count > 0
+    )
+    return np.asarray(excess)

@@ -56,7 +56,7 @@ def read(corrected: xr.Dataset, tile: Tile, fewest: int = 1) -> tuple[Array, Mas
         {
             "invalid_samples": invalid,
             "constant_signal": constant & (frames > 1),
-            "saturated": _saturated(raw),
+            "saturated": _saturated(raw, there),
             "frozen_frames": _frozen(counts, there) & ~invalid & ~constant,
         }
     )
@@ -135,12 +135,13 @@ def unusable(status: Flags) -> Mask:
     return np.asarray((status & np.uint16(masks)) != 0)
 
 
-def _saturated(raw: npt.NDArray[Any]) -> Mask:
-    """Where whole-number counts reach an end of their type."""
+def _saturated(raw: npt.NDArray[Any], there: Mask) -> Mask:
+    """Where whole-number counts that are used reach an end of their type."""
     if raw.dtype.kind not in "ui":
         return np.zeros(raw.shape[-1], dtype=bool)
     ends = np.iinfo(raw.dtype)
-    return np.asarray(np.any((raw == ends.max) | (raw == max(ends.min, 0)), axis=(0, 1)))
+    at_an_end = (raw == ends.max) | (raw == max(ends.min, 0))
+    return np.asarray(np.any(at_an_end & there, axis=(0, 1)))
 
 
 def _frozen(counts: Array, there: Mask) -> Mask:

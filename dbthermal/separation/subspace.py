@@ -247,7 +247,7 @@ def _flags(problem: Problem, estimate: _Estimate) -> dict[str, Mask]:
         "background_never_rests": told & fit.restless,
         "nonphysical_emissivity": nonphysical,
         "roles_may_be_swapped": told & ~nonphysical & (fit.emissivity.mean(axis=0) < 0.5),
-        "bands_apart": ~still & (np.abs(estimate.lateness) > _APART_SIGMAS),
+        "bands_apart": ~still & (estimate.lateness > _APART_SIGMAS),
         "object_not_smooth": (estimate.memory > _MEMORY_SIGMAS) | (found.misfit > 1.0 + misfit),
     }
 

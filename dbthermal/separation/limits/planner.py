@@ -80,9 +80,9 @@ def plan(
         `emissivity_std` [1], and `reflection_ratio_std` [1] of :math:`(1 - e_m) / (1 - e_1)` with
         band 1 the one that is always recorded; NaN for a band that is not of the combination.
         `best` (material): the filter of the smallest object deviation, "none" where each is above
-        that of a guess, a uniform number within the recording's range of temperatures. The
-        attribute `best` is the filter whose median over the materials is smallest. `noise` (band)
-        [K], and the recording's numbers as attributes.
+        that of a guess, a uniform number within the recording's range of temperatures.
+        `best_of_all` (): the filter whose median over the materials is smallest, "none" under the
+        same rule. `noise` (band) [K], and the recording's numbers as attributes.
 
     Raises
     ------
@@ -106,8 +106,9 @@ def plan(
     labels = [" + ".join(names[place] for place in chosen[1:]) for chosen in sets]
     result = _dataset(table, labels, parts, sets)
     own = result["object_temperature_std"]
-    best = _best(own, recording.range / np.sqrt(12.0))
-    of_all = labels[int(np.argmin(np.median(own.values, axis=0)))]
+    guess = recording.range / np.sqrt(12.0)
+    best = _best(own, guess)
+    of_all = _best(own.median("material").expand_dims("material"), guess)[0]
     return result.assign(
         best=("material", best, {"long_name": "filter of the smallest object deviation"}),
         best_of_all=((), of_all, {"long_name": "filter of its smallest median"}),
