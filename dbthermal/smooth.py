@@ -105,7 +105,6 @@ def subspace(
     of_camera = len(steps)
     if jump is not None:
         after = np.arange(len(plain)) >= jump
-        stamps = np.asarray(time, dtype=np.float64)
         times = np.asarray(time, dtype=np.float64)
         since = (times - times[jump]) / (times[-1] - times[0])
         steps += [np.where(after, 1.0, 0.0), np.where(after, since, 0.0)]

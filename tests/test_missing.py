@@ -91,7 +91,7 @@ def test_masks_of_pixels(case: Case) -> None:
 def test_masks_of_samples_are_nan(case: Case) -> None:
     """A mask of single samples is the same as NaN there, each pixel with its own frames."""
     _, capture, response = case
-    there = np.random.default_rng(4).random((350, 1, PIXELS)) > 0.1
+    there = np.random.default_rng(4).random((350, 1, PIXELS)) > 0.25  # too many to be bridged
     masked = separation.solve(capture, response, mask=xr.DataArray(there, dims=("time", "y", "x")))
     spoilt = separation.solve(without(capture, there), response)
     xr.testing.assert_identical(masked, spoilt)
@@ -255,9 +255,23 @@ def test_pixel_that_lacks_a_frame_is_left_out_where_all_must_have_the_same(metho
     """A method that needs the same frames of all pixels flags the one that lacks a sample."""
     _, capture, response = experiments.simulate(GLASS, RIG, TIME[:40], 4, seed=3)
     spoilt = capture.copy(deep=True)
-    spoilt["counts"].values[1, 7, 0, 2] = np.nan
+    spoilt["counts"].values[1, 7:10, 0, 2] = np.nan  # longer than what is bridged
     result = separation.solve(spoilt, response, method)
     lacking = result["status"].values[0] & schema.FLAGS["invalid_samples"] != 0
     np.testing.assert_array_equal(lacking, [False, False, True, False])
     given = np.isfinite(result["object_temperature"].values[:, 0]).any(axis=0)
     np.testing.assert_array_equal(given, ~lacking)
+
+
+def test_short_gaps_are_bridged() -> None:
+    """With single samples lost, others in each pixel, the object is as good, and NaN where lost."""
+    scene, capture, response = experiments.simulate(GLASS, RIG, TIME, 300, seed=5)
+    there = np.random.default_rng(6).random((350, 1, 300)) > 0.05
+    errors = []
+    for one in (capture, without(capture, there)):
+        error = separation.solve(one, response)["object_temperature"] - scene["object_temperature"]
+        errors.append(float(np.sqrt((error**2).mean())))
+    print(f"whole {errors[0]:.3f} K, one sample in twenty lost {errors[1]:.3f} K")
+    assert errors[1] < 1.1 * errors[0]
+    assert np.all(np.isnan(error.values[~there]))
+    assert np.isfinite(error.values[there]).mean() > 0.99

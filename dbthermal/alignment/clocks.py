@@ -35,7 +35,7 @@ class Interpolation:
 
     For a signal that changes by sudden steps, and for a random walk, this line is the expected
     value between two samples: what it misses has mean zero and is independent of what it gives, so
-    a regression on it is not biased [1]_.
+    a regression on it is not biased [1]_. At a step it misses by up to the half of it, though.
 
     Attributes
     ----------
@@ -45,6 +45,8 @@ class Interpolation:
         w, the weight of the frame after [1].
     known : ndarray of bool, shape (wanted,)
         False where the line would reach over a gap or past an end.
+    stamps : ndarray, shape (time,)
+        When the frames were exposed [s].
 
     References
     ----------
@@ -56,8 +58,11 @@ class Interpolation:
     after: Indices
     share: Array
     known: Mask
+    stamps: Array
 
-    def apply(self, frames: npt.NDArray[Any], out: npt.NDArray[Any]) -> None:
+    def apply(
+        self, frames: npt.NDArray[Any], out: npt.NDArray[Any], largest: float = np.inf
+    ) -> None:
         """
         Write the interpolated frames, NaN where they are not known.
 
@@ -67,6 +72,8 @@ class Interpolation:
             Samples, in any unit.
         out : ndarray, shape (wanted, ...)
             Where the result goes, floating.
+        largest : float
+            Step between two samples, in their unit, beyond which nothing between them is known.
         """
         for place, share in enumerate(self.share):
             before, after = frames[self.before[place]], frames[self.after[place]]
@@ -76,6 +83,21 @@ class Interpolation:
                 out[place] = after if share else before
             else:
                 out[place] = (1.0 - share) * before + share * after
+                out[place][self._step(frames, place) > largest] = np.nan
+
+    def _step(self, frames: npt.NDArray[Any], place: int) -> npt.NDArray[Any]:
+        """Change between two samples, or how much it is more than beside them: the smaller."""
+        before, after = int(self.before[place]), int(self.after[place])
+        change, time = frames[after] - frames[before], self.stamps
+        rates = [
+            (frames[late] - frames[early]) / (time[late] - time[early])
+            for early, late in ((before - 1, before), (after, after + 1))
+            if early >= 0 and late < len(frames) and np.isfinite(time[late] - time[early])
+        ]
+        width = time[after] - time[before]
+        known = [np.where(np.isnan(rate), change, rate * width) for rate in rates]
+        more = change - sum(known) / max(len(known), 1)
+        return np.asarray(np.minimum(np.abs(change), np.abs(more)))
 
     def within(self, segment: Indices) -> "Interpolation":
         """
@@ -318,4 +340,4 @@ def interpolation(stamps: Array, present: Mask, wanted: Array) -> Interpolation:
     share = (wanted - times[right - 1]) / width
     share = np.where(np.abs(share - np.rint(share)) * width <= SAME * step, np.rint(share), share)
     known = (share == 0) | (share == 1) | ((share > 0) & (share < 1) & (width <= _GAP * step))
-    return Interpolation(good[right - 1], good[right], share, known)
+    return Interpolation(good[right - 1], good[right], share, known, stamps)

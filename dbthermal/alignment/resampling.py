@@ -9,7 +9,8 @@ import xarray as xr
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtri
 
-from dbthermal import noise, schema
+from dbthermal import noise as noises
+from dbthermal import schema
 from dbthermal.alignment import clocks
 from dbthermal.alignment.offset import present, sample, time_offset
 
@@ -22,6 +23,8 @@ TRANSFORM: Final = schema.Variable(
 """What registration gives: for each band a 3x3 homography on (x, y, 1), in pixels."""
 
 # Median absolute deviation -> standard deviation of a normal distribution.
+# Deviations of noise beyond which a step lies between two frames.
+_STEP: Final = 5.0
 _MAD: Final = 1.0 / float(ndtri(0.75))
 # A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
 _DIGITS: Final = 9
@@ -81,7 +84,9 @@ def align(
     Notes
     -----
     Interpolation makes the noise of a band smaller, by up to 0.7, and correlates neighbouring
-    frames; in the quieter of two bands it hardly counts.
+    frames; in the quieter of two bands it hardly counts. Where a signal steps between two
+    frames, by five standard deviations of noise, nothing is interpolated: when it changed is not
+    known. Such a sample is NaN.
     """
     names = [str(name) for name in schema.check(corrected, "corrected")["band"].values]
     matrices = None if transform is None else _matrices(transform, names)
@@ -90,14 +95,18 @@ def align(
         corrected = _registered(corrected, matrices)
     counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
     stamps = clocks.exposures(corrected) + offsets[:, np.newaxis]
-    kept = _noisiest(corrected, stamps) if clock is None else names.index(_known(clock, names))
+    noise, relative = _noise(corrected, stamps)
+    kept = int(np.argmax(relative)) if clock is None else names.index(_known(clock, names))
     times, segment = clocks.filled(stamps[kept]), clocks.segments(corrected)
     aligned = np.empty(counts.shape, dtype=np.float32)
     for band, own in enumerate(stamps):
         movie = np.asarray(counts.isel(band=band).values, dtype=np.float32)
-        plan = clocks.interpolation(own, ~clocks.missing(movie), times).within(segment)
+        absent = clocks.missing(movie)
+        if absent.any():
+            movie = np.where(absent[:, np.newaxis, np.newaxis], np.float32(np.nan), movie)
+        plan = clocks.interpolation(own, ~absent, times).within(segment)
         plan = replace(plan, known=plan.known & (plan.labels(segment) == segment))
-        plan.apply(movie, aligned[band])
+        plan.apply(movie, aligned[band], _largest(noise[band], movie))
     lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
     result = _assembled(corrected, aligned, times)
     return result.assign_attrs(
@@ -204,16 +213,22 @@ def _known(name: str, names: list[str]) -> str:
     return name
 
 
-def _noisiest(corrected: xr.Dataset, stamps: Array) -> int:
-    """Band of the largest noise relative to its signal, by second differences in time."""
+def _largest(noise: float, movie: Movie) -> float:
+    """Step that noise does not make: a difference less the mean of its two neighbours [count]."""
+    rounding = 8.0 * np.finfo(np.float32).eps * np.nanmax(np.abs(movie), initial=0.0)
+    return float(_STEP * np.sqrt(3.0) * noise + rounding)
+
+
+def _noise(corrected: xr.Dataset, stamps: Array) -> Array:
+    """Noise of each band by second differences in time: in counts, and relative to its signal."""
     levels = []
     for frames, times in zip(sample(corrected), stamps, strict=True):
         here = present(frames) & np.isfinite(times)
         signal = frames[here]
-        rough = noise.second_difference(signal, times[here])
+        rough = noises.second_difference(signal, times[here])
         scatter = _MAD * np.median(np.abs(rough), axis=0)
-        levels.append(float(np.median(scatter / signal.std(axis=0))))
-    return int(np.argmax(levels))
+        levels.append((np.median(scatter), np.median(scatter / signal.std(axis=0))))
+    return np.array(levels).T
 
 
 def _registered(corrected: xr.Dataset, matrices: Array) -> xr.Dataset:

@@ -14,6 +14,12 @@ from dbthermal.separation.tiles import Tile
 MOST_MISSING: Final = 0.5
 """Share of the frames without which a pixel is not solved."""
 
+LONGEST_GAP: Final = 2
+"""Frames in a row that may be bridged in a pixel."""
+
+MOST_BRIDGED: Final = 0.15
+"""Share of the frames from which a pixel lacks too many to be bridged."""
+
 # Frames in a row that noise repeats by chance in less than one of 1e8 pixels.
 _FROZEN_FRAMES: Final = 4
 _ALL_UNDEFINED: Final = ("invalid_samples", "constant_signal", "dead_pixel")
@@ -37,7 +43,7 @@ def read(corrected: xr.Dataset, tile: Tile, fewest: int = 1) -> tuple[Array, Mas
     tuple of ndarray
         Counts (band, time, pixel) [count], zero where they are missing and for pixels that
         nothing can be computed of; which frames are there in all bands (time, pixel); status
-        (pixel).
+        (pixel). See `bridged` for pixels that lack a few.
     """
     part = corrected.isel(y=tile[0], x=tile[1])
     raw = part["counts"].values
@@ -64,6 +70,48 @@ def read(corrected: xr.Dataset, tile: Tile, fewest: int = 1) -> tuple[Array, Mas
         status |= part["status"].values.reshape(-1).astype(np.uint16)
     counts[:, :, unusable(status)] = 0.0
     return counts, there, status
+
+
+def bridged(counts: Array, there: Mask, time: Array) -> tuple[Array, Mask]:
+    """
+    Bridge short gaps of single pixels by a line in all bands.
+
+    A line between the same two frames in all bands holds the same mixture of object and
+    background, so nothing is biased, and all pixels of a tile keep the same frames. The result of
+    such a frame is no measurement, and is not given.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (band, time, pixel)
+        Counts [count].
+    there : ndarray of bool, shape (time, pixel)
+        Which frames each pixel has.
+    time : ndarray, shape (time,)
+        Times [s].
+
+    Returns
+    -------
+    tuple of ndarray
+        Counts, and which frames are there or bridged: gaps of `LONGEST_GAP` frames that most other
+        pixels have, in pixels that lack few.
+    """
+    common = there.mean(axis=1) > MOST_MISSING
+    wanted = ~there & common[:, np.newaxis]
+    wanted &= wanted.sum(axis=0) < MOST_BRIDGED * len(there)
+    if not np.any(wanted):
+        return counts, there
+    place = np.arange(len(there))[:, np.newaxis]
+    before = np.maximum.accumulate(np.where(there, place, -1), axis=0)
+    after = np.minimum.accumulate(np.where(there, place, len(there))[::-1], axis=0)[::-1]
+    wanted &= (before >= 0) & (after < len(there)) & (after - before <= LONGEST_GAP + 1)
+    frame, pixel = np.nonzero(wanted)
+    first, last = before[frame, pixel], after[frame, pixel]
+    share = (time[frame] - time[first]) / (time[last] - time[first])
+    filled = counts.copy()
+    filled[:, frame, pixel] = (1.0 - share) * counts[:, first, pixel] + share * counts[
+        :, last, pixel
+    ]
+    return filled, there | wanted
 
 
 def patterns(there: Mask, unusable: Mask) -> Iterator[tuple[Mask, Mask]]:
@@ -95,7 +143,7 @@ def patterns(there: Mask, unusable: Mask) -> Iterator[tuple[Mask, Mask]]:
             yield there[:, pixel], pixels
 
 
-def common(there: Mask, unusable: Mask) -> tuple[Mask, Mask]:
+def common(there: Mask, unusable: Mask, fewest: int = 1) -> tuple[Mask, Mask]:
     """
     Frames that most of the pixels have, for methods that need the same of all.
 
@@ -105,16 +153,20 @@ def common(there: Mask, unusable: Mask) -> tuple[Mask, Mask]:
         Which frames each pixel has.
     unusable : ndarray of bool, shape (pixel,)
         Pixels that nothing can be computed of.
+    fewest : int
+        Frames without which no pixel can be solved.
 
     Returns
     -------
     tuple of ndarray of bool
-        These frames (time), and the usable pixels (pixel) that lack any of them.
+        These frames (time), and the usable pixels (pixel) that lack any of them; all of the usable
+        pixels where these frames are too few.
     """
     if np.all(unusable):
         return np.ones(there.shape[0], dtype=bool), np.zeros_like(unusable)
     frames = np.mean(there[:, ~unusable], axis=1) > MOST_MISSING
-    return frames, ~unusable & ~np.all(there[frames], axis=0)
+    enough = frames.sum() >= fewest
+    return frames, ~unusable & ~(enough & np.all(there[frames], axis=0))
 
 
 def unusable(status: Flags) -> Mask:

@@ -190,19 +190,19 @@ class _Task:
 
     def separate(self, rows: slice, result: xr.Dataset, bar: "tqdm[Any]") -> None:
         """Separate a block of rows into its place in the result."""
-        for tile, status, problems in self._problems(rows):
+        for tile, status, there, problems in self._problems(rows):
             parts = []
             for frames, pixels, problem in problems:
                 found: Separated = self._call(self.method.separate, problem)
                 whole = found.status.size == pixels.size
                 parts.append((frames, pixels, found.of(pixels) if whole else found))
-            tiles.write(result, tile, self.bands, status, parts)
+            tiles.write(result, tile, self.bands, status, there, parts)
             bar.update(status.size)
 
     def survey(self, rows: slice, asked: Mask, bar: "tqdm[Any]") -> list[tuple[Places, Survey]]:
         """What a block's pixels tell of their materials, and which pixels of the image they are."""
         found = []
-        for tile, status, problems in self._problems(rows):
+        for tile, status, _, problems in self._problems(rows):
             place = self._places(tile, rows)
             for _, pixels, problem in problems:
                 chosen = asked[place[pixels]]
@@ -236,16 +236,17 @@ class _Task:
 
     def _problems(
         self, rows: slice
-    ) -> Iterator[tuple[tiles.Tile, Flags, list[tuple[Mask, Mask, Problem]]]]:
-        """Tiles of a block, the status of their pixels, and a problem for each set of frames."""
+    ) -> Iterator[tuple[tiles.Tile, Flags, Mask, list[tuple[Mask, Mask, Problem]]]]:
+        """Tiles of a block, status and samples of their pixels, problems by set of frames."""
         part = self.needed.isel(y=rows).load()
         whole = part.sizes["y"] * part.sizes["x"]
         size = whole if self.method.whole_image else getattr(self.settings, "batch", tiles.PIXELS)
         for tile in tiles.cover(part, size):
             counts, there, status = samples.read(part, tile, self.method.minimum_frames)
-            bad = samples.unusable(status)
+            bad, own = samples.unusable(status), there
+            counts, there = samples.bridged(counts, there, part["time"].values)
             if self.method.whole_image or self.method.every_frame:
-                frames, lacking = samples.common(there, bad)
+                frames, lacking = samples.common(there, bad, self.method.minimum_frames)
                 status[lacking] |= np.uint16(schema.FLAGS["invalid_samples"])
                 counts[:, :, lacking] = 0.0
                 usable = ~bad & ~lacking
@@ -258,7 +259,7 @@ class _Task:
                 one = problem if np.all(frames) else problem.at(frames)
                 alone = not (self.method.whole_image or np.all(pixels))
                 problems.append((frames, pixels, one.of(pixels) if alone else one))
-            yield tile, status, problems
+            yield tile, status, own, problems
 
     def _problem(self, part: xr.Dataset, counts: Array, tile: tiles.Tile, rows: slice) -> Problem:
         """All pixels and frames of a tile."""

@@ -162,6 +162,7 @@ def write(
     tile: Tile,
     bands: list[int],
     status: Flags,
+    there: Mask,
     parts: list[tuple[Mask, Mask, Separated]],
 ) -> None:
     """
@@ -177,6 +178,8 @@ def write(
         Order of the problem's bands in the capture.
     status : ndarray of uint16, shape (pixel,)
         From `read`; pixels of no part become NaN and keep only these bits.
+    there : ndarray of bool, shape (time, pixel)
+        Frames that the capture has; the temperatures of others are NaN.
     parts : list of tuple
         Frames (time), pixels (pixel), and what the method found there; NaN in other frames.
     """
@@ -200,6 +203,8 @@ def write(
                     target[band][where] = values[index]
             else:
                 _put(target, frames, where, values)
+        if "time" in variable.dims:
+            target[~there.reshape(-1, *shape)] = np.nan
 
 
 def _put(target: npt.NDArray[np.floating], frames: Mask, where: Mask, values: Array) -> None:
