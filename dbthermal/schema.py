@@ -192,7 +192,7 @@ FLAG_MEANINGS: Final = MappingProxyType(
         "frozen_frames": "the same counts in both bands for several frames, as while a shutter is "
         "closed: what stands still in them is read as signal",
         "object_jump": "the object jumped once: the jump was taken into its curve, the frames "
-        "around it are left out, and the values before and after hold",
+        "around it are left out, and the values that are given hold",
         "bands_apart": "the rapid changes of the bands are not simultaneous: a time offset "
         "between the cameras, or a reflection seen from two places",
         "roles_may_be_swapped": "mean emissivity below a half: a bright reflector, or what moves "

@@ -3,8 +3,9 @@
 In the order of use: `fit_correction` and `correct` (gain and offset of each pixel, from a
 blackbody; `correct_drifting` between two corrections), `mark_shutter` (frozen and repeated frames),
 `mark_bad` (pixels that turn bad in the capture), `undo_lag` (thermal lag of the pixels) and
-`undo_drift` (drift that all pixels share). A sample that is no measurement becomes NaN or is
-flagged, never filled.
+`undo_drift` (drift that all pixels share). Then `alignment.registration.register` and
+`alignment.align` bring two cameras together, and `separation.solve` follows. A sample that is no
+measurement becomes NaN or is flagged, never filled.
 """
 
 from dbthermal.frames.correction import (

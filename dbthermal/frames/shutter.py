@@ -98,8 +98,11 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     Take out the samples that a closed shutter or a lost frame repeats, and count the events.
 
     After an event every pixel of the band has an offset step of its own, of tens of counts, which
-    no camera reports. It is left in the counts: `separation.solve` estimates it with the rest,
-    by a free step of each pixel and band wherever `segment` changes. Events of two bands that
+    no camera reports. It is left in the counts: `separation.solve` keeps it out of the object, by a
+    free step of each pixel and band wherever `segment` changes; in the background it stays. Mark
+    before `alignment.align`, whose interpolation leaves no copies. Where stamps tell that a band
+    lost frames, its slots lie at other times than the other band's, and one event of both may count
+    as two: the frames between are then lost in `align`. Events of two bands that
     overlap, or follow without a frame between, are counted as one, so that cameras that fire
     together cost one step. An event before the first or after the last frame that is left makes
     none.

@@ -268,6 +268,12 @@ def with_mask(corrected: xr.Dataset, mask: xr.DataArray | None) -> xr.Dataset:
                 f"Invalid segment {segment.dims} of {segment.dtype}. Must be ('time',) of whole "
                 "numbers that do not fall."
             )
+        events, frames = len(np.unique(segment)) - 1, segment.size
+        if events > frames // 4:
+            raise ValueError(
+                f"Invalid segment: {events} shutter events in {frames} frames. "
+                "Must be at most one in four."
+            )
     if mask is None:
         return corrected.drop_vars("mask", errors="ignore")
     if not isinstance(mask, xr.DataArray):

@@ -94,7 +94,8 @@ def materials(
         `status`. Pixels with a ratio that is NaN are told by the picture alone.
     corrected : Dataset
         The capture: `counts` (band, time, y, x) [count]. May be lazy; only means over time are
-        kept. Frames that are NaN are left out.
+        kept. Frames that are NaN are left out, and of a capture with a `segment` all but the
+        longest.
     response : Dataset
         As given to `solve`.
     error_rate : float
@@ -131,6 +132,8 @@ def materials(
     A ratio that is withheld by its own value, as for being close to 1, biases the pooled one.
     """
     _check(result, corrected, error_rate, resolution)
+    frames = _longest_segment(corrected)
+    corrected, result = corrected.isel(time=frames), result.isel(time=frames)
     bands, noise = _order(result, response)
     means, variances = pictures.means(corrected, response, bands, noise)
     change = pictures.change(corrected, response, bands[0])
@@ -160,6 +163,11 @@ def _check(result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolut
     for name in _NEEDED:
         if name not in result:
             raise ValueError(f"Missing '{name}' in the result. Must be one of `solve`.")
+    if "reflection_ratio" in result.attrs.get("not_estimated", "").split():
+        raise ValueError(
+            f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
+            "reflection ratio. Must be of one that does, as 'subspace'."
+        )
     names, wanted = ([str(name) for name in part["band"].values] for part in (result, corrected))
     if names != wanted:
         raise ValueError(f"Invalid bands {names} of the result. Must be the capture's, {wanted}.")
@@ -169,6 +177,14 @@ def _check(result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolut
                 f"Invalid size {result.sizes[dim]} of '{dim}' of the result. "
                 f"Must be the capture's, {corrected.sizes[dim]}."
             )
+
+
+def _longest_segment(corrected: xr.Dataset) -> Mask:
+    """Frames between two shutter events: means across one would show the pattern's step."""
+    if "segment" not in corrected:
+        return np.ones(corrected.sizes["time"], dtype=bool)
+    names, counts = np.unique(corrected["segment"], return_counts=True)
+    return np.asarray(corrected["segment"].values == names[np.argmax(counts)])
 
 
 def _order(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:

@@ -112,6 +112,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     a suspicion; and a background that drifts along with the object's curve: the temperature holds,
     and the emissivity's deviation carries a drift that the option `background_drift` states.
 
+    A `segment` is used by "subspace" alone, and for the object alone: the step that a shutter
+    event leaves stays in the background, and makes the emissivity less certain, as its deviation
+    says; the object temperature is free of it. An object that jumps just then is not told.
+
     References
     ----------
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
