@@ -88,7 +88,8 @@ class Curve:
         """
         scale = self._scale(temperature)
         exponent = planck.SECOND_RADIATION_CONSTANT / scale
-        growth = self.amplitude / (np.expm1(exponent) * -np.expm1(-exponent))
+        excess = np.expm1(exponent)
+        growth = self.amplitude / excess * (1.0 + 1.0 / excess)
         return np.asarray(growth * exponent * self.wavelength / scale)
 
     def inverse(self, counts: npt.ArrayLike) -> Array:

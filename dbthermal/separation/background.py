@@ -56,17 +56,11 @@ def estimate(problem: Problem, emission: Emission, found: Direction) -> tuple[Ar
     contrast = background - emission.temperature
     through = contrast * first + emitted * emission.per_direction
     of_first = first_noise**2 - 1.0 / ((found.ratio / noise) ** 2).sum(axis=0)
-    of_direction = (
-        through**2 * found.across
-        + contrast**2 * of_first
-        - 2.0 * through * contrast * first_noise**2 * found.weights[0]
-    )
-    variance = (
-        1.0 / (total * curvature)
-        + of_direction * found.spread
-        + emitted**2 * emission.smooth_variance
-        + (contrast / (1.0 - first)) ** 2 * (emission.own_variance + emission.common_variance)
-    )
+    own = (emission.own_variance + emission.common_variance) / (1.0 - first) ** 2
+    common = 2.0 * first_noise**2 * found.weights[0] * found.spread
+    variance = 1.0 / (total * curvature) + emitted**2 * emission.smooth_variance
+    variance += through * (through * (found.across * found.spread) - contrast * common)
+    variance += contrast**2 * (of_first * found.spread + own)
     return background, np.asarray(variance)
 
 

@@ -176,18 +176,22 @@ def _newton(
     factors = found.weights * (1.0 - found.ratio * (1.0 - emissivity))
     own = [problem.blackbody(band, temperature) for band in range(len(factors))]
     slopes = [curve.slope(temperature) for curve in problem.curves]
-    value = sum(part * factor for part, factor in zip(own, factors, strict=True))
-    steepness = sum(part * factor for part, factor in zip(slopes, factors, strict=True))
-    shares = _shares(found, problem.noise)
-    other = sum(part * share for part, share in zip(own[1:], shares, strict=True))
+    value, steepness = _weighted(own, factors), _weighted(slopes, factors)
+    other = own[1] if len(own) == 2 else _weighted(own[1:], _shares(found, problem.noise))
     emitted = other - emissivity * (other - own[0])
-    return temperature + (clean - value) / steepness, np.asarray(steepness), np.asarray(emitted)
+    return temperature + (clean - value) / steepness, steepness, np.asarray(emitted)
+
+
+def _weighted(parts: list[Array], weights: Array) -> Array:
+    """Sum over the bands of (time, pixel), weighted by (band, pixel)."""
+    total = parts[0] * weights[0]
+    for part, weight in zip(parts[1:], weights[1:], strict=True):
+        total += part * weight
+    return np.asarray(total)
 
 
 def _shares(found: Direction, noise: tuple[float, ...]) -> Array:
     """Share (band - 1, pixel) of the ratios but the first in the variance of epsilon."""
-    if len(noise) == 2:
-        return np.ones_like(found.ratio[1:])
     squares = (np.array(noise) ** 2)[:, np.newaxis]
     parts = (found.weights**2 * (squares + found.ratio**2 * squares[0]))[1:]
     return np.asarray(parts / parts.sum(axis=0))

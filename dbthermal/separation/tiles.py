@@ -185,11 +185,12 @@ def write(
     """
     rows, columns = tile
     shape = shape_of(tile)
+    complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in parts)
     for name, variable in schema.STAGES["separated"].items():
         target = result[name].values[..., rows, columns]
         if name == "status":
             target[...] = status.reshape(shape)
-        else:
+        elif not complete or any(getattr(found, name) is None for _, _, found in parts):
             target[...] = np.nan
         for frames, pixels, found in parts:
             values = getattr(found, name)
@@ -203,7 +204,7 @@ def write(
                     target[band][where] = values[index]
             else:
                 _put(target, frames, where, values)
-        if "time" in variable.dims:
+        if "time" in variable.dims and not np.all(there):
             target[~there.reshape(-1, *shape)] = np.nan
 
 
