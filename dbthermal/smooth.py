@@ -153,25 +153,3 @@ def basis(time: npt.ArrayLike, order: int) -> Array:
     position = 2.0 * (time - time[0]) / span - 1.0
     columns, _ = np.linalg.qr(np.polynomial.legendre.legvander(position, order - 1))
     return np.asarray(columns)
-
-
-def residual_energy(functions: Array, first: Array, second: Array) -> Array:
-    r"""
-    Inner product of two signals after projection, for every order at once.
-
-    .. math:: S_K = \sum_t a b - \sum_{j \le K} (\Phi_j^T a)(\Phi_j^T b)
-
-    Parameters
-    ----------
-    functions : ndarray, shape (time, order)
-        From `basis`.
-    first, second : ndarray, shape (time, pixel)
-        Signals.
-
-    Returns
-    -------
-    ndarray, shape (order, pixel)
-        Row j is the inner product orthogonal to the first j + 1 functions.
-    """
-    total = np.einsum("tp,tp->p", first, second)
-    return np.asarray(total - np.cumsum((functions.T @ first) * (functions.T @ second), axis=0))

@@ -1,10 +1,15 @@
-"""What all tests share: the mirror of the outside files, and what a skip without it means."""
+"""What all tests share: the mirror of the outside files, what a skip without it means, glass."""
 
 import os
 from collections.abc import Generator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import xarray as xr
+
+from dbthermal import simulation
+from dbthermal.simulation import Background, Rig
 
 os.environ["MPLBACKEND"] = "agg"  # a test opens no window
 
@@ -18,6 +23,23 @@ def mirror() -> Path:
     if not Path(folder).is_dir():
         pytest.fail(f"Invalid DBTHERMAL_DATA {folder!r}. Must name a folder.")
     return Path(folder)
+
+
+@pytest.fixture(scope="module")
+def glass() -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
+    """Scene, capture and response: glass 0.86/0.72, 20 pixels as an image of 4 by 5."""
+    rig, time, rng = Rig(), np.arange(350) / 10.0, np.random.default_rng(11)
+    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    flat = simulation.independent_pixels(
+        time, emissivity, Background(), 20, rng, start=293.15, stop=333.15
+    )
+    warm, cold = (
+        flat[name].values.reshape(350, 4, 5)
+        for name in ("object_temperature", "background_temperature")
+    )
+    scene = simulation.scene(time, warm, cold, emissivity)
+    response = rig.response()
+    return scene, simulation.observe(scene, response, rng), response
 
 
 @pytest.hookimpl(wrapper=True)

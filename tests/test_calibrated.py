@@ -6,10 +6,10 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal import mixing, schema, separation, simulation, smooth
+from dbthermal import mixing, schema, separation, smooth
 from dbthermal import response as responses
 from dbthermal.separation import limits
-from dbthermal.simulation import Background, Rig
+from dbthermal.simulation import Rig
 
 RIG = Rig()
 TIME = np.arange(350) / 10.0
@@ -21,22 +21,6 @@ def emissivity_of(*values: float) -> xr.DataArray:
 
 
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
-
-
-@pytest.fixture(scope="module")
-def glass() -> Glass:
-    """Scene, capture and response: glass, 20 pixels as an image of 4 by 5."""
-    rng = np.random.default_rng(11)
-    flat = simulation.independent_pixels(
-        TIME, emissivity_of(0.86, 0.72), Background(), 20, rng, start=293.15, stop=333.15
-    )
-    warm, cold = (
-        flat[name].values.reshape(350, 4, 5)
-        for name in ("object_temperature", "background_temperature")
-    )
-    scene = simulation.scene(TIME, warm, cold, emissivity_of(0.86, 0.72))
-    response = RIG.response()
-    return scene, simulation.observe(scene, response, rng), response
 
 
 @settings(max_examples=25, deadline=None)

@@ -33,7 +33,7 @@ def without(capture: xr.Dataset, there: np.ndarray) -> xr.Dataset:
     )
 
 
-def agree(found: xr.Dataset, expected: xr.Dataset, frames: np.ndarray) -> None:
+def assert_agree(found: xr.Dataset, expected: xr.Dataset, frames: np.ndarray) -> None:
     """The frames that are there have the values of the shorter capture, the others none."""
     for name in schema.STAGES["separated"]:
         values = found[name].values
@@ -60,7 +60,7 @@ def test_missing_frames_are_as_if_never_taken(case: Case, band: list[int], value
     for one in band:
         spoilt["counts"].values[one, ~frames] = value
     expected = separation.solve(capture.isel(time=frames), response)
-    agree(separation.solve(spoilt, response), expected, frames)
+    assert_agree(separation.solve(spoilt, response), expected, frames)
 
 
 @pytest.mark.parametrize("noise_known", [True, False])
@@ -70,7 +70,7 @@ def test_masks_of_frames(case: Case, noise_known: bool) -> None:
     response = response if noise_known else response.drop_vars(["noise", "netd"])
     frames = lost(0.2, seed=3)
     found = separation.solve(capture, response, mask=xr.DataArray(frames, dims="time"))
-    agree(found, separation.solve(capture.isel(time=frames), response), frames)
+    assert_agree(found, separation.solve(capture.isel(time=frames), response), frames)
 
 
 def test_masks_of_pixels(case: Case) -> None:
@@ -99,7 +99,7 @@ def test_masks_of_samples_are_nan(case: Case) -> None:
     assert np.all(np.isfinite(masked["object_temperature"].values[there]))
     pixel = capture.isel(x=[7]).isel(time=there[:, 0, 7])
     alone = separation.solve(pixel, response)
-    agree(masked.isel(x=[7]), alone, there[:, 0, 7])
+    assert_agree(masked.isel(x=[7]), alone, there[:, 0, 7])
 
 
 @pytest.mark.parametrize(("missing", "good"), [(170, True), (180, False)])

@@ -67,22 +67,6 @@ def test_leverage_is_the_hat_matrix() -> None:
     np.testing.assert_allclose(result.sum(axis=0), np.arange(1.0, 6.0), rtol=0, atol=1e-12)
 
 
-def test_residual_energy_against_least_squares() -> None:
-    """For each order and pixel it is the inner product of the residuals of two polynomial fits."""
-    rng = np.random.default_rng(4)
-    time = np.arange(40.0)
-    first, second = rng.standard_normal((2, 40, 3))
-    result = smooth.residual_energy(smooth.basis(time, 4), first, second)
-    for order in range(1, 5):
-        design = np.vander(time / 40.0, order)
-        residuals = [
-            signal - design @ np.linalg.lstsq(design, signal, rcond=None)[0]
-            for signal in (first, second)
-        ]
-        expected = np.sum(residuals[0] * residuals[1], axis=0)
-        np.testing.assert_allclose(result[order - 1], expected, rtol=0, atol=1e-10)
-
-
 def segmented(frames: int, *events: int) -> np.ndarray:
     """Number of events before each frame."""
     return np.searchsorted(events, np.arange(frames), side="right")

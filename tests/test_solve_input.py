@@ -25,22 +25,6 @@ def emissivity_of(*values: float) -> xr.DataArray:
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 
-@pytest.fixture(scope="module")
-def glass() -> Glass:
-    """Scene, capture and response: glass, 20 pixels as an image of 4 by 5."""
-    rng = np.random.default_rng(11)
-    flat = simulation.independent_pixels(
-        TIME, emissivity_of(0.86, 0.72), Background(), 20, rng, start=293.15, stop=333.15
-    )
-    warm, cold = (
-        flat[name].values.reshape(350, 4, 5)
-        for name in ("object_temperature", "background_temperature")
-    )
-    scene = simulation.scene(TIME, warm, cold, emissivity_of(0.86, 0.72))
-    response = RIG.response()
-    return scene, simulation.observe(scene, response, rng), response
-
-
 def test_order_of_bands_and_tiles_does_not_matter(
     glass: Glass,
 ) -> None:
