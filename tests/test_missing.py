@@ -84,7 +84,7 @@ def test_masks_of_pixels(case: Case) -> None:
         if name != "status":
             assert np.all(np.isnan(found[name].values[..., ~used]))
         np.testing.assert_allclose(
-            found[name].values[..., used], whole[name].values[..., used], rtol=2e-3
+            found[name].values[..., used], whole[name].values[..., used], rtol=1e-6
         )
 
 

@@ -111,14 +111,18 @@ def lateness(
 
 
 def _excess(left: Array, change: Array, across: Array, noise: float) -> Array:
-    """Energy beyond that of the noise in frames at a change, in standard deviations."""
+    """
+    Energy beyond that of the noise in frames at a change, in standard deviations.
+
+    A chi-square variable of few degrees of freedom has a long tail: its cube root is nearly normal
+    (Wilson, Hilferty 1931, doi:10.1073/pnas.17.12.684).
+    """
     steps = np.abs(change) > _CHANGE * np.sqrt(2.0) * noise
     at = np.zeros(left.shape, dtype=bool)
     at[1:] |= steps
     at[:-1] |= steps
     count = at.sum(axis=0)
     energy = np.einsum("tp,tp->p", left * at, left) / across
-    excess = np.divide(
-        energy - count, np.sqrt(2.0 * count), out=np.zeros_like(energy), where=count > 0
-    )
-    return np.asarray(excess)
+    mean = np.divide(energy, count, out=np.ones_like(energy), where=count > 0)
+    spread = 2.0 / (9.0 * np.maximum(count, 1))
+    return np.asarray((np.cbrt(mean) - (1.0 - spread)) / np.sqrt(spread))

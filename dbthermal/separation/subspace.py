@@ -235,6 +235,8 @@ def _flags(problem: Problem, estimate: _Estimate) -> dict[str, Mask]:
     found, fit = estimate.found, estimate.emission
     frames, others = problem.time.size, len(problem.noise) - 1
     still = ~found.given & (found.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames))
+    # Not even in the quietest band is there more than its noise.
+    still |= ~found.given & (found.scatter[0, 0] <= 0)
     still |= ~np.isfinite(found.spread)
     gray = ~still & (found.spread * found.across > 1.0 / _GRAY_SIGMAS**2)
     told = ~still & ~gray & ~fit.constant
