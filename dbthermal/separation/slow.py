@@ -23,8 +23,8 @@ from dbthermal.separation.robust import Line
 from dbthermal.separation.separated import Array
 
 # Degrees of the polynomials over which a spectrum is averaged: from, and up to, not including;
-# and degrees of freedom: of the first three, one is along the object's curve.
-_OCTAVES: Final = ((1, 4, 2), (4, 8, 4))
+# and degrees of freedom lost: of the first three, one is along the object's curve.
+_OCTAVES: Final = ((1, 4, 1), (4, 8, 0))
 
 # Bounds of a 95 % interval, for an energy from few degrees of freedom and for a known one.
 _NORMAL95: Final = float(ndtri(0.975))
@@ -91,12 +91,12 @@ def variance(
     unit = curve / np.sqrt(energy)
     seen = seen - unit * (unit * seen).sum(axis=0)
     walk = degree**2 * (seen**2 - noise**2 / share)
-    octaves = [
-        walk[low - 1 : high - 1].sum(axis=0) / freedom * (stdtrit(freedom, 0.975) / _NORMAL95) ** 2
-        for low, high, freedom in _OCTAVES
-        if low <= len(walk)
-    ]
-    strongest = np.maximum(np.max(octaves, axis=0), 0.0)
+    octaves = []
+    for low, high, lost in _OCTAVES:
+        if (freedom := len(walk[low - 1 : high - 1]) - lost) > 0:
+            widened = (stdtrit(freedom, 0.975) / _NORMAL95) ** 2
+            octaves.append(walk[low - 1 : high - 1].sum(axis=0) / freedom * widened)
+    strongest = np.max(octaves, axis=0, initial=0.0)
     extrapolated = strongest * (unit**2 / degree**2).sum(axis=0) / energy
     drift = (reflectivity * prior.drift / np.ptp(own, axis=0)) ** 2 / 3.0
     return np.asarray(drift + extrapolated)

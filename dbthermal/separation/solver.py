@@ -130,6 +130,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         )
     names = [str(name) for name in corrected["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
+    if pool is not None and module.survey is None:
+        raise ValueError(f"Invalid pool for method '{method}', which does not pool.")
     corrected = given.with_mask(corrected, mask)
     deviations = _noise(corrected, response, curves)
     task = _Task(
@@ -157,8 +159,6 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     ):
         blocks = list(tiles.blocks(corrected, whole_image=module.whole_image))
         if labels is not None:
-            if module.survey is None:
-                raise ValueError(f"Invalid pool for method '{method}', which does not pool.")
             asked = pool_of.asked(labels)
             found = threads.map(lambda rows: task.survey(rows, asked, bar), blocks)
             task = task.pooled(labels, [part for block in found for part in block])
