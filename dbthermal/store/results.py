@@ -3,7 +3,7 @@
 Each function writes beside its goal and renames, so that what bears a result's name is whole,
 whatever happens on the way. Each result carries the record of what made it (see
 `dbthermal.provenance`) and nothing that differs between two runs of the same code on the same
-input. No other module opens or writes zarr.
+input. No other package opens or writes zarr.
 """
 
 import json
@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+
+from dbthermal.store import progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,7 +82,10 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
-    """Open what `save` wrote; values are read when they are used.
+    """Open what `save` or a `Recording` wrote; values are read when they are used.
+
+    A recording that was cut short, or is being written, opens as far as all bands are valid; its
+    attributes say ``complete`` = False and, in ``frames_written``, where each band ends.
 
     Parameters
     ----------
@@ -102,8 +107,27 @@ def open_dataset(path: str | Path) -> xr.Dataset:
         raise FileNotFoundError(
             f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
         )
-    dataset = xr.open_zarr(path, chunks=None, consolidated=False, zarr_format=3)
+    cut_short = not progress.attributes(path).get("closed", True)
+    dataset = _open_valid_part(Path(path)) if cut_short else _open(path)
     return _with_fixed_length_strings(dataset)
+
+
+def _open(path: str | Path, leave: Iterable[str] = ()) -> xr.Dataset:
+    dataset: xr.Dataset = xr.open_zarr(
+        path, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
+    )
+    return dataset
+
+
+def _open_valid_part(path: Path) -> xr.Dataset:
+    """Open the variables of a recording one by one, for their room differs while it grows."""
+    ends = progress.valid_part(path)
+    names = {array.parent.name for array in path.glob("*/zarr.json")}
+    parts = []
+    for name in sorted(names):
+        part = _open(path, leave=names - {name})
+        parts.append(part.isel({dim: end for dim, end in ends.items() if dim in part.dims}))
+    return xr.merge(parts, combine_attrs="override")
 
 
 def save_numbers(
