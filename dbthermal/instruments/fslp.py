@@ -1,0 +1,241 @@
+"""FSLP, the framing of the FLIR Boson's serial line: pure functions from bytes to frames and back.
+
+A frame is the start byte 8E, then channel, sequence number, command, status, data and checksum,
+big-endian and with three byte values escaped, then the end byte AE. Tested against public byte
+vectors and an emulator, not against hardware.
+
+References
+----------
+Facts alone were taken, no code: FLIR/rawBoson, ``rawBoson.c`` (commit 0f192d6); openmv/openmv,
+``drivers/boson`` (commit cbbb877); frames quoted in thurberdog/ghostCommand (commit 35dc641) and in
+LJMUAstroecology/flirpy issue 21.
+"""
+
+import binascii
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+COMMAND_CHANNEL: Final = 0x00
+"""Channel of commands and their replies; a receiver discards the frames of all others."""
+
+REQUEST: Final = 0xFFFFFFFF
+"""Status of a request; that of a reply is 0 or an error code."""
+
+MAXIMUM_DATA: Final = 751
+"""Most bytes of data in a frame to send, as in FLIR/rawBoson."""
+
+MAXIMUM_FRAME: Final = 2048
+"""Most unescaped bytes of a received frame: the buffer of the vendor's own receiver."""
+
+_START, _END, _ESCAPE = 0x8E, 0xAE, 0x9E
+# An escaped byte is sent as the escape byte and the value less this.
+_SHIFT = 0x0D
+_SPECIAL = (_START, _END, _ESCAPE)
+_UNESCAPED = {value - _SHIFT: value for value in _SPECIAL}
+_HEADER = struct.Struct(">BIII")
+_CHECKSUM = struct.Struct(">H")
+# CRC-16/AUG-CCITT, also called SPI-FUJITSU: polynomial 0x1021, no reflection, no final xor.
+_CHECKSUM_START = 0x1D0F
+
+
+@dataclass(frozen=True)
+class Frame:
+    """
+    One undamaged frame.
+
+    Attributes
+    ----------
+    channel : int
+        `COMMAND_CHANNEL`, or that of debug text and other traffic, 0 to 255.
+    sequence : int
+        Number of the request, echoed by its reply, unsigned, 32 bits.
+    command : int
+        Identifier of the function, unsigned, 32 bits.
+    status : int
+        `REQUEST`, or of a reply 0 for success, else an error code.
+    data : bytes
+        What the function takes or gives; empty in error replies.
+    """
+
+    channel: int
+    sequence: int
+    command: int
+    status: int
+    data: bytes = b""
+
+
+def checksum(content: bytes) -> int:
+    """
+    Checksum of a frame, CRC-16/AUG-CCITT.
+
+    Parameters
+    ----------
+    content : bytes
+        Unescaped, from the channel to the last byte of data.
+
+    Returns
+    -------
+    int
+        16 bits; 0xE5CC for ``b"123456789"``.
+    """
+    return binascii.crc_hqx(content, _CHECKSUM_START)
+
+
+def encode(
+    sequence: int,
+    command: int,
+    data: bytes = b"",
+    status: int = REQUEST,
+    *,
+    channel: int = COMMAND_CHANNEL,
+) -> bytes:
+    """
+    Bytes of a frame, ready to send.
+
+    Header, data and checksum are all escaped, so that start and end stand nowhere else.
+
+    Parameters
+    ----------
+    sequence, command, status : int
+        As in `Frame`, each in [0, 2^32).
+    data : bytes
+        At most `MAXIMUM_DATA` bytes.
+    channel : int
+        In [0, 256).
+
+    Returns
+    -------
+    bytes
+        17 bytes or more.
+
+    Raises
+    ------
+    ValueError
+        If a number does not fit its field, or there are too many data.
+    """
+    for name, value, bits in (
+        ("channel", channel, 8),
+        ("sequence number", sequence, 32),
+        ("command", command, 32),
+        ("status", status, 32),
+    ):
+        if not 0 <= value < 1 << bits:
+            raise ValueError(f"Invalid {name} {value}. Must lie in 0 to {(1 << bits) - 1}.")
+    if len(data) > MAXIMUM_DATA:
+        raise ValueError(f"Invalid data of {len(data)} bytes. Must be at most {MAXIMUM_DATA}.")
+    content = _HEADER.pack(channel, sequence, command, status) + data
+    content += _CHECKSUM.pack(checksum(content))
+    return bytes((_START, *_escaped(content), _END))
+
+
+def _escaped(content: bytes) -> bytes:
+    """Content with escapes in place of start, end and escape bytes."""
+    pieces = (bytes((_ESCAPE, v - _SHIFT)) if v in _SPECIAL else bytes((v,)) for v in content)
+    return b"".join(pieces)
+
+
+def next_sequence(sequence: int) -> int:
+    """
+    Sequence number that follows another, none of whose bytes would be escaped.
+
+    The vendor's software avoids such numbers too, perhaps because one of its receivers does not
+    unescape the header. The numbers increase, so none returns before 32 bits are through.
+
+    Parameters
+    ----------
+    sequence : int
+        In [0, 2^32).
+
+    Returns
+    -------
+    int
+        In [0, 2^32).
+    """
+    following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
+    for place, value in enumerate(following):
+        if value in _SPECIAL:  # the least number above: what stands behind starts from zero
+            raised = following[:place] + bytes([value + 1]) + bytes(3 - place)
+            return int.from_bytes(raised, "big")
+    return int.from_bytes(following, "big")
+
+
+class Decoder:
+    """
+    Finds the frames in a stream of bytes, however it is cut into pieces.
+
+    What stands between frames is ignored. A start byte always begins anew. A frame that is cut
+    short, too long or too short, holds an illegal escape or has the wrong checksum is dropped and
+    counted: of all start bytes that came in, each began a frame that was returned, one that is
+    counted in `damaged`, or the one that is still open.
+
+    Attributes
+    ----------
+    damaged : int
+        Frames that were dropped so far.
+    """
+
+    def __init__(self) -> None:
+        self.damaged = 0
+        self._content: bytearray | None = None  # None between frames
+        self._escaping = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a frame has begun and not yet ended."""
+        return self._content is not None
+
+    def feed(self, received: bytes) -> list[Frame]:
+        """
+        Take in the next bytes of the stream.
+
+        Parameters
+        ----------
+        received : bytes
+            Any number, of any value.
+
+        Returns
+        -------
+        list of Frame
+            The undamaged frames that they complete, of every channel.
+        """
+        return [frame for byte in received if (frame := self._step(byte)) is not None]
+
+    def _step(self, byte: int) -> Frame | None:
+        """Take in one byte; return the frame that it ends."""
+        if byte == _START:
+            self.damaged += self.is_open
+            self._content, self._escaping = bytearray(), False
+        elif self._content is not None:
+            if byte == _END:
+                return self._end(bytes(self._content))
+            self._append(self._content, byte)
+        return None
+
+    def _append(self, content: bytearray, byte: int) -> None:
+        """Add one byte to the open frame, or drop the frame."""
+        if (self._escaping and byte not in _UNESCAPED) or len(content) == MAXIMUM_FRAME:
+            self._drop()
+        elif self._escaping:
+            content.append(_UNESCAPED[byte])
+            self._escaping = False
+        elif byte == _ESCAPE:
+            self._escaping = True
+        else:
+            content.append(byte)
+
+    def _end(self, content: bytes) -> Frame | None:
+        """Return the frame that ends here, if it is undamaged."""
+        body, sent = content[: -_CHECKSUM.size], content[-_CHECKSUM.size :]
+        whole = len(body) >= _HEADER.size and not self._escaping
+        if not whole or _CHECKSUM.pack(checksum(body)) != sent:
+            self._drop()
+            return None
+        self._content = None
+        channel, sequence, command, status = _HEADER.unpack_from(body)
+        return Frame(channel, sequence, command, status, body[_HEADER.size :])
+
+    def _drop(self) -> None:
+        """Give up the open frame."""
+        self.damaged += 1
+        self._content, self._escaping = None, False
