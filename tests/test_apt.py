@@ -1,0 +1,298 @@
+"""APT messages: public byte vectors, an independent implementation, and arbitrary bytes."""
+
+import subprocess
+import sys
+from itertools import pairwise
+from types import ModuleType
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dbthermal.instruments import apt
+
+BAY_2 = 0x22
+INFO = (
+    bytes.fromhex("06 00 54 00 81 22 89 53 9A 05 49 4F 4E 30 30 31 20 00 2C 00 02 01 39 00")
+    + bytes(60)
+    + bytes.fromhex("01 00 03 00 01 00")
+)
+STATUS = "81 04 0E 00 81 22 01 00 01 00 00 00 00 00 00 00 07 00 00 00"
+LONG_STATUS = STATUS.replace("0E", "1C") + " 01 00" + " 00" * 12
+LONG_COMPLETED = "64 04 0E 00 81 50 01 00 68 AA A0 01 00 00 00 00 30 00 00 80"
+PARAMETERS = apt.VelocityParameters(1, minimum=0, acceleration=0x35B0, maximum=0x00CCCCCD)
+LIMITS = (
+    apt.StatusBits.FORWARD_LIMIT | apt.StatusBits.REVERSE_LIMIT | apt.StatusBits.FORWARD_SOFT_LIMIT
+)
+
+# Quoted in the tests of PnPQ, many of them from the maker's documentation; that of identifier 0018
+# from the maker's example program.
+REQUESTS = {
+    "53 04 06 00 A2 01 01 00 40 0D 03 00": apt.move_absolute(1, 200_000, destination=BAY_2),
+    "10 04 06 00 A2 01 01 00 40 0D 03 00": apt.set_position(1, 200_000, destination=BAY_2),
+    "13 04 0E 00 A2 01 01 00 00 00 00 00 B0 35 00 00 CD CC CC 00": apt.set_velocity_parameters(
+        PARAMETERS, destination=BAY_2
+    ),
+    "02 00 00 00 50 01": apt.disconnect(destination=apt.UNIT),
+    "10 02 01 02 50 01": apt.set_channel_enabled(1, enabled=False, destination=apt.UNIT),
+    "23 02 01 00 50 01": apt.identify(1, destination=apt.UNIT),
+    "11 04 01 00 50 01": apt.request_position(1, destination=apt.UNIT),
+    "80 04 01 00 50 01": apt.request_status(1, destination=apt.UNIT),
+    "90 04 01 00 50 01": apt.request_dc_status(1, destination=apt.UNIT),
+    "92 04 00 00 50 01": apt.acknowledge_status(destination=apt.UNIT),
+    "18 00 00 00 50 01": apt.no_flash_programming(destination=apt.UNIT),
+    "43 04 01 00 50 01": apt.home(1, destination=apt.UNIT),
+    "65 04 01 01 50 01": apt.stop(1, immediate=True, destination=apt.UNIT),
+}
+
+
+def decode(text: str | bytes) -> apt.Message:
+    """Return the one message that the bytes are."""
+    decoder = apt.Decoder()
+    (message,) = decoder.feed(bytes.fromhex(text) if isinstance(text, str) else text)
+    assert (decoder.dropped, decoder.pending) == (0, 0)
+    return message
+
+
+@pytest.mark.parametrize("expected", REQUESTS)
+def test_requests_have_the_published_bytes(expected: str) -> None:
+    """What a host sends is what others say that it sends."""
+    assert REQUESTS[expected].hex(" ").upper() == expected
+
+
+def test_move_completed_has_two_forms() -> None:
+    """The end of a move comes alone, or with a status that a K10CR1 appended (and that moves)."""
+    short, long = decode("64 04 01 00 01 22"), decode(LONG_COMPLETED)
+    assert short == apt.Message(apt.Id.MOT_MOVE_COMPLETED, 1, 0, apt.HOST, BAY_2)
+    assert (long.id, long.source, long.param1) == (apt.Id.MOT_MOVE_COMPLETED, apt.UNIT, 0)
+    assert len(long.data) == 14
+
+
+@pytest.mark.parametrize("identifier", ["64 04", "66 04"])
+@pytest.mark.parametrize("form", [" 01 00 01 22", LONG_COMPLETED[5:]])
+def test_completed_and_stopped_are_alike(identifier: str, form: str) -> None:
+    """The end of a move and a stop have the same two forms, and both go back to their bytes."""
+    assert apt.encode(decode(identifier + form)) == bytes.fromhex(identifier + form)
+
+
+@pytest.mark.parametrize("text", [STATUS, LONG_STATUS])
+def test_status_of_either_length(text: str) -> None:
+    """A status says position and bits; what a K10CR2 has behind is not read."""
+    assert apt.Status.parse(decode(text)) == apt.Status(1, position=1, encoder=0, bits=LIMITS)
+
+
+def test_info_of_the_documentation() -> None:
+    """The documentation's example of who a controller is."""
+    info = apt.Info.parse(decode(INFO))
+    assert (info.serial_number, info.model, info.type) == (94_000_009, "ION001", 44)
+    assert (info.firmware, info.hardware, info.modification) == ("57.1.2", 1, 3)
+    assert info.channels == 1
+
+
+def test_position_of_the_documentation() -> None:
+    """The documentation's example of a counter, with its addresses the way they really come."""
+    message = decode("12 04 06 00 81 22 01 00 40 0D 03 00")
+    assert apt.Position.parse(message) == apt.Position(1, 200_000)
+
+
+@pytest.mark.parametrize(
+    ("payload", "identifier"),
+    [
+        (apt.Position(1, -(2**31)), apt.Id.MOT_GET_POSCOUNTER),
+        (PARAMETERS, apt.Id.MOT_GET_VELPARAMS),
+        (apt.HomeParameters(1, 2, 1, 4_397_466, -5), apt.Id.MOT_GET_HOMEPARAMS),
+        (apt.Status(1, -1, 0, apt.StatusBits(0x80001410)), apt.Id.MOT_GET_STATUSUPDATE),
+        (apt.Notice(0x0453, 7, "no motor"), apt.Id.HW_RICHRESPONSE),
+        (apt.Info(40_000_000, "SCC201", 45, "1.2.3", 1, 0, 1), apt.Id.HW_GET_INFO),
+    ],
+)
+def test_payloads_come_back(
+    payload: apt.Position | apt.Status | apt.Notice | apt.Info, identifier: apt.Id
+) -> None:
+    """What a record packs, it reads, and it reads nothing else."""
+    message = apt.Message(identifier, 0, 0, apt.HOST, apt.BAY_1, payload.pack())
+    assert type(payload).parse(decode(apt.encode(message))) == payload
+    with pytest.raises(ValueError, match="Invalid message 0x0444"):
+        type(payload).parse(apt.Message(apt.Id.MOT_MOVE_HOMED, 1, 0, apt.HOST, apt.BAY_1))
+    with pytest.raises(ValueError, match="Invalid data of 1 bytes"):
+        type(payload).parse(apt.Message(identifier, 0, 0, apt.HOST, apt.BAY_1, b"\0"))
+
+
+def test_answers_in_a_parameter() -> None:
+    """Whether a channel is enabled or a bay used is in the second parameter, 1 or 2."""
+    assert apt.is_enabled(decode("12 02 01 01 01 21"))
+    assert not apt.is_occupied(decode("61 00 00 02 01 11"))
+    with pytest.raises(ValueError, match=r"Invalid param2 0 of .* Must be 1 or 2"):
+        apt.is_enabled(decode("12 02 01 00 01 21"))
+    bits = apt.status_bits(decode("2A 04 06 00 81 21 01 00 00 04 00 80"))
+    assert bits == apt.StatusBits.HOMED | apt.StatusBits.ENABLED
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        (apt.Message(0x10000, 0, 0, 1, 1), "Invalid identifier 65536"),
+        (apt.Message(1, 256, 0, 1, 1), "Invalid param1 256"),
+        (apt.Message(1, 0, -1, 1, 1), "Invalid param2 -1"),
+        (apt.Message(1, 0, 0, 0x80, 1), "Invalid destination 128"),
+        (apt.Message(1, 0, 0, 1, 1, bytes(256)), "Invalid number of data 256"),
+        (apt.Message(1, 0, 1, 1, 1, b"x"), "Invalid parameters"),
+    ],
+)
+def test_what_does_not_fit_is_refused(message: apt.Message, error: str) -> None:
+    """A message whose numbers do not fit its fields is an error, and nothing is cut."""
+    with pytest.raises(ValueError, match=error):
+        apt.encode(message)
+    with pytest.raises(ValueError, match=r"Invalid Position\(channel=1, position=2147483648\)"):
+        apt.move_absolute(1, 2**31, destination=apt.BAY_1)
+
+
+known = st.sampled_from([INFO, *map(bytes.fromhex, (STATUS, LONG_STATUS, LONG_COMPLETED))])
+cut_short = st.tuples(known, st.integers(0, 90)).map(lambda pair: pair[0][: pair[1]])
+streams = st.lists(st.one_of(st.binary(max_size=9), known, cut_short), max_size=8).map(b"".join)
+
+
+@given(streams, st.lists(st.integers(0, 400), max_size=8))
+def test_arbitrary_bytes(stream: bytes, cuts: list[int]) -> None:
+    """Any bytes in any pieces: the same messages, no exception, and every byte accounted for."""
+    decoder, pieces = apt.Decoder(), apt.Decoder()
+    messages = decoder.feed(stream)
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    found = [
+        message for start, end in pairwise(edges) for message in pieces.feed(stream[start:end])
+    ]
+    assert (found, pieces.dropped, pieces.pending) == (messages, decoder.dropped, decoder.pending)
+    read = sum(len(apt.encode(message)) for message in messages)
+    assert read + decoder.dropped + decoder.pending == len(stream)
+
+
+@given(st.lists(st.tuples(st.sampled_from([b"", b"\xff", b"\xfe\xfe\xff"]), known), max_size=6))
+def test_messages_are_found_behind_noise(parts: list[tuple[bytes, bytes]]) -> None:
+    """Bytes that begin no message cost themselves only, and are counted."""
+    decoder = apt.Decoder()
+    messages = decoder.feed(b"".join(noise + message for noise, message in parts))
+    assert [apt.encode(message) for message in messages] == [message for _, message in parts]
+    assert decoder.dropped == sum(len(noise) for noise, _ in parts)
+
+
+@given(st.binary(max_size=90), st.sampled_from(list(apt.Id)))
+def test_parsers_meet_arbitrary_data(data: bytes, identifier: apt.Id) -> None:
+    """A parser returns its record, or raises ValueError."""
+    message = apt.Message(identifier, 1, 1, apt.HOST, apt.BAY_1, data)
+    parsers = (apt.Info, apt.Status, apt.Position, apt.HomeParameters, apt.Notice)
+    for parse in (*(parser.parse for parser in parsers), apt.is_enabled, apt.status_bits):
+        try:
+            parse(message)
+        except ValueError as error:
+            assert str(error).startswith("Invalid")  # noqa: PT017 - either is right
+
+
+def test_half_a_message_is_given_up() -> None:
+    """What pends can be dropped, and is counted; the next message is then found."""
+    decoder = apt.Decoder()
+    assert decoder.feed(INFO[:50]) == []
+    decoder.discard()
+    assert (decoder.dropped, decoder.pending) == (50, 0)
+    assert len(decoder.feed(bytes.fromhex(STATUS))) == 1
+
+
+@pytest.mark.parametrize("header", ["64 04 00 00 81 21", "81 04 00 00 81 21", "81 04 0E 00 01 21"])
+def test_lengths_that_no_message_has(header: str) -> None:
+    """Data of no bytes, or none where there must be some, are no message."""
+    decoder = apt.Decoder()
+    assert decoder.feed(bytes.fromhex(header)) == []
+    assert decoder.dropped == 1
+
+
+def test_what_a_host_sends_is_not_heard_by_a_host() -> None:
+    """An echo of the host's own messages is no answer."""
+    decoder = apt.Decoder()
+    assert decoder.feed(apt.request_info(destination=apt.UNIT) + bytes(6)) == []
+    assert decoder.dropped == 7
+
+
+@pytest.fixture(name="other")
+def _other() -> ModuleType:
+    module: ModuleType = pytest.importorskip(
+        "thorlabs_apt_protocol",
+        reason="thorlabs-apt-protocol 29.0.0 is not installed: it is a check by other hands",
+    )
+    return module
+
+
+def test_requests_agree_with_another_implementation(other: ModuleType) -> None:
+    """thorlabs-apt-protocol builds the same bytes, of every message that it knows."""
+    to, home = apt.BAY_1, apt.HomeParameters(1, 2, 1, 4_397_466, -50)
+    address = {"dest": to, "source": apt.HOST}
+    channel = {**address, "chan_ident": 1}
+    speeds = {"min_velocity": 0, "acceleration": 0x35B0, "max_velocity": 0x00CCCCCD}
+    homes = {"home_dir": 2, "limit_switch": 1, "home_velocity": 4_397_466, "offset_distance": -50}
+    pairs = {
+        "hw_disconnect": (apt.disconnect(destination=to), address),
+        "hw_no_flash_programming": (apt.no_flash_programming(destination=to), address),
+        "hw_req_info": (apt.request_info(destination=to), address),
+        "hw_start_updatemsgs": (apt.start_updates(destination=to), address),
+        "hw_stop_updatemsgs": (apt.stop_updates(destination=to), address),
+        "rack_req_bayused": (apt.request_bay_used(3, destination=to), {**address, "bay_ident": 3}),
+        "mod_identify": (apt.identify(1, destination=to), channel),
+        "mod_set_chanenablestate": (
+            apt.set_channel_enabled(1, enabled=True, destination=to),
+            {**channel, "enable_state": 1},
+        ),
+        "mod_req_chanenablestate": (apt.request_channel_enabled(1, destination=to), channel),
+        "mot_set_poscounter": (
+            apt.set_position(1, -7, destination=to),
+            {**channel, "position": -7},
+        ),
+        "mot_req_poscounter": (apt.request_position(1, destination=to), channel),
+        "mot_set_velparams": (
+            apt.set_velocity_parameters(PARAMETERS, destination=to),
+            channel | speeds,
+        ),
+        "mot_req_velparams": (apt.request_velocity_parameters(1, destination=to), channel),
+        "mot_set_homeparams": (apt.set_home_parameters(home, destination=to), channel | homes),
+        "mot_req_homeparams": (apt.request_home_parameters(1, destination=to), channel),
+        "mot_move_home": (apt.home(1, destination=to), channel),
+        "mot_move_absolute": (
+            apt.move_absolute(1, 68_267, destination=to),
+            {**channel, "position": 68_267},
+        ),
+        "mot_move_relative": (
+            apt.move_relative(1, -9, destination=to),
+            {**channel, "distance": -9},
+        ),
+        "mot_move_stop": (apt.stop(1, destination=to), {**channel, "stop_mode": 2}),
+        "mot_req_statusupdate": (apt.request_status(1, destination=to), channel),
+        "mot_req_dcstatusupdate": (apt.request_dc_status(1, destination=to), channel),
+    }
+    for name, (built, arguments) in pairs.items():
+        assert built == getattr(other, name)(**arguments), name
+
+
+def test_replies_agree_with_another_implementation(other: ModuleType) -> None:
+    """thorlabs-apt-protocol reads the same out of what a controller answers."""
+    unpacker = other.Unpacker()
+    home = apt.HomeParameters(1, 2, 1, 4_397_466, -50)
+    answers = {apt.Id.MOT_GET_HOMEPARAMS: home, apt.Id.MOT_GET_VELPARAMS: PARAMETERS}
+    stream = bytes.fromhex(STATUS + "12 04 06 00 81 22 01 00 40 0D 03 00 12 02 01 01 01 21") + INFO
+    for identifier, payload in answers.items():
+        stream += apt.encode(apt.Message(identifier, 0, 0, apt.HOST, apt.BAY_1, payload.pack()))
+    unpacker.feed(stream)
+    status, position, enabled, info, homes, speeds = list(unpacker)
+    assert (status.position, status.forward_limit_switch, status.homed) == (1, True, False)
+    assert (position.position, enabled.enabled) == (200_000, True)
+    assert (info.serial_number, info.nchs, info.hw_version) == (94_000_009, 1, 1)
+    assert list(info.firmware_version) == [57, 1, 2]
+    assert (homes.home_velocity, homes.offset_distance) == (home.velocity, home.offset)
+    assert (speeds.acceleration, speeds.max_velocity) == (0x35B0, 0x00CCCCCD)
+
+
+def test_the_codec_needs_no_serial_port() -> None:
+    """The codec loads neither pyserial nor pyusb nor ctypes."""
+    script = (
+        "import sys, dbthermal.instruments.apt as a; print({'serial', 'usb'} & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, check=True, text=True
+    )
+    assert done.stdout.strip() == "set()"
