@@ -1,0 +1,227 @@
+"""The inventory of the rig on an emulated USB bus and a written sysfs tree."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import usb.backend.libusb0
+import usb.backend.libusb1
+import usb.backend.openusb
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dbthermal.instruments import inventory
+from dbthermal.instruments.emulated import usb as emulated
+from dbthermal.instruments.emulated.usb import EmulatedBackend, apt, boson, tc08
+from dbthermal.instruments.inventory import Device
+
+
+def look(
+    tmp_path: Path, *devices: emulated.EmulatedDevice, frame_rate: float = 30.0
+) -> list[Device]:
+    """Find the devices on a bus of their own, with the sysfs that belongs to it."""
+    backend = EmulatedBackend(*devices)
+    emulated.write_sysfs(tmp_path, backend)
+    found = inventory.find(backend, sysfs=tmp_path, dev=tmp_path / "dev", frame_rate=frame_rate)
+    assert backend.opened == 0
+    return found
+
+
+def test_whole_rig(tmp_path: Path) -> None:
+    """Two cameras, the wheel's controller and the logger are found, and nothing is to complain."""
+    found = look(tmp_path, tc08(), apt(), boson(2, bus=2), boson(1))
+    assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
+    assert [device.path for device in found] == ["1-1", "2-2", "1-3", "1-4"]
+    assert [device.serial for device in found] == ["EMULATED1", "EMULATED2", "EMULATED", "EMULATED"]
+    assert [device.speed for device in found] == ["high", "high", "full", "full"]
+    assert {device.warnings for device in found} == {()}
+    assert all(device.is_simulated for device in found)
+
+
+def test_nothing_plugged_in(tmp_path: Path) -> None:
+    """An empty bus gives an empty list, and the description says what is missing."""
+    assert look(tmp_path) == []
+    assert "FLIR Boson: not found (09cb:4007)" in inventory.describe([])
+
+
+def test_other_devices_are_not_listed(tmp_path: Path) -> None:
+    """A mouse is none of the rig's, nor is another of FLIR's devices."""
+    others = (
+        emulated.EmulatedDevice(0x046D, 0xC077, ""),
+        emulated.EmulatedDevice(0x09CB, 0x0100, ""),
+    )
+    assert look(tmp_path, *others[:1]) == []
+    assert inventory.find(EmulatedBackend(others[1]), sysfs=tmp_path) == []
+
+
+def test_nodes_belong_to_their_camera(tmp_path: Path) -> None:
+    """Each camera has the nodes below its own USB device, in the order of their numbers."""
+    nodes = {0: ("uvcvideo", "video10"), 1: ("uvcvideo", "video9"), 2: ("cdc_acm", "ttyACM1")}
+    first, second = look(tmp_path, boson(1, nodes=nodes, ports=(1, 2)), boson(2, ports=(1, 3)))
+    dev = tmp_path / "dev"
+    assert first.video_nodes == (str(dev / "video9"), str(dev / "video10"))
+    assert first.serial_nodes == (str(dev / "ttyACM1"),)
+    assert second.video_nodes == (str(dev / "video2"), str(dev / "video3"))
+    assert (first.path, second.path) == ("1-1.2", "1-1.3")
+
+
+def test_controller_behind_a_serial_converter(tmp_path: Path) -> None:
+    """The node of a USB converter lies one folder deeper, and is found too."""
+    assert look(tmp_path, apt())[0].serial_nodes == (str(tmp_path / "dev" / "ttyUSB0"),)
+
+
+def test_missing_driver(tmp_path: Path) -> None:
+    """A device whose kernel driver made no node says which module to load."""
+    controller, camera = sorted(
+        look(tmp_path, apt(nodes={}), boson(nodes={})), key=lambda d: d.kind.key
+    )
+    assert controller.warnings == (
+        "It has no serial node. Must have its kernel driver: is ftdi_sio loaded?",
+    )
+    assert len(camera.warnings) == 2
+
+
+@pytest.mark.parametrize("kind", ["boson", "apt", "tc08"])
+def test_permission(tmp_path: Path, kind: str) -> None:
+    """What may not be opened gives the udev rule to write, and its number from sysfs."""
+    device = {"boson": boson, "apt": apt, "tc08": tc08}[kind](fault="permission")
+    found = look(tmp_path, device)[0]
+    assert f'ATTR{{idVendor}}=="{device.vendor:04x}"' in found.warnings[0]
+    assert "/etc/udev/rules.d/70-dbthermal.rules" in found.warnings[0]
+    assert found.serial == device.serial
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("unplugged", "was unplugged while"),
+        ("timeout", "does not answer"),
+        ("damaged", "serial number is damaged"),
+        ("mute", "has no strings"),
+        ("unsupported", "libusb has no driver"),
+    ],
+)
+def test_device_that_does_not_tell_its_number(fault: emulated.Fault, message: str) -> None:
+    """Each way in which a device does not tell its number is a warning; the others are listed."""
+    backend = EmulatedBackend(tc08(fault=fault), tc08(ports=(5,)))
+    found = inventory.find(backend, sysfs=Path("/nowhere"))
+    assert message in found[0].warnings[0]
+    assert (found[0].serial, found[1].serial, found[1].warnings) == (None, "EMULATED", ())
+
+
+def test_device_without_a_number(tmp_path: Path) -> None:
+    """A device that has no serial number is not asked for one."""
+    found = look(tmp_path, tc08(serial="", fault="permission"))
+    assert (found[0].serial, found[0].warnings) == (None, ())
+    assert "without serial number" in inventory.describe(found)
+
+
+def test_camera_at_full_speed(tmp_path: Path) -> None:
+    """A camera on a bad cable runs at full speed, and the rates are given."""
+    found = look(tmp_path, boson(speed=2), frame_rate=60.0)
+    assert (
+        found[0]
+        .warnings[0]
+        .startswith(
+            "It runs at full speed, and 60 frames/s take 314.6 Mbit/s. Must be at high speed"
+        )
+    )
+
+
+def test_rates() -> None:
+    """Y16 of 640 x 512 takes 157.3 Mbit/s at 30 Hz; a high-speed bus carries 426 Mbit/s."""
+    assert inventory.video_rate(30.0) == pytest.approx(157.3e6, abs=0.05e6)
+    assert abs(inventory.HIGH_SPEED_PAYLOAD - 425.98e6) < 0.01e6
+
+
+def test_two_cameras_on_one_bus(tmp_path: Path) -> None:
+    """Two cameras at 60 Hz do not fit a bus, and each says so, with the numbers."""
+    found = look(tmp_path, boson(1, ports=(1, 1)), boson(2, ports=(1, 2)), frame_rate=60.0)
+    assert " and ".join(found[0].warnings) == (
+        "It shares bus 1 and the root port with EMULATED2: 629.1 Mbit/s at 60 frames/s, of 426.0 "
+        "Mbit/s at most. Use ports of two controllers, or 30 frames/s: 314.6 Mbit/s."
+    )
+    assert "with EMULATED1" in found[1].warnings[0]
+
+
+def test_two_cameras_that_fit(tmp_path: Path) -> None:
+    """At 30 Hz two cameras share a bus, at 60 Hz they have one each; neither is warned of."""
+    found = look(tmp_path / "slow", boson(1), boson(2), frame_rate=30.0)
+    found += look(tmp_path / "apart", boson(1), boson(2, bus=2), frame_rate=60.0)
+    assert {device.warnings for device in found} == {()}
+
+
+def test_two_root_ports(tmp_path: Path) -> None:
+    """Two root ports of one bus may or may not share it: the warning says so."""
+    found = look(tmp_path, boson(1), boson(2), frame_rate=60.0)
+    assert "though not the root port (ask the controller)" in found[0].warnings[0]
+
+
+def test_node_that_may_not_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node without permission names its group and the command."""
+    node = tmp_path / "dev" / "ttyUSB0"
+    node.parent.mkdir()
+    node.touch()
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    found = look(tmp_path, apt())[0]
+    assert found.warnings[0].startswith(f"No permission for {node}. Must be in its group '")
+
+
+def test_system_without_sysfs() -> None:
+    """Where there is no sysfs, the devices are found and their nodes are said to be unknown."""
+    found = inventory.find(EmulatedBackend(boson()), sysfs=Path("/nowhere"))
+    assert found[0].warnings == (
+        "Its nodes are not known: there is no /nowhere/bus/usb/devices/1-1.",
+    )
+
+
+def test_missing_libusb(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without libusb the error says what to install."""
+    for module in (usb.backend.libusb1, usb.backend.libusb0, usb.backend.openusb):
+        monkeypatch.setattr(module, "get_backend", lambda: None)
+    with pytest.raises(inventory.LibusbMissingError, match=r"No libusb found\. Must be installed"):
+        inventory.find()
+
+
+def test_description(tmp_path: Path) -> None:
+    """The description names each device, says that it is emulated, and puts warnings below it."""
+    lines = inventory.describe(look(tmp_path, boson(speed=2), tc08())).splitlines()
+    nodes = " ".join(str(tmp_path / "dev" / name) for name in ("video0", "video1", "ttyACM0"))
+    assert lines[0] == f"emulated FLIR Boson EMULATED1: 1-1, full speed, {nodes}"
+    assert lines[1].startswith("  ! It runs at full speed")
+    assert lines[2].startswith("Thorlabs APT controller: not found")
+    assert lines[3] == "emulated Pico TC-08 EMULATED: 1-4, full speed, no nodes"
+
+
+@pytest.mark.parametrize("order", ["set_configuration", "reset", "detach_kernel_driver"])
+def test_emulated_bus_refuses_what_disturbs(order: str) -> None:
+    """The emulated bus would notice if a live device were disturbed."""
+    device = next(usb.core.find(find_all=True, backend=EmulatedBackend(boson())))
+    with pytest.raises(AssertionError, match=r"on a live device\. Must only be looked at"):
+        getattr(device, order)(*([0] if order.startswith("detach") else []))
+
+
+@given(st.binary(max_size=80))
+def test_any_string_descriptor(answer: bytes) -> None:
+    """Whatever bytes a device sends as its number, it is text or a warning, never an exception."""
+    backend = EmulatedBackend(tc08())
+    backend.answer = lambda *_: answer
+    found = inventory.find(backend, sysfs=Path("/nowhere"))[0]
+    assert isinstance(found.serial, str) or found.warnings
+
+
+def test_only_the_inventory_loads_pyusb() -> None:
+    """`import dbthermal.instruments` does without pyusb."""
+    code = "import sys, dbthermal.instruments; print('usb' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+@pytest.mark.hardware
+def test_hardware() -> None:
+    """With the rig plugged in, all of it is found, and nothing stands in the way."""
+    found = inventory.find()
+    assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
+    assert [device.warnings for device in found] == [()] * 4
