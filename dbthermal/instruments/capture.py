@@ -1,0 +1,100 @@
+"""What was recorded, as the stage `capture`: ready for correction, alignment and separation."""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import schema, store
+from dbthermal.alignment import clocks
+from dbthermal.instruments.frames_source import UNTIMED
+
+Array = npt.NDArray[np.float64]
+
+
+def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
+    r"""
+    Open a recording, also one that was cut short, or is being written.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``, from `dbthermal.instruments.record.record`.
+    fitted : bool
+        Whether exposure times come from a line through both clocks, :math:`h = a + b d` with the
+        device's time d and the host's h, by least squares, for a camera whose stamps are on a clock
+        of its own. They are then late by the mean time that a frame takes to the host.
+
+    Returns
+    -------
+    Dataset
+        Stage `capture`: `counts` (band, time, y, x) [count], read when used, `exposure_time` (band,
+        time) [s], NaN for a frame that is damaged, repeated or missing, and what is in
+        `dbthermal.instruments.tape.VARIABLES` but the log, see `notes`. `time` is when the first
+        band was exposed. Where it was fitted, attribute ``clock_rates`` has b of each band.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none.
+    ValueError
+        If a band has fewer than two frames with a time: too short, or a camera's own clock.
+    """
+    recording = store.open_dataset(path)
+    opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
+    if fitted:
+        opened = _fitted(opened)
+    # The coordinate must be there for the stamps to be looked at, of which it is made.
+    numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
+    time = clocks.filled(clocks.exposures(numbered)[0])
+    seconds = schema.COORDINATES["time"].attrs
+    return schema.check(numbered.assign_coords(time=("time", time, seconds)), "capture")
+
+
+def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
+    """
+    Read the log of a recording.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``.
+
+    Returns
+    -------
+    list of tuple
+        Time [s], kind (a name of `dbthermal.instruments.tape.Note` in lower case), source and
+        value of each note, in the order of writing.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is none.
+    """
+    recording = store.open_dataset(path)
+    kinds = {number: name for name, number in recording.attrs["log_kinds"].items()}
+    sources = recording.attrs["log_sources"]
+    columns = (recording[f"log_{name}"].values for name in ("time", "kind", "source", "value"))
+    return [
+        (float(time), kinds[int(kind)], sources[int(source)], float(value))
+        for time, kind, source, value in zip(*columns, strict=True)
+    ]
+
+
+def _fitted(recording: xr.Dataset) -> xr.Dataset:
+    """Put exposure times of good frames on the host's clock by a line through both."""
+    unusable = recording["frame_flags"].values & int(UNTIMED)
+    device, host = recording["device_time"].values, recording["host_time"].values
+    stamps, rates = np.full(device.shape, np.nan), []
+    for place, band in enumerate(recording["band"].values):
+        good = (unusable[place] == 0) & np.isfinite(device[place])
+        if np.count_nonzero(good) < 2:
+            raise ValueError(f"Invalid band '{band}' without two good frames. Must have two.")
+        line = np.polynomial.Polynomial.fit(device[place, good], host[place, good], 1)
+        stamps[place, good] = line(device[place, good])
+        rates.append(float(line.deriv()(0.0)))
+    attrs = recording["exposure_time"].attrs
+    return recording.assign(exposure_time=(("band", "time"), stamps, attrs)).assign_attrs(
+        clock_rates=rates
+    )

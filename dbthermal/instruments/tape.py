@@ -1,0 +1,348 @@
+"""Frames and notes on their way into a recording: numbered, flagged, gathered into chunks.
+
+A `Tape` looks at each frame beside the one before: a number that leaps is a loss, one that does not
+rise a repetition, and a time that does not rise is none. Nothing is left out: a damaged frame is
+written with its flags, and only its exposure time is NaN, so that `dbthermal.alignment` passes over
+it. What is no frame goes into the log: losses, shutter events, readings of other instruments.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal import store
+from dbthermal.alignment import clocks
+from dbthermal.instruments import telemetry
+from dbthermal.instruments.frames_source import (
+    GOOD,
+    MEANINGS,
+    UNTIMED,
+    Frame,
+    FrameFlag,
+    FrameSource,
+)
+from dbthermal.schema import STAGES, Variable
+
+CHUNK: Final = 30
+"""Frames of a chunk: half a second at 60 Hz, which is what a kill may cost."""
+
+VARIABLES: Final = MappingProxyType(
+    {
+        "counts": STAGES["capture"]["counts"],
+        "exposure_time": clocks.EXPOSURE_TIME,
+        "device_time": Variable(("band", "time"), "float64", "s", "device's stamp of the frame"),
+        "host_time": Variable(("band", "time"), "float64", "s", "when the host had the frame"),
+        "sequence": Variable(("band", "time"), "int64", "1", "number of the frame by its driver"),
+        "frame_flags": Variable(("band", "time"), "uint16", "1", "flags of the frame, 0 is good"),
+        "log_time": Variable(("log",), "float64", "s", "time of the note"),
+        "log_kind": Variable(("log",), "int16", "1", "what is noted"),
+        "log_source": Variable(("log",), "int16", "1", "whose note it is"),
+        "log_value": Variable(("log",), "float64", "1", "value of the note, in the source's unit"),
+    }
+)
+"""What every recording holds. Times are on the host's clock since ``clock_origin``; `device_time`
+is as it came. The attributes name kinds, sources and flags."""
+
+TELEMETRY: Final = MappingProxyType(
+    {
+        "telemetry": Variable(
+            ("band", "time", "telemetry_row", "x"), "uint16", "1", "telemetry rows as they came"
+        ),
+        "fpa_temperature": Variable(
+            ("band", "time"), "float32", "K", "temperature of the focal-plane array"
+        ),
+    }
+)
+"""What a recording holds besides, if the cameras give telemetry."""
+
+
+class Note(IntEnum):
+    """Kinds of notes in the log, by what their value is."""
+
+    READING = 0
+    """The reading."""
+    READING_FAILED = 1
+    """NaN: the instrument gave none."""
+    FRAMES_LOST = 2
+    """Number of frames that the driver or the camera lost."""
+    FRAMES_REFUSED = 3
+    """Number of frames that came, but for which the queue was full."""
+    SEQUENCE_STANDS = 4
+    """Step of the sequence number, 0 or less."""
+    DAMAGED = 5
+    """Flags of the frame."""
+    SHUTTER_CLOSED = 6
+    """Sequence number of the first frame."""
+    SHUTTER_OPEN = 7
+    """Sequence number of the first frame."""
+    CORRECTION = 8
+    """Camera's number of the frame at which it renewed its offsets, from the telemetry."""
+    NO_FRAME = 9
+    """Time without a frame [s]."""
+    SOURCE_LOST = 10
+    """NaN: the source gives no more frames."""
+
+
+@dataclass
+class _Band:
+    """What is known of one band while it is recorded."""
+
+    block: dict[str, npt.NDArray[Any]]
+    filled: int = 0
+    sequence: int | None = None
+    device_time: float = -math.inf
+    closed: bool = False
+    last_correction: int | None = None
+    counts: dict[str, int] = field(
+        default_factory=lambda: dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
+    )
+
+
+class Tape:
+    """
+    What frames and notes are handed to, in the order in which they come.
+
+    Parameters
+    ----------
+    path : str or Path
+        Recording to make, ``*.zarr``.
+    sources : mapping
+        Band to its source, all of one shape.
+    readings : mapping
+        Name of each further instrument's reading to its unit.
+    origin : float
+        Host's clock at time 0 [s].
+    attrs : mapping
+        Attributes of the recording, JSON.
+    chunk : int
+        Frames of a chunk.
+
+    Attributes
+    ----------
+    recording : Recording
+        What is on the disk.
+    broken : bool
+        Whether writing failed: what was written before is valid, and no more is to be handed over.
+
+    Raises
+    ------
+    FileExistsError
+        If there is something at `path`.
+    ValueError
+        If the sources differ in shape or telemetry.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        sources: Mapping[str, FrameSource],
+        *,
+        readings: Mapping[str, str],
+        origin: float,
+        attrs: Mapping[str, Any],
+        chunk: int = CHUNK,
+    ) -> None:
+        (rows, columns), telemetry_rows = _common_format(sources)
+        self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
+        self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
+        self._origin, self._chunk = origin, chunk
+        self._names = [*sources, *readings]
+        self._notes: list[tuple[float, int, int, float]] = []
+        self.broken = False
+        self.recording = store.Recording.create(
+            path,
+            self._variables,
+            self._sizes,
+            list(sources),
+            chunk=chunk,
+            attrs={**attrs, **_legend(self._names, readings, origin)},
+        )
+        self._bands = {band: _Band(self._new_block()) for band in sources}
+
+    @property
+    def totals(self) -> dict[str, dict[str, int]]:
+        """Band to its ``frames``, ``lost``, ``refused`` and ``damaged``, numbers of frames."""
+        return {band: dict(state.counts) for band, state in self._bands.items()}
+
+    def frame(self, band: str, frame: Frame, refused: int = 0) -> None:
+        """
+        Take a frame; write the chunk if it is whole.
+
+        Parameters
+        ----------
+        band : str
+            Its band.
+        frame : Frame
+            As it came from the source.
+        refused : int
+            Frames of this band that came since the one before and were not taken.
+        """
+        state = self._bands[band]
+        flags = frame.flags | self._compared(band, frame, refused)
+        if flags & (FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE):
+            state.counts["damaged"] += 1
+            self.note(Note.DAMAGED, band, frame.host_time, int(flags))
+        self._watch_shutter(band, frame)
+        timed = not flags & (UNTIMED | FrameFlag.FOREIGN_CLOCK)
+        values: dict[str, Any] = {
+            "counts": frame.counts,
+            "exposure_time": frame.device_time - self._origin if timed else math.nan,
+            "device_time": frame.device_time,
+            "host_time": frame.host_time - self._origin,
+            "sequence": frame.sequence,
+            "frame_flags": int(flags),
+            **self._decoded(band, frame),
+        }
+        for name, value in values.items():
+            state.block[name][state.filled] = value
+        state.filled += 1
+        state.counts["frames"] += 1
+        if state.filled == self._chunk:
+            self._write(band)
+
+    def note(self, kind: Note, source: str, time: float, value: float = math.nan) -> None:
+        """
+        Put a line into the log.
+
+        Parameters
+        ----------
+        kind : Note
+            What it is.
+        source : str
+            Band, or name of a reading.
+        time : float
+            On the host's clock [s].
+        value : float
+            See `Note`.
+        """
+        row = time - self._origin, int(kind), self._names.index(source), value
+        self._notes.append(row)
+
+    def refused(self, band: str, number: int, time: float) -> None:
+        """
+        Count frames that came and were not taken, after the last one that was.
+
+        Parameters
+        ----------
+        band : str
+            Their band.
+        number : int
+            How many.
+        time : float
+            On the host's clock [s].
+        """
+        if number:
+            self._bands[band].counts["refused"] += number
+            self.note(Note.FRAMES_REFUSED, band, time, number)
+
+    def close(self, *, complete: bool, ended: str) -> None:
+        """
+        Write what is left, and the coordinate `time`: the first band's exposure times.
+
+        Parameters
+        ----------
+        complete : bool
+            Whether the recording went as planned.
+        ended : str
+            Why it ended.
+        """
+        for band in self._bands:
+            self._write(band)
+        self._write_notes()
+        time = self._times(next(iter(self._bands)))
+        self.recording.close(complete=complete, time=time, ended=ended, totals=self.totals)
+
+    def _compared(self, band: str, frame: Frame, refused: int) -> FrameFlag:
+        """Flags from the frame before, and the notes of what is missing between them."""
+        state, flags = self._bands[band], GOOD
+        self.refused(band, refused, frame.host_time)
+        step = 1 if state.sequence is None else frame.sequence - state.sequence
+        lost = step - 1 - refused
+        if step < 1:
+            flags |= FrameFlag.SEQUENCE_STANDS
+            self.note(Note.SEQUENCE_STANDS, band, frame.host_time, step)
+        elif lost > 0:
+            state.counts["lost"] += lost
+            self.note(Note.FRAMES_LOST, band, frame.host_time, lost)
+        flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else GOOD
+        if frame.device_time > state.device_time:
+            state.device_time = frame.device_time
+        else:  # NaN too
+            flags |= FrameFlag.TIME_STANDS
+        state.sequence = frame.sequence
+        return flags
+
+    def _watch_shutter(self, band: str, frame: Frame) -> None:
+        state = self._bands[band]
+        closed = FrameFlag.SHUTTER_CLOSED in frame.flags
+        if closed != state.closed:
+            kind = Note.SHUTTER_CLOSED if closed else Note.SHUTTER_OPEN
+            self.note(kind, band, frame.host_time, frame.sequence)
+            state.closed = closed
+
+    def _decoded(self, band: str, frame: Frame) -> dict[str, Any]:
+        """Telemetry as it came, and what of it is of use frame by frame."""
+        if frame.telemetry is None:
+            return {}
+        state, fields = self._bands[band], telemetry.decode(frame.telemetry)
+        if state.last_correction not in {None, fields.last_ffc_frame}:
+            self.note(Note.CORRECTION, band, frame.host_time, fields.last_ffc_frame)
+        state.last_correction = fields.last_ffc_frame
+        return {"telemetry": frame.telemetry, "fpa_temperature": fields.fpa_temperature}
+
+    def _write(self, band: str) -> None:
+        state, self.broken = self._bands[band], True
+        if state.filled:
+            block = {name: values[: state.filled] for name, values in state.block.items()}
+            self.recording.append(band, block)
+            state.filled = 0
+        self._write_notes()
+        self.broken = False
+
+    def _write_notes(self) -> None:
+        if self._notes:
+            names = ("log_time", "log_kind", "log_source", "log_value")
+            columns = zip(names, zip(*self._notes, strict=True), strict=True)
+            self.recording.append_log(
+                {name: np.array(values, self._variables[name].dtype) for name, values in columns}
+            )
+            self._notes = []
+        self.recording.commit(totals=self.totals)
+
+    def _new_block(self) -> dict[str, npt.NDArray[Any]]:
+        sizes = {**self._sizes, "time": self._chunk}
+        return {
+            name: np.zeros([sizes[dim] for dim in variable.dims[1:]], variable.dtype)
+            for name, variable in self._variables.items()
+            if variable.dims[0] == "band"
+        }
+
+    def _times(self, band: str) -> npt.NDArray[np.float64] | None:
+        """Exposure times without holes; None where there are not two."""
+        stamps = self.recording.read("exposure_time", band)
+        return clocks.filled(stamps) if np.isfinite(stamps).sum() > 1 else None
+
+
+def _common_format(sources: Mapping[str, FrameSource]) -> tuple[tuple[int, int], int]:
+    formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
+    if len(set(formats.values())) != 1:
+        raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
+    return next(iter(formats.values()))
+
+
+def _legend(names: list[str], readings: Mapping[str, str], origin: float) -> dict[str, Any]:
+    """Attributes that say what the numbers in log and flags mean."""
+    return {
+        "clock_origin": origin,
+        "log_sources": names,
+        "log_units": dict(readings),
+        "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
+        "frame_flag_masks": {str(flag.name).lower(): int(flag) for flag in MEANINGS},
+    }

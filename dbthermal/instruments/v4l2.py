@@ -1,0 +1,232 @@
+"""Raw 16-bit frames of a camera on Linux, with the kernel's stamps, numbers and flags.
+
+A thin use of Video4Linux2, in a few calls (see `dbthermal.instruments.v4l2_calls`). The kernel's
+stamp of a frame is on CLOCK_MONOTONIC and, from uvcvideo, of the start of its exposure
+(https://docs.kernel.org/userspace-api/media/v4l/buffer.html). Tested with a stand-in for the
+kernel's calls, not against a camera.
+"""
+
+import errno
+import struct
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+
+from dbthermal.instruments import v4l2_calls as calls
+from dbthermal.instruments.frames_source import (
+    FRAME_TIMEOUT,
+    GOOD,
+    Counts,
+    Frame,
+    FrameFlag,
+    NoFrameError,
+    SourceLostError,
+)
+from dbthermal.instruments.v4l2_calls import Kernel, Stream
+
+_ERROR: Final = 0x40  # V4L2_BUF_FLAG_ERROR
+_CLOCK_MASK: Final = 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_MASK
+_MONOTONIC: Final = 0x2000  # V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC
+_MICRO: Final = 1e-6
+_TYPE: Final = struct.pack("=I", calls.CAPTURE)
+
+
+class Capture:
+    """
+    A camera's node that streams Y16 frames; open one with `Capture.open`.
+
+    It is a `FrameSource` and a context manager, and `close` may be called again. It resets nothing.
+
+    Parameters
+    ----------
+    path : str
+        The node, such as ``"/dev/video0"``.
+    stream : Stream
+        What to ask of the camera.
+    kernel : Kernel, optional
+        Calls to the kernel.
+
+    Attributes
+    ----------
+    identity : mapping
+        ``device``, the node, and, once open, ``model``, what the driver calls the camera.
+    is_simulated : bool
+        False.
+    """
+
+    is_simulated: Final = False
+
+    def __init__(self, path: str, stream: Stream, kernel: Kernel | None = None) -> None:
+        self.path, self.stream = path, stream
+        self.identity: Mapping[str, str] = {"device": path}
+        self._kernel = kernel or Kernel()
+        self._file: int | None = None
+        self._maps: list[Any] = []
+
+    @classmethod
+    def open(cls, path: str, stream: Stream | None = None, kernel: Kernel | None = None) -> Self:
+        """
+        Open a node, agree on format and rate, and start the stream.
+
+        Parameters
+        ----------
+        path : str
+            Such as ``"/dev/video0"``.
+        stream : Stream, optional
+            What to ask of the camera; 640 x 512 pixels at 60 Hz, without telemetry.
+        kernel : Kernel, optional
+            Calls to the kernel.
+
+        Returns
+        -------
+        Capture
+            Streaming.
+
+        Raises
+        ------
+        OSError
+            If the node cannot be opened, is busy, or this is not Linux.
+        ValueError
+            If the node gives no Y16, or the driver agrees to another format or rate.
+        """
+        capture = cls(path, stream or Stream(), kernel)
+        capture._start()
+        return capture
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the image, without telemetry [pixel]."""
+        return self.stream.shape
+
+    @property
+    def telemetry_rows(self) -> int:
+        """Rows of telemetry that come with each frame."""
+        return self.stream.telemetry_rows
+
+    @property
+    def frame_rate(self) -> float:
+        """Rate that was agreed on [Hz]."""
+        return self.stream.frame_rate
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
+        """
+        Wait for the next frame; see `dbthermal.instruments.frames_source.FrameSource.read`.
+
+        Parameters
+        ----------
+        timeout : float
+            How long to wait [s].
+
+        Returns
+        -------
+        Frame
+            A copy; the buffer is the kernel's again. Damaged frames say so in their flags.
+
+        Raises
+        ------
+        NoFrameError
+            If none came in time.
+        SourceLostError
+            If the camera is gone, or this is closed.
+        """
+        file = self._opened()
+        if not self._kernel.select([file], [], [], timeout)[0]:
+            raise NoFrameError(f"No frame from '{self.path}' in {timeout} s.")
+        buffer = _buffer(0)
+        self._call(file, calls.DQBUF, buffer)
+        frame = self._frame(buffer, self._kernel.clock())
+        self._call(file, calls.QBUF, buffer)
+        return frame
+
+    def close(self) -> None:
+        """Stop the stream and close the node; a second call does nothing."""
+        if self._file is None:
+            return
+        file, self._file = self._file, None
+        try:
+            self._kernel.ioctl(file, calls.STREAMOFF, bytearray(_TYPE))
+        except OSError as error:
+            if error.errno != errno.ENODEV:  # unplugged: there is nothing left to stop
+                raise
+        finally:
+            for memory in self._maps:
+                memory.close()
+            self._maps.clear()
+            self._kernel.close(file)
+
+    def _start(self) -> None:
+        self._file = file = calls.open_node(self.path, self._kernel)
+        try:
+            card = calls.agree(file, self.path, self.stream, self._kernel)
+            self.identity = {"device": self.path, "model": card}
+            self._map_buffers(file)
+            self._kernel.ioctl(file, calls.STREAMON, bytearray(_TYPE))
+        except BaseException:
+            self.close()
+            raise
+
+    def _map_buffers(self, file: int) -> None:
+        request = bytearray(calls.REQUEST.pack(calls.BUFFERS, calls.CAPTURE, calls.MMAP))
+        self._kernel.ioctl(file, calls.REQBUFS, request)
+        for index in range(calls.REQUEST.unpack(request)[0]):
+            buffer = _buffer(index)
+            self._kernel.ioctl(file, calls.QUERYBUF, buffer)
+            offset, length = calls.BUFFER.unpack(buffer)[9:11]
+            self._maps.append(self._kernel.map(file, length, offset))
+            self._kernel.ioctl(file, calls.QBUF, buffer)
+
+    def _opened(self) -> int:
+        if self._file is None:
+            raise SourceLostError(f"No frames from '{self.path}': it is closed.")
+        return self._file
+
+    def _call(self, file: int, number: int, argument: bytearray) -> None:
+        try:
+            self._kernel.ioctl(file, number, argument)
+        except BlockingIOError as error:
+            raise NoFrameError(f"No frame from '{self.path}', though it was announced.") from error
+        except OSError as error:
+            if error.errno not in (errno.ENODEV, errno.EIO):
+                raise
+            message = f"No more frames from '{self.path}': {error.strerror}."
+            raise SourceLostError(message) from error
+
+    def _frame(self, buffer: bytearray, host_time: float) -> Frame:
+        """Copy a frame out of its buffer and translate what the kernel says of it."""
+        index, _, used, said, _, seconds, micros, sequence, *_ = calls.BUFFER.unpack(buffer)
+        image = np.zeros((self.stream.rows, self.shape[1]), dtype="<u2")
+        size = min(used, image.nbytes)
+        image.reshape(-1).view(np.uint8)[:size] = np.frombuffer(self._maps[index], np.uint8, size)
+        flags = FrameFlag.DRIVER_ERROR if said & _ERROR else GOOD
+        flags |= FrameFlag.WRONG_SIZE if used != image.nbytes else GOOD
+        flags |= FrameFlag.FOREIGN_CLOCK if said & _CLOCK_MASK != _MONOTONIC else GOOD
+        counts, telemetry = _split(image.astype(np.uint16, copy=False), self.stream)
+        return Frame(counts, seconds + _MICRO * micros, host_time, sequence, flags, telemetry)
+
+
+def _buffer(index: int) -> bytearray:
+    """Argument for a buffer of this number."""
+    return bytearray(calls.BUFFER.pack(index, calls.CAPTURE, 0, 0, 0, 0, 0, 0, calls.MMAP, 0, 0))
+
+
+def _split(image: Counts, stream: Stream) -> tuple[Counts, Counts | None]:
+    """Image, and telemetry rows if there are."""
+    rows = stream.telemetry_rows
+    if rows == 0:
+        return image, None
+    return (
+        (image[rows:], image[:rows]) if stream.telemetry_first else (image[:-rows], image[-rows:])
+    )

@@ -1,0 +1,230 @@
+"""The emulated camera shows the world it is in, and has the faults that it is told to have."""
+
+import numpy as np
+import pytest
+
+from dbthermal.instruments import telemetry
+from dbthermal.instruments.emulated import frames as emulated
+from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.frames_source import (
+    Counts,
+    Frame,
+    FrameFlag,
+    NoFrameError,
+    SourceLostError,
+    frames,
+)
+
+SHAPE, RATE = (8, 80), 10.0
+
+
+class Clock:
+    """A clock that goes on only while somebody sleeps."""
+
+    def __init__(self) -> None:
+        self.time = 1000.0
+
+    def __call__(self) -> float:
+        """The time [s]."""
+        return self.time
+
+    def sleep(self, duration: float) -> None:
+        """Let time pass."""
+        self.time += duration
+
+
+def level(counts: int) -> Movie:
+    """A movie of 100 even frames, each one count above the one before."""
+    steps = np.arange(counts, counts + 100, dtype=np.uint16)
+    return Movie(np.broadcast_to(steps[:, None, None], (100, *SHAPE)), RATE, endless=True)
+
+
+def camera(
+    faults: Faults | None = None, band: str | None = "8-14", rows: int = 0
+) -> EmulatedCamera:
+    """A camera on a bench with a wheel of two filters, on a clock that nobody waits for."""
+    clock = Clock()
+    world = World(clock=clock, filters={1: "9.5", 2: "11"})
+    world.add_camera("wide", 93588)
+    pictures = {"8-14": level(1000), "9.5": level(2000), "11": level(3000)}
+    return EmulatedCamera(
+        world, "wide", pictures, band, SHAPE, RATE, rows, faults or Faults(), clock.sleep
+    )
+
+
+def shown(frame: Frame) -> int:
+    """Counts of the first pixel."""
+    return int(frame.counts[0, 0])
+
+
+def test_frames_come_at_their_rate() -> None:
+    """Number, picture and both clocks go on together."""
+    found = list(frames(camera(), 5))
+    assert [frame.sequence for frame in found] == list(range(5))
+    assert [shown(frame) for frame in found] == list(range(1000, 1005))
+    times = [frame.device_time for frame in found]
+    np.testing.assert_allclose(times, 1000 + np.arange(5) / RATE, rtol=0, atol=1e-9)
+    assert all(frame.host_time == pytest.approx(frame.device_time) for frame in found)
+
+
+def test_it_says_that_it_is_emulated() -> None:
+    """Nobody takes it for a camera."""
+    assert camera().is_simulated
+    assert "emulated" in camera().identity["model"]
+    assert camera().identity["device"].startswith("sim://")
+
+
+def test_wheel_changes_what_is_seen() -> None:
+    """Behind the wheel the band is the filter's; between two filters nothing is seen."""
+    behind = camera(band=None)
+    found = [shown(behind.read())]
+    for position in (2, None, 3):
+        behind.world.wheel_position = position
+        found.append(shown(behind.read()))
+    assert found == [2000, 3001, emulated.CLOSED, emulated.CLOSED]
+
+
+def test_shutter_freezes_and_leaves_other_offsets() -> None:
+    """During a correction the image stands and says so; after it each pixel has an offset."""
+    source = camera(Faults(ffc=frozenset({3}), offset_step=20.0))
+    found = list(frames(source, 12))
+    closed = [FrameFlag.SHUTTER_CLOSED in frame.flags for frame in found]
+    assert np.flatnonzero(closed).tolist() == [3, 4, 5, 6, 7]
+    assert all(np.array_equal(frame.counts, found[2].counts) for frame in found[3:8])
+    step = found[8].counts.astype(int) - 1008
+    assert 15 < step.std() < 25
+    np.testing.assert_array_equal(found[9].counts.astype(int) - 1009, step)
+
+
+def test_shutter_may_be_anothers_command() -> None:
+    """A correction that was started over the serial line freezes the frames too."""
+    source = camera()
+    source.read()
+    source.world.start_ffc("wide", 0.25)
+    assert [bool(frame.flags) for frame in frames(source, 4)] == [True, True, False, False]
+
+
+def test_telemetry_says_what_the_camera_is_about() -> None:
+    """Counter, corrections and temperature are in the rows, and in the world."""
+    source = camera(Faults(ffc=frozenset({3})), rows=2)
+    source.world.camera("wide").fpa_temperature = 311.2
+    last = list(frames(source, 6))[-1]
+    assert last.telemetry is not None
+    fields = telemetry.decode(last.telemetry)
+    assert (fields.frame_counter, fields.last_ffc_frame, fields.camera_serial) == (5, 3, 93588)
+    assert fields.fpa_temperature == pytest.approx(311.2, abs=1e-9)
+    assert fields.part_number == "emulated"
+
+
+def test_dropped_frames_leave_a_gap() -> None:
+    """A frame that never comes is missing in the numbers, and takes its time."""
+    found = list(frames(camera(Faults(dropped=frozenset({2, 3}))), 4))
+    assert [frame.sequence for frame in found] == [0, 1, 4, 5]
+    assert found[2].device_time - found[1].device_time == pytest.approx(0.3)
+
+
+def test_nobody_reads() -> None:
+    """The buffers hold some frames; if nobody reads, the others are lost, and it shows."""
+    source = camera()
+    source.read()
+    source.sleep(0.75)
+    assert source.read().sequence == 1
+    source.sleep(2.0)
+    assert source.read().sequence == 27
+
+
+def test_damage() -> None:
+    """A corrupt frame says so, or does not; of a short one the rest is 0."""
+    faults = Faults(corrupt=frozenset({1}), unseen=frozenset({2}), short=frozenset({3}))
+    found = list(frames(camera(faults), 5))
+    expected = [0, FrameFlag.DRIVER_ERROR, 0, FrameFlag.WRONG_SIZE, 0]
+    assert [frame.flags for frame in found] == expected
+    lower = [int(np.ptp(frame.counts[4:].astype(int))) for frame in found]
+    assert [value > 0 for value in lower] == [False, True, True, False, False]
+    assert (found[3].counts[4:] == 0).all()
+
+
+def test_repeated_image_has_its_own_number() -> None:
+    """As a driver that lost a frame and hands out the last one again."""
+    found = list(frames(camera(Faults(repeated=frozenset({2}))), 4))
+    assert [shown(frame) for frame in found] == [1000, 1001, 1001, 1003]
+    assert [frame.sequence for frame in found] == [0, 1, 2, 3]
+
+
+def test_clock_of_its_own() -> None:
+    """A drifting clock goes at its rate, and is not said to be the host's."""
+    found = list(frames(camera(Faults(clock_rate=1.01)), 3))
+    assert np.diff([frame.device_time for frame in found]) == pytest.approx(0.101)
+    assert all(frame.flags == FrameFlag.FOREIGN_CLOCK for frame in found)
+
+
+def test_unplugged_and_closed() -> None:
+    """A camera that is gone, or was closed, says which."""
+    source = camera(Faults(unplugged=2))
+    list(frames(source, 2))
+    with pytest.raises(SourceLostError, match="emulated camera 'wide': it is unplugged"):
+        source.read()
+    assert not source.world.camera("wide").plugged
+    with camera() as other:
+        pass
+    other.close()
+    with pytest.raises(SourceLostError, match="it is closed"):
+        other.read()
+
+
+def test_no_frame_in_time() -> None:
+    """A wait shorter than a frame ends without one; the next wait has it."""
+    source = camera()
+    source.read()
+    with pytest.raises(NoFrameError, match=r"No frame from emulated camera 'wide' in 0\.01 s"):
+        source.read(0.01)
+    assert source.read().sequence == 1
+
+
+def test_movie_ends() -> None:
+    """What was not computed is not shown."""
+    movie = Movie(np.zeros((5, *SHAPE), dtype=np.uint16), RATE)
+    assert movie(0.49).shape == SHAPE
+    with pytest.raises(ValueError, match=r"Invalid time 0\.5 s of a movie\. Must lie in \[0, 0\.5"):
+        movie(0.5)
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (np.zeros((3, 4), dtype=np.uint16), r"Invalid picture \(3, 4\) of uint16 in band '8-14'"),
+        (np.zeros(SHAPE, dtype=np.float64), r"Must be \(8, 80\) of uint16"),
+    ],
+)
+def test_pictures_are_counts(picture: Counts, message: str) -> None:
+    """A picture of another size or kind is not bent to fit."""
+    source = camera()
+    source.pictures = {"8-14": lambda _: picture}
+    with pytest.raises(ValueError, match=message):
+        source.read()
+
+
+def test_unknown_names() -> None:
+    """A band without a picture, and a camera that is not on the bench, are named."""
+    source = camera(band="12")
+    with pytest.raises(KeyError, match="Unknown band '12'"):
+        source.read()
+    with pytest.raises(KeyError, match="Unknown camera 'narrow'"):
+        EmulatedCamera(source.world, "narrow", {})
+
+
+def test_world_has_places_and_slots() -> None:
+    """Thermocouples read what they are at; slots and names are checked."""
+    world = World(scene=lambda time: {"plate": 300.0 + time}, clock=Clock())
+    world.thermocouples.update({1: "plate", 2: "blackbody", 4: "moon"})
+    world.blackbody_temperature = 320.0
+    assert [world.thermocouple_temperature(channel) for channel in (1, 2)] == [300.0, 320.0]
+    assert np.isnan(world.thermocouple_temperature(3))
+    with pytest.raises(KeyError, match="Unknown place 'moon' of thermocouple 4"):
+        world.thermocouple_temperature(4)
+    with pytest.raises(ValueError, match=r"Invalid filter position 7\. Must lie in 1 to 6"):
+        world.wheel_position = 7
+    world.add_camera("wide", 1)
+    with pytest.raises(ValueError, match="Repeated camera 'wide'"):
+        world.add_camera("wide", 2)

@@ -1,0 +1,289 @@
+"""Capture by Video4Linux2: what is asked of the kernel, and what of its answers is seen."""
+
+import errno
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dbthermal.instruments import v4l2, v4l2_calls
+from dbthermal.instruments.frames_source import FrameFlag, NoFrameError, SourceLostError, frames
+from dbthermal.instruments.v4l2_calls import Stream
+
+STREAM = Stream(shape=(4, 6), telemetry_rows=2)
+BYTES = 2 * 6 * 6
+GOOD = 0x12000  # stamp of the monotonic clock, of the start of exposure
+
+
+class Memory(bytearray):
+    """Mapped memory that can be closed."""
+
+    closed = False
+
+    def close(self) -> None:
+        """As of `mmap.mmap`."""
+        self.closed = True
+
+
+@dataclass
+class Driver:
+    """Stands in for the kernel: a node with a format, a rate and frames to give."""
+
+    formats: tuple[int, ...] = (0x32315559, v4l2_calls.Y16)
+    capabilities: int = 0x04200001
+    rows: int = 6
+    rate: int = 60
+    answers: list[tuple[int, int, int, int]] = field(default_factory=list)
+    calls: list[int] = field(default_factory=list)
+    maps: list[Memory] = field(default_factory=list)
+    queued: list[int] = field(default_factory=list)
+    open_files: int = 0
+    lost: int = 0
+
+    def kernel(self, platform: str = "linux") -> v4l2_calls.Kernel:
+        """Calls to this driver."""
+        return v4l2_calls.Kernel(
+            open=self._open,
+            close=self._close,
+            ioctl=self._ioctl,
+            map=self._map,
+            select=lambda *_: ([3], [], []) if self.answers or self.lost else ([], [], []),
+            clock=lambda: 12.5,
+            platform=platform,
+        )
+
+    def _open(self, path: str, flags: int) -> int:  # noqa: ARG002 - as os.open
+        self.open_files += 1
+        return 3
+
+    def _close(self, file: int) -> None:
+        assert file == 3
+        self.open_files -= 1
+
+    def _map(self, file: int, length: int, offset: int) -> Memory:
+        assert (file, offset) == (3, 4096 * len(self.maps))
+        self.maps.append(Memory(length))
+        return self.maps[-1]
+
+    def _ioctl(self, file: int, number: int, argument: bytearray) -> int:
+        assert file == 3
+        self.calls.append(number)
+        if self.lost and number in {v4l2_calls.DQBUF, v4l2_calls.STREAMOFF}:
+            raise OSError(self.lost, "No such device")
+        if number in REPLIES:
+            REPLIES[number](self, argument)
+        return 0
+
+    def _capability(self, argument: bytearray) -> None:
+        argument[:] = v4l2_calls.CAPABILITY.pack(
+            b"uvcvideo", b"Boson: FLIR Video", b"", 0, 0, self.capabilities
+        )
+
+    def _enumerate(self, argument: bytearray) -> None:
+        index = struct.unpack_from("=I", argument)[0]
+        if index >= len(self.formats):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        argument[:] = v4l2_calls.FORMAT_ENTRY.pack(index, 1, 0, b"", self.formats[index])
+
+    def _format(self, argument: bytearray) -> None:
+        kind, columns, _, code, place, line, _, space = v4l2_calls.FORMAT.unpack(argument)
+        argument[:] = v4l2_calls.FORMAT.pack(
+            kind, columns, self.rows, code, place, line, self.rows * line, space
+        )
+
+    def _rate(self, argument: bytearray) -> None:
+        argument[:] = v4l2_calls.PARAMETERS.pack(1, 0, 0, 1, self.rate, 0, 0)
+
+    def _query(self, argument: bytearray) -> None:
+        index = struct.unpack_from("=I", argument)[0]
+        argument[:] = v4l2_calls.BUFFER.pack(index, 1, 0, 0, 0, 0, 0, 0, 1, 4096 * index, BYTES)
+
+    def _queue(self, argument: bytearray) -> None:
+        self.queued.append(struct.unpack_from("=I", argument)[0])
+
+    def _dequeue(self, argument: bytearray) -> None:
+        if self.answers[0][0] < 0:
+            self.answers.pop(0)
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+        used, flags, micros, sequence = self.answers.pop(0)
+        index = self.queued.pop(0)
+        self.maps[index][:] = np.arange(sequence, sequence + BYTES // 2, dtype="<u2").tobytes()
+        argument[:] = v4l2_calls.BUFFER.pack(
+            index, 1, used, flags, 1, 7, micros, sequence, 1, 4096 * index, BYTES
+        )
+
+
+REPLIES: dict[int, Callable[[Driver, bytearray], None]] = {
+    v4l2_calls.QUERYCAP: Driver._capability,
+    v4l2_calls.ENUM_FMT: Driver._enumerate,
+    v4l2_calls.S_FMT: Driver._format,
+    v4l2_calls.S_PARM: Driver._rate,
+    v4l2_calls.QUERYBUF: Driver._query,
+    v4l2_calls.QBUF: Driver._queue,
+    v4l2_calls.DQBUF: Driver._dequeue,
+}
+
+
+def opened(driver: Driver, **changes: Any) -> v4l2.Capture:
+    """Open the node of a driver."""
+    stream = Stream(**{**STREAM.__dict__, **changes})
+    return v4l2.Capture.open("/dev/video0", stream, driver.kernel())
+
+
+def test_layouts_have_the_kernels_sizes() -> None:
+    """The structures are as large as on 64-bit Linux."""
+    assert (v4l2_calls.BUFFER.size, v4l2_calls.FORMAT.size) == (88, 208)
+    assert (v4l2_calls.CAPABILITY.size, v4l2_calls.PARAMETERS.size) == (104, 204)
+
+
+def test_frame_comes_with_stamp_number_and_telemetry() -> None:
+    """A good frame: image and telemetry apart, the kernel's stamp, the host's, the number."""
+    driver = Driver(answers=[(BYTES, GOOD, 250_000, 41)])
+    with opened(driver) as capture:
+        frame = capture.read()
+    np.testing.assert_array_equal(frame.counts.ravel(), np.arange(41, 65))
+    assert frame.telemetry is not None
+    np.testing.assert_array_equal(frame.telemetry.ravel(), np.arange(65, 77))
+    assert (frame.device_time, frame.host_time, frame.sequence) == (7.25, 12.5, 41)
+    assert frame.flags == 0
+    assert capture.identity == {"device": "/dev/video0", "model": "Boson: FLIR Video"}
+
+
+def test_calls_come_in_order() -> None:
+    """Format, rate, buffers, stream, frames: and each buffer goes back to the kernel."""
+    driver = Driver(answers=[(BYTES, GOOD, 0, number) for number in range(20)])
+    with opened(driver) as capture:
+        assert [frame.sequence for frame in frames(capture, 20)] == list(range(20))
+    enumerated = 3 * [v4l2_calls.ENUM_FMT]
+    buffers = v4l2_calls.BUFFERS * [v4l2_calls.QUERYBUF, v4l2_calls.QBUF]
+    assert driver.calls == [
+        v4l2_calls.QUERYCAP,
+        *enumerated,
+        v4l2_calls.S_FMT,
+        v4l2_calls.S_PARM,
+        v4l2_calls.REQBUFS,
+        *buffers,
+        v4l2_calls.STREAMON,
+        *(20 * [v4l2_calls.DQBUF, v4l2_calls.QBUF]),
+        v4l2_calls.STREAMOFF,
+    ]
+
+
+def test_telemetry_may_be_above() -> None:
+    """Where the camera is set so, the first rows are the telemetry."""
+    driver = Driver(answers=[(BYTES, GOOD, 0, 0)])
+    with opened(driver, telemetry_first=True) as capture:
+        frame = capture.read()
+    assert frame.telemetry is not None
+    assert (frame.telemetry[0, 0], frame.counts[0, 0]) == (0, 12)
+
+
+@pytest.mark.parametrize(
+    ("used", "flags", "expected"),
+    [
+        (BYTES, GOOD | 0x40, FrameFlag.DRIVER_ERROR),
+        (10, GOOD, FrameFlag.WRONG_SIZE),
+        (0, GOOD | 0x40, FrameFlag.WRONG_SIZE | FrameFlag.DRIVER_ERROR),
+        (BYTES + 2, GOOD, FrameFlag.WRONG_SIZE),
+        (BYTES, 0x4000, FrameFlag.FOREIGN_CLOCK),
+    ],
+)
+def test_damage_is_told(used: int, flags: int, expected: FrameFlag) -> None:
+    """A damaged frame comes, and says what is wrong with it; what is missing is 0."""
+    driver = Driver(answers=[(used, flags, 0, 5)])
+    with opened(driver) as capture:
+        frame = capture.read()
+    assert frame.flags == expected
+    assert np.count_nonzero(frame.counts) == min(used // 2, 24)
+
+
+def test_a_frame_is_the_readers_own() -> None:
+    """The kernel may write its buffer again: the frame stays."""
+    driver = Driver(answers=[(BYTES, GOOD, 0, 5)])
+    with opened(driver) as capture:
+        frame = capture.read()
+        for memory in driver.maps:
+            memory[:] = bytes(BYTES)
+    assert frame.counts[0, 0] == 5
+
+
+@pytest.mark.parametrize("answers", [[], [(-1, 0, 0, 0)]])
+def test_no_frame_in_time(answers: list[tuple[int, int, int, int]]) -> None:
+    """Silence, and a frame that was announced and is not there, are told apart from a loss."""
+    with (
+        opened(Driver(answers=answers)) as capture,
+        pytest.raises(NoFrameError, match="No frame from '/dev/video0'"),
+    ):
+        capture.read(0.1)
+
+
+def test_unplugging_is_told_and_close_still_works() -> None:
+    """A camera that is pulled out ends the stream; nothing stays open."""
+    driver = Driver()
+    capture = opened(driver)
+    driver.lost = errno.ENODEV
+    with pytest.raises(SourceLostError, match="No more frames from '/dev/video0': No such device"):
+        capture.read()
+    capture.close()
+    capture.close()
+    assert driver.open_files == 0
+    assert all(memory.closed for memory in driver.maps)
+    with pytest.raises(SourceLostError, match="it is closed"):
+        capture.read()
+
+
+@pytest.mark.parametrize(
+    ("driver", "message"),
+    [
+        (Driver(formats=(0x32315559,)), r"with \['YU12'\]\. Must offer 'Y16 '"),
+        (Driver(capabilities=0x04A00000), r"with \[\]\. Must offer 'Y16 '"),
+        (Driver(rows=4), r"Must be \(6, 6, .* is the telemetry set as requested"),
+        (Driver(rate=30), r"Invalid frame period 1/30 s of '/dev/video0'\. Must be 1/60\.0 s"),
+        (Driver(rate=0), "Invalid frame period 1/0 s"),
+    ],
+)
+def test_other_streams_are_refused(driver: Driver, message: str) -> None:
+    """What the driver sets instead of what was asked is an error, and the node is closed."""
+    with pytest.raises(ValueError, match=message):
+        opened(driver)
+    assert driver.open_files == 0
+
+
+def test_node_with_y16_is_found() -> None:
+    """The camera's other node, of metadata, lists no format."""
+    assert v4l2_calls.Y16 in v4l2_calls.formats("/dev/video0", Driver().kernel())
+    other = Driver(capabilities=0x04A00000)
+    assert v4l2_calls.formats("/dev/video1", other.kernel()) == []
+    assert other.open_files == 0
+
+
+def test_other_systems_are_refused() -> None:
+    """Elsewhere than on Linux there is a clear error."""
+    with pytest.raises(OSError, match=r"No video on 'darwin'\. Must be Linux"):
+        v4l2.Capture.open("/dev/video0", STREAM, Driver().kernel("darwin"))
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 2**31),
+            st.integers(0, 2**32 - 1),
+            st.integers(0, 10**6 - 1),
+            st.integers(0, 2**32 - 1),
+        ),
+        max_size=20,
+    )
+)
+def test_whatever_the_kernel_says_is_a_frame(answers: list[tuple[int, int, int, int]]) -> None:
+    """Any sizes, flags and numbers give frames of the agreed shape, with the kernel's numbers."""
+    driver = Driver(answers=[(*answer[:3], answer[3] % 60_000) for answer in answers])
+    with opened(driver) as capture:
+        for answer in answers:
+            frame = capture.read()
+            assert (frame.sequence, frame.counts.shape) == (answer[3] % 60_000, (4, 6))
+            assert (answer[0] != BYTES) == (FrameFlag.WRONG_SIZE in frame.flags)
