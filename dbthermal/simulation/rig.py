@@ -225,7 +225,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     """
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
-        counts[index] = _digitise(movie.values, detector, str(movie["band"].item()))
+        counts[index] = digitise(movie.values, _of_band(detector, str(movie["band"].item())))
     return corrected.assign(counts=(corrected["counts"].dims, counts)).pipe(_describe, "capture")
 
 
@@ -268,10 +268,9 @@ def blackbody_movies(
     level = xr.DataArray(temperatures, dims="temperature", name="temperature")
     movies = np.empty((len(rig.bands), len(temperatures), *shape), dtype=np.uint16)
     for index, counts in enumerate(_blackbody(response, level)):
-        noise = float(response["noise"][index])
+        noise, here = float(response["noise"][index]), _of_band(detector, rig.bands[index])
         for place, mean in enumerate(counts):
-            frame = mean + rng.normal(0.0, noise, shape)
-            movies[index, place] = _digitise(frame, detector, rig.bands[index])
+            movies[index, place] = digitise(mean + rng.normal(0.0, noise, shape), here)
     return xr.Dataset(
         {"counts": (("band", "temperature", "frame", "y", "x"), movies, {"units": "count"})},
         coords={
@@ -282,17 +281,39 @@ def blackbody_movies(
     )
 
 
-def _digitise(counts: np.ndarray, detector: xr.Dataset, band: str) -> np.ndarray:
-    """Raw 16-bit counts (..., y, x) of one band: fixed pattern, rounding, dead pixels at 0."""
-    schema.band_positions(detector, [band], "the detector")
-    here = detector.sel(band=band)
-    raw = np.rint(here["gain"].values * counts + here["offset"].values)
+def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
+    """
+    Raw counts of one band: fixed pattern, rounding, dead pixels at 0.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (..., y, x)
+        Corrected counts [count].
+    detector : Dataset
+        From `pattern`, of this band: (y, x).
+
+    Returns
+    -------
+    ndarray of uint16, shape (..., y, x)
+        Raw counts [count].
+
+    Raises
+    ------
+    ValueError
+        If a count does not fit into 16 bits.
+    """
+    raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
     if not (raw.min() >= 0 and raw.max() <= frames.DETECTOR_MAXIMUM):  # a NaN fails it, too
         raise ValueError(
-            f"Invalid counts {raw.min()} to {raw.max()} in band '{band}'. "
+            f"Invalid counts {raw.min()} to {raw.max()} in band '{detector['band'].item()}'. "
             f"Must lie in [0, {frames.DETECTOR_MAXIMUM}]."
         )
-    return np.where(here["dead"].values, 0, raw).astype(np.uint16)
+    return np.where(detector["dead"].values, 0, raw).astype(np.uint16)
+
+
+def _of_band(detector: xr.Dataset, band: str) -> xr.Dataset:
+    schema.band_positions(detector, [band], "the detector")
+    return detector.sel(band=band)
 
 
 def _describe(dataset: xr.Dataset, stage: str) -> xr.Dataset:
