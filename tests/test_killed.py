@@ -1,6 +1,7 @@
-"""What a kill leaves: a store that opens, and all frames but those of the last chunk."""
+"""What a kill or a power loss leaves: a store that opens, and all frames but the last chunk's."""
 
 import multiprocessing
+import os
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -10,17 +11,19 @@ import pytest
 import xarray as xr
 
 from dbthermal import store
-from dbthermal.instruments import record
+from dbthermal.instruments import record, tape
 from dbthermal.instruments.capture import notes, open_capture
 from dbthermal.instruments.emulated.frames import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.fetching import Limits, Reading
-from dbthermal.instruments.frames_source import Counts
+from dbthermal.instruments.frames_source import Counts, Frame
 from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.store import durable
 
 SHAPE, RATE, CHUNK = (32, 40), 200.0, 6
 BANDS = ("8-14", "9.5")
 KILLS = 20
+LOSSES = 11
 
 
 def picture(time: float) -> Counts:
@@ -126,3 +129,106 @@ def test_kill_while_it_is_closed(tmp_path: Path) -> None:
         if not closed:
             store.recover(path)
             check(store.open_dataset(path), written)
+
+
+class Disk:
+    """What is on a disk for certain: contents of files and names in folders, as last synced."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.contents: dict[int, bytes] = {}
+        self.names: dict[int, list[tuple[str, int, bool]]] = {}
+
+    def sync(self, path: Path) -> None:
+        """Bring to the disk what a file or a folder has in it now."""
+        number = path.stat().st_ino
+        if path.is_dir():
+            self.names[number] = listed(path)
+            return
+        # A second name, so that the file's number is not given away.
+        kept = self.root.parent / f"kept-{number}"
+        kept.unlink(missing_ok=True)
+        kept.hardlink_to(path)
+        self.contents[number] = path.read_bytes()
+
+    def power_loss(self, left: Path, *, early: bool) -> None:
+        """Make what is left: names that were not synced are there already, or not yet."""
+        folders = [self.root, *(path for path in self.root.rglob("*") if path.is_dir())]
+        now = {path.stat().st_ino: listed(path) for path in folders}
+        self._restore(left, self.root.stat().st_ino, now if early else self.names)
+
+    def _restore(
+        self, left: Path, number: int, names: dict[int, list[tuple[str, int, bool]]]
+    ) -> None:
+        left.mkdir()
+        for name, inside, is_folder in names.get(number, []):
+            if is_folder:
+                self._restore(left / name, inside, names)
+            else:
+                (left / name).write_bytes(self.contents.get(inside, b""))
+
+
+def listed(folder: Path) -> list[tuple[str, int, bool]]:
+    """Name, number and kind of what is in a folder."""
+    return [(entry.name, entry.inode(), entry.is_dir()) for entry in os.scandir(folder)]
+
+
+def frame(number: int) -> Frame:
+    """A good frame of this number."""
+    time = number / RATE
+    return Frame(picture(time), time, time, number)
+
+
+def two_bands(path: Path) -> tape.Tape:
+    """A tape of two bands, in chunks of three frames, which is handed frames by hand."""
+    world, sources = World(), {}
+    for number, band in enumerate(BANDS):
+        world.add_camera(band, number)
+        sources[band] = EmulatedCamera(world, band, {band: picture}, band, SHAPE, RATE)
+    return tape.Tape(path, sources, readings={"plate": "K"}, origin=0.0, attrs={}, chunk=3)
+
+
+def check_left(left: Path, committed: list[int]) -> None:
+    """All that was declared valid is there, frames and notes."""
+    opened = store.open_dataset(left)
+    written = list(opened.attrs["frames_written"].values())
+    assert all(np.greater_equal(written, committed))
+    closed = opened.attrs["closed"]
+    assert opened.sizes["time"] == (max(written) if closed else min(written))
+    check(opened, written if closed else 2 * [min(written)])
+    assert opened.sizes["log"] == opened.attrs["log_written"]
+    np.testing.assert_array_equal(opened["log_value"], np.arange(opened.sizes["log"]))
+
+
+@pytest.mark.parametrize("early", [True, False])
+def test_power_loss_costs_the_last_chunk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, early: bool
+) -> None:
+    """Whatever the disk had not been asked to keep is lost: what was declared valid is there."""
+    (tmp_path / "disk").mkdir()
+    disk, committed, syncs = Disk(tmp_path / "disk"), [0, 0], 0
+
+    def lose() -> None:
+        left = tmp_path / f"left-{syncs}"
+        disk.power_loss(left, early=early)
+        check_left(left / "a.zarr", committed)
+
+    def sync(path: Path) -> None:
+        nonlocal syncs
+        syncs += 1
+        if recorded and syncs % LOSSES == 0:
+            lose()
+        disk.sync(path)
+
+    recorded: tape.Tape | None = None
+    monkeypatch.setattr(durable, "_THREADS", 1)
+    monkeypatch.setattr(durable, "_to_disk", sync)
+    recorded = two_bands(tmp_path / "disk" / "a.zarr")
+    for number in range(15):
+        band = BANDS[number % 2 if number < 14 else 0]
+        recorded.note(tape.Note.READING, "plate", number / RATE, number)
+        recorded.frame(band, frame(number // 2))
+        committed = list(recorded.recording.frames.values())
+    recorded.close(complete=True, ended="stopped")
+    syncs, committed = -1, [8, 7]
+    lose()

@@ -2,30 +2,28 @@
 
 The folder is a zarr store (format 3) from the first moment on. Chunks are written first, to
 the disk and not only to its cache; then ``zarr.json``, which says how much is valid, is replaced in
-one step. What a kill or a power loss leaves is thus a store without the chunk that was being
-written, and it says so: ``complete`` is False and ``frames_written`` is where each band ends.
+one step. What was declared valid is never written over, but replaced in one step, too. What a kill
+or a power loss leaves is thus a store without the chunk that was being written, and it says so:
+``complete`` is False and ``frames_written`` is where each band ends.
 `dbthermal.store.open_dataset` opens that much of it.
 """
 
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 import zarr
-from zarr.codecs import BloscCodec
 
 from dbthermal.schema import COORDINATES, Variable
-from dbthermal.store.progress import attributes, to_disk, write_attributes
+from dbthermal.store import growing
+from dbthermal.store.durable import DurableStore, made_beside, tree_to_disk
+from dbthermal.store.progress import attributes, write_attributes
 
 Values = npt.NDArray[Any]
-
-_COMPRESSOR: Final = BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle")
-_LOG_CHUNK: Final = 4096
 
 
 class Recording:
@@ -48,7 +46,6 @@ class Recording:
 
     def __init__(self, path: Path, group: zarr.Group, chunk: int, attrs: dict[str, Any]) -> None:
         self.path, self.chunk = path, chunk
-        self._group = group
         # A chunk of zeros is written too: one that is not there was never recorded.
         config: Any = {"write_empty_chunks": True}
         self._arrays = {name: array.with_config(config) for name, array in group.arrays()}
@@ -67,6 +64,7 @@ class Recording:
         *,
         chunk: int,
         attrs: Mapping[str, Any],
+        fills: Mapping[str, float] | None = None,
     ) -> Self:
         """
         Make the folder, with nothing in it but what is to come.
@@ -85,6 +83,8 @@ class Recording:
             Frames of a chunk: a kill costs at most that many of a band.
         attrs : mapping
             JSON: identities, provenance.
+        fills : mapping, optional
+            What a variable holds where a band has no frame any more; else it is NaN, or 0.
 
         Returns
         -------
@@ -110,13 +110,13 @@ class Recording:
             "log_written": 0,
         }
         values = json.loads(json.dumps({**attrs, **progress}, allow_nan=False))
-        group = zarr.open_group(path, mode="w-", zarr_format=3, attributes=values)
-        for name, variable in variables.items():
-            _create(group, name, variable, {**sizes, "band": len(bands), "time": chunk}, chunk)
-        _create_text(group, "band", bands)
-        recording = cls(path, group, chunk, values)
-        recording.commit()
-        return recording
+        whole = {**sizes, "band": len(bands), "time": chunk}
+        with made_beside(path, path.absolute().parent) as part:
+            group = zarr.open_group(part, mode="w-", zarr_format=3, attributes=values)
+            for name, variable in variables.items():
+                growing.create(group, name, variable, whole, fill=(fills or {}).get(name))
+            growing.create_text(group, "band", bands)
+        return cls(path, _open(path), chunk, values)
 
     def __enter__(self) -> Self:
         return self
@@ -147,7 +147,7 @@ class Recording:
             If the variables are not all there, differ in their frames, are more than a chunk, or
             follow on a chunk that is not whole.
         """
-        wanted = {name for name, array in self._arrays.items() if _is_movie(array)}
+        wanted = {name for name, array in self._arrays.items() if growing.is_movie(array)}
         if block.keys() != wanted:
             raise ValueError(f"Invalid variables {sorted(block)}. Must be {sorted(wanted)}.")
         lengths = {values.shape[0] for values in block.values()}
@@ -159,9 +159,9 @@ class Recording:
             )
         place = list(self.frames).index(band)
         for name, values in block.items():
-            _grow(self._arrays[name], 1, start + length, self.chunk)
+            growing.grow(self._arrays[name], 1, start + length)
             self._arrays[name][place, start : start + length] = values
-        self._sync(block, Path("c", str(place), str(start // self.chunk)))
+        self._to_disk(block, [Path("c", str(place), str(start // self.chunk))])
         self.frames[band] += length
 
     def append_log(self, columns: Mapping[str, Values]) -> None:
@@ -178,15 +178,16 @@ class Recording:
         ValueError
             If the columns are not all there.
         """
-        wanted = {name for name, array in self._arrays.items() if _dims(array) == ("log",)}
+        wanted = {name for name, array in self._arrays.items() if growing.dims(array) == ("log",)}
         if columns.keys() != wanted:
             raise ValueError(f"Invalid columns {sorted(columns)}. Must be {sorted(wanted)}.")
-        start, length = self.rows, len(next(iter(columns.values())))
+        start, end = self.rows, self.rows + len(next(iter(columns.values())))
         for name, values in columns.items():
-            _grow(self._arrays[name], 0, start + length, _LOG_CHUNK)
-            self._arrays[name][start : start + length] = values
-        self._sync(columns, Path("c"))
-        self.rows += length
+            growing.grow(self._arrays[name], 0, end)
+            self._arrays[name][start:end] = values
+        chunks = range(start // growing.LOG_CHUNK, (end - 1) // growing.LOG_CHUNK + 1)
+        self._to_disk(columns, [Path("c", str(number)) for number in chunks])
+        self.rows = end
 
     def read(self, name: str, band: str) -> Values:
         """
@@ -244,7 +245,7 @@ class Recording:
                 self._repeat_last(place, own, frames)
         for array in self._arrays.values():
             shape = {"time": frames, "log": self.rows}
-            sizes = zip(_dims(array), array.shape, strict=True)
+            sizes = zip(growing.dims(array), array.shape, strict=True)
             array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
         if time is not None:
             self._create_time(time)
@@ -253,32 +254,34 @@ class Recording:
 
     def _repeat_last(self, place: int, own: int, frames: int) -> None:
         counts = self._arrays["counts"]
-        _grow(counts, 1, frames, self.chunk)
+        growing.grow(counts, 1, frames)
         last = np.asarray(counts[place, own - 1])
         while own < frames:
-            after = min(frames, (own // self.chunk + 1) * self.chunk)
+            number = own // self.chunk
+            after = min(frames, (number + 1) * self.chunk)
             counts[place, own:after] = np.broadcast_to(last, (after - own, *last.shape))
+            self._to_disk(["counts"], [Path("c", str(place), str(number))])
             own = after
 
     def _create_time(self, time: Values) -> None:
-        array = self._group.create_array(
-            "time",
-            data=time.astype(np.float64),
-            dimension_names=("time",),
-            attributes=dict(COORDINATES["time"].attrs),
-        )
-        self._sync({array.basename: time}, Path("c"))
+        with made_beside(self.path / "time", self.path.absolute().parent) as part:
+            zarr.create_array(
+                part,
+                data=time.astype(np.float64),
+                dimension_names=("time",),
+                attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
+            )
 
-    def _sync(self, names: Mapping[str, Values], chunk: Path) -> None:
-        """Bring chunks to the disk."""
-        folders = [self.path / name / chunk for name in names]
-        files = [path for folder in folders for path in (folder, *folder.rglob("*"))]
-        to_disk([*files, *(folder.parent for folder in folders)])
+    def _to_disk(self, names: Iterable[str], chunks: Sequence[Path]) -> None:
+        """Bring chunks of some arrays to the disk, and the folders that they are in."""
+        tree_to_disk([self.path / name / chunk for name in names for chunk in chunks], self.path)
 
 
 def recover(path: str | Path) -> None:
     """
     Close a recording that was cut short: all its frames are kept, and it stays incomplete.
+
+    Attribute ``ended`` is then ``"cut short"``.
 
     Not needed for reading: without it, `dbthermal.store.open_dataset` opens as many frames as all
     bands have.
@@ -298,48 +301,11 @@ def recover(path: str | Path) -> None:
     attrs = attributes(path)
     if attrs.get("complete", True) or attrs.get("closed", False):
         raise ValueError(f"Invalid recording '{path}'. Must be one that was cut short.")
-    group = zarr.open_group(Path(path), mode="r+", use_consolidated=False)
-    arrays = [array for array in dict(group.arrays()).values() if _is_movie(array)]
-    Recording(Path(path), group, arrays[0].chunks[1], attrs).close(complete=False)
+    group = _open(path)
+    arrays = [array for array in dict(group.arrays()).values() if growing.is_movie(array)]
+    recording = Recording(Path(path), group, arrays[0].chunks[1], attrs)
+    recording.close(complete=False, ended="cut short")
 
 
-def _create(
-    group: zarr.Group, name: str, variable: Variable, sizes: Mapping[str, int], chunk: int
-) -> None:
-    if variable.dims[:2] != ("band", "time") and variable.dims != ("log",):
-        raise ValueError(
-            f"Invalid dims {variable.dims} of '{name}'. Must be ('band', 'time', ...) or ('log',)."
-        )
-    whole = {**sizes, "log": 0}
-    chunks = {**sizes, "band": 1, "time": chunk, "log": _LOG_CHUNK}
-    fill = math.nan if np.dtype(variable.dtype).kind == "f" else 0
-    group.create_array(
-        name,
-        shape=tuple(whole[dim] for dim in variable.dims),
-        chunks=tuple(chunks[dim] for dim in variable.dims),
-        dtype=variable.dtype,
-        compressors=_COMPRESSOR,
-        fill_value=fill,
-        dimension_names=variable.dims,
-        attributes=dict(variable.attrs),
-    )
-
-
-def _create_text(group: zarr.Group, name: str, values: Sequence[str]) -> None:
-    array = group.create_array(name, shape=(len(values),), dtype=str, dimension_names=(name,))
-    array[:] = np.array(values, dtype=np.dtypes.StringDType())
-
-
-def _dims(array: Any) -> tuple[str, ...]:
-    return tuple(array.metadata.dimension_names)
-
-
-def _is_movie(array: Any) -> bool:
-    return _dims(array)[:2] == ("band", "time")
-
-
-def _grow(array: Any, axis: int, size: int, chunk: int) -> None:
-    """Make room, doubling each time, so that metadata are written seldom."""
-    if array.shape[axis] < size:
-        room = max(2 * array.shape[axis], math.ceil(size / chunk) * chunk)
-        array.resize((*array.shape[:axis], room, *array.shape[axis + 1 :]))
+def _open(path: str | Path) -> zarr.Group:
+    return zarr.open_group(DurableStore(path), mode="r+", use_consolidated=False)

@@ -107,8 +107,9 @@ def open_dataset(path: str | Path) -> xr.Dataset:
         raise FileNotFoundError(
             f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
         )
-    cut_short = not progress.attributes(path).get("closed", True)
-    dataset = _open_valid_part(Path(path)) if cut_short else _open(path)
+    attrs = progress.attributes(path)
+    cut_short = not attrs.get("closed", True)
+    dataset = _open_valid_part(Path(path), attrs) if cut_short else _open(path)
     return _with_fixed_length_strings(dataset)
 
 
@@ -119,15 +120,16 @@ def _open(path: str | Path, leave: Iterable[str] = ()) -> xr.Dataset:
     return dataset
 
 
-def _open_valid_part(path: Path) -> xr.Dataset:
+def _open_valid_part(path: Path, attrs: Mapping[str, Any]) -> xr.Dataset:
     """Open the variables of a recording one by one, for their room differs while it grows."""
-    ends = progress.valid_part(path)
+    ends = progress.valid_part(attrs)
     names = {array.parent.name for array in path.glob("*/zarr.json")}
     parts = []
     for name in sorted(names):
         part = _open(path, leave=names - {name})
         parts.append(part.isel({dim: end for dim, end in ends.items() if dim in part.dims}))
-    return xr.merge(parts, combine_attrs="override")
+    # The attributes as read first, for they may have gone on since.
+    return xr.merge(parts, combine_attrs="override").assign_attrs(attrs)
 
 
 def save_numbers(
