@@ -130,8 +130,8 @@ def test_nobody_reads() -> None:
     source.read()
     source.sleep(0.75)
     assert source.read().sequence == 1
-    source.sleep(2.0)
-    assert source.read().sequence == 27
+    source.sleep(4.0)
+    assert source.read().sequence == 47
 
 
 def test_damage() -> None:
@@ -180,6 +180,58 @@ def test_no_frame_in_time() -> None:
     with pytest.raises(NoFrameError, match=r"No frame from emulated camera 'wide' in 0\.01 s"):
         source.read(0.01)
     assert source.read().sequence == 1
+
+
+def test_camera_that_waits_for_pulses_gives_none() -> None:
+    """While the sensor takes no frames none come; then they go on, none of them missing."""
+    source = camera()
+    source.read()
+    state = source.world.camera("wide")
+    state.streaming = False
+    with pytest.raises(NoFrameError, match="emulated camera 'wide': it takes none now"):
+        source.read(3.0)
+    state.streaming = True
+    found = list(frames(source, 2))
+    assert [frame.sequence for frame in found] == [1, 2]
+    assert found[0].device_time == pytest.approx(1003.0)
+    state.streaming, state.plugged = False, False
+    with pytest.raises(SourceLostError, match="it is unplugged"):
+        source.read()
+
+
+def test_scene_begins_when_it_is_told() -> None:
+    """Before, its beginning is seen; then pictures and thermocouples go with its own time."""
+    clock = Clock()
+    world = World(clock=clock, scene=lambda time: {"plate": 300.0 + time}, waits=True)
+    world.add_camera("wide", 1)
+    world.thermocouples[1] = "plate"
+    clock.sleep(5.0)
+    source = EmulatedCamera(
+        world, "wide", {"8-14": level(1000)}, "8-14", SHAPE, RATE, sleep=clock.sleep
+    )
+    assert [shown(frame) for frame in frames(source, 3)] == [1000] * 3
+    assert (world.scene_time(), world.thermocouple_temperature(1)) == (0.0, 300.0)
+    world.begin()
+    assert world.scene_began == clock()
+    assert [shown(frame) for frame in frames(source, 3)] == [1001, 1002, 1003]
+    assert world.thermocouple_temperature(1) == pytest.approx(300.3)
+    world.begin()
+    assert (world.scene_time(), world.scene_time(1.0)) == (0.0, 0.0)
+
+
+def test_blackbody_approaches_what_it_is_set_to() -> None:
+    """After one time constant 1/e is left, whatever it was set to before; without one, nothing."""
+    clock = Clock()
+    slow, fast = (World(clock=clock, blackbody_temperature=300.0, time_constant=x) for x in (2, 0))
+    for world in (slow, fast):
+        world.blackbody_temperature = 310.0
+    clock.sleep(2.0)
+    assert slow.blackbody_temperature == pytest.approx(310 - 10 / np.e, abs=1e-9)
+    assert fast.blackbody_temperature == 310.0
+    slow.blackbody_temperature = 300.0
+    assert slow.blackbody_temperature == pytest.approx(310 - 10 / np.e, abs=1e-9)
+    clock.sleep(2.0)
+    assert slow.blackbody_temperature == pytest.approx(300 + (10 - 10 / np.e) / np.e, abs=1e-9)
 
 
 def test_movie_ends() -> None:

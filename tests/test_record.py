@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import alignment, frames, store
-from dbthermal.instruments import record, tape
+from dbthermal.instruments import record, tape, writing
 from dbthermal.instruments.capture import notes, open_capture
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
@@ -96,6 +96,35 @@ def test_recording_says_what_made_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(opened["fpa_temperature"][0, 0], 308.2, rtol=0, atol=0.06)
 
 
+def test_identities_beside_those_of_the_sources(tmp_path: Path) -> None:
+    """What else is known of a camera is added to what its frames say, and other devices too."""
+    camera: dict[str, str | bool] = {"software_revision": "1.2.3", "is_simulated": True}
+    known: dict[str, dict[str, str | bool]] = {"9.5": camera, "wheel": {"model": "a"}}
+    path = tmp_path / "a.zarr"
+    record.record(session(), bench(), path, identities=known, limits=SMALL)
+    found = open_capture(path).attrs["identities"]
+    assert found["9.5"] == {
+        "device": "sim://camera/9.5",
+        "model": "emulated Boson",
+        "serial_number": "101",
+        **camera,
+    }
+    assert (set(found), found["wheel"]) == ({*BANDS, "wheel"}, {"model": "a"})
+
+
+def test_frames_from_before_are_not_taken(tmp_path: Path) -> None:
+    """What a driver held since an earlier look is of another time, and maybe another filter."""
+    sources = bench()
+    for source in sources.values():
+        source.read()
+    time.sleep(0.05)
+    summary = record.record(session(), sources, tmp_path / "a.zarr", limits=SMALL)
+    opened = open_capture(tmp_path / "a.zarr")
+    assert float(opened["exposure_time"].min()) >= 0
+    assert int(opened["sequence"][:, 0].min()) > 4
+    assert all(total["lost"] == 0 for total in summary.totals.values())
+
+
 def test_recording_goes_on_to_alignment(tmp_path: Path) -> None:
     """A recording with losses and a shutter event goes through correction, marking, alignment."""
     first = Faults(dropped=frozenset({7, 8}), corrupt=frozenset({20}))
@@ -176,25 +205,6 @@ def test_clock_of_its_own_is_fitted(tmp_path: Path) -> None:
         open_capture(tmp_path / "a.zarr")
     fitted = open_capture(tmp_path / "a.zarr", fitted=True)
     np.testing.assert_allclose(fitted.attrs["clock_rates"], [1, 1 / 1.05], rtol=0, atol=0.02)
-
-
-def test_slow_disk_refuses_frames_and_counts_them(tmp_path: Path) -> None:
-    """Every frame of a queue that overflows is either there or counted as refused or lost."""
-    limits = Limits(chunk=CHUNK, reserve=0, queue=2, preview_period=0.0)
-    path = tmp_path / "a.zarr"
-    summary = record.record(
-        session(0.5), bench(), path, limits=limits, preview=lambda _: time.sleep(0.03)
-    )
-    opened = open_capture(path)
-    for place, band in enumerate(BANDS):
-        total = summary.totals[band]
-        assert total["refused"] > 5
-        last = int(opened["sequence"][place].max())
-        noted = [n[3] for n in notes(path) if n[1:3] == ("frames_refused", band)]
-        assert sum(noted) == total["refused"]
-        behind = sum(total.values()) - 1 - last
-        assert 0 <= behind <= noted[-1]
-        assert FrameFlag.FRAMES_LOST_BEFORE & int(opened["frame_flags"][place].max())
 
 
 def test_numbers_that_stand_are_flagged(tmp_path: Path) -> None:
@@ -286,11 +296,11 @@ def test_wrong_sources_are_refused(tmp_path: Path) -> None:
 def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Too little space is an error before it begins, and ends it on the way with all it has."""
     limits = Limits(chunk=CHUNK, reserve=1000)
-    monkeypatch.setattr(record, "_free", lambda _: 5000)
+    monkeypatch.setattr(writing, "free", lambda _: 5000)
     with pytest.raises(OSError, match=r"Too little space: 5000 bytes are free\. Must be 47080"):
         record.record(session(), bench(), tmp_path / "a.zarr", limits=limits)
     answers = iter([10**9, 10**9, 999])
-    monkeypatch.setattr(record, "_free", lambda _: next(answers))
+    monkeypatch.setattr(writing, "free", lambda _: next(answers))
     with pytest.raises(OSError, match="Too little space: 999 bytes") as raised:
         record.record(session(), bench(), tmp_path / "a.zarr", limits=limits)
     assert raised.value.errno == errno.ENOSPC

@@ -8,7 +8,7 @@ import xarray as xr
 
 from dbthermal import schema, store
 from dbthermal.alignment import clocks
-from dbthermal.instruments.frames_source import UNTIMED
+from dbthermal.instruments.frames_source import UNTIMED, FrameFlag
 
 Array = npt.NDArray[np.float64]
 
@@ -48,7 +48,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     # The coordinate must be there for the stamps to be looked at, of which it is made.
     numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
     time = clocks.filled(clocks.exposures(numbered)[0])
-    seconds = schema.COORDINATES["time"].attrs
+    seconds = {**schema.COORDINATES["time"].attrs, "long_name": "time since the start"}
     return schema.check(numbered.assign_coords(time=("time", time, seconds)), "capture")
 
 
@@ -80,6 +80,97 @@ def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
         (float(time), kinds[int(kind)], sources[int(source)], float(value))
         for time, kind, source, value in zip(*columns, strict=True)
     ]
+
+
+def mean_reading(path: str | Path, source: str) -> float:
+    """
+    Mean of what an instrument read during a recording.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``.
+    source : str
+        Name of the reading.
+
+    Returns
+    -------
+    float
+        In the reading's unit, over those that did not fail.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no recording.
+    ValueError
+        If it has no such reading, or all failed.
+    """
+    values = [note[3] for note in notes(path) if note[1:3] == ("reading", source)]
+    if not values:
+        raise ValueError(f"No reading of '{source}' in the recording '{path}'. Must have one.")
+    return float(np.mean(values))
+
+
+def overview(folder: str | Path) -> xr.Dataset:
+    """
+    What the recordings in a folder hold, and whether they are whole.
+
+    Parameters
+    ----------
+    folder : str or Path
+        With recordings; what else is in it is passed over.
+
+    Returns
+    -------
+    Dataset
+        One row a recording and band: `frames`, of which `damaged`; `lost` by camera or driver, and
+        `refused` by a full queue; `frame_rate` by the good frames' stamps [Hz], NaN without two;
+        `complete`, whether the recording went to its planned end. Coordinates `recording`, `band`.
+
+    Raises
+    ------
+    ValueError
+        If there is no recording.
+    """
+    rows = [
+        {"recording": path.stem, "band": band, **totals, **_rate_and_end(opened, band)}
+        for path in sorted(Path(folder).glob("*.zarr"))
+        if "frames_written" in (opened := store.open_dataset(path)).attrs
+        for band, totals in opened.attrs["totals"].items()
+    ]
+    if not rows:
+        raise ValueError(f"Invalid folder '{folder}' without recordings. Must have one.")
+    found = xr.Dataset({name: ("row", [row[name] for row in rows]) for name in rows[0]})
+    return found.set_coords(["recording", "band"])
+
+
+def _rate_and_end(recording: xr.Dataset, band: str) -> dict[str, float | bool]:
+    stamps = recording["device_time"].sel(band=band)
+    usable = (recording["frame_flags"].sel(band=band) & int(UNTIMED)) == 0
+    steps = np.diff(stamps.values[usable.values & np.isfinite(stamps.values)])
+    rate = 1.0 / float(np.median(steps)) if steps.size else np.nan
+    return {"frame_rate": rate, "complete": bool(recording.attrs["complete"])}
+
+
+def good_frames(capture: xr.Dataset, band: str) -> npt.NDArray[np.intp]:
+    """
+    Frames of one band that are whole, have a time, and show the view and not the shutter.
+
+    Parameters
+    ----------
+    capture : Dataset
+        From `open_capture`.
+    band : str
+        Its name.
+
+    Returns
+    -------
+    ndarray
+        Their places in `time`.
+    """
+    one = capture.sel(band=band)
+    has_view = (one["frame_flags"].values & int(FrameFlag.SHUTTER_CLOSED)) == 0
+    return np.flatnonzero(np.isfinite(one["exposure_time"].values) & has_view)
 
 
 def _fitted(recording: xr.Dataset) -> xr.Dataset:

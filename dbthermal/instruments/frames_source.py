@@ -30,6 +30,8 @@ class FrameFlag(IntFlag):
     FRAMES_LOST_BEFORE = 16
     SEQUENCE_STANDS = 32
     TIME_STANDS = 64
+    TIME_AHEAD = 128
+    PADDED = 256
 
 
 GOOD: Final = FrameFlag(0)
@@ -44,6 +46,8 @@ MEANINGS: Final = MappingProxyType(
         FrameFlag.FRAMES_LOST_BEFORE: "the sequence number leaps: frames are missing before it",
         FrameFlag.SEQUENCE_STANDS: "the sequence number does not rise: repeated, or started anew",
         FrameFlag.TIME_STANDS: "the device time does not rise, or is not known",
+        FrameFlag.TIME_AHEAD: "the device time is later than the host had the frame",
+        FrameFlag.PADDED: "no frame: the band has fewer than another, and its last one is repeated",
     }
 )
 """The first four are the source's to set, the others the recorder's, who sees the frame before."""
@@ -53,6 +57,8 @@ UNTIMED: Final = (
     | FrameFlag.WRONG_SIZE
     | FrameFlag.SEQUENCE_STANDS
     | FrameFlag.TIME_STANDS
+    | FrameFlag.TIME_AHEAD
+    | FrameFlag.PADDED
 )
 """A frame with one of these is recorded but is no measurement: it gets no exposure time."""
 

@@ -1,34 +1,31 @@
 """Record a session: the frames of all cameras and the readings beside them, to one store.
 
 A thread for each camera fetches its frames, one more asks the other instruments, so that none waits
-for another; what they bring goes through a queue of bounded length to the caller's thread, which
-writes. If the disk is too slow the queue fills, frames are refused, and the recording says how many
-and when. Whatever ends it, the frames that came are on the disk.
+for another; what they bring goes through a queue of bounded length to the thread that writes (see
+`dbthermal.instruments.writing`). If the disk is too slow the queue fills, frames are refused, and
+the recording says how many and when. The caller's thread shows the preview. Whatever ends it, also
+an interrupt by the keyboard, the frames that came are on the disk.
 """
 
 import errno
-import queue
-import shutil
 import threading
 import time as system_time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from dbthermal import provenance
+from dbthermal.instruments import writing
 from dbthermal.instruments.fetching import Limits, Reading, Run, ask, fetch
 from dbthermal.instruments.frames_source import Frame, FrameSource
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.tape import Note, Tape
+from dbthermal.instruments.tape import Tape
+from dbthermal.instruments.writing import Written
 
-_POLL: Final = 0.05  # how long the writer waits before it looks whether all is over [s]
+_POLL: Final = 0.01  # least wait of the one who looks on [s]
 _BYTES: Final = 2  # of a pixel
-
-
-def _free(path: Path) -> int:
-    return shutil.disk_usage(path).free
 
 
 @dataclass(frozen=True)
@@ -41,17 +38,20 @@ class Preview:
     time : float
         Since the start [s].
     frames : mapping
-        Band to its last frame.
+        Band to its last frame, the bands left out that had none.
     totals : mapping
         Band to numbers of frames: ``frames``, ``lost``, ``refused``, ``damaged``.
     readings : mapping
         Name to the last value of each reading, NaN if it failed.
+    units : mapping
+        Name to unit of each reading; in kelvin unless named.
     """
 
     time: float
     frames: Mapping[str, Frame]
     totals: Mapping[str, Mapping[str, int]]
     readings: Mapping[str, float]
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,13 @@ class Summary:
     totals: Mapping[str, Mapping[str, int]]
 
 
-def record(
+def record(  # noqa: PLR0913 - the one entrance; all but the first three are by name
     session: Session,
     sources: Mapping[str, FrameSource],
     path: str | Path,
     *,
     readings: Mapping[str, Reading] | None = None,
+    identities: Mapping[str, Mapping[str, str | bool]] | None = None,
     limits: Limits | None = None,
     preview: Callable[[Preview], None] | None = None,
     stop: threading.Event | None = None,
@@ -88,6 +89,9 @@ def record(
 ) -> Summary:
     """
     Record until the session's duration is over, `stop` is set or no source is left.
+
+    Frames that a driver held from before the start, as their stamps say, are not taken: they show
+    another filter, or another scene.
 
     Parameters
     ----------
@@ -99,10 +103,12 @@ def record(
         Store to make, ``*.zarr``; see `dbthermal.instruments.capture.open_capture`.
     readings : mapping, optional
         Name to what else is asked: thermocouples, the cameras' temperatures, the blackbody.
+    identities : mapping, optional
+        Band, or name of another device, to what it is: kept beside what the sources say.
     limits : Limits, optional
         How much is held, and how long is waited.
     preview : callable, optional
-        Called now and then with a `Preview`; what time it takes, the queue must bridge.
+        Called now and then with a `Preview`, in the caller's thread; it may take its time.
     stop : Event, optional
         Ends the recording when set.
     clock : callable
@@ -122,39 +128,40 @@ def record(
     ValueError
         If the sources are not the session's, or are emulated where it says hardware, or vice versa.
     Exception
-        What a source, a reading or the preview raised; what was recorded is kept.
+        What a source, a reading or the preview raised; what was recorded is kept. So it is when
+        the keyboard interrupts, but then the writer may need a moment to end.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
     start = clock()
-    tape = _tape(session, sources, Path(path), readings, start, limits)
+    known = _identified(sources, identities or {})
+    units = {name: reading.units for name, reading in readings.items()}
+    tape = _tape(session, sources, Path(path), units, known, start, limits)
     run = Run(limits, clock, clock() + session.duration, stop or threading.Event())
     run.room.update((band, threading.Semaphore(limits.queue)) for band in sources)
-    threads = [
-        *(
-            threading.Thread(target=fetch, args=(run, *item), name=item[0], daemon=True)
-            for item in sources.items()
-        ),
-        threading.Thread(target=ask, args=(run, readings), name="readings", daemon=True),
+    written = Written(start)
+    fetching = [
+        threading.Thread(target=fetch, args=(run, *item), name=item[0], daemon=True)
+        for item in sources.items()
     ]
-    ended = "interrupted"
-    for thread in threads:
-        thread.start()
+    asking = threading.Thread(target=ask, args=(run, readings), name="readings", daemon=True)
+    # No daemon: it ends its work whatever becomes of this thread.
+    writer = threading.Thread(
+        target=writing.write, args=(run, tape, written, fetching, asking), name="writer"
+    )
     try:
-        ended = _write(run, tape, threads[:-1], preview, start)
-    except OSError as error:
-        ended = "no space" if error.errno == errno.ENOSPC else "error"
+        writer.start()
+        _look_on(run, written, writer, preview, units)
+    except BaseException:
+        written.interrupted = True
         raise
     finally:
         run.over.set()
-        _join(run, threads)
-        if not tape.broken:
-            _drain(run, tape)
-            ended = "error" if run.errors else ended
-            tape.close(complete=ended in {"duration", "stopped"}, ended=ended)
+        if writer.ident is not None:  # None only where an interrupt came before its start
+            writer.join()
     if run.errors:
         raise run.errors[0]
-    return Summary(Path(path), ended, tape.totals)
+    return Summary(Path(path), written.ended, written.totals)
 
 
 def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
@@ -174,11 +181,22 @@ def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
             )
 
 
+def _identified(
+    sources: Mapping[str, FrameSource], identities: Mapping[str, Mapping[str, str | bool]]
+) -> dict[str, dict[str, str | bool]]:
+    """Merge what the sources say of themselves with what else is known."""
+    own = {band: dict(source.identity) for band, source in sources.items()}
+    return {
+        name: {**own.get(name, {}), **identities.get(name, {})} for name in {**own, **identities}
+    }
+
+
 def _tape(
     session: Session,
     sources: Mapping[str, FrameSource],
     path: Path,
-    readings: Mapping[str, Reading],
+    units: Mapping[str, str],
+    identities: Mapping[str, Mapping[str, str | bool]],
     start: float,
     limits: Limits,
 ) -> Tape:
@@ -188,85 +206,35 @@ def _tape(
     rows, columns = session.shape
     frames = sum(session.duration * source.frame_rate for source in sources.values())
     needed = limits.reserve + int(_BYTES * rows * columns * frames)
-    free = _free(folder)
+    free = writing.free(folder)
     if free < needed:
         raise OSError(
             errno.ENOSPC, f"Too little space: {free} bytes are free. Must be {needed}", str(folder)
         )
     attrs = {
         "is_simulated": session.simulated,
-        "identities": {band: dict(source.identity) for band, source in sources.items()},
+        "origin": "simulated, emulated rig" if session.simulated else "measured",
+        "identities": identities,
         "frame_rates": {band: source.frame_rate for band, source in sources.items()},
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
         "provenance": provenance.record(session.content()),
     }
-    units = {name: reading.units for name, reading in readings.items()}
     return Tape(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)
 
 
-def _write(
+def _look_on(
     run: Run,
-    tape: Tape,
-    fetching: list[threading.Thread],
+    written: Written,
+    writer: threading.Thread,
     preview: Callable[[Preview], None] | None,
-    start: float,
-) -> str:
-    """Write what comes until all is over; tell why."""
-    last: dict[str, Frame] = {}
-    values: dict[str, float] = {}
-    written, shown = 0, -float("inf")
-    while run.going() and any(thread.is_alive() for thread in fetching):
-        _take_notes(run, tape, values)
-        try:
-            band, frame, refused = run.frames.get(timeout=_POLL)
-        except queue.Empty:
-            continue
-        tape.frame(band, frame, refused)
-        run.room[band].release()
-        last[band] = frame
-        written += 1
-        if written % run.limits.chunk == 0:
-            _check_space(tape.recording.path, run.limits.reserve)
-        if preview and run.clock() - shown >= run.limits.preview_period:
-            shown = run.clock()
-            preview(Preview(shown - start, dict(last), tape.totals, dict(values)))
-    if run.stop.is_set():
-        return "stopped"
-    return "source lost" if run.lost else "duration"
-
-
-def _join(run: Run, threads: list[threading.Thread]) -> None:
-    """Wait for the threads; one that hangs in its device must not keep what was recorded."""
-    for thread in threads:
-        thread.join(run.limits.patience)
-        if thread.is_alive():
-            run.errors.append(
-                TimeoutError(
-                    f"No answer of the device of '{thread.name}' within {run.limits.patience} s "
-                    "after the end. Must keep its time limits."
-                )
-            )
-
-
-def _check_space(path: Path, reserve: int) -> None:
-    free = _free(path)
-    if free < reserve:
-        message = f"Too little space: {free} bytes are free. Must be {reserve}"
-        raise OSError(errno.ENOSPC, message, str(path))
-
-
-def _drain(run: Run, tape: Tape) -> None:
-    """Write what is still in the queues, when the threads are done."""
-    while not run.frames.empty():
-        tape.frame(*run.frames.get_nowait())
-    _take_notes(run, tape, {})
-    for band, number in run.refused.items():
-        tape.refused(band, number, run.clock())
-
-
-def _take_notes(run: Run, tape: Tape, values: dict[str, float]) -> None:
-    while not run.notes.empty():
-        note: Any = run.notes.get_nowait()
-        tape.note(*note)
-        if note[0] in {Note.READING, Note.READING_FAILED}:
-            values[note[1]] = note[3]
+    units: Mapping[str, str],
+) -> None:
+    """Show what is recorded, until there is no more."""
+    period = _POLL  # until there is something to show
+    while writer.is_alive():
+        writer.join(period)
+        if preview and written.frames and run.going():
+            period = max(_POLL, run.limits.preview_period)
+            time = run.clock() - written.start
+            parts = dict(written.frames), written.totals, dict(written.readings), units
+            preview(Preview(time, *parts))

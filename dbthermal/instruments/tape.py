@@ -1,15 +1,15 @@
 """Frames and notes on their way into a recording: numbered, flagged, gathered into chunks.
 
 A `Tape` looks at each frame beside the one before: a number that leaps is a loss, one that does not
-rise a repetition, and a time that does not rise is none. Nothing is left out: a damaged frame is
-written with its flags, and only its exposure time is NaN, so that `dbthermal.alignment` passes over
-it. What is no frame goes into the log: losses, shutter events, readings of other instruments.
+rise a repetition, and a time that does not rise, or is still to come, is none. Nothing is left out:
+a damaged frame is written with its flags, and only its exposure time is NaN, so that
+`dbthermal.alignment` passes over it. What is no frame goes into the log: losses, shutter events,
+readings of other instruments.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import IntEnum
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from dbthermal import store
 from dbthermal.alignment import clocks
 from dbthermal.instruments import telemetry
+from dbthermal.instruments.contents import TELEMETRY, VARIABLES, Note
 from dbthermal.instruments.frames_source import (
     GOOD,
     MEANINGS,
@@ -28,66 +29,16 @@ from dbthermal.instruments.frames_source import (
     FrameFlag,
     FrameSource,
 )
-from dbthermal.schema import STAGES, Variable
+
+__all__ = ["CHUNK", "TELEMETRY", "VARIABLES", "Note", "Tape"]
 
 CHUNK: Final = 30
 """Frames of a chunk: half a second at 60 Hz, which is what a kill may cost."""
 
-VARIABLES: Final = MappingProxyType(
-    {
-        "counts": STAGES["capture"]["counts"],
-        "exposure_time": clocks.EXPOSURE_TIME,
-        "device_time": Variable(("band", "time"), "float64", "s", "device's stamp of the frame"),
-        "host_time": Variable(("band", "time"), "float64", "s", "when the host had the frame"),
-        "sequence": Variable(("band", "time"), "int64", "1", "number of the frame by its driver"),
-        "frame_flags": Variable(("band", "time"), "uint16", "1", "flags of the frame, 0 is good"),
-        "log_time": Variable(("log",), "float64", "s", "time of the note"),
-        "log_kind": Variable(("log",), "int16", "1", "what is noted"),
-        "log_source": Variable(("log",), "int16", "1", "whose note it is"),
-        "log_value": Variable(("log",), "float64", "1", "value of the note, in the source's unit"),
-    }
-)
-"""What every recording holds. Times are on the host's clock since ``clock_origin``; `device_time`
-is as it came. The attributes name kinds, sources and flags."""
-
-TELEMETRY: Final = MappingProxyType(
-    {
-        "telemetry": Variable(
-            ("band", "time", "telemetry_row", "x"), "uint16", "1", "telemetry rows as they came"
-        ),
-        "fpa_temperature": Variable(
-            ("band", "time"), "float32", "K", "temperature of the focal-plane array"
-        ),
-    }
-)
-"""What a recording holds besides, if the cameras give telemetry."""
-
-
-class Note(IntEnum):
-    """Kinds of notes in the log, by what their value is."""
-
-    READING = 0
-    """The reading."""
-    READING_FAILED = 1
-    """NaN: the instrument gave none."""
-    FRAMES_LOST = 2
-    """Number of frames that the driver or the camera lost."""
-    FRAMES_REFUSED = 3
-    """Number of frames that came, but for which the queue was full."""
-    SEQUENCE_STANDS = 4
-    """Step of the sequence number, 0 or less."""
-    DAMAGED = 5
-    """Flags of the frame."""
-    SHUTTER_CLOSED = 6
-    """Sequence number of the first frame."""
-    SHUTTER_OPEN = 7
-    """Sequence number of the first frame."""
-    CORRECTION = 8
-    """Camera's number of the frame at which it renewed its offsets, from the telemetry."""
-    NO_FRAME = 9
-    """Time without a frame [s]."""
-    SOURCE_LOST = 10
-    """NaN: the source gives no more frames."""
+_AHEAD: Final = 1e-3  # by how much a stamp may be later than the frame was there [s]
+_HELD: Final = 1.0  # how long a note may wait for a chunk before it is written without one [s]
+_DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
+_FILLS: Final = MappingProxyType({"frame_flags": int(FrameFlag.PADDED), "sequence": -1})
 
 
 @dataclass
@@ -163,6 +114,7 @@ class Tape:
             list(sources),
             chunk=chunk,
             attrs={**attrs, **_legend(self._names, readings, origin)},
+            fills=_FILLS,
         )
         self._bands = {band: _Band(self._new_block()) for band in sources}
 
@@ -186,7 +138,7 @@ class Tape:
         """
         state = self._bands[band]
         flags = frame.flags | self._compared(band, frame, refused)
-        if flags & (FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE):
+        if flags & _DAMAGED:
             state.counts["damaged"] += 1
             self.note(Note.DAMAGED, band, frame.host_time, int(flags))
         self._watch_shutter(band, frame)
@@ -224,6 +176,8 @@ class Tape:
         """
         row = time - self._origin, int(kind), self._names.index(source), value
         self._notes.append(row)
+        if row[0] - self._notes[0][0] > _HELD:
+            self._write_notes()
 
     def refused(self, band: str, number: int, time: float) -> None:
         """
@@ -272,12 +226,18 @@ class Tape:
             state.counts["lost"] += lost
             self.note(Note.FRAMES_LOST, band, frame.host_time, lost)
         flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else GOOD
-        if frame.device_time > state.device_time:
-            state.device_time = frame.device_time
-        else:  # NaN too
-            flags |= FrameFlag.TIME_STANDS
         state.sequence = frame.sequence
-        return flags
+        return flags | self._timed(state, frame)
+
+    def _timed(self, state: _Band, frame: Frame) -> FrameFlag:
+        """Flag of a stamp that is none; one of the future must not spoil those that follow."""
+        own_clock = FrameFlag.FOREIGN_CLOCK in frame.flags
+        if not own_clock and frame.device_time > frame.host_time + _AHEAD:
+            return FrameFlag.TIME_AHEAD
+        if not frame.device_time > state.device_time:  # NaN too
+            return FrameFlag.TIME_STANDS
+        state.device_time = frame.device_time
+        return GOOD
 
     def _watch_shutter(self, band: str, frame: Frame) -> None:
         state = self._bands[band]
@@ -291,6 +251,8 @@ class Tape:
         """Telemetry as it came, and what of it is of use frame by frame."""
         if frame.telemetry is None:
             return {}
+        if frame.flags & _DAMAGED:  # its telemetry may be, too: it is kept, but not believed
+            return {"telemetry": frame.telemetry, "fpa_temperature": math.nan}
         state, fields = self._bands[band], telemetry.decode(frame.telemetry)
         if state.last_correction not in {None, fields.last_ffc_frame}:
             self.note(Note.CORRECTION, band, frame.host_time, fields.last_ffc_frame)
@@ -298,15 +260,16 @@ class Tape:
         return {"telemetry": frame.telemetry, "fpa_temperature": fields.fpa_temperature}
 
     def _write(self, band: str) -> None:
-        state, self.broken = self._bands[band], True
+        state = self._bands[band]
         if state.filled:
+            self.broken = True
             block = {name: values[: state.filled] for name, values in state.block.items()}
             self.recording.append(band, block)
             state.filled = 0
         self._write_notes()
-        self.broken = False
 
     def _write_notes(self) -> None:
+        self.broken = True
         if self._notes:
             names = ("log_time", "log_kind", "log_source", "log_value")
             columns = zip(names, zip(*self._notes, strict=True), strict=True)
@@ -315,6 +278,7 @@ class Tape:
             )
             self._notes = []
         self.recording.commit(totals=self.totals)
+        self.broken = False
 
     def _new_block(self) -> dict[str, npt.NDArray[Any]]:
         sizes = {**self._sizes, "time": self._chunk}

@@ -1,9 +1,10 @@
 """Raw 16-bit frames of a camera on Linux, with the kernel's stamps, numbers and flags.
 
 A thin use of Video4Linux2, in a few calls (see `dbthermal.instruments.v4l2_calls`). The kernel's
-stamp of a frame is on CLOCK_MONOTONIC and, from uvcvideo, of the start of its exposure
-(https://docs.kernel.org/userspace-api/media/v4l/buffer.html). Tested with a stand-in for the
-kernel's calls, not against a camera.
+stamp of a frame is on CLOCK_MONOTONIC. That of uvcvideo claims to be of the start of the exposure
+(https://docs.kernel.org/userspace-api/media/v4l/buffer.html); likely, unless that module is told to
+use the camera's clock, it is of the frame's first packet. Tested with a stand-in for the kernel's
+calls, not against a camera.
 """
 
 import errno
@@ -29,6 +30,7 @@ from dbthermal.instruments.v4l2_calls import Kernel, Stream
 _ERROR: Final = 0x40  # V4L2_BUF_FLAG_ERROR
 _CLOCK_MASK: Final = 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_MASK
 _MONOTONIC: Final = 0x2000  # V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC
+_GONE: Final = (errno.ENODEV, errno.EIO)
 _MICRO: Final = 1e-6
 _TYPE: Final = struct.pack("=I", calls.CAPTURE)
 
@@ -51,7 +53,8 @@ class Capture:
     Attributes
     ----------
     identity : mapping
-        ``device``, the node, and, once open, ``model``, what the driver calls the camera.
+        ``device``, the node, and, once open, ``model``, what the driver calls the camera, ``bus``,
+        where it is plugged in, and ``driver``.
     is_simulated : bool
         False.
     """
@@ -142,14 +145,17 @@ class Capture:
         SourceLostError
             If the camera is gone, or this is closed.
         """
-        file = self._opened()
-        if not self._kernel.select([file], [], [], timeout)[0]:
+        file, buffer = self._opened(), _buffer(0)
+        deadline = self._kernel.clock() + timeout
+        while self._announced(file, deadline):
+            if self._taken(file, buffer):
+                break
+        else:
             raise NoFrameError(f"No frame from '{self.path}' in {timeout} s.")
-        buffer = _buffer(0)
-        self._call(file, calls.DQBUF, buffer)
-        frame = self._frame(buffer, self._kernel.clock())
-        self._call(file, calls.QBUF, buffer)
-        return frame
+        try:
+            return self._frame(buffer, self._kernel.clock())
+        finally:
+            self._give_back(file, buffer)
 
     def close(self) -> None:
         """Stop the stream and close the node; a second call does nothing."""
@@ -157,7 +163,7 @@ class Capture:
             return
         file, self._file = self._file, None
         try:
-            self._kernel.ioctl(file, calls.STREAMOFF, bytearray(_TYPE))
+            self._kernel.ask(file, calls.STREAMOFF, bytearray(_TYPE))
         except OSError as error:
             if error.errno != errno.ENODEV:  # unplugged: there is nothing left to stop
                 raise
@@ -170,39 +176,54 @@ class Capture:
     def _start(self) -> None:
         self._file = file = calls.open_node(self.path, self._kernel)
         try:
-            card = calls.agree(file, self.path, self.stream, self._kernel)
-            self.identity = {"device": self.path, "model": card}
+            identity = calls.agree(file, self.path, self.stream, self._kernel)
+            self.identity = {"device": self.path, **identity}
             self._map_buffers(file)
-            self._kernel.ioctl(file, calls.STREAMON, bytearray(_TYPE))
+            self._kernel.ask(file, calls.STREAMON, bytearray(_TYPE))
         except BaseException:
             self.close()
             raise
 
     def _map_buffers(self, file: int) -> None:
         request = bytearray(calls.REQUEST.pack(calls.BUFFERS, calls.CAPTURE, calls.MMAP))
-        self._kernel.ioctl(file, calls.REQBUFS, request)
+        self._kernel.ask(file, calls.REQBUFS, request)
         for index in range(calls.REQUEST.unpack(request)[0]):
             buffer = _buffer(index)
-            self._kernel.ioctl(file, calls.QUERYBUF, buffer)
+            self._kernel.ask(file, calls.QUERYBUF, buffer)
             offset, length = calls.BUFFER.unpack(buffer)[9:11]
             self._maps.append(self._kernel.map(file, length, offset))
-            self._kernel.ioctl(file, calls.QBUF, buffer)
+            self._kernel.ask(file, calls.QBUF, buffer)
 
     def _opened(self) -> int:
         if self._file is None:
             raise SourceLostError(f"No frames from '{self.path}': it is closed.")
         return self._file
 
-    def _call(self, file: int, number: int, argument: bytearray) -> None:
+    def _announced(self, file: int, deadline: float) -> bool:
+        wait = max(0.0, deadline - self._kernel.clock())
+        return bool(self._kernel.select([file], [], [], wait)[0])
+
+    def _taken(self, file: int, buffer: bytearray) -> bool:
+        """Take the buffer of a frame; False if none is there, though it was announced."""
         try:
-            self._kernel.ioctl(file, number, argument)
-        except BlockingIOError as error:
-            raise NoFrameError(f"No frame from '{self.path}', though it was announced.") from error
+            self._kernel.ask(file, calls.DQBUF, buffer)
+        except BlockingIOError:
+            return False
         except OSError as error:
-            if error.errno not in (errno.ENODEV, errno.EIO):
+            if error.errno not in _GONE:
                 raise
             message = f"No more frames from '{self.path}': {error.strerror}."
             raise SourceLostError(message) from error
+        return True
+
+    def _give_back(self, file: int, buffer: bytearray) -> None:
+        try:
+            self._kernel.ask(file, calls.QBUF, buffer)
+        except OSError as error:
+            if (
+                error.errno not in _GONE
+            ):  # the frame came: the next `read` tells that it was the last
+                raise
 
     def _frame(self, buffer: bytearray, host_time: float) -> Frame:
         """Copy a frame out of its buffer and translate what the kernel says of it."""

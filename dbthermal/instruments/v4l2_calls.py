@@ -25,8 +25,9 @@ except ImportError as missing:  # Windows
 Y16: Final = 0x20363159
 """Pixel format ``Y16 ``: 16 bits a pixel, little-endian, before any gain control."""
 
-BUFFERS: Final = 8
-"""Frames that the kernel holds while nobody reads; beyond, it drops."""
+BUFFERS: Final = 32
+"""Frames that the kernel holds while nobody reads, the most it can; beyond, it drops: half a second
+at 60 Hz, in which a busy computer gets round to read again."""
 
 QUERYCAP: Final = 0x80685600
 ENUM_FMT: Final = 0xC0405602
@@ -117,6 +118,31 @@ class Kernel:
     clock: Callable[[], float] = time.monotonic
     platform: str = sys.platform
 
+    def ask(self, file: int, number: int, argument: bytearray) -> None:
+        """
+        Call `ioctl`, again where a signal came between: unlike other calls, Python's does not.
+
+        Parameters
+        ----------
+        file : int
+            Open node.
+        number : int
+            Of the call.
+        argument : bytearray
+            Its argument, which the kernel changes.
+
+        Raises
+        ------
+        OSError
+            If the kernel refuses.
+        """
+        while True:
+            try:
+                self.ioctl(file, number, argument)
+            except InterruptedError:
+                continue
+            return
+
 
 def formats(path: str, kernel: Kernel | None = None) -> list[int]:
     """
@@ -176,7 +202,7 @@ def open_node(path: str, kernel: Kernel) -> int:
     return kernel.open(path, os.O_RDWR | os.O_NONBLOCK)
 
 
-def agree(file: int, path: str, wanted: Stream, kernel: Kernel) -> str:
+def agree(file: int, path: str, wanted: Stream, kernel: Kernel) -> dict[str, str]:
     """
     Set format and rate. A driver sets what is nearest to what it cannot do: here an error.
 
@@ -193,8 +219,9 @@ def agree(file: int, path: str, wanted: Stream, kernel: Kernel) -> str:
 
     Returns
     -------
-    str
-        What the driver calls the camera.
+    dict
+        ``model``, what the driver calls the camera, ``bus``, where it is plugged in, and
+        ``driver`` with its version, on which it depends what a stamp means.
 
     Raises
     ------
@@ -203,23 +230,26 @@ def agree(file: int, path: str, wanted: Stream, kernel: Kernel) -> str:
     ValueError
         If the node gives no Y16, or the driver agrees to another format or rate.
     """
-    captures, card = _captures(file, kernel)
+    captures, identity = _captures(file, kernel)
     offered = _formats(file, kernel) if captures else []
     if Y16 not in offered:
         names = [code.to_bytes(4, "little").decode("ascii", "backslashreplace") for code in offered]
         raise ValueError(f"Invalid video node '{path}' with {names}. Must offer 'Y16 '.")
     _agree_on_format(file, path, wanted, kernel)
     _agree_on_rate(file, path, wanted.frame_rate, kernel)
-    return card
+    return identity
 
 
-def _captures(file: int, kernel: Kernel) -> tuple[bool, str]:
-    """Whether the node captures video (the camera's other nodes give metadata), and its card."""
+def _captures(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:
+    """Whether the node captures video (a camera has others, for metadata), and its identity."""
     capability = bytearray(CAPABILITY.size)
-    kernel.ioctl(file, QUERYCAP, capability)
-    _, card, _, _, _, node = CAPABILITY.unpack(capability)
+    kernel.ask(file, QUERYCAP, capability)
+    *texts, version, _, node = CAPABILITY.unpack(capability)
+    driver, card, bus = (text.rstrip(b"\0").decode("utf-8", "backslashreplace") for text in texts)
+    release = f"{version >> 16}.{version >> 8 & 0xFF}.{version & 0xFF}"
     wanted = _VIDEO_CAPTURE | _STREAMING
-    return node & wanted == wanted, card.rstrip(b"\0").decode("utf-8", "backslashreplace")
+    identity = {"model": card, "bus": bus, "driver": f"{driver} {release}"}
+    return node & wanted == wanted, identity
 
 
 def _formats(file: int, kernel: Kernel) -> list[int]:
@@ -227,7 +257,7 @@ def _formats(file: int, kernel: Kernel) -> list[int]:
     while True:
         entry = bytearray(FORMAT_ENTRY.pack(len(found), CAPTURE, 0, b"", 0))
         try:
-            kernel.ioctl(file, ENUM_FMT, entry)
+            kernel.ask(file, ENUM_FMT, entry)
         except OSError as error:
             if error.errno == errno.EINVAL:  # the end of the list
                 return found
@@ -240,7 +270,7 @@ def _agree_on_format(file: int, path: str, stream: Stream, kernel: Kernel) -> No
     line = _BYTES * columns
     wanted = columns, rows, Y16, _PROGRESSIVE, line, rows * line
     argument = bytearray(FORMAT.pack(CAPTURE, *wanted, 0))
-    kernel.ioctl(file, S_FMT, argument)
+    kernel.ask(file, S_FMT, argument)
     got = FORMAT.unpack(argument)[1:7]
     if got != wanted:
         raise ValueError(
@@ -251,7 +281,7 @@ def _agree_on_format(file: int, path: str, stream: Stream, kernel: Kernel) -> No
 
 def _agree_on_rate(file: int, path: str, rate: float, kernel: Kernel) -> None:
     argument = bytearray(PARAMETERS.pack(CAPTURE, 0, 0, 1000, round(1000 * rate), 0, 0))
-    kernel.ioctl(file, S_PARM, argument)
+    kernel.ask(file, S_PARM, argument)
     numerator, denominator = PARAMETERS.unpack(argument)[3:5]
     if numerator == 0 or abs(denominator / numerator - rate) > _RATE_TOLERANCE * rate:
         raise ValueError(

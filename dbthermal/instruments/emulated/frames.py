@@ -1,10 +1,10 @@
 """Emulated cameras: frames of a `World`, with the faults that real ones have.
 
-How the scene looks is handed in: for each band a picture, a function of time that gives counts, as
-of a movie that the simulation computed before (`Movie`). What the emulated camera adds is what a
-camera does: a frame rate, a clock, buffers that overflow if nobody reads, a shutter that freezes
-the image and leaves other offsets, telemetry, and the faults that it is told to have. It is no
-model of a detector: noise and response are in the counts that are handed in.
+How the scene looks is handed in: for each band a picture, a function of the scene's time that gives
+counts, as of a movie that the simulation computed before (`Movie`). What the emulated camera adds
+is what a camera does: a frame rate, a clock, buffers that overflow if nobody reads, a shutter that
+freezes the image and leaves other offsets, telemetry, and the faults that it is told to have. It is
+no model of a detector: noise and response are in the counts that are handed in.
 """
 
 import math
@@ -31,7 +31,7 @@ from dbthermal.instruments.frames_source import (
 
 Picture = Callable[[float], Counts]
 
-BUFFERS: Final = 8
+BUFFERS: Final = 32
 """Frames that are held while nobody reads, as by the V4L2 driver; beyond, they are dropped."""
 
 CLOSED: Final = 10_000
@@ -66,7 +66,7 @@ class Movie:
         Parameters
         ----------
         time : float
-            Since the world began [s].
+            Since the scene began, see `World.scene_time` [s].
 
         Returns
         -------
@@ -223,7 +223,13 @@ class EmulatedCamera:
         SourceLostError
             If the camera is unplugged or closed.
         """
-        self._start = self.world.time if self._start is None else self._start
+        if not self._state.streaming:
+            self._start = None
+            self.sleep(timeout)
+            self._check_plugged()
+            raise NoFrameError(f"No frame from emulated camera '{self.name}': it takes none now.")
+        if self._start is None:
+            self._start = self.world.time - self._number / self.frame_rate
         self._skip(self.world.time)
         due = self._start + self._number / self.frame_rate
         wait = due - self.world.time
@@ -275,7 +281,7 @@ class EmulatedCamera:
         elif band not in self.pictures:
             raise KeyError(f"Unknown band '{band}'. Must be one of {sorted(self.pictures)}.")
         else:
-            image = self.pictures[band](time)
+            image = self.pictures[band](self.world.scene_time(time))
         if image.shape != self.shape or image.dtype != np.uint16:
             raise ValueError(
                 f"Invalid picture {image.shape} of {image.dtype} in band '{band}'. "

@@ -4,7 +4,8 @@ The wheel's emulator turns `World.wheel_position`, and what the camera behind it
 camera's emulator starts a flat-field correction, and the frame source freezes; a program sets
 `World.blackbody_temperature`, and the thermocouples and the frames follow. There is no physics
 here, only who is where and how warm. All temperatures are in kelvin, all times in seconds since
-the world began, on the clock that was injected.
+the world began, on the clock that was injected; what happens in the scene has a time of its own,
+`World.scene_time`, so that a recording can begin with it.
 """
 
 import math
@@ -40,6 +41,8 @@ class CameraState:
         Of its focal-plane array [K].
     plugged : bool
         False once it was pulled out.
+    streaming : bool
+        False while its sensor takes no frames: it boots, or waits for pulses that do not come.
     frame_count : int
         Frames since its sensor started.
     ffc_count : int
@@ -55,6 +58,7 @@ class CameraState:
     serial_number: int
     fpa_temperature: float = FPA
     plugged: bool = True
+    streaming: bool = True
     frame_count: int = 0
     ffc_count: int = 0
     ffc_until: float = -math.inf
@@ -79,13 +83,16 @@ class World:
         The slot in the beam at the start.
     blackbody_temperature : float
         Of the blackbody [K].
+    time_constant : float
+        With which the blackbody approaches what it is set to [s]; 0 is at once.
     scene : callable, optional
-        Temperatures of what is in the scene [K], by name, at a time [s]; by default none.
+        Temperatures of what is in the scene [K], by name, at a time of the scene [s]; by default
+        none.
+    waits : bool
+        Whether the scene stands at its beginning until `begin`; else it begins with the world.
 
     Attributes
     ----------
-    blackbody_temperature : float
-        May be set [K].
     thermocouples : dict
         What each channel, 1 to 8, of the thermocouple logger is at: a name in `scene`, or
         ``"blackbody"``, ``"room"`` or ``"open"``.
@@ -93,13 +100,15 @@ class World:
         `CameraState` of each camera by its name; see `add_camera`.
     epoch : float
         When the world began, on its clock [s].
+    scene_began : float
+        When the scene began, on the world's clock [s]; infinite before.
     is_simulated : bool
         True.
 
     Raises
     ------
     ValueError
-        If a slot is not 1 to 6.
+        If a slot is not 1 to 6, or the time constant is negative.
     """
 
     is_simulated: Final = True
@@ -111,22 +120,61 @@ class World:
         filters: Mapping[int, str] | None = None,
         wheel_position: int = 1,
         blackbody_temperature: float = ROOM,
+        time_constant: float = 0.0,
         scene: Callable[[float], Mapping[str, float]] | None = None,
+        waits: bool = False,
     ) -> None:
+        if not 0 <= time_constant < math.inf:
+            raise ValueError(f"Invalid time_constant {time_constant} s. Must be 0 or more.")
         self.lock = threading.RLock()
         self.clock = clock
         self.filters = {_slot(slot): name for slot, name in (filters or {}).items()}
-        self.blackbody_temperature = blackbody_temperature
         self.thermocouples: dict[int, str] = {}
         self.cameras: dict[str, CameraState] = {}
         self._scene = scene
         self._wheel: int | None = _slot(wheel_position)
         self.epoch = clock()
+        self.scene_began = math.inf if waits else self.epoch
+        self._time_constant = time_constant
+        self._blackbody = blackbody_temperature, 0.0, self.epoch  # goal, distance from it, when
 
     @property
     def time(self) -> float:
         """Time since the world began [s]."""
         return self.clock() - self.epoch
+
+    def begin(self) -> None:
+        """Let the scene begin now, or anew."""
+        self.scene_began = self.clock()
+
+    def scene_time(self, time: float | None = None) -> float:
+        """
+        Time since the scene began.
+
+        Parameters
+        ----------
+        time : float, optional
+            When, since the world began [s]; now, unless given.
+
+        Returns
+        -------
+        float
+            [s]; 0 before it began.
+        """
+        now = self.time if time is None else time
+        return max(0.0, self.epoch + now - self.scene_began)
+
+    @property
+    def blackbody_temperature(self) -> float:
+        """Temperature of the blackbody [K]; set, it goes there with the time constant."""
+        goal, distance, since = self._blackbody
+        if distance == 0 or self._time_constant == 0:
+            return goal
+        return goal + distance * math.exp((since - self.clock()) / self._time_constant)
+
+    @blackbody_temperature.setter
+    def blackbody_temperature(self, goal: float) -> None:
+        self._blackbody = goal, self.blackbody_temperature - goal, self.clock()
 
     @property
     def wheel_position(self) -> int | None:
@@ -150,14 +198,14 @@ class World:
         Parameters
         ----------
         time : float, optional
-            When [s]; now, unless given.
+            When, since the world began [s]; now, unless given.
 
         Returns
         -------
         dict
             Name to temperature [K]; always with ``"blackbody"`` and ``"room"``.
         """
-        scene = {} if self._scene is None else self._scene(self.time if time is None else time)
+        scene = {} if self._scene is None else self._scene(self.scene_time(time))
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:
