@@ -1,15 +1,15 @@
-"""APT messages: public byte vectors, an independent implementation, and arbitrary bytes."""
+"""APT messages: public byte vectors, published numbers, and arbitrary bytes."""
 
 import subprocess
 import sys
 from itertools import pairwise
-from types import ModuleType
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal.instruments import apt
+from dbthermal.instruments.apt.codec import LENGTHS
 
 BAY_2 = 0x22
 INFO = (
@@ -43,6 +43,68 @@ REQUESTS = {
     "18 00 00 00 50 01": apt.no_flash_programming(destination=apt.UNIT),
     "43 04 01 00 50 01": apt.home(1, destination=apt.UNIT),
     "65 04 01 01 50 01": apt.stop(1, immediate=True, destination=apt.UNIT),
+}
+
+
+# Published identifiers, and the lengths of the data that follow [byte]: those of PnPQ, of
+# thorlabs-apt-protocol and of the maker's examples, which agree.
+PUBLISHED = {
+    "HW_DISCONNECT": (0x0002, 0),
+    "HW_REQ_INFO": (0x0005, 0),
+    "HW_GET_INFO": (0x0006, 84),
+    "HW_START_UPDATEMSGS": (0x0011, 0),
+    "HW_STOP_UPDATEMSGS": (0x0012, 0),
+    "HW_NO_FLASH_PROGRAMMING": (0x0018, 0),
+    "RACK_REQ_BAYUSED": (0x0060, 0),
+    "RACK_GET_BAYUSED": (0x0061, 0),
+    "HW_RESPONSE": (0x0080, 0),
+    "HW_RICHRESPONSE": (0x0081, 68),
+    "MOD_SET_CHANENABLESTATE": (0x0210, 0),
+    "MOD_REQ_CHANENABLESTATE": (0x0211, 0),
+    "MOD_GET_CHANENABLESTATE": (0x0212, 0),
+    "MOD_IDENTIFY": (0x0223, 0),
+    "MOT_SET_POSCOUNTER": (0x0410, 6),
+    "MOT_REQ_POSCOUNTER": (0x0411, 0),
+    "MOT_GET_POSCOUNTER": (0x0412, 6),
+    "MOT_SET_VELPARAMS": (0x0413, 14),
+    "MOT_REQ_VELPARAMS": (0x0414, 0),
+    "MOT_GET_VELPARAMS": (0x0415, 14),
+    "MOT_REQ_STATUSBITS": (0x0429, 0),
+    "MOT_GET_STATUSBITS": (0x042A, 6),
+    "MOT_SET_HOMEPARAMS": (0x0440, 14),
+    "MOT_REQ_HOMEPARAMS": (0x0441, 0),
+    "MOT_GET_HOMEPARAMS": (0x0442, 14),
+    "MOT_MOVE_HOME": (0x0443, 0),
+    "MOT_MOVE_HOMED": (0x0444, 0),
+    "MOT_MOVE_RELATIVE": (0x0448, 0, 6),
+    "MOT_MOVE_ABSOLUTE": (0x0453, 0, 6),
+    "MOT_MOVE_COMPLETED": (0x0464, 0, 14),
+    "MOT_MOVE_STOP": (0x0465, 0),
+    "MOT_MOVE_STOPPED": (0x0466, 0, 14),
+    "MOT_SUSPEND_ENDOFMOVEMSGS": (0x046B, 0),
+    "MOT_RESUME_ENDOFMOVEMSGS": (0x046C, 0),
+    "MOT_REQ_STATUSUPDATE": (0x0480, 0),
+    "MOT_GET_STATUSUPDATE": (0x0481, 14, 28),
+    "MOT_REQ_DCSTATUSUPDATE": (0x0490, 0),
+    "MOT_GET_DCSTATUSUPDATE": (0x0491, 14),
+    "MOT_ACK_DCSTATUSUPDATE": (0x0492, 0),
+}
+BITS = {
+    "FORWARD_LIMIT": 0,
+    "REVERSE_LIMIT": 1,
+    "FORWARD_SOFT_LIMIT": 2,
+    "REVERSE_SOFT_LIMIT": 3,
+    "MOVING_FORWARD": 4,
+    "MOVING_REVERSE": 5,
+    "JOGGING_FORWARD": 6,
+    "JOGGING_REVERSE": 7,
+    "CONNECTED": 8,
+    "HOMING": 9,
+    "HOMED": 10,
+    "SETTLED": 13,
+    "POSITION_ERROR": 14,
+    "OVERLOAD": 24,
+    "ENABLED": 31,
 }
 
 
@@ -211,80 +273,42 @@ def test_what_a_host_sends_is_not_heard_by_a_host() -> None:
     assert decoder.dropped == 7
 
 
-@pytest.fixture(name="other")
-def _other() -> ModuleType:
-    module: ModuleType = pytest.importorskip(
-        "thorlabs_apt_protocol",
-        reason="thorlabs-apt-protocol 29.0.0 is not installed: it is a check by other hands",
-    )
-    return module
+def test_identifiers_and_lengths_are_the_published_ones() -> None:
+    """Each message has the identifier and the lengths of data that others have."""
+    found = {known.name: (known.value, *LENGTHS[known]) for known in apt.Id}
+    assert found == PUBLISHED
 
 
-def test_requests_agree_with_another_implementation(other: ModuleType) -> None:
-    """thorlabs-apt-protocol builds the same bytes, of every message that it knows."""
-    to, home = apt.BAY_1, apt.HomeParameters(1, 2, 1, 4_397_466, -50)
-    address = {"dest": to, "source": apt.HOST}
-    channel = {**address, "chan_ident": 1}
-    speeds = {"min_velocity": 0, "acceleration": 0x35B0, "max_velocity": 0x00CCCCCD}
-    homes = {"home_dir": 2, "limit_switch": 1, "home_velocity": 4_397_466, "offset_distance": -50}
-    pairs = {
-        "hw_disconnect": (apt.disconnect(destination=to), address),
-        "hw_no_flash_programming": (apt.no_flash_programming(destination=to), address),
-        "hw_req_info": (apt.request_info(destination=to), address),
-        "hw_start_updatemsgs": (apt.start_updates(destination=to), address),
-        "hw_stop_updatemsgs": (apt.stop_updates(destination=to), address),
-        "rack_req_bayused": (apt.request_bay_used(3, destination=to), {**address, "bay_ident": 3}),
-        "mod_identify": (apt.identify(1, destination=to), channel),
-        "mod_set_chanenablestate": (
-            apt.set_channel_enabled(1, enabled=True, destination=to),
-            {**channel, "enable_state": 1},
-        ),
-        "mod_req_chanenablestate": (apt.request_channel_enabled(1, destination=to), channel),
-        "mot_set_poscounter": (
-            apt.set_position(1, -7, destination=to),
-            {**channel, "position": -7},
-        ),
-        "mot_req_poscounter": (apt.request_position(1, destination=to), channel),
-        "mot_set_velparams": (
-            apt.set_velocity_parameters(PARAMETERS, destination=to),
-            channel | speeds,
-        ),
-        "mot_req_velparams": (apt.request_velocity_parameters(1, destination=to), channel),
-        "mot_set_homeparams": (apt.set_home_parameters(home, destination=to), channel | homes),
-        "mot_req_homeparams": (apt.request_home_parameters(1, destination=to), channel),
-        "mot_move_home": (apt.home(1, destination=to), channel),
-        "mot_move_absolute": (
-            apt.move_absolute(1, 68_267, destination=to),
-            {**channel, "position": 68_267},
-        ),
-        "mot_move_relative": (
-            apt.move_relative(1, -9, destination=to),
-            {**channel, "distance": -9},
-        ),
-        "mot_move_stop": (apt.stop(1, destination=to), {**channel, "stop_mode": 2}),
-        "mot_req_statusupdate": (apt.request_status(1, destination=to), channel),
-        "mot_req_dcstatusupdate": (apt.request_dc_status(1, destination=to), channel),
-    }
-    for name, (built, arguments) in pairs.items():
-        assert built == getattr(other, name)(**arguments), name
+def test_bits_are_the_published_ones() -> None:
+    """Each bit of a motor's state is where others have it."""
+    assert {bit.name: bit.bit_length() - 1 for bit in apt.StatusBits} == BITS
 
 
-def test_replies_agree_with_another_implementation(other: ModuleType) -> None:
-    """thorlabs-apt-protocol reads the same out of what a controller answers."""
-    unpacker = other.Unpacker()
-    home = apt.HomeParameters(1, 2, 1, 4_397_466, -50)
-    answers = {apt.Id.MOT_GET_HOMEPARAMS: home, apt.Id.MOT_GET_VELPARAMS: PARAMETERS}
-    stream = bytes.fromhex(STATUS + "12 04 06 00 81 22 01 00 40 0D 03 00 12 02 01 01 01 21") + INFO
-    for identifier, payload in answers.items():
-        stream += apt.encode(apt.Message(identifier, 0, 0, apt.HOST, apt.BAY_1, payload.pack()))
-    unpacker.feed(stream)
-    status, position, enabled, info, homes, speeds = list(unpacker)
-    assert (status.position, status.forward_limit_switch, status.homed) == (1, True, False)
-    assert (position.position, enabled.enabled) == (200_000, True)
-    assert (info.serial_number, info.nchs, info.hw_version) == (94_000_009, 1, 1)
-    assert list(info.firmware_version) == [57, 1, 2]
-    assert (homes.home_velocity, homes.offset_distance) == (home.velocity, home.offset)
-    assert (speeds.acceleration, speeds.max_velocity) == (0x35B0, 0x00CCCCCD)
+@pytest.mark.parametrize(
+    ("source", "heard"), [(0x11, 1), (0x21, 1), (0x2A, 1), (0x50, 1), (0x2B, 0), (0x01, 0)]
+)
+def test_a_computer_hears_controllers_alone(source: int, heard: int) -> None:
+    """The rack, its ten bays and a unit are heard; from any other address it is noise."""
+    decoder = apt.Decoder()
+    assert len(decoder.feed(bytes((0x64, 0x04, 1, 0, 1, source)))) == heard
+    assert decoder.dropped == 1 - heard
+
+
+@pytest.mark.parametrize(
+    ("payload", "message"),
+    [
+        (apt.Status(1, 2**31, 0, apt.StatusBits(0)), "Invalid Status.* fields must hold it"),
+        (apt.Notice(1 << 16, 0, ""), "Invalid Notice.* fields must hold it"),
+        (apt.Info(1 << 32, "BSC201", 45, "1.0.0", 1, 0, 1), "Invalid Info.* fields must hold it"),
+        (apt.Info(1, "BSC201-LONG", 45, "1.0.0", 1, 0, 1), "Invalid model 'BSC201-LONG'"),
+    ],
+)
+def test_numbers_that_do_not_fit_a_reply(
+    payload: apt.Status | apt.Notice | apt.Info, message: str
+) -> None:
+    """A record whose numbers do not fit its fields is an error that shows it."""
+    with pytest.raises(ValueError, match=message):
+        payload.pack()
 
 
 def test_the_codec_needs_no_serial_port() -> None:

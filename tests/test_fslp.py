@@ -151,6 +151,16 @@ def test_a_damaged_frame_is_dropped_and_counted(sent: bytes) -> None:
     assert decoder.feed(SERIAL_REPLY) == [VECTORS[1][1]]
 
 
+def test_the_longest_frame_is_read() -> None:
+    """As many bytes as the vendor's own receiver holds make a frame, one more do not."""
+    for size, found in ((MAXIMUM_FRAME, 1), (MAXIMUM_FRAME + 1, 0)):
+        body = bytes(size - 2)
+        sent = b"\x8e" + body + checksum(body).to_bytes(2) + b"\xae"
+        assert not {0x8E, 0x9E, 0xAE} & {*sent[1:-1]}
+        assert len(Decoder().feed(sent)) == found
+    assert MAXIMUM_FRAME == 2048
+
+
 @given(st.integers(0, (1 << 32) - 1))
 def test_sequence_numbers_need_no_escape(sequence: int) -> None:
     """The number after any other is larger, but at the end, and holds no special byte."""

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ import usb.backend.openusb
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dbthermal.instruments import inventory
+from dbthermal.instruments import inventory, permissions
 from dbthermal.instruments.emulated import usb as emulated
 from dbthermal.instruments.emulated.usb import EmulatedBackend, apt, boson, tc08
 from dbthermal.instruments.inventory import Device
@@ -29,6 +30,24 @@ def look(
     return found
 
 
+def denied_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int, *, group: int, own: set[int]
+) -> Path:
+    """Nodes of a camera that may not be used, of this mode and group, to a user of other groups."""
+    dev = tmp_path / "dev"
+    dev.mkdir()
+    for name in ("video0", "video1", "ttyACM0"):
+        (dev / name).touch()
+        (dev / name).chmod(mode)
+    about, groups = (dev / "video0").stat(), {0: "root", 44: "video"}
+    stat = os.stat_result([*about[:5], group, *about[6:]])
+    monkeypatch.setattr(permissions, "_stat", lambda _: stat)
+    monkeypatch.setattr(Path, "group", lambda *_: groups[group])
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "getgroups", lambda: list(own))
+    return dev
+
+
 def test_whole_rig(tmp_path: Path) -> None:
     """Two cameras, the wheel's controller and the logger are found, and nothing is to complain."""
     found = look(tmp_path, tc08(), apt(), boson(2, bus=2), boson(1))
@@ -43,7 +62,11 @@ def test_whole_rig(tmp_path: Path) -> None:
 def test_nothing_plugged_in(tmp_path: Path) -> None:
     """An empty bus gives an empty list, and the description says what is missing."""
     assert look(tmp_path) == []
-    assert "FLIR Boson: not found (09cb:4007)" in inventory.describe([])
+    told = inventory.describe([]).splitlines()
+    assert told[0] == (
+        "FLIR Boson: not found (09cb:4007). Must be plugged in and switched on; "
+        "'lsusb -d 09cb:4007' lists it then."
+    )
 
 
 def test_other_devices_are_not_listed(tmp_path: Path) -> None:
@@ -77,20 +100,34 @@ def test_missing_driver(tmp_path: Path) -> None:
     controller, camera = sorted(
         look(tmp_path, apt(nodes={}), boson(nodes={})), key=lambda d: d.kind.key
     )
-    assert controller.warnings == (
-        "It has no serial node. Must have its kernel driver: is ftdi_sio loaded?",
+    assert " ".join(controller.warnings) == (
+        "It has no serial node. Must have its kernel driver: run 'sudo modprobe ftdi_sio', and if "
+        "there is still none, 'echo 0403 faf0 | sudo tee "
+        "/sys/bus/usb-serial/drivers/ftdi_sio/new_id'."
     )
-    assert len(camera.warnings) == 2
+    modules = [warning.split("modprobe ")[1] for warning in camera.warnings]
+    assert modules == ["uvcvideo'.", "cdc_acm'."]
 
 
-@pytest.mark.parametrize("kind", ["boson", "apt", "tc08"])
-def test_permission(tmp_path: Path, kind: str) -> None:
-    """What may not be opened gives the udev rule to write, and its number from sysfs."""
-    device = {"boson": boson, "apt": apt, "tc08": tc08}[kind](fault="permission")
-    found = look(tmp_path, device)[0]
+def test_permission(tmp_path: Path) -> None:
+    """What may not be opened gives the line to type; who has nodes and a number needs none."""
+    found = look(tmp_path, tc08(fault="permission"), boson(fault="permission"))
+    assert [device.serial for device in found] == ["EMULATED1", "EMULATED"]
+    assert (found[0].warnings, len(found[1].warnings)) == ((), 1)
+    assert (
+        """echo 'SUBSYSTEM=="usb", ATTR{idVendor}=="0ce9", ATTR{idProduct}=="1000", MODE="0660", """
+        """GROUP="plugdev", TAG+="uaccess"' | sudo tee -a /etc/udev/rules.d/70-dbthermal.rules"""
+    ) in found[1].warnings[0]
+
+
+@pytest.mark.parametrize("kind", [boson, apt, tc08])
+def test_permission_where_there_is_no_sysfs(
+    kind: Callable[..., emulated.EmulatedDevice],
+) -> None:
+    """Whose number is known nowhere gets the rule, nodes or not."""
+    device = kind(fault="permission")
+    found = inventory.find(EmulatedBackend(device), sysfs=Path("/nowhere"))[0]
     assert f'ATTR{{idVendor}}=="{device.vendor:04x}"' in found.warnings[0]
-    assert "/etc/udev/rules.d/70-dbthermal.rules" in found.warnings[0]
-    assert found.serial == device.serial
 
 
 @pytest.mark.parametrize(
@@ -160,13 +197,30 @@ def test_two_root_ports(tmp_path: Path) -> None:
 
 
 def test_node_that_may_not_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A node without permission names its group and the command."""
-    node = tmp_path / "dev" / "ttyUSB0"
-    node.parent.mkdir()
-    node.touch()
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    found = look(tmp_path, apt())[0]
-    assert found.warnings[0].startswith(f"No permission for {node}. Must be in its group '")
+    """Nodes without permission name their group and the command, once for all of a group."""
+    dev = denied_nodes(tmp_path, monkeypatch, 0o660, group=44, own={1000})
+    found = look(tmp_path, boson())[0]
+    assert len(found.warnings) == 1
+    nodes = ", ".join(str(dev / name) for name in ("video0", "video1", "ttyACM0"))
+    assert found.warnings[0].startswith(f"No permission for {nodes}. Must be in its group 'video'")
+
+
+@pytest.mark.parametrize(("mode", "group"), [(0o600, 44), (0o660, 0)])
+def test_node_that_only_root_may_use(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int, group: int
+) -> None:
+    """Nobody is told to join the group root, or one that does not help: a rule is needed."""
+    denied_nodes(tmp_path, monkeypatch, mode, group=group, own={1000})
+    warnings = look(tmp_path, boson())[0].warnings
+    assert ["video4linux" in warning for warning in warnings] == [True, False]
+    assert 'SUBSYSTEM=="tty", ATTRS{idVendor}=="09cb"' in warnings[1]
+    assert not any("usermod" in warning for warning in warnings)
+
+
+def test_node_of_the_own_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who is in the group already is not told to join it."""
+    denied_nodes(tmp_path, monkeypatch, 0o660, group=44, own={44})
+    assert "Its group 'video' is yours, yet" in look(tmp_path, boson())[0].warnings[0]
 
 
 def test_system_without_sysfs() -> None:
@@ -219,9 +273,12 @@ def test_only_the_inventory_loads_pyusb() -> None:
     assert done.stdout.strip() == "False"
 
 
-@pytest.mark.hardware
-def test_hardware() -> None:
-    """With the rig plugged in, all of it is found, and nothing stands in the way."""
-    found = inventory.find()
-    assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
-    assert [device.warnings for device in found] == [()] * 4
+def test_emulated_rig_has_nothing_to_complain_of() -> None:
+    """All four devices are found with their nodes, and nothing is left when it is over."""
+    with emulated.rig() as bus:
+        found = inventory.find(**bus)
+        assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
+        assert not [device.warnings for device in found if device.warnings]
+        assert "no nodes" not in inventory.describe(found[:3])
+        root = bus["sysfs"]
+    assert not root.exists()

@@ -10,7 +10,6 @@ itself. Tested against an emulated backend and a written sysfs tree, not against
 """
 
 import errno
-import os
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -20,6 +19,8 @@ from typing import Any, Final
 
 import usb.core
 import usb.util
+
+from dbthermal.instruments import permissions
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,10 @@ Universal Serial Bus Specification 2.0, table 5-10.
 SLOW: Final = 30.0
 """The slower of the two frame rates that a Boson offers over USB [Hz]."""
 
-MODULES: Final = MappingProxyType({"boson": "uvcvideo and cdc_acm", "apt": "ftdi_sio"})
-"""Linux modules that make the nodes; ftdi_sio may have to be told of 0403:faf0."""
+MODULES: Final = MappingProxyType(
+    {("boson", "video"): "uvcvideo", ("boson", "serial"): "cdc_acm", ("apt", "serial"): "ftdi_sio"}
+)
+"""Linux module that makes the nodes of a kind and family; an old ftdi_sio is told of 0403:faf0."""
 
 
 class LibusbMissingError(RuntimeError):
@@ -138,26 +141,6 @@ def video_rate(frame_rate: float, width: int = 640, height: int = 512) -> float:
     return 16.0 * width * height * frame_rate
 
 
-def udev_rule(kind: Kind) -> str:
-    """
-    Rule that lets the user at the machine, and the group plugdev, open a device.
-
-    Parameters
-    ----------
-    kind : Kind
-        The device.
-
-    Returns
-    -------
-    str
-        One line for ``/etc/udev/rules.d/70-dbthermal.rules``; before 73, or ``uaccess`` is late.
-    """
-    return (
-        f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{kind.vendor:04x}", '
-        f'ATTR{{idProduct}}=="{kind.product:04x}", MODE="0660", GROUP="plugdev", TAG+="uaccess"'
-    )
-
-
 def find(
     backend: Any = None,
     *,
@@ -224,7 +207,11 @@ def describe(devices: Iterable[Device]) -> str:
             lines.append(f"{name} {serial}: {device.path}, {device.speed} speed, {nodes}")
             lines += [f"  ! {warning}" for warning in device.warnings]
         if not of_kind:
-            lines.append(f"{kind.name}: not found ({kind.vendor:04x}:{kind.product:04x})")
+            usb_id = f"{kind.vendor:04x}:{kind.product:04x}"
+            lines.append(
+                f"{kind.name}: not found ({usb_id}). Must be plugged in and switched on; "
+                f"'lsusb -d {usb_id}' lists it then."
+            )
     return "\n".join(lines)
 
 
@@ -250,18 +237,28 @@ def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
         return replace(device, serial=serial).warned(
             problem, f"Its nodes are not known: there is no {folder}." if kind.nodes else None
         )
-    written = folder / "serial"
-    if serial is None and written.is_file():
-        serial = written.read_text(encoding="utf-8", errors="backslashreplace").strip()
+    serial = _written(folder / "serial") if serial is None else serial
     video = _nodes(dev, folder.glob("*:*/video4linux/video*"))
     tty = _nodes(dev, [*folder.glob("*:*/tty/tty*"), *folder.glob("*:*/ttyUSB*/tty/tty*")])
     device = replace(device, serial=serial, video_nodes=video, serial_nodes=tty)
-    lacking = [
-        f"It has no {family} node. Must have its kernel driver: is {MODULES[kind.key]} loaded?"
-        for family, nodes in (("video", video), ("serial", tty))
-        if family in kind.nodes and not nodes
-    ]
-    return device.warned(problem, *lacking, *(_access(Path(node)) for node in (*video, *tty)))
+    families = {"video": video, "serial": tty}
+    lacking = [_lacking(kind, name) for name in kind.nodes if not families[name]]
+    denied = permissions.denied_nodes([*video, *tty], kind.vendor, kind.product)
+    if problem == permissions.denied_device(kind.vendor, kind.product) and serial and kind.nodes:
+        problem = None  # its number is known from sysfs, and its drivers open its nodes
+    return device.warned(problem, *lacking, *denied)
+
+
+def _lacking(kind: Kind, family: str) -> str:
+    """Say what to do for nodes that no kernel driver made."""
+    module = MODULES[kind.key, family]
+    text = f"It has no {family} node. Must have its kernel driver: run 'sudo modprobe {module}'"
+    if module != "ftdi_sio":
+        return f"{text}."
+    return (
+        f"{text}, and if there is still none, 'echo {kind.vendor:04x} {kind.product:04x} | "
+        "sudo tee /sys/bus/usb-serial/drivers/ftdi_sio/new_id'."
+    )
 
 
 def _serial_number(kind: Kind, raw: Any) -> tuple[str | None, str | None]:
@@ -287,13 +284,18 @@ def _problem(kind: Kind, error: Exception) -> str:
     """Say what an error of the bus means, and what to do."""
     number = getattr(error, "errno", None)
     if number in {errno.EACCES, errno.EPERM}:
-        return (
-            "No permission to open it. Put this line into /etc/udev/rules.d/70-dbthermal.rules, "
-            f"run 'udevadm control --reload', and plug it in again: {udev_rule(kind)}"
-        )
+        return permissions.denied_device(kind.vendor, kind.product)
     if number in {errno.ENODEV, errno.ENOENT}:
         return "It was unplugged while it was looked at."
     return f"It does not answer: {error}. Plug it in again."
+
+
+def _written(entry: Path) -> str | None:
+    """Text of an entry of sysfs; None if there is none, as of a device that was just pulled out."""
+    try:
+        return entry.read_text(encoding="utf-8", errors="backslashreplace").strip()
+    except OSError:
+        return None
 
 
 def _nodes(dev: Path, entries: Iterable[Path]) -> tuple[str, ...]:
@@ -301,17 +303,6 @@ def _nodes(dev: Path, entries: Iterable[Path]) -> tuple[str, ...]:
     names = {entry.name for entry in entries}
     ordered = sorted(names, key=lambda name: (len(re.sub(r"\D", "", name)), name))
     return tuple(str(dev / name) for name in ordered)
-
-
-def _access(node: Path) -> str | None:
-    """Say what to do if a node may not be read and written."""
-    if not node.exists() or os.access(node, os.R_OK | os.W_OK):
-        return None
-    group = node.group()
-    return (
-        f"No permission for {node}. Must be in its group '{group}': "
-        f"run 'sudo usermod -aG {group} $USER' and log in again."
-    )
 
 
 def _with_bandwidth(device: Device, cameras: list[Device], frame_rate: float) -> Device:

@@ -7,6 +7,7 @@ over a line can be noted and played back, see `dbthermal.instruments.dialogue`. 
 pseudo-terminals, not on hardware.
 """
 
+import errno
 import importlib
 from collections.abc import Callable
 from pathlib import Path
@@ -32,6 +33,7 @@ EMULATORS: Final = MappingProxyType(
 """
 
 _SCHEMES = ("serial", "pty", "sim")
+_NO_LINE = (errno.ENOTTY, errno.EINVAL)
 
 
 class TransportError(OSError):
@@ -169,19 +171,28 @@ class SerialTransport(Closing):
         -------
         bool
             False if the port has no such line, as is true of every pseudo-terminal.
+
+        Raises
+        ------
+        TransportError
+            If the device is gone.
         """
         try:
             self._port.rts = level
-        except OSError:
+        except OSError as error:
+            if error.errno not in _NO_LINE:
+                raise self._lost("set RTS of", error) from error
             return False
         return True
 
     def close(self) -> None:
         """Give the port back and end its emulator; a second time does nothing."""
-        self._port.close()
         after, self._after = self._after, None
-        if after is not None:
-            after()
+        try:
+            self._port.close()
+        finally:
+            if after is not None:
+                after()
 
     def _lost(self, action: str, error: OSError) -> TransportError:
         return TransportError(
@@ -203,7 +214,7 @@ def open_serial(
     ----------
     url : str
         ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, where the emulator
-        says which options it takes.
+        says which options it takes; ``sim://boson/wide`` is ``sim://boson?name=wide``.
     baudrate : int
         Speed of the line [bit/s].
     rtscts : bool
@@ -219,8 +230,8 @@ def open_serial(
     Raises
     ------
     ValueError
-        If the name is none of these, or a pseudo-terminal is given as a serial port, which would
-        let an emulator pass for hardware.
+        If the name is none of these, says more than is understood, or gives a pseudo-terminal as a
+        serial port, which would let an emulator pass for hardware.
     TransportError
         If the port cannot be opened.
     """
@@ -229,6 +240,8 @@ def open_serial(
         raise ValueError(f"Invalid device '{url}'. Must begin with serial://, pty:// or sim://.")
     if parts.scheme == "sim":
         return _open_emulated(url, world, baudrate=baudrate, rtscts=rtscts)
+    if parts.query or parts.fragment:
+        raise ValueError(f"Invalid device '{url}' with options. Must have none but after sim://.")
     path = parts.netloc + parts.path
     if parts.scheme == "serial" and Path(path).resolve().is_relative_to("/dev/pts"):
         raise ValueError(f"Invalid device '{url}', a pseudo-terminal. Must begin with pty://.")
@@ -245,14 +258,24 @@ def _open_emulated(
         raise ValueError(
             f"Invalid device '{url}'. Must be one of {sorted(EMULATORS)} after sim://."
         )
-    options = dict(parse_qsl(parts.query, strict_parsing=bool(parts.query)))
-    emulated = importlib.import_module(EMULATORS[parts.netloc]).start(options, world)
+    emulated = importlib.import_module(EMULATORS[parts.netloc]).start(_options(url), world)
     try:
         port = _open_port(emulated.path, baudrate=baudrate, rtscts=rtscts)
     except TransportError:
         emulated.close()
         raise
     return SerialTransport(port, url, is_simulated=True, after=emulated.close)
+
+
+def _options(url: str) -> dict[str, str]:
+    """Options of an emulator, by their names: its path is its name."""
+    parts = urlsplit(url)
+    pairs = parse_qsl(parts.query, keep_blank_values=True)
+    pairs += [("name", parts.path.removeprefix("/"))] if parts.path else []
+    options = dict(pairs)
+    if "" in options.values() or len(options) < len(pairs) or parts.fragment:
+        raise ValueError(f"Invalid device '{url}'. Must have each option once, as option=value.")
+    return options
 
 
 def _open_port(path: str, *, baudrate: int, rtscts: bool) -> serial.Serial:

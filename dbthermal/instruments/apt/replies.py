@@ -111,11 +111,11 @@ class Info:
         return cls(serial_number, text, kind, firmware, hardware, modification, channels, notes)
 
     def pack(self) -> bytes:
-        """Return the data of the message; ValueError if the model does not fit."""
+        """Return the data of the message; ValueError if the model or a number does not fit."""
         major, interim, minor = (int(part) for part in self.firmware.split("."))
         kind = (self.serial_number, _text("model", self.model, 8), self.type)
         versions = (self.hardware, self.modification, self.channels)
-        return _INFO.pack(*kind, minor, interim, major, 0, self.notes, *versions)
+        return _packed(_INFO, self, *kind, minor, interim, major, 0, self.notes, *versions)
 
 
 @dataclass(frozen=True)
@@ -165,8 +165,8 @@ class Status:
         return cls(channel, position, encoder, StatusBits(bits))
 
     def pack(self) -> bytes:
-        """Return the data of the message, in its shorter form."""
-        return _STATUS.pack(self.channel, self.position, self.encoder, int(self.bits))
+        """Return the data, in its shorter form; ValueError if a number does not fit its field."""
+        return _packed(_STATUS, self, self.channel, self.position, self.encoder, int(self.bits))
 
 
 @dataclass(frozen=True)
@@ -183,10 +183,7 @@ class _Numbers:
 
     def pack(self) -> bytes:
         """Return the data of the message; ValueError if a number does not fit its field."""
-        try:
-            return self._FORMAT.pack(*astuple(self))
-        except struct.error as error:
-            raise ValueError(f"Invalid {self}. Its fields must hold it: {error}.") from error
+        return _packed(self._FORMAT, self, *astuple(self))
 
 
 @dataclass(frozen=True)
@@ -295,8 +292,8 @@ class Notice:
         return cls(cause, code, text)
 
     def pack(self) -> bytes:
-        """Return the data of HW_RICHRESPONSE; ValueError if the notes do not fit."""
-        return _NOTICE.pack(self.id, self.code, _text("notes", self.notes, 64))
+        """Return the data of HW_RICHRESPONSE; ValueError if the notes or a number do not fit."""
+        return _packed(_NOTICE, self, self.id, self.code, _text("notes", self.notes, 64))
 
 
 def is_enabled(message: Message) -> bool:
@@ -313,6 +310,14 @@ def status_bits(message: Message) -> StatusBits:
     """State of the motor, from MOT_GET_STATUSBITS; ValueError if another."""
     data = _data(message, {Id.MOT_GET_STATUSBITS}, _STATUS_BITS.size)
     return StatusBits(_STATUS_BITS.unpack(data)[1])
+
+
+def _packed(layout: struct.Struct, record: object, *fields: int | bytes) -> bytes:
+    """Return the fields of a record as bytes, if each fits."""
+    try:
+        return layout.pack(*fields)
+    except struct.error as error:
+        raise ValueError(f"Invalid {record}. Its fields must hold it: {error}.") from error
 
 
 def _text(name: str, text: str, size: int) -> bytes:

@@ -255,10 +255,11 @@ class Boson(Closing):
 
         def finished() -> int | None:
             nonlocal changed
-            if self.read(commands.FFC_IN_PROGRESS) or self.ffc_status() != FfcStatus.COMPLETE:
+            in_progress = self._read(commands.FFC_IN_PROGRESS, 0)
+            if in_progress or self._read(commands.FFC_STATUS, 0) != FfcStatus.COMPLETE:
                 changed = True
                 return None
-            last = self.read(commands.LAST_FFC_FRAME)
+            last = self._read(commands.LAST_FFC_FRAME, 0)
             return last if changed or last != before else None
 
         self.start_ffc()
@@ -305,8 +306,8 @@ class Boson(Closing):
             If they do not come; external synchronisation is then disabled. If the camera does not
             answer either, its mode is unknown.
         """
-        self.set(commands.SYNC_MODE, SyncMode.SLAVE)
-        try:
+        try:  # a mode that was set without an answer has to be undone too
+            self.set(commands.SYNC_MODE, SyncMode.SLAVE)
             goal = self.frame_count() + frames
             self._wait(f"{frames} frames", lambda: self.frame_count() >= goal or None, timeout)
         except BosonError as error:

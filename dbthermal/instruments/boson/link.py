@@ -28,11 +28,11 @@ MAXIMUM_RECEIVED: Final = 65536
 _READ_SIZE = 4096
 
 
-class BosonError(Exception):
+class BosonError(RuntimeError):
     """The camera did not do what it was asked to."""
 
 
-class BosonTimeoutError(BosonError):
+class BosonTimeoutError(BosonError, TimeoutError):
     """No reply came in time; a command that changes the camera may have been carried out."""
 
 
@@ -179,8 +179,9 @@ class Link(Closing):
             )
 
     def close(self) -> None:
-        """Give the line back; a second time does nothing."""
-        self._transport.close()
+        """Give the line back, once an exchange of another thread is over; twice is as once."""
+        with self._lock:
+            self._transport.close()
 
     def _exchange(self, name: str, command: int, data: bytes) -> bytes:
         """Send one request and return the data of its reply."""

@@ -20,7 +20,7 @@ from dbthermal.instruments import apt
 from dbthermal.instruments.apt.codec import CONTROLLERS
 from dbthermal.instruments.emulated.apt_faults import MODELS, Faults
 from dbthermal.instruments.emulated.apt_motor import Drive, Motor
-from dbthermal.instruments.emulated.port import EmulatedPort
+from dbthermal.instruments.emulated.port import EmulatedPort, number
 from dbthermal.instruments.emulated.world import World
 
 SERIAL_NUMBER: Final = 40_000_000
@@ -188,7 +188,7 @@ class EmulatedApt:
 
     def _tell(self, message: apt.Message) -> None:
         """Answer a question about the motor."""
-        counter = apt.Position(1, self.motor.position)
+        counter = apt.Position(1, self.motor.counter)
         bits = self._status().bits
         answers = {
             apt.Id.MOT_REQ_POSCOUNTER: (apt.Id.MOT_GET_POSCOUNTER, counter.pack()),
@@ -249,7 +249,7 @@ class EmulatedApt:
         bits = self.motor.bits | self.faults.stuck
         if self._info.model == "SCC201":
             bits |= apt.StatusBits.JOGGING_FORWARD
-        return apt.Status(1, self.motor.position, 0, bits)
+        return apt.Status(1, self.motor.counter, 0, bits)
 
     def _enable(self, message: apt.Message) -> None:
         self.motor.enabled = message.param2 == 1
@@ -318,7 +318,8 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     Parameters
     ----------
     options : mapping
-        ``model``, ``sn`` (serial number) and ``offset`` (slot 1 from the home switch [deg]).
+        ``model``, ``sn`` (serial number), ``offset`` (slot 1 from the home switch [deg]) and
+        ``name``, which says nothing more: a world has one wheel.
     world : World or None
         What it is part of, or None for one of its own.
 
@@ -332,13 +333,13 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     ValueError
         If an option is not known or is no number.
     """
-    unknown = sorted(options.keys() - {"model", "sn", "offset"})
+    unknown = sorted(options.keys() - {"model", "sn", "offset", "name"})
     if unknown:
-        raise ValueError(f"Unknown option '{unknown[0]}'. Must be model, sn or offset.")
+        raise ValueError(f"Unknown option '{unknown[0]}'. Must be model, sn, offset or name.")
     device = EmulatedApt(
         World() if world is None else world,
         model=options.get("model", "BSC201"),
-        serial_number=int(options.get("sn", str(SERIAL_NUMBER))),
-        slot_offset=float(options.get("offset", "0")),
+        serial_number=number(options, "sn", SERIAL_NUMBER, (0, (1 << 32) - 1)),
+        slot_offset=number(options, "offset", 0.0, (-360.0, 360.0)),
     )
     return EmulatedPort(device)

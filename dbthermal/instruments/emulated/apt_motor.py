@@ -111,6 +111,11 @@ class Motor:
         self.drive: Drive | None = None
 
     @property
+    def counter(self) -> int:
+        """The position as a controller counts it, in 32 bits: a motor that runs on wraps round."""
+        return (self.position + (1 << 31)) % (1 << 32) - (1 << 31)
+
+    @property
     def bits(self) -> StatusBits:
         """State, as the controller reports it."""
         bits = StatusBits.CONNECTED

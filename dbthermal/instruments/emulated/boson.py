@@ -18,8 +18,8 @@ from dbthermal.instruments import fslp
 from dbthermal.instruments.boson import commands
 from dbthermal.instruments.boson.commands import FfcMode, FfcStatus, Setting, SyncMode
 from dbthermal.instruments.emulated.boson_faults import Fault, Faults, misshapen
-from dbthermal.instruments.emulated.port import EmulatedPort
-from dbthermal.instruments.emulated.world import FFC_DURATION, CameraState, World
+from dbthermal.instruments.emulated.port import EmulatedPort, number
+from dbthermal.instruments.emulated.world import FFC_DURATION, FPA, CameraState, World
 
 SERIAL_NUMBER: Final = 93588
 """Of an emulated camera that nobody numbered: that of the public example."""
@@ -45,6 +45,8 @@ DEFAULTS: Final = MappingProxyType(
 )
 """Settings at first power-on, by the identifier that reads them; not those of a real camera."""
 
+_SERIAL_NUMBERS = (0, (1 << 32) - 1)
+_FPA_TEMPERATURES = (0.0, 655.0)  # [K] what its counts, 100 /K in 16 bits, hold
 _STATUS, _RANGE, _FEW, _MANY, _UNKNOWN = 0x162, 0x203, 0x17D, 0x17E, 0x161
 _BUSY = 0x283
 
@@ -163,6 +165,7 @@ class EmulatedBoson:
     def _advance(self) -> None:
         """Let the time that went by since the last call have its effects."""
         now = self._world.time
+        self._camera.streaming = self.streaming  # an emulated frame source looks at it
         if self._free_running:
             frames = math.floor((now - self._counted) * FRAME_RATE + 1e-6)
             self._camera.frame_count += frames if self.streaming else 0
@@ -311,9 +314,9 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     Parameters
     ----------
     options : mapping
-        ``camera``, its name in the world (``"boson"`` unless given); ``sn``, its serial number,
-        and ``fpa``, the temperature of its focal-plane array [K], if the world has no such camera;
-        ``frames``, ``"source"`` where an emulated frame source counts the frames.
+        ``camera`` or ``name``, its name in the world (``"boson"`` unless given); ``sn``, its serial
+        number, and ``fpa``, the temperature of its focal-plane array [K], if the world has no such
+        camera; ``frames``, ``"source"`` where an emulated frame source counts the frames.
     world : World or None
         What it is part of, or None for one of its own.
 
@@ -327,15 +330,17 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     ValueError
         If an option is not known, is no number, or disagrees with the world.
     """
-    unknown = sorted(options.keys() - {"camera", "sn", "fpa", "frames"})
-    if unknown:
-        raise ValueError(f"Unknown option '{unknown[0]}'. Must be camera, sn, fpa or frames.")
+    unknown = sorted(options.keys() - {"camera", "name", "sn", "fpa", "frames"})
+    if unknown or {"camera", "name"} <= options.keys():
+        wrong = unknown[0] if unknown else "camera' beside 'name"
+        raise ValueError(f"Unknown option '{wrong}'. Must be camera (or name), sn, fpa or frames.")
     world = World() if world is None else world
-    name = options.get("camera", "boson")
+    name = options.get("camera", options.get("name", "boson"))
+    serial_number = number(options, "sn", SERIAL_NUMBER, _SERIAL_NUMBERS)
+    fpa_temperature = number(options, "fpa", FPA, _FPA_TEMPERATURES)
     if name not in world.cameras:
-        camera = world.add_camera(name, int(options.get("sn", SERIAL_NUMBER)))
-        if "fpa" in options:
-            camera.fpa_temperature = camera.last_ffc_temperature = float(options["fpa"])
+        camera = world.add_camera(name, serial_number)
+        camera.fpa_temperature = camera.last_ffc_temperature = fpa_temperature
     elif {"sn", "fpa"} & options.keys():
         raise ValueError(f"Invalid options sn, fpa of camera '{name}'. Must be set in its world.")
     if options.get("frames", "source") != "source":

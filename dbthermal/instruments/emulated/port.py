@@ -11,8 +11,8 @@ import threading
 import time as system_time
 import tty
 from collections import deque
-from collections.abc import Callable
-from typing import Final, Protocol
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol, TypeVar
 
 from dbthermal.instruments.transport import Closing, TransportError
 
@@ -20,6 +20,8 @@ TICK: Final = 0.01
 """Longest time after which a port looks whether it is to end, or the device was pulled out [s]."""
 
 _READ_SIZE = 4096
+
+Number = TypeVar("Number", bound=float)
 
 
 class Device(Protocol):
@@ -43,8 +45,8 @@ class EmulatedPort(Closing):
     """
     A raw pseudo-terminal on which a thread lets an emulated device answer.
 
-    If the device is pulled out the terminal hangs up, as a real one does. What a driver does not
-    read is kept, without blocking the device.
+    If the device is pulled out, or an error in it ends the thread, the terminal hangs up, as a real
+    one does. What a driver does not read is kept, without blocking the device.
 
     Parameters
     ----------
@@ -79,6 +81,14 @@ class EmulatedPort(Closing):
         self._thread.join()
 
     def _serve(self) -> None:
+        try:
+            self._let_talk()
+        finally:
+            os.close(self._master)
+            os.close(self._slave)
+
+    def _let_talk(self) -> None:
+        """Carry bytes until the device is pulled out, or the port is closed."""
         waiting: deque[bytes] = deque()
         while self.device.plugged and not self._ending.is_set():
             timeout = min(TICK, max(0.0, self.device.next_due()))
@@ -92,8 +102,6 @@ class EmulatedPort(Closing):
                 rest = piece[os.write(self._master, piece) :]
                 if rest:
                     waiting.appendleft(rest)
-        os.close(self._master)
-        os.close(self._slave)
 
 
 class Loop(Closing):
@@ -156,3 +164,46 @@ class Loop(Closing):
     def _check(self) -> None:
         if self._closed or not self._device.plugged:
             raise TransportError("Lost the emulated device. It must stay connected and open.")
+
+
+def number(
+    options: Mapping[str, str], name: str, default: Number, limits: tuple[Number, Number]
+) -> Number:
+    """
+    Number that an option of an emulator's address gives, as in ``sim://boson?sn=7``.
+
+    Parameters
+    ----------
+    options : mapping
+        Text of each option by its name.
+    name : str
+        Of the option.
+    default : int or float
+        Without it; a whole number if only such ones are allowed.
+    limits : tuple
+        Least and largest number that is allowed.
+
+    Returns
+    -------
+    int or float
+        As `default` is.
+
+    Raises
+    ------
+    ValueError
+        If it is no such number.
+    """
+    if name not in options:
+        return default
+    lowest, highest = limits
+    try:
+        value = type(default)(options[name])
+        allowed = lowest <= value <= highest  # which NaN is not
+    except ValueError:
+        allowed = False
+    if not allowed:
+        raise ValueError(
+            f"Invalid option {name}={options[name]} of an emulator. "
+            f"Must be a number ({type(default).__name__}) in {lowest} to {highest}."
+        )
+    return value

@@ -8,8 +8,10 @@ so that a test sees it. No device's own protocol is emulated here.
 import errno
 from array import array
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, Final, Literal, NoReturn
 
@@ -278,6 +280,27 @@ def write_sysfs(root: Path, backend: EmulatedBackend) -> None:
         link = root / "bus" / "usb" / "devices" / name
         link.parent.mkdir(parents=True, exist_ok=True)
         link.symlink_to(real)
+
+
+@contextmanager
+def rig() -> Iterator[dict[str, Any]]:
+    """
+    Plug in two cameras on a bus each, a wheel's controller and a thermocouple logger.
+
+    Yields
+    ------
+    dict
+        Arguments for `dbthermal.instruments.inventory.find`; the files behind them are removed in
+        the end.
+    """
+    backend = EmulatedBackend(boson(1), boson(2, bus=2), apt(), tc08())
+    with TemporaryDirectory() as folder:
+        root = Path(folder)
+        write_sysfs(root, backend)
+        for node in (node for device in backend.devices for _, node in device.nodes.values()):
+            (root / "dev").mkdir(exist_ok=True)
+            (root / "dev" / node).touch()
+        yield {"backend": backend, "sysfs": root, "dev": root / "dev"}
 
 
 def string_descriptor(device: EmulatedDevice, index: int) -> bytes:

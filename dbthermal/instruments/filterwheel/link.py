@@ -18,6 +18,9 @@ ATTEMPTS: Final = 2
 READ_SIZE: Final = 256
 """Most bytes that are read at once."""
 
+MAXIMUM_UNASKED: Final = 65536
+"""Most bytes that may have come unasked: a line that talks without end is another device's."""
+
 _EVENTS = (apt.Id.MOT_MOVE_COMPLETED, apt.Id.MOT_MOVE_STOPPED, apt.Id.MOT_MOVE_HOMED)
 _NOTICES = (apt.Id.HW_RESPONSE, apt.Id.HW_RICHRESPONSE)
 _LOGGER = logging.getLogger(__name__)
@@ -53,7 +56,7 @@ class NotHomedError(WheelError):
 
 class Link:
     """
-    One controller at the other end of a line.
+    One controller at the other end of a line, for one thread at a time.
 
     Parameters
     ----------
@@ -126,6 +129,8 @@ class Link:
         ------
         NoReplyError
             If there was none.
+        WrongDeviceError
+            If more than `MAXIMUM_UNASKED` bytes came before.
         TransportError
             If the device is gone.
         """
@@ -191,8 +196,14 @@ class Link:
 
     def _collect(self) -> None:
         """Take in what has come so far."""
+        count = 0
         while received := self._transport.read(READ_SIZE, 0.0):
             self._sorted(received)
+            count += len(received)
+            if count > MAXIMUM_UNASKED:
+                raise WrongDeviceError(
+                    f"More than {MAXIMUM_UNASKED} bytes came unasked. Must be an APT controller."
+                )
 
     def _sorted(self, received: bytes) -> list[apt.Message]:
         """Keep events and notices, return the other messages."""

@@ -11,7 +11,7 @@ from typing import Final
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.filterwheel.controller import Controller
-from dbthermal.instruments.filterwheel.link import StalledWheelError, WheelError, WheelTimeoutError
+from dbthermal.instruments.filterwheel.link import StalledWheelError, WheelTimeoutError
 from dbthermal.instruments.filterwheel.settings import Settings
 
 MOVING: Final = (
@@ -61,7 +61,8 @@ class Motion:
         Raises
         ------
         StalledWheelError
-            If it does not start, stands still, or comes to rest elsewhere.
+            If it does not start, stands still, comes to rest elsewhere, or the controller reports
+            one of the settings' `faults`.
         WheelTimeoutError
             If it takes longer than the settings' `move_timeout`.
         WheelError
@@ -88,7 +89,8 @@ class Motion:
         Raises
         ------
         StalledWheelError
-            If the wheel does not start, or comes to rest before the switch was found.
+            If the wheel does not start, comes to rest before the switch was found, or the
+            controller reports one of the settings' `faults`.
         WheelTimeoutError
             If it takes longer than the settings' `home_timeout`.
         WheelError
@@ -129,7 +131,9 @@ class Motion:
         faults = status.bits & self._settings.faults
         if faults:
             controller.stop()
-            raise WheelError(f"The controller reports {faults!r}. Must be none.")
+            raise StalledWheelError(
+                f"The controller reports {faults.name}, and the wheel was stopped. Must be none."
+            )
         watch.look(status, self._clock())
         watch.reported |= controller.link.take_event(end, controller.motor)
         return status

@@ -21,6 +21,10 @@ POSITIONS: Final = 6
 """Slots of the wheel, numbered from 1."""
 
 _DEGREES = 360.0
+_POSITIVE = (
+    *("velocity", "home_velocity", "acceleration", "tolerance", "reply_timeout", "home_timeout"),
+    *("move_timeout", "start_timeout", "stall_timeout", "poll_interval"),
+)
 _HOME = {"home_direction": (1, 2), "home_limit_switch": (1, 4)}
 
 
@@ -140,7 +144,7 @@ class Settings:
     acceleration : float
         [turn/s^2].
     tolerance : float
-        How far from a slot the wheel may be [deg].
+        How far from a slot the wheel may be [deg], less than half the way to the next, 30.
     models : mapping
         How the names of the controllers begin that are accepted, and their scales.
     addresses : tuple of tuple
@@ -187,10 +191,14 @@ class Settings:
 
     def __post_init__(self) -> None:
         self._check_filters()
-        for name in ("velocity", "home_velocity", "acceleration", "tolerance"):
+        for name in _POSITIVE:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"Invalid {name} {value} of the wheel. Must be positive.")
+        if self.tolerance >= _DEGREES / POSITIONS / 2:
+            raise ValueError(f"Invalid tolerance {self.tolerance} deg. Must be less than 30 deg.")
+        if not self.addresses:
+            raise ValueError("Invalid addresses () of the wheel. Must be one pair at least.")
         if not -_DEGREES < self.home_offset < _DEGREES:
             raise ValueError(f"Invalid home_offset {self.home_offset}. Must lie in (-360, 360).")
         for name, allowed in _HOME.items():

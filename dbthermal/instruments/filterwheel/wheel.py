@@ -26,7 +26,7 @@ _LOGGER = logging.getLogger(__name__)
 
 class FilterWheel(Closing):
     """
-    A filter wheel whose line is open; see `open`.
+    A filter wheel whose line is open, for one thread at a time; see `open`.
 
     Parameters
     ----------
@@ -164,7 +164,8 @@ class FilterWheel(Closing):
         Raises
         ------
         StalledWheelError
-            If the wheel does not start, or stops before the switch was found.
+            If the wheel does not start, stops before the switch was found, or the controller
+            reports one of the settings' `faults`.
         WheelTimeoutError
             If the switch is not found within the settings' `home_timeout`; the wheel was stopped.
         WheelError
@@ -195,7 +196,8 @@ class FilterWheel(Closing):
         NotHomedError
             If the controller was not homed since it was switched on, or steps may be lost since.
         StalledWheelError
-            If the wheel does not move, or stops elsewhere.
+            If the wheel does not move, stops elsewhere, or the controller reports one of the
+            settings' `faults`: steps may be lost, and it must be homed before the next move.
         WheelTimeoutError
             If it takes longer than the settings' `move_timeout`; the wheel was stopped.
         WheelError

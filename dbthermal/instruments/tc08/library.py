@@ -57,7 +57,7 @@ ERRORS: Final[Mapping[int, str]] = {
 """Meaning of the library's error numbers; 15 and 16 are often taken for one another."""
 
 
-class TC08Error(Exception):
+class TC08Error(RuntimeError):
     """
     A function of the library failed.
 

@@ -26,6 +26,10 @@ Fetched = tuple[npt.NDArray[np.int64], Array, bool]
 
 # [ms] The library's times begin anew after 24 days: at 2^31 ms, if they are what their type holds.
 _WRAP = 2**31
+
+LONGEST: Final = (_WRAP - 1) / 1000.0
+"""Longest interval of a stream [s], for which 32 bits hold the milliseconds."""
+
 # [interval] Farthest a sample of the cold junction may lie from that of a channel.
 _NEAR = 1.5
 

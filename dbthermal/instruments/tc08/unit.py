@@ -16,7 +16,7 @@ from dbthermal.instruments.tc08.channels import Channels, Conversion
 from dbthermal.instruments.tc08.library import CHANNELS, Library, TC08Error
 from dbthermal.instruments.tc08.opening import OPEN_TIMEOUT, Info
 from dbthermal.instruments.tc08.readings import Scan
-from dbthermal.instruments.tc08.stream import Stream
+from dbthermal.instruments.tc08.stream import LONGEST, Stream
 
 if TYPE_CHECKING:
     from dbthermal.instruments.emulated.tc08 import Bench
@@ -307,16 +307,16 @@ class TC08:
         Raises
         ------
         ValueError
-            If the interval is shorter than `minimum_interval`, or not whole.
+            If the interval is shorter than `minimum_interval`, not whole, or beyond 24 days.
         TC08Error, RuntimeError
             If the library fails, the unit is not open, no channels are set, or it streams.
         """
-        handle = self._ready_handle()
-        shortest, asked = self.minimum_interval(), round(1000.0 * interval)
-        if interval < shortest or abs(1000.0 * interval - asked) > _WHOLE:
+        handle, shortest = self._ready_handle(), self.minimum_interval()
+        asked = round(1000.0 * interval) if shortest <= interval <= LONGEST else 0
+        if not asked or abs(1000.0 * interval - asked) > _WHOLE:
             raise ValueError(
                 f"Invalid interval {interval} s of {len(self._channels.kinds)} channels. "
-                f"Must be {shortest} s or longer, and whole milliseconds."
+                f"Must be {shortest} s or longer, to {LONGEST} s, and whole milliseconds."
             )
         actual = self._require(self._library.usb_tc08_run(handle, asked), "start to stream")
         self._stream = Stream(

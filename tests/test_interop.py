@@ -1,0 +1,147 @@
+"""Checks by other hands: independent programs against the codecs, the emulator and the tables.
+
+Each test runs where its package can be imported: flirpy 0.6.2 (MIT), thorlabs-apt-protocol 29.0.0
+(MIT) and thermocouple-its90 1.0.2 (MIT). None of them is needed by the package.
+"""
+
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from dbthermal.instruments import apt, thermocouple
+from dbthermal.instruments.emulated.boson import EmulatedBoson
+from dbthermal.instruments.emulated.port import EmulatedPort
+from dbthermal.instruments.emulated.world import World
+
+TO = apt.BAY_1
+SPEEDS = apt.VelocityParameters(1, minimum=0, acceleration=0x35B0, maximum=0x00CCCCCD)
+HOME = apt.HomeParameters(1, 2, 1, 4_397_466, -50)
+# By the function of thorlabs-apt-protocol, in its spelling: what is built here, and its arguments.
+REQUESTS: dict[str, tuple[bytes, dict[str, int]]] = {
+    "hw_disconnect": (apt.disconnect(destination=TO), {}),
+    "hw_no_flash_programming": (apt.no_flash_programming(destination=TO), {}),
+    "hw_req_info": (apt.request_info(destination=TO), {}),
+    "hw_start_updatemsgs": (apt.start_updates(destination=TO), {}),
+    "hw_stop_updatemsgs": (apt.stop_updates(destination=TO), {}),
+    "rack_req_bayused": (apt.request_bay_used(3, destination=TO), {"bay_ident": 3}),
+    "mod_identify": (apt.identify(1, destination=TO), {"chan_ident": 1}),
+    "mod_set_chanenablestate": (
+        apt.set_channel_enabled(1, enabled=True, destination=TO),
+        {"chan_ident": 1, "enable_state": 1},
+    ),
+    "mod_req_chanenablestate": (
+        apt.request_channel_enabled(1, destination=TO),
+        {"chan_ident": 1},
+    ),
+    "mot_set_poscounter": (
+        apt.set_position(1, -7, destination=TO),
+        {"chan_ident": 1, "position": -7},
+    ),
+    "mot_req_poscounter": (apt.request_position(1, destination=TO), {"chan_ident": 1}),
+    "mot_set_velparams": (
+        apt.set_velocity_parameters(SPEEDS, destination=TO),
+        {"chan_ident": 1, "min_velocity": 0, "acceleration": 0x35B0, "max_velocity": 0x00CCCCCD},
+    ),
+    "mot_req_velparams": (apt.request_velocity_parameters(1, destination=TO), {"chan_ident": 1}),
+    "mot_set_homeparams": (
+        apt.set_home_parameters(HOME, destination=TO),
+        {
+            "chan_ident": 1,
+            "home_dir": 2,
+            "limit_switch": 1,
+            "home_velocity": 4_397_466,
+            "offset_distance": -50,
+        },
+    ),
+    "mot_req_homeparams": (apt.request_home_parameters(1, destination=TO), {"chan_ident": 1}),
+    "mot_move_home": (apt.home(1, destination=TO), {"chan_ident": 1}),
+    "mot_move_absolute": (
+        apt.move_absolute(1, 68_267, destination=TO),
+        {"chan_ident": 1, "position": 68_267},
+    ),
+    "mot_move_relative": (
+        apt.move_relative(1, -9, destination=TO),
+        {"chan_ident": 1, "distance": -9},
+    ),
+    "mot_move_stop": (apt.stop(1, destination=TO), {"chan_ident": 1, "stop_mode": 2}),
+    "mot_req_statusupdate": (apt.request_status(1, destination=TO), {"chan_ident": 1}),
+    "mot_req_dcstatusupdate": (apt.request_dc_status(1, destination=TO), {"chan_ident": 1}),
+    "mot_ack_dcstatusupdate": (apt.acknowledge_status(destination=TO), {}),
+    "mot_suspend_endofmovemsges": (apt.suspend_end_of_move(destination=TO), {}),
+    "mot_resume_endofmovemsges": (apt.resume_end_of_move(destination=TO), {}),
+}
+
+
+@pytest.fixture
+def protocol() -> ModuleType:
+    """Another implementation of APT."""
+    module: ModuleType = pytest.importorskip("thorlabs_apt_protocol")
+    return module
+
+
+def test_requests_agree(protocol: ModuleType) -> None:
+    """thorlabs-apt-protocol builds the same bytes, of every message that both know."""
+    built = {name: request for name, (request, _) in REQUESTS.items()}
+    assert built == {
+        name: getattr(protocol, name)(dest=TO, source=apt.HOST, **arguments)
+        for name, (_, arguments) in REQUESTS.items()
+    }
+
+
+def test_replies_agree(protocol: ModuleType) -> None:
+    """thorlabs-apt-protocol reads the same out of what a controller answers."""
+    unpacker = protocol.Unpacker()
+    status = apt.Status(1, -68_267, 0, apt.StatusBits.REVERSE_LIMIT | apt.StatusBits.HOMED)
+    answers = [
+        (apt.Id.MOT_GET_STATUSUPDATE, status.pack()),
+        (apt.Id.MOT_GET_POSCOUNTER, apt.Position(1, 200_000).pack()),
+        (apt.Id.HW_GET_INFO, apt.Info(94_000_009, "BSC201", 45, "57.1.2", 1, 3, 1).pack()),
+        (apt.Id.MOT_GET_HOMEPARAMS, HOME.pack()),
+        (apt.Id.MOT_GET_VELPARAMS, SPEEDS.pack()),
+    ]
+    for identifier, data in answers:
+        unpacker.feed(apt.encode(apt.Message(identifier, 0, 0, apt.HOST, TO, data)))
+    where, counter, info, homes, speeds = list(unpacker)
+    assert (where.position, where.reverse_limit_switch, where.homed) == (-68_267, True, True)
+    assert counter.position == 200_000
+    assert (info.serial_number, info.nchs, list(info.firmware_version)) == (
+        *(94_000_009, 1),
+        [57, 1, 2],
+    )
+    assert (homes.home_velocity, homes.offset_distance) == (HOME.velocity, HOME.offset)
+    assert (speeds.acceleration, speeds.max_velocity) == (SPEEDS.acceleration, SPEEDS.maximum)
+
+
+def test_flirpy_understands_the_emulated_boson() -> None:
+    """Flirpy, unchanged, reads and sets; its known error of the sign is seen, too."""
+    flirpy = pytest.importorskip("flirpy.camera.boson")
+    world = World()
+    state = world.add_camera("boson", 93588)
+    state.fpa_temperature = state.last_ffc_temperature = 273.15 + 43.1  # its checksum is escaped
+    with EmulatedPort(EmulatedBoson(world, "boson")) as port:
+        camera = flirpy.Boson(port=port.path)
+        assert (camera.get_camera_serial(), camera.get_fpa_temperature()) == (93588, 43.1)
+        assert camera.get_part_number().strip("\0 ") == "EMULATED-BOSON-640"
+        camera.set_ffc_manual()
+        camera.do_ffc()
+        assert (camera.get_ffc_mode(), camera.get_ffc_state(), state.ffc_count) == (0, 1, 1)
+        camera.set_ffc_auto()
+        assert camera.get_ffc_mode() == 1
+        state.fpa_temperature = 260.85
+        assert camera.get_fpa_temperature() == 6541.3
+        camera.close()
+
+
+def test_type_t_agrees() -> None:
+    """thermocouple-its90 has the same voltages and temperatures, with a cold junction too."""
+    other = pytest.importorskip("thermocouple_its90").TypeT
+    celsius = np.arange(-270.0, 400.5, 0.5)
+    voltage = [other.emf(float(value)) for value in celsius]
+    inside = np.clip(celsius + thermocouple.ICE_POINT, 3.15, 673.15)  # the sum's rounding
+    assert_allclose(thermocouple.emf(inside), voltage, rtol=0, atol=1e-9)  # [mV]
+    emf = np.arange(-5.0, 19.5, 0.1)
+    tips = [other.temperature(float(value), reference=25.0) for value in emf]
+    found = thermocouple.temperature(emf, 298.15) - thermocouple.ICE_POINT
+    assert_allclose(found, tips, rtol=0, atol=1e-6)  # [K]
