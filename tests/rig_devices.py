@@ -1,0 +1,111 @@
+"""Emulated devices of the rig below their drivers, on a clock of their own, for several tests."""
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from dbthermal.instruments import apt, fslp
+from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.emulated.apt import EmulatedApt
+from dbthermal.instruments.emulated.boson import EmulatedBoson
+from dbthermal.instruments.emulated.boson_faults import Fault
+from dbthermal.instruments.emulated.port import Loop
+from dbthermal.instruments.emulated.tc08 import EmulatedTC08
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.filterwheel import FilterWheel, Settings
+from dbthermal.instruments.tc08 import TC08
+
+FILTERS = {1: "open", 3: "9.5", 5: "LW"}
+
+
+class Clock:
+    """
+    Time that passes only when somebody waits.
+
+    Attributes
+    ----------
+    now : float
+        The time [s].
+    events : list of tuple
+        What is to be done, and when [s].
+    """
+
+    def __init__(self, now: float = 100.0) -> None:
+        self.now = now
+        self.events: list[tuple[float, Callable[[], None]]] = []
+
+    def __call__(self) -> float:
+        """Time [s]."""
+        return self.now
+
+    def sleep(self, duration: float) -> None:
+        """Let time pass [s], and do what is due."""
+        self.now += duration
+        due = [event for event in self.events if event[0] <= self.now]
+        for event in due:
+            self.events.remove(event)
+            event[1]()
+
+
+class BosonBench:
+    """An emulated camera and its driver, on one clock."""
+
+    def __init__(self, serial_number: int = 93588) -> None:
+        self.clock = Clock()
+        self.world = World(clock=self.clock)
+        self.state = self.world.add_camera("boson", serial_number)
+        self.device = EmulatedBoson(self.world, "boson")
+        self.loop = Loop(self.device, clock=self.clock, sleep=self.clock.sleep)
+        self.camera = Boson(self.loop, first_sequence=1, clock=self.clock, sleep=self.clock.sleep)
+
+    def spoil(self, *faults: Fault | None) -> None:
+        """Give the next requests these faults."""
+        self.device.faults.once = deque(faults)
+
+    def exchange(self, request: bytes) -> list[fslp.Frame]:
+        """Send bytes past the driver and decode what comes back."""
+        self.loop.write(request)
+        return fslp.Decoder().feed(self.loop.read(4096, 0.1))
+
+
+class WheelBench:
+    """An emulated wheel, and the driver that turns it, on one clock that takes no time."""
+
+    def __init__(self, model: str = "BSC201", slot_offset: float = 0.0, **options: object) -> None:
+        self.clock = Clock(0.0)
+        self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
+        self.device = EmulatedApt(self.world, model=model, slot_offset=slot_offset)
+        loop = Loop(self.device, clock=self.clock, sleep=self.clock.sleep)
+        chosen = Settings(filters=FILTERS, **options)  # type: ignore[arg-type]
+        self.wheel = FilterWheel(loop, chosen, clock=self.clock, sleep=self.clock.sleep)
+
+    def homed(self) -> FilterWheel:
+        """Connect and home the wheel."""
+        self.wheel.connect()
+        self.wheel.home()
+        return self.wheel
+
+    def sent(self, identifier: apt.Id) -> list[apt.Message]:
+        """What the driver sent of one kind."""
+        return [message for message in self.device.received if message.id == identifier]
+
+
+class LoggerBench:
+    """A driver on an emulated unit, a clock, and tips whose temperatures a test sets."""
+
+    def __init__(self, **settings: float) -> None:
+        self.clock = Clock(1000.0)
+        self.tips = {1: 350.0, 2: 300.0}
+        self.unit = EmulatedTC08(
+            lambda channel, _: self.tips.get(channel, np.nan),
+            clock=self.clock,
+            sleep=self.clock.sleep,
+            **settings,  # type: ignore[arg-type]
+        )
+        self.driver = TC08(self.unit, clock=self.clock, sleep=self.clock.sleep)
+
+    def ready(self, conversion: str = "library") -> TC08:
+        """Open the unit with two thermocouples of type T."""
+        self.driver.open().set_channels({1: "T", 2: "T"}, conversion=conversion)  # type: ignore[arg-type]
+        return self.driver

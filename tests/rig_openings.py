@@ -1,0 +1,142 @@
+"""How each device of the rig is opened for its tests: on a stub, on its emulator, on hardware."""
+
+import os
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from rig_devices import FILTERS, BosonBench, Clock, LoggerBench, WheelBench
+from rig_stubs import StubCamera, StubController, StubLibrary
+from test_v4l2 import BYTES, GOOD, STREAM, Driver
+
+from dbthermal.instruments import v4l2
+from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.emulated.apt import start as start_wheel
+from dbthermal.instruments.emulated.boson import start as start_camera
+from dbthermal.instruments.emulated.frames import EmulatedCamera
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.filterwheel import FilterWheel, Settings
+from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.v4l2_calls import Stream
+
+QUICK = Settings(filters=FILTERS, reply_timeout=5.0, poll_interval=0.005)
+
+
+def address(name: str) -> str:
+    """Name of a real device, from the environment."""
+    if name not in os.environ:
+        pytest.fail(f"{name} is not set: it names the device to test")
+    return os.environ[name]
+
+
+class Opened(NamedTuple):
+    """A device, whether hardware is behind it, and how a second client would open it."""
+
+    device: Any
+    is_simulated: bool
+    again: Callable[[], object] | None = None
+
+
+def stub_camera(_: ExitStack) -> Opened:
+    """A Boson's driver on a table of answers."""
+    clock = Clock()
+    return Opened(Boson(StubCamera(clock), clock=clock, sleep=clock.sleep), True)
+
+
+def loop_camera(_: ExitStack) -> Opened:
+    """A Boson's driver on the emulator, in memory."""
+    return Opened(BosonBench().camera, True)
+
+
+def port_camera(stack: ExitStack) -> Opened:
+    """A Boson's driver on the emulator, on a pseudo-terminal."""
+    url = f"pty://{stack.enter_context(start_camera({'sn': '93588'}, None)).path}"
+    return Opened(Boson.from_url(url, timeout=5.0), True, lambda: Boson.from_url(url))
+
+
+def real_camera(_: ExitStack) -> Opened:
+    """A Boson."""
+    url = address("DBTHERMAL_BOSON")
+    return Opened(Boson.from_url(url), False, lambda: Boson.from_url(url))
+
+
+def stub_wheel(_: ExitStack) -> Opened:
+    """A wheel's driver on a controller that takes no time."""
+    clock = Clock()
+    wheel = FilterWheel(StubController(), QUICK, clock=clock, sleep=clock.sleep)
+    wheel.connect()
+    return Opened(wheel, True)
+
+
+def loop_wheel(_: ExitStack) -> Opened:
+    """A wheel's driver on the emulator, in memory."""
+    bench = WheelBench()
+    bench.wheel.connect()
+    return Opened(bench.wheel, True)
+
+
+def port_wheel(stack: ExitStack) -> Opened:
+    """A wheel's driver on the emulator, on a pseudo-terminal, a hundred times as fast."""
+    port: Any = stack.enter_context(start_wheel({"model": "BSC101"}, None))
+    port.device.faults.slow = 0.01
+    url = f"pty://{port.path}"
+    return Opened(FilterWheel.open(url, QUICK), True, lambda: FilterWheel.open(url, QUICK))
+
+
+def real_wheel(_: ExitStack) -> Opened:
+    """A wheel."""
+    url, settings = address("DBTHERMAL_WHEEL"), Settings(filters=FILTERS)
+    opened = FilterWheel.open(url, settings)
+    return Opened(opened, False, lambda: FilterWheel.open(url, settings))
+
+
+def stub_logger(_: ExitStack) -> Opened:
+    """A TC-08's driver on an object of a few functions."""
+    library = StubLibrary()
+    return Opened(TC08(library).open(), True, lambda: TC08(library).open())
+
+
+def emulated_logger(_: ExitStack) -> Opened:
+    """A TC-08's driver on the emulated library."""
+    bench = LoggerBench()
+    return Opened(bench.driver.open(), True, lambda: TC08(bench.unit).open())
+
+
+def real_logger(_: ExitStack) -> Opened:
+    """A TC-08 with a type T in socket 1, in a room."""
+    url = address("DBTHERMAL_TC08")
+    return Opened(TC08.from_url(url), False, lambda: TC08.from_url(url))
+
+
+def stub_video(_: ExitStack) -> Opened:
+    """The V4L2 driver on a stand-in for the kernel's calls, which it takes for the kernel."""
+    answers = [(BYTES, GOOD, 1000 * number, number) for number in range(10)]
+    kernel = Driver(answers=answers).kernel()
+    return Opened(v4l2.Capture.open("/dev/video0", STREAM, kernel), False)
+
+
+def emulated_video(_: ExitStack) -> Opened:
+    """An emulated camera on a clock that nobody waits for."""
+    clock = Clock()
+    world = World(clock=clock)
+    world.add_camera("wide", 1)
+    picture = np.ones((4, 6), dtype=np.uint16)
+    pictures = {"8-14": lambda _: picture}
+    camera = EmulatedCamera(world, "wide", pictures, "8-14", (4, 6), 60.0, sleep=clock.sleep)
+    return Opened(camera, True)
+
+
+def real_video(_: ExitStack) -> Opened:
+    """A camera's node."""
+    path = address("DBTHERMAL_VIDEO")
+    return Opened(v4l2.Capture.open(path, Stream()), False)
+
+
+Opening = Callable[[ExitStack], Opened]
+
+CAMERAS: list[Opening] = [stub_camera, loop_camera, port_camera, real_camera]
+WHEELS: list[Opening] = [stub_wheel, loop_wheel, port_wheel, real_wheel]
+LOGGERS: list[Opening] = [stub_logger, emulated_logger, real_logger]
+VIDEOS: list[Opening] = [stub_video, emulated_video, real_video]

@@ -1,0 +1,88 @@
+"""A small rig of two cameras, wheel and thermocouples, described in YAML and emulated."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import numpy as np
+
+from dbthermal.instruments.devices import Devices, emulated_world, open_devices
+from dbthermal.instruments.emulated.frames import Picture
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.fetching import Limits
+from dbthermal.instruments.frames_source import Counts
+from dbthermal.instruments.session import Session
+
+SHAPE = (4, 80)
+LEVELS = {"8-14": 1000, "9.5": 20_000, "11": 40_000}
+"""Counts in each band [count], to which ten for each kelvin of the blackbody are added."""
+
+QUICK = Limits(chunk=5, reserve=0, reading_period=0.05, preview_period=0.02)
+"""No space is kept free, and readings come often."""
+
+TEXT = """
+name: plate
+simulated: true
+protocol: response
+duration: 0.15
+frame_rate: 100
+shape: [4, 80]
+telemetry_rows: 2
+cameras:
+  "8-14":
+    video: {simulated: "sim://camera/wide", hardware: "v4l2:///dev/video0"}
+    control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
+  9.5:
+    video: {simulated: "sim://camera/narrow", hardware: "v4l2:///dev/video2"}
+    control: {simulated: "sim://boson/narrow", hardware: "serial:///dev/ttyACM1"}
+devices:
+  filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
+  thermocouples: {simulated: "sim://tc08", hardware: "tc08:"}
+filters: {1: 9.5, 3: "11"}
+wheel: {velocity: 10.0, home_velocity: 10.0, acceleration: 100.0, addresses: [[17, 33]]}
+sweep: [9.5, 11]
+thermocouples: {1: blackbody, 4: plate}
+blackbody: {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, timeout: 20}
+"""
+
+
+def replaced(*changes: tuple[str, str], text: str = TEXT) -> str:
+    """Return the session with other texts, each in one place."""
+    for old, new in changes:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    return text
+
+
+def scene_text() -> str:
+    """Return a session of the same rig that records a scene."""
+    lines = replaced(("protocol: response", "protocol: scene")).splitlines()
+    return "\n".join(line for line in lines if not line.startswith(("sweep", "blackbody")))
+
+
+def bench(session: Session, **settings: float) -> World:
+    """World of a session, with a plate at 330 K."""
+    return emulated_world(session, scene=lambda _: {"plate": 330.0}, **settings)
+
+
+def pictures(world: World) -> dict[str, Picture]:
+    """What is seen: the band's level and the blackbody, with a pattern of columns."""
+
+    def seen(level: int) -> Picture:
+        pattern = np.arange(SHAPE[1]) % 2
+
+        def picture(_: float) -> Counts:
+            row = level + round(10 * world.blackbody_temperature) + pattern
+            return np.broadcast_to(row, SHAPE).astype(np.uint16)
+
+        return picture
+
+    return {band: seen(level) for band, level in LEVELS.items()}
+
+
+@contextmanager
+def rig(session: Session, world: World | None = None) -> Iterator[Devices]:
+    """Devices of an emulated session, with its pictures."""
+    world = bench(session) if world is None else world
+    shown: Mapping[str, Picture] = pictures(world)
+    with open_devices(session, world, shown) as devices:
+        yield devices

@@ -1,0 +1,292 @@
+"""The Boson's driver on its emulator: what faults look like to a user, and how true it is."""
+
+from collections import deque
+from enum import IntEnum
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rig_devices import BosonBench, Clock
+from test_boson import SERIAL, SERIAL_REQUEST, SET_GAIN
+
+from dbthermal.instruments import fslp
+from dbthermal.instruments.boson import (
+    Boson,
+    BosonError,
+    BosonReplyError,
+    BosonStatusError,
+    BosonTimeoutError,
+    commands,
+)
+from dbthermal.instruments.boson.commands import (
+    FfcMode,
+    FfcStatus,
+    GainMode,
+    Setting,
+    Switch,
+    SyncMode,
+)
+from dbthermal.instruments.emulated.boson import BOOT_DURATION, IMMINENT, EmulatedBoson
+from dbthermal.instruments.emulated.boson_faults import Fault
+from dbthermal.instruments.emulated.port import EmulatedPort, Loop
+from dbthermal.instruments.emulated.world import FFC_DURATION, World
+from dbthermal.instruments.transport import TransportError
+
+
+@pytest.fixture
+def bench() -> BosonBench:
+    """An emulated camera in memory, on a clock of its own."""
+    return BosonBench()
+
+
+@pytest.mark.parametrize("setting", commands.SETTINGS, ids=lambda setting: setting.name)
+def test_every_setting_is_kept(bench: BosonBench, setting: Setting[int]) -> None:
+    """What is set is read back."""
+    members = [*setting.kind] if issubclass(setting.kind, IntEnum) else [2, 8]
+    for value in members:
+        bench.camera.set(setting, value)
+        assert bench.camera.get(setting) == value
+
+
+def test_every_reading_has_a_value(bench: BosonBench) -> None:
+    """All readings are answered, at values whose bytes need escapes too."""
+    bench.state.serial_number = 0x8E9EAE81
+    bench.state.fpa_temperature = bench.state.last_ffc_temperature = 0x0C9E / 10
+    values = {reading.name: bench.camera.read(reading) for reading in commands.READINGS}
+    assert values["serial number"] == 0x8E9EAE81
+    assert values["FPA temperature [K]"] == pytest.approx(323.0, abs=0.05)
+    assert values["FFC status"] is FfcStatus.NONE_PERFORMED
+    assert values["part number"] == "EMULATED-BOSON-640"
+
+
+@pytest.mark.parametrize("sequence", [0x8E9EAE00, 0x0000AE8E, 0x9E9E9E9E])
+def test_the_emulator_echoes_any_sequence_number(bench: BosonBench, sequence: int) -> None:
+    """Headers that need escapes are understood and answered."""
+    frames = bench.exchange(fslp.encode(sequence, SERIAL))
+    assert frames == [fslp.Frame(0, sequence, SERIAL, 0, (93588).to_bytes(4))]
+
+
+@pytest.mark.parametrize(
+    ("command", "data", "request_status", "status"),
+    [
+        (0x0000FFFF, b"", fslp.REQUEST, 0x161),
+        (SERIAL, b"", 0, 0x162),
+        (SET_GAIN, b"\x00", fslp.REQUEST, 0x17D),
+        (SERIAL, b"\x00", fslp.REQUEST, 0x17E),
+        (SET_GAIN, b"\x00\x00\x00\x05", fslp.REQUEST, 0x203),
+        (0x0000000D, b"\x00\x03", fslp.REQUEST, 0x203),
+    ],
+)
+def test_the_emulator_refuses_as_a_camera_does(
+    bench: BosonBench, command: int, data: bytes, request_status: int, status: int
+) -> None:
+    """Unknown commands, wrong sizes and wrong values have their status and no data."""
+    frames = bench.exchange(fslp.encode(1, command, data, request_status))
+    assert frames == [fslp.Frame(0, 1, command, status)]
+
+
+@pytest.mark.parametrize(
+    "noise", [b"\x00\x11", SERIAL_REQUEST[:9], SERIAL_REQUEST[:-2] + b"\0\xae"]
+)
+def test_the_emulator_listens_on_after_noise(bench: BosonBench, noise: bytes) -> None:
+    """Rubbish, a frame cut short, and one with a wrong checksum are not answered."""
+    other = fslp.encode(5, SERIAL, channel=1)
+    assert [f.sequence for f in bench.exchange(noise + other + SERIAL_REQUEST)] == [1]
+
+
+@given(st.lists(st.binary(max_size=60), max_size=6))
+def test_the_emulator_takes_any_bytes(pieces: list[bytes]) -> None:
+    """Whatever is written, it does not fail, and answers the next good request."""
+    bench = BosonBench()
+    for piece in pieces:
+        bench.loop.write(piece)
+        bench.loop.read(4096, 0.0)
+    assert bench.camera.serial_number() == 93588
+
+
+@pytest.mark.parametrize(
+    ("fault", "timeouts", "discarded", "damaged"),
+    [
+        (Fault.DROP, 1, 0, 0),
+        (Fault.LATE, 1, 1, 0),
+        (Fault.HOLD, 1, 1, 0),
+        (Fault.BAD_CHECKSUM, 1, 0, 1),
+        (Fault.ILLEGAL_ESCAPE, 1, 0, 1),
+        (Fault.CUT, 1, 0, 1),
+        (Fault.DEBUG_TEXT, 0, 1, 0),
+    ],
+)
+def test_a_fault_of_the_line_is_overcome_and_counted(
+    bench: BosonBench, fault: Fault, timeouts: int, discarded: int, damaged: int
+) -> None:
+    """The right value is read in spite of it, and the next one too; the statistics tell."""
+    bench.spoil(fault)
+    assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
+    assert bench.camera.serial_number() == 93588
+    found = bench.camera.statistics
+    assert (found.timeouts, found.discarded, found.damaged) == (timeouts, discarded, damaged)
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        (Fault.WRONG_COMMAND, BosonReplyError),
+        (Fault.SHORT, BosonReplyError),
+        (Fault.BUSY, BosonStatusError),
+    ],
+)
+def test_a_fault_of_the_camera_is_an_error(
+    bench: BosonBench, fault: Fault, error: type[BosonError]
+) -> None:
+    """A reply of another command, a short one and a refusal reach the user; the line goes on."""
+    bench.spoil(fault)
+    with pytest.raises(error):
+        bench.camera.fpa_temperature()
+    assert bench.camera.serial_number() == 93588
+
+
+def test_a_change_that_is_answered_late_is_done_once(bench: BosonBench) -> None:
+    """The user is told that no reply came, and finds the change made."""
+    bench.spoil(Fault.LATE)
+    with pytest.raises(BosonTimeoutError, match="set gain mode"):
+        bench.camera.set(commands.GAIN_MODE, GainMode.LOW)
+    assert bench.camera.get(commands.GAIN_MODE) is GainMode.LOW
+
+
+def test_replies_may_come_byte_by_byte(bench: BosonBench) -> None:
+    """Single bytes make whole replies."""
+    bench.device.faults.single_bytes = True
+    assert bench.camera.identity().serial_number == 93588
+
+
+@pytest.mark.parametrize("stalls", [False, True])
+def test_a_correction_is_waited_for(bench: BosonBench, stalls: bool) -> None:
+    """It takes as long as the shutter does, whether or not the camera answers meanwhile."""
+    bench.device.faults.ffc_stalls = stalls
+    for number in (1, 2):
+        start = bench.clock.now
+        frame = bench.camera.run_ffc()
+        assert FFC_DURATION <= bench.clock.now - start < FFC_DURATION + 0.2
+        assert (bench.state.ffc_count, bench.state.last_ffc_frame) == (number, frame)
+    assert bench.camera.ffc_status() is FfcStatus.COMPLETE
+
+
+def test_a_correction_that_stalls_past_the_timeout_shifts_no_reply(bench: BosonBench) -> None:
+    """Replies that a closed shutter delays past their time are not taken for later ones."""
+    bench.device.faults.ffc_stalls = True
+    bench.camera._link.timeout = 0.1
+    bench.camera.start_ffc()
+    assert bench.camera._read(commands.SERIAL_NUMBER, repeats=9) == 93588
+    assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
+    assert bench.camera.statistics.discarded == bench.camera.statistics.timeouts > 0
+
+
+def test_a_correction_that_takes_too_long_is_an_error(bench: BosonBench) -> None:
+    """The wait has an end that the message names."""
+    with pytest.raises(BosonTimeoutError, match=r"No flat-field correction within 0\.2 s"):
+        bench.camera.run_ffc(timeout=0.2)
+
+
+@pytest.mark.parametrize("reason", ["temperature", "frames"])
+def test_the_camera_corrects_itself(bench: BosonBench, reason: str) -> None:
+    """In automatic mode a drift or a number of frames starts one, after it said so."""
+    if reason == "temperature":
+        bench.state.fpa_temperature += 2.5
+    else:
+        bench.state.frame_count += 18000
+    assert bench.camera.read(commands.FFC_DESIRED) == 1
+    assert bench.camera.ffc_status() is FfcStatus.IMMINENT
+    bench.clock.sleep(IMMINENT)
+    assert bench.camera.ffc_status() is FfcStatus.IN_PROGRESS
+    assert bench.camera.read(commands.FFC_IN_PROGRESS) is Switch.ON
+    bench.clock.sleep(FFC_DURATION)
+    assert bench.camera.ffc_status() is FfcStatus.COMPLETE
+
+
+def test_the_camera_leaves_it_to_the_user_in_manual_mode(bench: BosonBench) -> None:
+    """In manual mode a drift makes a correction desired, and no more."""
+    bench.camera.set(commands.FFC_MODE, FfcMode.MANUAL)
+    bench.state.fpa_temperature += 5
+    bench.clock.sleep(60)
+    assert bench.camera.read(commands.FFC_DESIRED) == 1
+    assert bench.camera.ffc_status() is FfcStatus.NONE_PERFORMED
+
+
+def test_pulses_are_followed_if_they_come(bench: BosonBench) -> None:
+    """Slave mode stays once frames are counted."""
+    bench.camera.follow_pulses()
+    assert bench.camera.get(commands.SYNC_MODE) is SyncMode.SLAVE
+
+
+def test_pulses_that_do_not_come_are_an_error(bench: BosonBench) -> None:
+    """Without frames synchronisation is disabled again, and the user is told."""
+    bench.device.faults.pulses = False
+    with pytest.raises(BosonError, match=r"No external pulses: .* was disabled again"):
+        bench.camera.follow_pulses()
+    assert bench.camera.get(commands.SYNC_MODE) is SyncMode.DISABLED
+    before = bench.camera.frame_count()
+    bench.clock.sleep(1.0)
+    assert bench.camera.frame_count() == before + 60
+
+
+def test_a_camera_is_mute_while_it_boots(bench: BosonBench) -> None:
+    """It is asked until it answers, which takes as long as booting does."""
+    assert bench.camera.reboot()
+    assert not bench.device.streaming
+    start = bench.clock.now
+    assert bench.camera.wait_until_booted() == 93588
+    assert BOOT_DURATION <= bench.clock.now - start < BOOT_DURATION + 1.1
+
+
+def test_a_camera_that_does_not_boot_is_an_error(bench: BosonBench) -> None:
+    """The wait has an end; a reboot without acknowledgement says so."""
+    bench.spoil(Fault.DROP)
+    assert not bench.camera.reboot()
+    with pytest.raises(BosonTimeoutError, match="No answer within 1 s"):
+        bench.camera.wait_until_booted(timeout=1.0)
+
+
+def test_settings_are_lost_unless_they_are_saved(bench: BosonBench) -> None:
+    """Flash memory is written when it is asked for, and never else."""
+    bench.camera.set(commands.AVERAGER, Switch.ON)
+    bench.camera.reboot()
+    bench.camera.wait_until_booted()
+    assert (bench.camera.get(commands.AVERAGER), bench.device.flash_writes) == (Switch.OFF, 0)
+    bench.camera.set(commands.AVERAGER, Switch.ON)
+    bench.camera.save_defaults()
+    bench.camera.reboot()
+    bench.camera.wait_until_booted()
+    assert (bench.camera.get(commands.AVERAGER), bench.device.flash_writes) == (Switch.ON, 1)
+
+
+def test_an_unplugged_camera_is_an_error(bench: BosonBench) -> None:
+    """No question is repeated to a camera that is gone."""
+    bench.state.plugged = False
+    with pytest.raises(TransportError):
+        bench.camera.serial_number()
+
+
+def test_an_emulated_frame_source_counts_the_frames() -> None:
+    """Where frames come from a source, the camera reports the source's count."""
+    world = World(clock=(clock := Clock()))
+    state = world.add_camera("boson", 7)
+    device = EmulatedBoson(world, "boson", free_running=False)
+    camera = Boson(Loop(device, clock=clock, sleep=clock.sleep), clock=clock, sleep=clock.sleep)
+    state.frame_count = 41
+    clock.sleep(5)
+    assert camera.frame_count() == 41
+
+
+def test_a_pseudo_terminal_brings_every_reply_until_it_hangs_up() -> None:
+    """Byte by byte and with text between, a hundred replies are right; then the plug is pulled."""
+    world = World()
+    world.add_camera("boson", 93588)
+    device = EmulatedBoson(world, "boson")
+    device.faults.single_bytes = True
+    device.faults.once = deque([Fault.DEBUG_TEXT, None] * 50)
+    with EmulatedPort(device) as port, Boson.from_url(f"pty://{port.path}") as camera:
+        assert {camera.serial_number() for _ in range(100)} == {93588}
+        assert camera.statistics.discarded == 50
+        world.camera("boson").plugged = False
+        with pytest.raises(TransportError, match="must stay connected"):
+            camera.serial_number()

@@ -1,0 +1,235 @@
+"""What every device keeps, whatever is behind its driver: a stub, an emulator, or hardware.
+
+To hold hardware against it, name the devices in DBTHERMAL_BOSON (serial:///dev/ttyACM0),
+DBTHERMAL_WHEEL (serial:///dev/ttyUSB0), DBTHERMAL_TC08 (tc08:) and DBTHERMAL_VIDEO (/dev/video0),
+and run with -m hardware: the wheel turns, a shutter closes, nothing is saved.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rig_devices import FILTERS
+from rig_openings import CAMERAS, LOGGERS, VIDEOS, WHEELS, Opened, Opening
+
+from dbthermal.instruments import inventory
+from dbthermal.instruments.boson import Boson, commands
+from dbthermal.instruments.boson.commands import FfcMode, FfcStatus
+from dbthermal.instruments.emulated import usb
+from dbthermal.instruments.filterwheel import FilterWheel
+from dbthermal.instruments.frames_source import FrameSource, NoFrameError, SourceLostError, frames
+from dbthermal.instruments.tc08 import TC08, Flag
+from dbthermal.instruments.transport import TransportError
+
+CLOSED = (TransportError, RuntimeError, SourceLostError)
+NAMES = {"model", "part_number", "serial", "serial_number"}
+
+
+def opens(*ways: Opening) -> pytest.MarkDecorator:
+    """For each of these ways to open a device; on hardware only if asked for."""
+    marks = {True: [pytest.mark.hardware], False: []}
+    cases = [
+        pytest.param(way, id=way.__name__, marks=marks[way.__name__.startswith("real")])
+        for way in ways
+    ]
+    return pytest.mark.parametrize("opened", cases, indirect=True)
+
+
+@pytest.fixture
+def opened(request: pytest.FixtureRequest) -> Iterator[Opened]:
+    """A device that is open."""
+    with ExitStack() as stack:
+        way = request.param(stack)
+        with closing(way.device):
+            yield way
+
+
+def identity(device: Any) -> Mapping[str, object]:
+    """What a device says it is, by name."""
+    if isinstance(device, Boson):
+        return vars(device.identity())
+    return vars(device.info()) if isinstance(device, TC08) else device.identity
+
+
+def ask(device: Any) -> object:
+    """Ask the simplest question of a device."""
+    match device:
+        case Boson():
+            return device.serial_number()
+        case FilterWheel():
+            return device.status()
+        case TC08():
+            return device.info()
+        case _:
+            return device.read()
+
+
+# What all devices keep.
+
+
+@opens(*CAMERAS, *WHEELS, *LOGGERS, *VIDEOS)
+def test_a_device_says_who_it_is(opened: Opened) -> None:
+    """Its identity is told twice alike, names it, and says whether hardware is behind it."""
+    told = identity(opened.device)
+    assert dict(told) == dict(identity(opened.device))
+    names = [value for name, value in told.items() if name in NAMES]
+    assert names != []
+    assert all(names)
+    assert opened.device.is_simulated is told.get("is_simulated", opened.is_simulated)
+    assert opened.device.is_simulated is opened.is_simulated
+
+
+@opens(*CAMERAS, *WHEELS, *LOGGERS, *VIDEOS)
+def test_close_is_final(opened: Opened) -> None:
+    """Closed, and closed again, a device answers no more, and the error says what to do."""
+    ask(opened.device)
+    opened.device.close()
+    opened.device.close()
+    with pytest.raises(CLOSED, match=r"[Mm]ust|is closed"):
+        ask(opened.device)
+
+
+@opens(*CAMERAS, *WHEELS, *LOGGERS, *VIDEOS)
+def test_a_device_is_a_context_manager(opened: Opened) -> None:
+    """At the end of `with` it is closed."""
+    with opened.device as device:
+        ask(device)
+    with pytest.raises(CLOSED):
+        ask(opened.device)
+
+
+@opens(*CAMERAS[2:], *WHEELS[2:], *LOGGERS)
+def test_a_device_has_one_client(opened: Opened) -> None:
+    """A second client is refused with what to do, and the first is not disturbed."""
+    assert opened.again is not None
+    with pytest.raises(OSError, match="other program"):
+        opened.again()
+    ask(opened.device)
+
+
+# What each kind keeps besides.
+
+
+@opens(*CAMERAS)
+def test_a_camera_has_a_number(opened: Opened) -> None:
+    """It has a serial number that stays."""
+    camera: Boson = opened.device
+    assert camera.identity().serial_number == camera.wait_until_booted() > 0
+
+
+@opens(*CAMERAS)
+def test_a_camera_has_a_temperature(opened: Opened) -> None:
+    """Both ways to ask for it agree within their steps and what it drifts meanwhile."""
+    camera: Boson = opened.device
+    other = camera.read(commands.FPA_TEMPERATURE_KELVIN)
+    assert camera.fpa_temperature() == pytest.approx(other, abs=0.5)
+    assert 220 < other < 380
+
+
+@opens(*CAMERAS)
+def test_a_camera_counts_frames(opened: Opened) -> None:
+    """The count rises with time."""
+    camera: Boson = opened.device
+    before = camera.frame_count()
+    camera._sleep(0.2)
+    assert camera.frame_count() > before
+
+
+@opens(*CAMERAS)
+def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
+    """A correction ends, and has the number of a frame after the last."""
+    camera: Boson = opened.device
+    before = camera.read(commands.LAST_FFC_FRAME)
+    camera._sleep(0.05)
+    assert camera.run_ffc() > before
+    assert camera.ffc_status() is FfcStatus.COMPLETE
+
+
+@opens(*CAMERAS)
+def test_a_camera_keeps_a_mode(opened: Opened) -> None:
+    """The shutter's mode is set and read back; one that there is not is refused."""
+    camera: Boson = opened.device
+    before = camera.get(commands.FFC_MODE)
+    camera.set(commands.FFC_MODE, FfcMode.MANUAL)
+    assert camera.get(commands.FFC_MODE) is FfcMode.MANUAL
+    wrong: Any = 4
+    with pytest.raises(ValueError, match="Invalid FFC mode 4"):
+        camera.set(commands.FFC_MODE, wrong)
+    camera.set(commands.FFC_MODE, before)
+    assert camera.get(commands.FFC_MODE) is before
+
+
+@opens(*WHEELS)
+def test_a_wheel_goes_to_every_slot(opened: Opened) -> None:
+    """Homed, it finds every slot, and the band in the beam; one that there is not is refused."""
+    wheel: FilterWheel = opened.device
+    wheel.home()
+    for position in (1, 4, 2, 6, 3, 5):
+        wheel.move_to(position)
+        assert wheel.position() == position
+    with pytest.raises(ValueError, match=r"Invalid filter position 7\. Must lie in 1 to 6"):
+        wheel.move_to(7)
+    assert wheel.band() == FILTERS[5]
+
+
+@opens(*LOGGERS)
+def test_a_logger_reads_a_room(opened: Opened) -> None:
+    """Cold junction and tip have temperatures that rooms have; a socket that is off has none."""
+    logger: TC08 = opened.device
+    logger.set_channels({1: "T"})
+    scan = logger.single()
+    assert 273.0 < scan.temperature[0] < 320.0
+    assert 200.0 < scan.temperature[1] < 400.0
+    assert list(scan.flag[:3]) == [0, 0, Flag.MISSING]
+    assert np.isnan(scan.temperature[2])
+
+
+@opens(*LOGGERS)
+def test_a_loggers_conversions_agree(opened: Opened) -> None:
+    """The library's conversion and this package's give one temperature; channel 9 is refused."""
+    logger: TC08 = opened.device
+    logger.set_channels({1: "T"})
+    assert abs(logger.cross_check(1)) < 0.5
+    assert logger.minimum_interval() >= 0.1
+    with pytest.raises(ValueError, match=r"Invalid channel 9\. Must lie in 1 to 8"):
+        logger.set_channels({9: "T"})
+
+
+@opens(*VIDEOS)
+def test_frames_follow_one_another(opened: Opened) -> None:
+    """Frames have the source's shape, numbers that rise by one, times that rise."""
+    source: FrameSource = opened.device
+    found = list(frames(source, 10))
+    assert {frame.counts.shape for frame in found} == {source.shape}
+    assert {frame.counts.dtype for frame in found} == {np.dtype(np.uint16)}
+    assert np.all(np.diff([frame.sequence for frame in found]) == 1)
+    assert np.all(np.diff([frame.device_time for frame in found]) > 0)
+    assert {frame.telemetry is None for frame in found} == {source.telemetry_rows == 0}
+
+
+@opens(*VIDEOS)
+def test_silence_is_no_loss(opened: Opened) -> None:
+    """After a wait without a frame the source is as before."""
+    source: FrameSource = opened.device
+    list(frames(source, 10))
+    with pytest.raises(NoFrameError, match="No frame from"):
+        source.read(0.0)
+    source.close()
+
+
+@pytest.mark.parametrize(
+    "emulated", [True, pytest.param(False, marks=pytest.mark.hardware, id="hardware")]
+)
+def test_the_rig_is_found(emulated: bool, tmp_path: Path) -> None:
+    """With the rig plugged in all of it is found, and nothing stands in the way."""
+    if emulated:
+        backend = usb.EmulatedBackend(usb.boson(1), usb.boson(2, bus=2), usb.apt(), usb.tc08())
+        usb.write_sysfs(tmp_path, backend)
+        found = inventory.find(backend, sysfs=tmp_path, dev=tmp_path / "dev")
+    else:
+        found = inventory.find()
+    assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
+    assert [device.warnings for device in found] == [()] * 4

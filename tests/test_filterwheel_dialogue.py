@@ -1,0 +1,108 @@
+"""The filter wheel's driver byte for byte, and among answers that are none."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rig_devices import FILTERS, Clock
+
+from dbthermal.instruments import apt
+from dbthermal.instruments.dialogue import Dialogue, Pair
+from dbthermal.instruments.filterwheel import FilterWheel, Settings, WheelError
+
+SETTINGS = Settings(filters=FILTERS)
+
+
+def _greeting(unit: int) -> bytes:
+    start_ = apt.no_flash_programming(destination=unit) + apt.stop_updates(destination=unit)
+    return start_ + apt.request_info(destination=unit)
+
+
+def _reply(identifier: apt.Id, data: bytes, *, source: int = apt.BAY_1) -> bytes:
+    return apt.encode(apt.Message(identifier, 0, 0, apt.HOST, source, data))
+
+
+def _connection() -> list[Pair]:
+    """What a driver and a BSC201 say to each other, byte for byte, until it is connected."""
+    to, info = apt.BAY_1, apt.Info(40_000_000, "BSC201", 45, "1.0.0", 1, 0, 1)
+    speeds = apt.VelocityParameters(1, 0, 4506, 21_987_328)
+    before, home = apt.HomeParameters(1, 2, 1, 0, 0), apt.HomeParameters(1, 2, 1, 4_397_466, 0)
+    return [
+        (_greeting(apt.UNIT), None),
+        (_greeting(apt.RACK), _reply(apt.Id.HW_GET_INFO, info.pack(), source=apt.RACK)),
+        (
+            apt.set_velocity_parameters(speeds, destination=to)
+            + apt.request_velocity_parameters(1, destination=to),
+            _reply(apt.Id.MOT_GET_VELPARAMS, speeds.pack()),
+        ),
+        (
+            apt.request_home_parameters(1, destination=to),
+            _reply(apt.Id.MOT_GET_HOMEPARAMS, before.pack()),
+        ),
+        (
+            apt.set_home_parameters(home, destination=to)
+            + apt.request_home_parameters(1, destination=to),
+            _reply(apt.Id.MOT_GET_HOMEPARAMS, home.pack()),
+        ),
+        (bytes.fromhex("10 02 01 01 21 01 11 02 01 00 21 01"), bytes.fromhex("12 02 01 01 01 21")),
+    ]
+
+
+def _status(position: int, bits: int) -> bytes:
+    packed = apt.Status(1, position, 0, apt.StatusBits(bits)).pack()
+    return _reply(apt.Id.MOT_GET_STATUSUPDATE, packed)
+
+
+def test_dialogue_of_a_move() -> None:
+    """Every byte of a connection and a move, with the report of the end between two answers."""
+    clock, ask = Clock(), bytes.fromhex("80 04 01 00 21 01")
+    move = bytes.fromhex("53 04 06 00 A1 01 01 00 AB 0A 01 00")
+    end = bytes.fromhex("64 04 01 00 01 21")
+    dialogue = Dialogue(
+        [
+            *_connection(),
+            (ask, _status(0, 0x80000500)),
+            (move + ask, _status(30_000, 0x80000510)),
+            (ask, [end[:2], end[2:] + _status(68_267, 0x80000510)]),
+            (ask, _status(68_267, 0x80000500)),
+        ]
+    )
+    with dialogue:
+        wheel = FilterWheel(dialogue, SETTINGS, clock=clock, sleep=clock.sleep)
+        assert wheel.connect().model == "BSC201"
+        wheel.move_to(2)
+
+
+def test_answers_of_others() -> None:
+    """What came before a question, from another bay or of another channel is no answer to it."""
+    ask, answer = bytes.fromhex("80 04 01 00 21 01"), _status(3, 0)
+    old, other_bay = _status(1, 0), _status(2, 0)[:5] + b"\x22" + _status(2, 0)[6:]
+    other_channel = answer[:6] + b"\x02" + answer[7:10] + b"\x01" + answer[11:]
+    later = [old, b"", other_bay + other_channel, answer]
+    settings_ = Settings(addresses=((apt.RACK, apt.BAY_1),))
+    with Dialogue([(None, later[:2]), (ask, later[2:])]) as dialogue:
+        assert FilterWheel(dialogue, settings_).status().position == 3
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.binary(max_size=40), max_size=6))
+def test_arbitrary_answers(answers: list[bytes]) -> None:
+    """Whatever a device says, connecting ends, and fails with an error that is documented."""
+    clock = Clock()
+
+    class Babbler(Dialogue):
+        """A device that says what it likes."""
+
+        def write(self, data: bytes) -> None:
+            """Take anything."""
+
+    babbler = Babbler([(None, answers)] if answers else [])
+    with pytest.raises(WheelError):
+        FilterWheel(babbler, SETTINGS, clock=clock, sleep=clock.sleep).connect()
+
+
+@pytest.mark.parametrize("bits", [b"\x12\x02\x01\x00\x01\x21", b"\x12\x02\x01\x03\x01\x21"])
+def test_neither_enabled_nor_not(bits: bytes) -> None:
+    """An answer that is neither yes nor no is an error of the wheel, not of the program."""
+    dialogue = Dialogue([*_connection()[:-1], (_connection()[-1][0], bits)])
+    with dialogue, pytest.raises(WheelError, match="does not say what the motor does"):
+        FilterWheel(dialogue, SETTINGS).connect()

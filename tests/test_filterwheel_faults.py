@@ -1,0 +1,265 @@
+"""What goes wrong with a filter wheel: which faults are overcome, and what the others look like."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rig_devices import WheelBench
+
+from dbthermal.instruments import apt
+from dbthermal.instruments.filterwheel import (
+    ControllerError,
+    NoReplyError,
+    NotHomedError,
+    StalledWheelError,
+    WheelError,
+    WheelTimeoutError,
+)
+from dbthermal.instruments.transport import TransportError
+
+
+def test_no_raw_move_without_current() -> None:
+    """The emulated motor runs away if it is moved before it is enabled, as users report."""
+    bench = WheelBench()
+    parameters = apt.VelocityParameters(1, 0, 4506, 21_987_328)
+    bench.device.receive(apt.set_velocity_parameters(parameters, destination=apt.BAY_1))
+    bench.device.receive(apt.move_absolute(1, 100, destination=apt.BAY_1))
+    bench.clock.sleep(100.0)
+    bench.device.poll()
+    assert bench.device.motor.position > 10_000_000
+
+
+def test_started_updates_end_in_silence() -> None:
+    """The emulated controller stops answering 5 s after its updates were started."""
+    bench = WheelBench()
+    bench.wheel.connect()
+    bench.device.receive(apt.start_updates(destination=apt.RACK))
+    for _ in range(60):
+        bench.clock.sleep(0.1)
+        bench.device.poll()
+    with pytest.raises(NoReplyError, match="No answer MOT_GET_STATUSUPDATE from address 0x21"):
+        bench.wheel.status()
+
+
+def test_unset_speeds_make_homing_do_nothing() -> None:
+    """A controller that does not take the speeds is found out before it is asked to home."""
+    bench = WheelBench()
+    bench.device.faults.deaf_to = {apt.Id.MOT_SET_VELPARAMS}
+    with pytest.raises(WheelError, match=r"velocity 0. Must be 21987328"):
+        bench.wheel.connect()
+    bench.device.faults.deaf_to = {apt.Id.MOT_SET_HOMEPARAMS}
+    with pytest.raises(WheelError, match=r"home velocity 0. Must be 4397466"):
+        bench.wheel.connect()
+    bench.device.faults.deaf_to = {apt.Id.MOT_MOVE_HOME}
+    with pytest.raises(StalledWheelError, match="Search for home: the wheel did not start"):
+        bench.homed()
+
+
+def test_an_earlier_search_for_home_does_not_count() -> None:
+    """Neither the bit nor the report of an earlier search for home ends the next one."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.receive(apt.home(1, destination=apt.BAY_1))
+    bench.clock.sleep(10.0)
+    wheel.status()
+    bench.device.faults.deaf_to = {apt.Id.MOT_MOVE_HOME}
+    with pytest.raises(StalledWheelError, match="did not start"):
+        wheel.home()
+
+
+def test_motor_that_is_not_enabled() -> None:
+    """A controller that gives the motor no current is found out when it is connected."""
+    bench = WheelBench()
+    bench.device.faults.deaf_to = {apt.Id.MOD_SET_CHANENABLESTATE}
+    with pytest.raises(WheelError, match="did not enable the motor"):
+        bench.wheel.connect()
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {"single_bytes": True},
+        {"hold": True},
+        {"noise": b"\xff\x12\x04"},
+        {"stray_completed": True},
+        {"unreported": True},
+        {"long_reports": True},
+        {"late": 0.3},
+        {"drop": 1},
+        {"stuck": apt.StatusBits.JOGGING_FORWARD | apt.StatusBits.JOGGING_REVERSE},
+        {"slow": 1.5},
+    ],
+    ids=lambda faults: next(iter(faults)),
+)
+def test_harmless_faults(faults: dict[str, object]) -> None:
+    """Split, merged, late, missing, unasked and noisy answers: the wheel is where it should be."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    for name, value in faults.items():
+        setattr(bench.device.faults, name, value)
+    for position in (3, 6, 2):
+        wheel.move_to(position)
+        assert bench.world.wheel_position == position == wheel.position()
+
+
+def test_moving_bits_that_stick() -> None:
+    """Where the bits of a move stick, its report ends it; the next one is refused."""
+    bench = WheelBench()
+    wheel = bench.homed()
+
+    def stick() -> None:
+        bench.device.faults.stuck = apt.StatusBits.MOVING_FORWARD
+
+    bench.clock.events.append((bench.clock.now + 0.3, stick))
+    wheel.move_to(3)
+    assert bench.world.wheel_position == 3
+    with pytest.raises(WheelError, match="still moving"):
+        wheel.move_to(4)
+
+
+def test_stall() -> None:
+    """A wheel that stands though it should move is stopped, and must be homed again."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.stands_after = 20.0
+    message = r"Move to 120.00 deg: the wheel stood at 20.00 deg for 2.0 s .* was stopped"
+    with pytest.raises(StalledWheelError, match=message):
+        wheel.move_to(3)
+    assert bench.sent(apt.Id.MOT_MOVE_STOP)
+    with pytest.raises(NotHomedError, match="lost steps"):
+        wheel.move_to(1)
+    bench.device.faults.stands_after = 360.0
+    wheel.home()
+    wheel.move_to(3)
+    assert bench.world.wheel_position == 3
+
+
+def test_move_that_ends_elsewhere() -> None:
+    """That the controller says it is done is not believed where the wheel is elsewhere."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.stops_short = 1.5
+    with pytest.raises(StalledWheelError, match=r"the wheel stopped at 118.50 deg. Must arrive"):
+        wheel.move_to(3)
+
+
+def test_move_that_does_not_start() -> None:
+    """A move that the controller ignores is an error after a while."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.deaf_to = {apt.Id.MOT_MOVE_ABSOLUTE}
+    with pytest.raises(StalledWheelError, match=r"the wheel did not start and is at 0.00 deg"):
+        wheel.move_to(3)
+    assert bench.clock.now < 60.0
+
+
+def test_slow_wheel() -> None:
+    """A move or a search for home that takes too long is stopped, and says where it was."""
+    bench = WheelBench(move_timeout=5.0, home_timeout=10.0)
+    wheel = bench.homed()
+    bench.device.faults.slow = 30.0
+    with pytest.raises(WheelTimeoutError, match=r"still at .* deg after 5.0 s, and was stopped"):
+        wheel.move_to(4)
+    bench.device.faults.slow = 1.0
+    wheel.move_to(4)
+    bench.device.faults.slow = 30.0
+    with pytest.raises(WheelTimeoutError, match=r"Search for home: .* after 10.0 s"):
+        wheel.home()
+    with pytest.raises(NotHomedError):
+        wheel.move_to(1)
+
+
+def test_lost_steps_are_seen_by_nobody() -> None:
+    """Without an encoder a slip goes unnoticed, which the driver says; homing undoes it."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.slips = 5.0
+    wheel.move_to(3)
+    assert (wheel.position(), bench.world.wheel_position) == (3, None)
+    bench.device.faults.slips = 0.0
+    wheel.home()
+    wheel.move_to(3)
+    assert bench.world.wheel_position == 3
+
+
+def test_errors_of_the_controller() -> None:
+    """What the controller reports by itself stops what is to come, with its text, once."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.notice = "motor hot"
+    with pytest.raises(ControllerError, match="It reported error 1 of message 0x0480: motor hot"):
+        wheel.move_to(3)
+    assert not bench.sent(apt.Id.MOT_MOVE_ABSOLUTE)
+    wheel.move_to(3)
+    bench.device.faults.notice = "motor cold"
+    with pytest.raises(ControllerError, match="motor cold"):
+        wheel.home()
+
+
+def test_overload() -> None:
+    """A motor whose controller reports an overload is stopped."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.stuck = apt.StatusBits.OVERLOAD
+    with pytest.raises(WheelError, match=r"The controller reports .*OVERLOAD"):
+        wheel.move_to(3)
+    assert bench.sent(apt.Id.MOT_MOVE_STOP)
+
+
+def test_answers_that_come_too_late() -> None:
+    """Answers later than the limit may be those of an older question: never a wrong slot."""
+    bench, patient = WheelBench(), WheelBench(reply_timeout=1.5)
+    wheel = bench.homed()
+    bench.device.faults.late = patient.device.faults.late = 1.2
+    wheel.move_to(3)
+    assert bench.world.wheel_position == wheel.position() == 3
+    with pytest.raises(StalledWheelError, match="did not start"):
+        wheel.move_to(6)
+    patient.homed().move_to(6)
+    assert patient.world.wheel_position == 6
+
+
+def test_silence_in_a_move() -> None:
+    """A controller that falls silent is an error in bounded time, not a wait for ever."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.silent = True
+    before = bench.clock.now
+    with pytest.raises(NoReplyError, match="must be on and in no other program's use"):
+        wheel.move_to(2)
+    assert bench.clock.now - before < 3.0
+
+
+def test_unplugged() -> None:
+    """A cable that was pulled out is an error at once, and closing is still allowed, twice."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.plugged = False
+    with pytest.raises(TransportError, match="Lost the emulated device"):
+        wheel.move_to(2)
+    wheel.close()
+    wheel.close()
+
+
+def test_late_report_of_an_earlier_move() -> None:
+    """A stale report before the wheel starts does not end the move, nor make it a stall."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.stray_completed = True
+    bench.device.faults.late = 0.4
+    wheel.move_to(4)
+    assert bench.world.wheel_position == 4
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=12), st.integers(0, 3))
+def test_noise_on_the_line(noise: bytes, drop: int) -> None:
+    """With any bytes before every answer, and some missing: the right slot, or a known error."""
+    bench = WheelBench()
+    bench.device.faults.noise = noise
+    bench.device.faults.drop = drop
+    try:
+        bench.homed().move_to(2)
+    except WheelError:
+        assert bench.clock.now < 200.0
+    else:
+        assert bench.world.wheel_position == 2
