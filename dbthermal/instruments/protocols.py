@@ -1,100 +1,68 @@
-"""The steps of a session: open its cameras, wait for the blackbody, record at each temperature.
+"""What is done with the rig: wait for the blackbody, sweep it, record a scene.
 
 Gain, offset and response are calibrated before a blackbody that goes through several temperatures;
-the emissivity bench goes through them with a sample. Each step is a recording of its own, begun
-only when the temperature rests. A scene is one recording: `dbthermal.instruments.record.record`.
+the emissivity bench goes through them with samples. At each temperature the wheel goes through its
+filters, and each of these is a recording of its own, begun only when the temperature rests. What
+was recorded is opened by `open_sweep` and `bench_series`, a scene by
+`dbthermal.instruments.capture.open_capture`.
 """
 
+import threading
 import time as system_time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit
 
 import numpy as np
-import xarray as xr
 
-from dbthermal import schema
-from dbthermal.instruments.capture import open_capture
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Picture
-from dbthermal.instruments.emulated.world import World
+from dbthermal import store
+from dbthermal.instruments.capture import mean_reading
 from dbthermal.instruments.fetching import Limits, Reading
-from dbthermal.instruments.frames_source import FrameFlag, FrameSource
-from dbthermal.instruments.record import Summary, record
+from dbthermal.instruments.frames_source import SourceLostError
+from dbthermal.instruments.record import Preview, Summary, record
+from dbthermal.instruments.rig import Devices
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.sweep import (
+    BLACKBODY,
+    bench_series,
+    is_complete,
+    open_sweep,
+    require_filter,
+    step_path,
+)
+
+__all__ = ["Step", "bench_series", "open_sweep", "record_scene", "record_sweep", "wait_stable"]
 
 STABILITY_PERIOD: Final = 1.0
 """Time from reading to reading while a temperature is awaited [s]."""
 
-_NO_VIEW: Final = int(FrameFlag.SHUTTER_CLOSED)
 
-
-@contextmanager
-def open_sources(
-    session: Session,
-    world: World | None = None,
-    pictures: Mapping[str, Picture] | None = None,
-    faults: Mapping[str, Faults] | None = None,
-) -> Iterator[dict[str, FrameSource]]:
+@dataclass(frozen=True)
+class Step:
     """
-    Open the cameras of a session: the real ones, or, by its one switch, the emulated ones.
+    One recording of a sweep.
 
-    Parameters
+    Attributes
     ----------
-    session : Session
-        Cameras at ``v4l2:///dev/video0``, or ``sim://camera/<name>`` with the name of a camera of
-        the world. The band of a slot of the wheel is the band in the beam, else the camera's own.
-    world : World, optional
-        The emulated bench; needed for emulated cameras.
-    pictures : mapping, optional
-        Band to what the emulated cameras see in it.
-    faults : mapping, optional
-        Band to what goes wrong with its emulated camera.
-
-    Yields
-    ------
-    dict
-        Band to its source, closed in the end.
-
-    Raises
-    ------
-    ValueError
-        If an address is of another kind, or there is no world for it.
-    OSError
-        If a camera cannot be opened.
+    number : int
+        Of the temperature, from 0.
+    temperature : float
+        What the blackbody was set to [K].
+    blackbody : float
+        Mean of what was read of it during the recording [K].
+    band : str or None
+        Of the filter in the beam; None without a wheel.
+    summary : Summary
+        How the recording went.
     """
-    with ExitStack() as stack:
-        sources: dict[str, FrameSource] = {}
-        for band, camera in session.cameras.items():
-            address = urlsplit(session.url(camera.video))
-            if address.scheme == "v4l2" and not session.simulated:
-                from dbthermal.instruments import v4l2, v4l2_calls  # noqa: PLC0415 - Linux only
 
-                stream = v4l2_calls.Stream(
-                    session.shape, session.frame_rate, session.telemetry_rows
-                )
-                sources[band] = stack.enter_context(v4l2.Capture.open(address.path, stream))
-            elif address.scheme == "sim" and session.simulated and world is not None:
-                emulated = EmulatedCamera(
-                    world,
-                    address.path.lstrip("/"),
-                    pictures or {},
-                    None if band in session.filters.values() else band,
-                    session.shape,
-                    session.frame_rate,
-                    session.telemetry_rows,
-                    (faults or {}).get(band, Faults()),
-                )
-                sources[band] = stack.enter_context(emulated)
-            else:
-                raise ValueError(
-                    f"Invalid address '{address.geturl()}' of the camera of band '{band}'. Must be "
-                    "'v4l2:///dev/...', or 'sim://camera/<name>' with a world if simulated."
-                )
-        yield sources
+    number: int
+    temperature: float
+    blackbody: float
+    band: str | None
+    summary: Summary
 
 
 def wait_stable(
@@ -152,108 +120,174 @@ def wait_stable(
     )
 
 
-def record_steps(
-    session: Session,
-    sources: Mapping[str, FrameSource],
+def record_sweep(
+    devices: Devices,
     folder: str | Path,
     *,
     set_temperature: Callable[[float], None],
-    readings: Mapping[str, Reading],
+    read_blackbody: Callable[[], float] | None = None,
     limits: Limits | None = None,
+    preview: Callable[[Preview], None] | None = None,
     clock: Callable[[], float] = system_time.monotonic,
     sleep: Callable[[float], None] = system_time.sleep,
-) -> list[Summary]:
+) -> list[Step]:
     """
-    Record one step at each temperature of the blackbody, as soon as it rests there.
+    Record at each temperature of the blackbody, as soon as it rests there, through each filter.
+
+    Recordings of this sweep that are in the folder and complete are kept, so that a sweep that was
+    interrupted goes on where it was. Call `Devices.prepare` before.
 
     Parameters
     ----------
-    session : Session
-        With a blackbody.
-    sources : mapping
-        As for `dbthermal.instruments.record.record`.
+    devices : Devices
+        Of a session with a blackbody.
     folder : str or Path
-        Where the recordings go: ``<name>_<number>.zarr``.
+        Where the recordings go: ``<name>_<step>_<band>.zarr``.
     set_temperature : callable
         Sets the blackbody [K], or asks the user to.
-    readings : mapping
-        As for `record`; ``"blackbody"`` is awaited.
-    limits : Limits, optional
-        As for `record`.
+    read_blackbody : callable, optional
+        Reads it [K]; by default the thermocouple named ``"blackbody"`` does.
+    limits, preview : optional
+        As for `dbthermal.instruments.record.record`. The camera behind the wheel is called by the
+        band of the filter in the beam.
     clock, sleep : callable
         Time [s], for the wait.
 
     Returns
     -------
-    list of Summary
-        Of each step.
+    list of Step
+        In the order of the session, those that were kept too.
 
     Raises
     ------
     ValueError
-        If there is no blackbody in the session or the readings.
+        If there is no blackbody in the session or the readings; or a recording is there that is
+        incomplete, or of another temperature, or during which the wheel turned.
     TimeoutError
         As `wait_stable`; the steps before are kept.
+    SourceLostError
+        If a camera is lost on the way.
+    WheelError, ReadingError, OSError
+        As `Devices.select`, as `Devices.readings`, and as `record`.
     """
-    if session.blackbody is None or "blackbody" not in readings:
+    session = devices.session
+    extra = {} if read_blackbody is None else {BLACKBODY: Reading(read_blackbody)}
+    known = {**devices.readings(), **extra}
+    if session.blackbody is None or BLACKBODY not in known:
         raise ValueError(f"Invalid session '{session.name}'. Must have and read a blackbody.")
-    done = []
-    for number, temperature in enumerate(session.blackbody.temperatures):
-        set_temperature(temperature)
-        wait_stable(session, temperature, readings["blackbody"].read, clock=clock, sleep=sleep)
-        step = replace(session, name=f"{session.name}_{number:02d}")
-        path = Path(folder) / f"{step.name}.zarr"
-        done.append(record(step, sources, path, readings=readings, limits=limits))
-    return done
+    plan = _plan(session, folder)
+    kept = [_kept(number, temperature, band, path) for number, temperature, band, path in plan]
+    steps: list[Step] = []
+    resting: int | None = None
+    for (number, temperature, band, path), was in zip(plan, kept, strict=True):
+        if was is None and resting != number:
+            set_temperature(temperature)
+            wait_stable(session, temperature, known[BLACKBODY].read, clock=clock, sleep=sleep)
+            resting = number
+        summary = was or _record_step(devices, band, path, extra, limits, preview)
+        steps.append(Step(number, temperature, mean_reading(path, BLACKBODY), band, summary))
+    return steps
 
 
-def blackbody_movies(paths: Mapping[float, str | Path], *, frames: int) -> xr.Dataset:
+def record_scene(
+    devices: Devices,
+    path: str | Path,
+    *,
+    limits: Limits | None = None,
+    preview: Callable[[Preview], None] | None = None,
+    stop: threading.Event | None = None,
+) -> Summary:
     """
-    Put the steps of a calibration together.
+    Record a scene with all devices; an emulated scene begins with the recording.
+
+    Call `Devices.prepare` before.
 
     Parameters
     ----------
-    paths : mapping
-        Temperature [K] to the recording at it.
-    frames : int
-        Frames of each to take, the first ones of each band that are whole and show the blackbody.
+    devices : Devices
+        Of any session.
+    path : str or Path
+        Store to make, ``*.zarr``.
+    limits, preview, stop : optional
+        As for `dbthermal.instruments.record.record`.
 
     Returns
     -------
-    Dataset
-        Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x).
+    Summary
+        How it went.
 
     Raises
     ------
-    ValueError
-        If a recording has fewer good frames in a band.
+    FileExistsError, OSError, ValueError
+        As `record`.
     """
-    movies = []
-    for _, path in sorted(paths.items()):
-        capture = open_capture(path)
-        movies.append(
-            xr.concat([_good(capture, band, frames, path) for band in capture["band"]], dim="band")
-        )
-    axis = xr.DataArray(
-        sorted(paths),
-        dims="temperature",
-        name="temperature",
-        attrs=schema.COORDINATES["temperature"].attrs,
+    identities, own = devices.identities(), devices.session.filtered
+    if devices.wheel is not None and devices.wheel.band() != own:
+        raise ValueError(f"Invalid filter in the beam. Must be '{own}': prepare the devices.")
+    devices.flush()
+    if devices.world is not None:
+        devices.world.begin()
+    return record(
+        devices.session,
+        devices.sources,
+        path,
+        readings=devices.readings(),
+        identities=identities,
+        limits=limits,
+        preview=preview,
+        stop=stop,
     )
-    counts = xr.concat(movies, dim=axis).transpose("band", "temperature", "frame", "y", "x")
-    return schema.check(counts.to_dataset(name="counts"), "blackbody_movies")
 
 
-def _good(capture: xr.Dataset, band: xr.DataArray, frames: int, path: str | Path) -> xr.DataArray:
-    """Counts (frame, y, x) of good frames of one band."""
-    one = capture.sel(band=band)
-    good = np.flatnonzero(
-        np.isfinite(one["exposure_time"].values) & ((one["frame_flags"].values & _NO_VIEW) == 0)
-    )
-    if good.size < frames:
+def _plan(session: Session, folder: str | Path) -> list[tuple[int, float, str | None, Path]]:
+    """Step, temperature [K], band behind the wheel and recording, in their order."""
+    assert session.blackbody is not None
+    return [
+        (number, temperature, band, step_path(folder, session.name, number, band))
+        for number, temperature in enumerate(session.blackbody.temperatures)
+        for band in session.swept or (None,)
+    ]
+
+
+def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
+    """How a recording of the sweep went that is there already; None if there is none."""
+    if not path.exists():
+        return None
+    if not is_complete(path):
         raise ValueError(
-            f"Invalid recording '{path}' with {good.size} good frames in band '{band.item()}'. "
-            f"Must have {frames}."
+            f"Incomplete recording '{path}'. Must be complete: move it away, and this step is "
+            "recorded again."
         )
-    counts = one["counts"].isel(time=slice(0, int(good[frames - 1]) + 1)).load()
-    return counts.isel(time=good[:frames]).drop_vars("time").rename(time="frame")
+    attrs = store.open_dataset(path).attrs
+    was = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
+    if was[number : number + 1] != [temperature]:
+        raise ValueError(f"Recording '{path}' of temperatures {was} K. Must be of {temperature} K.")
+    require_filter(path, band)
+    return Summary(path, attrs["ended"], attrs["totals"])
+
+
+def _record_step(
+    devices: Devices,
+    band: str | None,
+    path: Path,
+    extra: Mapping[str, Reading],
+    limits: Limits | None,
+    preview: Callable[[Preview], None] | None,
+) -> Summary:
+    """Turn the filter into the beam, and record to the end."""
+    here = devices if band is None else devices.select(band)
+    identities = here.identities()
+    here.flush()
+    summary = record(
+        here.session,
+        here.sources,
+        path,
+        readings={**here.readings(), **extra},
+        identities=identities,
+        limits=limits,
+        preview=preview,
+    )
+    if summary.ended != "duration":
+        raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
+    require_filter(path, band)
+    return summary

@@ -1,0 +1,147 @@
+"""One command records a session, from its file to movies that open, and says how it went."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_session import LEVELS, TEXT, bench, pictures, replaced, scene_text
+
+from dbthermal import acquire
+from dbthermal.instruments import inventory, protocols
+from dbthermal.instruments.boson.commands import FfcStatus
+from dbthermal.instruments.capture import open_capture
+from dbthermal.instruments.devices import Devices
+from dbthermal.instruments.emulated.frames import Picture
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.record import Preview
+from dbthermal.instruments.session import Session
+
+TWO = replaced(
+    ("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("window: 3", "window: 0.1"), ("0.15", "0.5")
+)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Look at the blackbody more often."""
+    monkeypatch.setattr(protocols, "STABILITY_PERIOD", 0.05)
+
+
+def levels(_: Session, world: World) -> Mapping[str, Picture]:
+    """Pictures that tell band and temperature."""
+    return pictures(world)
+
+
+def written(path: Path, text: str) -> str:
+    """Path of a session that is written there."""
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every device is named as emulated, the progress is told, and the movies are of the sweep."""
+    file, folder = written(tmp_path / "a.yaml", TWO), tmp_path / "recorded"
+    assert acquire.main([file, str(folder)], pictures=levels) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("Session 'plate': every device is emulated, nothing is measured.")
+    assert "filter_wheel: model BSC201" in said
+    assert "Setting the emulated blackbody to 16.85 degC." in said
+    assert "11: " in said
+    assert "FPA 35.0 \N{DEGREE SIGN}C, FFC complete" in said
+    assert f"{folder / 'plate_01_11.zarr'}: duration" in said
+    movies = protocols.open_sweep(folder, "plate", frames=8)
+    exact = np.add.outer(list(LEVELS.values()), [2900, 3000])
+    np.testing.assert_array_equal(movies["counts"][:, :, 0, 0, 0], exact)
+
+
+def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
+    """Told to simulate, a session of hardware is recorded from the simulation's blackbody."""
+    text = scene_text().replace("simulated: true", "simulated: false")
+    file = written(tmp_path / "a.yaml", text.replace('3: "11"', "3: 10.6"))
+    assert acquire.main([file, str(tmp_path), "--simulate"]) == 0
+    capture = open_capture(tmp_path / "plate.zarr")
+    assert capture.attrs["is_simulated"] is True
+    assert float(capture["counts"].std("x").mean()) > 1
+
+
+def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The devices are opened and named, and no more."""
+    world = bench(Session.from_yaml(TEXT))
+    arguments = [written(tmp_path / "a.yaml", TEXT), str(tmp_path / "b"), "--dry-run"]
+    assert acquire.main(arguments, world, levels) == 0
+    assert "9.5: device sim://camera/narrow" in capsys.readouterr().out
+    assert world.camera("wide").ffc_count == 0
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "message"),
+    [
+        ("name: plate", 2, "Missing 'simulated' in the session"),
+        (TEXT.replace("sim://tc08", "sim://tc09"), 1, "Failed: Invalid URL 'sim://tc09'"),
+    ],
+)
+def test_failures_have_a_status(
+    text: str, status: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is wrong is said, and other programs are told."""
+    file = written(tmp_path / "a.yaml", text)
+    assert acquire.main([file, str(tmp_path)], pictures=levels) == status
+    assert message in capsys.readouterr().err
+
+
+def test_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file that is not there is named."""
+    assert acquire.main([str(tmp_path / "a.yaml"), str(tmp_path)]) == 2
+    assert "No session in" in capsys.readouterr().err
+
+
+def test_interrupted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who interrupts it is told that nothing is lost."""
+
+    def interrupt(_: acquire.Progress, __: Preview) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(acquire.Progress, "__call__", interrupt)
+    file = written(tmp_path / "a.yaml", scene_text())
+    assert acquire.main([file, str(tmp_path)], pictures=levels) == 130
+    assert "Interrupted: what was recorded is kept." in capsys.readouterr().err
+    assert (tmp_path / "plate.zarr").is_dir()
+
+
+def test_hardware_is_looked_for_and_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a rig that is not there the bus and the first address say so."""
+    monkeypatch.setattr(inventory, "find", lambda **_: [])
+    real = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
+    assert acquire.main([written(tmp_path / "a.yaml", real), str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    assert inventory.describe([]) in said.out
+    assert "/dev/none/" in said.err
+
+
+def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without an emulated one, the user is asked to set it, in degrees Celsius."""
+    asked: list[str] = []
+    monkeypatch.setattr("builtins.input", asked.append)
+    devices = Devices(Session.from_yaml(TEXT), {})
+    acquire._setter(devices)(300.0)
+    assert asked == ["\nSet the blackbody to 26.85 degC, and press Enter: "]
+
+
+def test_progress_is_a_line() -> None:
+    """One line tells the losses, the temperatures and the shutter of each band."""
+    lines: list[str] = []
+    progress = acquire.Progress(lines.append)
+    totals = {"9.5": {"frames": 10, "lost": 3, "refused": 0, "damaged": 0}}
+    readings = {"fpa 9.5": 308.15, "ffc 9.5": float(FfcStatus.IN_PROGRESS)}
+    progress(Preview(1.0, {}, totals, readings))
+    assert len(lines) == 1
+    assert lines[0].startswith("\r   1.0 s  9.5: ")
+    for part in ("3 lost", "0 refused", "FPA 35.0 \N{DEGREE SIGN}C", "FFC in progress"):
+        assert part in lines[0]
+    assert "\n" not in lines[0]

@@ -1,0 +1,271 @@
+"""The devices of a session are opened by their addresses, prepared, and say what they are."""
+
+import threading
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from rig_session import SHAPE, TEXT, bench, pictures, replaced, rig
+
+from dbthermal.instruments.boson import Boson, BosonTimeoutError, commands
+from dbthermal.instruments.boson.commands import FfcMode, FfcStatus, Ir16Mode, Switch, SyncMode
+from dbthermal.instruments.devices import (
+    Devices,
+    ReadingError,
+    Thermocouples,
+    emulated_world,
+    open_devices,
+)
+from dbthermal.instruments.emulated.boson import EmulatedBoson
+from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
+from dbthermal.instruments.emulated.port import EmulatedPort
+from dbthermal.instruments.filterwheel import NotHomedError
+from dbthermal.instruments.frames_source import NoFrameError
+from dbthermal.instruments.session import Session
+from dbthermal.instruments.tc08 import TC08, Flag, Scan
+
+
+@pytest.fixture
+def devices() -> Iterator[Devices]:
+    """Open the whole rig on emulators."""
+    with rig(Session.from_yaml(TEXT)) as opened:
+        yield opened
+
+
+def test_whole_rig_is_opened_and_closed() -> None:
+    """All devices of the file answer through their drivers, and are closed in the end."""
+    before = threading.active_count()
+    with rig(Session.from_yaml(TEXT)) as devices:
+        assert list(devices.sources) == list(devices.cameras) == ["8-14", "9.5"]
+        assert devices.wheel is not None
+        assert devices.logger is not None
+        assert threading.active_count() == before + 3  # each emulated line has one
+    assert threading.active_count() == before
+    for source in devices.sources.values():
+        with pytest.raises(ConnectionError, match="it is closed"):
+            source.read()
+    with pytest.raises(RuntimeError, match="closed"):
+        devices.logger.info()
+
+
+def test_opening_changes_nothing(devices: Devices) -> None:
+    """Cameras are as they were switched on, and the wheel was neither homed nor turned."""
+    assert devices.cameras["9.5"].get(commands.FFC_MODE) == FfcMode.AUTO
+    assert devices.cameras["9.5"].ffc_status() == FfcStatus.NONE_PERFORMED
+    assert devices.wheel is not None
+    with pytest.raises(NotHomedError):
+        devices.wheel.position()
+
+
+def test_every_device_says_what_it_is(devices: Devices) -> None:
+    """Numbers and versions are there, and that all are emulated."""
+    found = devices.identities()
+    assert found["8-14"]["serial_number"] == "93588"
+    assert found["9.5"]["serial_number"] == "93589"
+    assert found["9.5"]["device"] == "sim://camera/narrow"
+    assert found["9.5"]["software_revision"] == "0.0.0"
+    assert (found["filter_wheel"]["model"], found["thermocouples"]["serial"]) == (
+        "BSC201",
+        "EMULATED",
+    )
+    assert all(identity["is_simulated"] is True for identity in found.values())
+
+
+def test_readings_are_named(devices: Devices) -> None:
+    """Thermocouples, focal planes, shutters and the wheel's slot are asked through the drivers."""
+    assert devices.world is not None
+    devices.world.blackbody_temperature = 300.0
+    devices.world.camera("narrow").fpa_temperature = 311.25
+    devices.prepare()
+    readings = devices.readings()
+    found = {name: reading.read() for name, reading in readings.items()}
+    expected = {"blackbody": 300.0, "plate": 330.0, "fpa 8-14": 308.15, "fpa 9.5": 311.25}
+    expected |= {"ffc 8-14": 3.0, "ffc 9.5": 3.0, "filter_wheel": 1.0}
+    assert found == pytest.approx(expected, abs=1e-4)  # a thermocouple is of 32 bits
+    units = {name: reading.units for name, reading in readings.items()}
+    assert {name for name, unit in units.items() if unit == "1"} == {
+        "ffc 8-14",
+        "ffc 9.5",
+        "filter_wheel",
+    }
+
+
+def test_prepared_for_a_measurement(devices: Devices) -> None:
+    """16 bits, telemetry, a correction that was run and no other to come, and the filter in."""
+    devices.prepare()
+    for camera in devices.cameras.values():
+        assert camera.get(commands.IR16_MODE) == Ir16Mode.COUNTS_16
+        assert camera.get(commands.FFC_MODE) == FfcMode.MANUAL
+        assert camera.get(commands.TELEMETRY) == Switch.ON
+        assert camera.ffc_status() == FfcStatus.COMPLETE
+    assert devices.wheel is not None
+    assert devices.world is not None
+    assert (devices.wheel.band(), devices.world.filter_name) == ("9.5", "9.5")
+    assert devices.world.camera("wide").ffc_count == 1
+
+
+def test_setting_that_is_not_taken_is_an_error() -> None:
+    """A camera that acknowledges and stays as it was is not recorded with."""
+    camera = SimpleNamespace(set=lambda *_: None, get=lambda _: Ir16Mode.TLINEAR)
+    cameras = {"9.5": cast(Boson, camera)}
+    with pytest.raises(ValueError, match=r"Invalid IR16 mode .*TLINEAR.* of band '9\.5'.* Must be"):
+        Devices(Session.from_yaml(TEXT), {}, cameras).prepare()
+
+
+def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:
+    """Turned to another filter, source, command port and identity of the camera bear its name."""
+    devices.prepare()
+    here = devices.select("11")
+    assert list(here.sources) == list(here.cameras) == list(here.session.bands) == ["8-14", "11"]
+    assert here.sources["11"] is devices.sources["9.5"]
+    assert {"fpa 11", "ffc 11"} < here.readings().keys()
+    assert here.identities()["11"]["serial_number"] == "93589"
+    assert here.select("9.5").session.bands == ("8-14", "9.5")
+    with pytest.raises(ValueError, match=r"Invalid band '8-14' of the wheel"):
+        devices.select("8-14")
+
+
+def test_no_wheel_to_turn() -> None:
+    """Where there is no wheel no filter is selected."""
+    devices = Devices(Session.from_yaml(TEXT), {})
+    with pytest.raises(ValueError, match="Invalid band '11' of a session without a wheel"):
+        devices.select("11")
+
+
+def test_frames_that_wait_are_thrown_away(devices: Devices) -> None:
+    """After a flush the next frame is one that was exposed after it."""
+    assert devices.world is not None
+    source = devices.sources["8-14"]
+    source.read()
+    threading.Event().wait(0.05)
+    start = devices.world.clock()
+    devices.flush()
+    assert source.read().device_time >= start
+
+
+class Logger:
+    """A logger that counts its scans; channel 2 is open."""
+
+    def __init__(self) -> None:
+        self.scans = 0
+
+    def single(self) -> Scan:
+        """Scan once more: each one is a kelvin warmer."""
+        self.scans += 1
+        values = np.full(9, 300.0 + self.scans)
+        flags = np.where(np.arange(9) == 2, Flag.MISSING, Flag.GOOD).astype(np.uint8)
+        return Scan(0.0, 0.0, values, np.full(9, np.nan), flags)
+
+
+def test_one_scan_gives_all_channels_once() -> None:
+    """A round of readings is one scan; nobody gets a value twice, or an old one."""
+    logger, now = Logger(), [0.0]
+    names = {1: "plate", 2: "room", 3: "wall"}
+    thermocouples = Thermocouples(cast(TC08, logger), names, lambda: now[0])
+    assert [thermocouples.read(1), thermocouples.read(3), logger.scans] == [301.0, 301.0, 1]
+    assert [thermocouples.read(1), logger.scans] == [302.0, 2]
+    now[0] = 1.1
+    assert [thermocouples.read(3), logger.scans] == [303.0, 3]
+    with pytest.raises(ReadingError, match=r"No temperature of thermocouple 'room' in channel 2"):
+        thermocouples.read(2)
+
+
+def test_instrument_that_fails_is_a_failed_reading(devices: Devices) -> None:
+    """A mute camera and an unplugged logger raise what a recording notes and survives."""
+
+    def mute() -> float:
+        raise BosonTimeoutError("No reply to 'FPA temperature [K]'.")
+
+    camera = SimpleNamespace(fpa_temperature=mute, ffc_status=mute)
+    readings = Devices(devices.session, {}, {"9.5": cast(Boson, camera)}).readings()
+    with pytest.raises(ReadingError, match="No answer: No reply to 'FPA temperature"):
+        readings["fpa 9.5"].read()
+    assert devices.logger is not None
+    devices.logger.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        devices.readings()["plate"].read()
+
+
+def test_frames_and_commands_of_two_cameras_are_told(devices: Devices) -> None:
+    """Cables that were exchanged do not go unnoticed, where the frames say whose they are."""
+    crossed = dict(zip(devices.cameras, list(devices.cameras.values())[::-1], strict=True))
+    wrong = Devices(devices.session, devices.sources, crossed)
+    with pytest.raises(ValueError, match=r"Invalid cameras \('93588', '93589'\) of band '8-14'"):
+        wrong.identities()
+
+
+def test_frames_are_counted_once(devices: Devices) -> None:
+    """With a frame source, the emulated camera's counter is that of the frames that came."""
+    for _ in range(5):
+        frame = devices.sources["9.5"].read()
+    assert devices.cameras["9.5"].frame_count() == frame.sequence >= 4
+
+
+def test_camera_that_waits_for_pulses_gives_no_frames() -> None:
+    """Told over its command port to wait for pulses that do not come, its frame source is mute."""
+    world = bench(Session.from_yaml(TEXT))
+    device = EmulatedBoson(world, "narrow", free_running=False)
+    device.faults.pulses = False
+    source = EmulatedCamera(world, "narrow", pictures(world), "9.5", SHAPE, telemetry_rows=2)
+    with EmulatedPort(device) as port, Boson.from_url(f"pty://{port.path}") as camera:
+        source.read()
+        camera.set(commands.SYNC_MODE, SyncMode.SLAVE)
+        assert camera.get(commands.SYNC_MODE) == SyncMode.SLAVE
+        with pytest.raises(NoFrameError, match="it takes none now"):
+            source.read(0.1)
+        camera.set(commands.SYNC_MODE, SyncMode.DISABLED)
+        assert camera.get(commands.SYNC_MODE) == SyncMode.DISABLED
+        assert source.read().sequence == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("sim://camera/wide", "sim://camera/tele"), "Unknown camera 'tele'"),
+        (
+            ("sim://camera/wide", "sim://boson/wide"),
+            "Invalid address 'sim://boson/wide' of the cam",
+        ),
+        (("sim://boson/wide", "sim://apt/wide"), "Must be 'sim://boson/<name>'"),
+        (("sim://boson/wide", "sim://boson/tele"), "Unknown camera 'tele'"),
+        (("sim://tc08", "sim://tc09"), "Invalid URL 'sim://tc09'"),
+        (("{velocity", "{speed"), "Invalid setting of the wheel 'speed'"),
+    ],
+)
+def test_other_addresses_are_refused(change: tuple[str, str], message: str) -> None:
+    """What is not of the rig is named; nothing stays open."""
+    world = bench(Session.from_yaml(TEXT))
+    before = threading.active_count()
+    with (
+        pytest.raises((ValueError, KeyError), match=message),
+        open_devices(Session.from_yaml(replaced(change)), world),
+    ):
+        pass
+    assert threading.active_count() == before
+
+
+def test_hardware_has_no_emulated_world() -> None:
+    """A session of hardware never gets emulated frames."""
+    real = Session.from_yaml(replaced(("simulated: true", "simulated: false")))
+    arguments: list[dict[str, Any]] = [{"world": bench(real)}, {"faults": {"9.5": Faults()}}]
+    for extra in arguments:
+        with (
+            pytest.raises(ValueError, match="Invalid world for the hardware of 'plate'"),
+            open_devices(real, **extra),
+        ):
+            pass
+
+
+def test_world_of_a_session() -> None:
+    """Cameras, filters and thermocouples of the emulated bench are those of the session."""
+    session = Session.from_yaml(TEXT)
+    world = emulated_world(session, wheel_position=3)
+    assert (list(world.cameras), world.filter_name) == (["wide", "narrow"], "11")
+    assert world.thermocouples == {1: "blackbody", 4: "plate"}
+    with open_devices(session, faults={"9.5": Faults(seed=3)}) as devices:
+        wide, narrow = devices.sources.values()
+    assert isinstance(wide, EmulatedCamera)
+    assert isinstance(narrow, EmulatedCamera)
+    assert (wide.band, narrow.band, narrow.faults.seed) == ("8-14", None, 3)

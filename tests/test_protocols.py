@@ -1,0 +1,314 @@
+"""The rig waits for the blackbody, sweeps it through all filters, and what it recorded opens."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from rig_session import LEVELS, QUICK, SHAPE, TEXT, bench, replaced, rig, scene_text
+
+from dbthermal import store
+from dbthermal.instruments import protocols, sweep
+from dbthermal.instruments.capture import notes, open_capture
+from dbthermal.instruments.devices import Devices
+from dbthermal.instruments.emulated.frames import Faults
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.frames_source import SourceLostError
+from dbthermal.instruments.protocols import Step
+from dbthermal.instruments.record import Preview
+from dbthermal.instruments.session import Session
+
+ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"))
+TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"))
+BENCH = replaced(("protocol: response", "protocol: emissivity_bench"))
+
+
+class Clock:
+    """A clock that goes on only while somebody sleeps."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        """The time [s]."""
+        return self.now
+
+    def sleep(self, duration: float) -> None:
+        """Let time pass."""
+        self.now += duration
+
+
+def setter(devices: Devices, log: list[float] | None = None) -> Callable[[float], None]:
+    """Set the emulated blackbody, and note it."""
+
+    def set_temperature(value: float) -> None:
+        assert devices.world is not None
+        devices.world.blackbody_temperature = value
+        if log is not None:
+            log.append(value)
+
+    return set_temperature
+
+
+def swept(
+    devices: Devices,
+    folder: Path,
+    log: list[float] | None = None,
+    read: Callable[[], float] | None = None,
+    preview: Callable[[Preview], None] | None = None,
+) -> list[Step]:
+    """Sweep without waiting: the blackbody is where it is set at once."""
+    clock = Clock()
+    return protocols.record_sweep(
+        devices,
+        folder,
+        set_temperature=setter(devices, log),
+        read_blackbody=read,
+        limits=QUICK,
+        preview=preview,
+        clock=clock,
+        sleep=clock.sleep,
+    )
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Step]]:
+    """Record three temperatures through two filters."""
+    folder = tmp_path_factory.mktemp("sweep")
+    with rig(Session.from_yaml(BENCH)) as devices:
+        devices.prepare()
+        return folder, swept(devices, folder)
+
+
+def test_each_temperature_and_filter_is_a_recording(recorded: tuple[Path, list[Step]]) -> None:
+    """Names and steps say which; the temperature is the one that was read meanwhile."""
+    folder, steps = recorded
+    names = [f"plate_{number:02d}_{band}.zarr" for number in range(3) for band in ("9.5", "11")]
+    assert [step.summary.path.name for step in steps] == names
+    assert sorted(path.name for path in folder.iterdir()) == sorted(names)
+    assert [(step.number, step.temperature, step.band) for step in steps[:3]] == [
+        (0, 300.0, "9.5"),
+        (0, 300.0, "11"),
+        (1, 290.0, "9.5"),
+    ]
+    found = [step.blackbody for step in steps[::2]]
+    np.testing.assert_allclose(found, [300.0, 290.0, 310.0], rtol=0, atol=1e-4)  # [K]
+
+
+def test_wheel_decides_what_is_seen(recorded: tuple[Path, list[Step]]) -> None:
+    """Joined, all bands have the counts of their filter at the temperature that was read."""
+    movies = protocols.open_sweep(recorded[0], "plate", frames=8)
+    assert movies["counts"].shape == (3, 3, 8, *SHAPE)
+    assert list(movies["band"].values) == ["8-14", "9.5", "11"]
+    np.testing.assert_allclose(movies["temperature"], [290.0, 300.0, 310.0], rtol=0, atol=1e-4)
+    level = xr.DataArray(list(LEVELS.values()), dims="band") + 10 * movies["temperature"].round(2)
+    exact = level + xr.DataArray(np.arange(SHAPE[1]) % 2, dims="x")
+    np.testing.assert_array_equal(movies["counts"] - exact, 0 * movies["counts"])
+    assert movies.attrs["is_simulated"] is True
+
+
+def test_recording_says_what_it_was_made_with(recorded: tuple[Path, list[Step]]) -> None:
+    """Devices, slot of the wheel and blackbody are in each recording, under its band's name."""
+    path = recorded[0] / "plate_01_11.zarr"
+    identities = store.open_dataset(path).attrs["identities"]
+    assert set(identities) == {"8-14", "11", "filter_wheel", "thermocouples"}
+    assert identities["11"]["part_number"] == "EMULATED-BOSON-640"
+    found = {source: value for _, kind, source, value in notes(path) if kind == "reading"}
+    assert found["filter_wheel"] == 3
+    assert found["blackbody"] == pytest.approx(290.0, abs=1e-4)
+    assert found["ffc 11"] == 3
+
+
+def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Step]]) -> None:
+    """Counts are of region and good frames, corrected, and temperatures are those read."""
+    region = {"plate": (slice(0, 2), slice(0, 10))}
+    series = protocols.bench_series(recorded[0], "plate", region)["plate"]
+    seen = np.array([3000.5, 2900.5, 3100.5]) + np.array(list(LEVELS.values()))[:, None]
+    np.testing.assert_allclose(series["counts"], seen, rtol=0, atol=1e-9)  # [count]
+    np.testing.assert_allclose(series["object_temperature"], [330.0] * 3, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(
+        series["background_temperature"], [300.0, 290.0, 310.0], rtol=0, atol=1e-4
+    )
+    ones = np.ones((3, *SHAPE))
+    bad = ones > 1
+    bad[..., 1::2] = True  # of each band the columns that see one count more
+    dims = ("band", "y", "x")
+    correction = xr.Dataset(
+        {"gain": (dims, 0.5 * ones), "offset": (dims, 7 * ones), "bad": (dims, bad)},
+        coords={"band": list(LEVELS)},
+    )
+    corrected = protocols.bench_series(recorded[0], "plate", region, correction)["plate"]
+    np.testing.assert_allclose(corrected["counts"], 0.5 * (seen - 0.5) + 7, rtol=0, atol=1e-2)
+    with pytest.raises(ValueError, match="No frame or no pixel of band '8-14'"):
+        protocols.bench_series(recorded[0], "plate", {"plate": (slice(9, 9), slice(0, 2))})
+    with pytest.raises(ValueError, match="No reading of 'wall' in the recording"):
+        protocols.bench_series(recorded[0], "plate", {"wall": (slice(0, 2), slice(0, 2))})
+
+
+def test_what_is_missing_is_named(recorded: tuple[Path, list[Step]], tmp_path: Path) -> None:
+    """No sweep, too few frames, readings that differ, recordings that are not there."""
+    folder, _ = recorded
+    with pytest.raises(FileNotFoundError, match="No recording of a sweep 'dish'"):
+        protocols.open_sweep(folder, "dish", frames=8)
+    with pytest.raises(ValueError, match=r"plate_00_9\.5\.zarr' with .* Must have 900\."):
+        protocols.open_sweep(folder, "plate", frames=900)
+    (tmp_path / "plate_00_9.5.zarr").symlink_to(folder / "plate_00_9.5.zarr")
+    with pytest.raises(ValueError, match=r"Missing recording '.*plate_00_11\.zarr' of the sweep"):
+        protocols.open_sweep(tmp_path, "plate", frames=8)
+
+
+def test_recordings_of_a_step_must_agree(
+    recorded: tuple[Path, list[Step]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A blackbody that drifted between two filters has no one temperature."""
+    values = iter([300.0, 300.2])
+    monkeypatch.setattr(sweep, "mean_reading", lambda *_: next(values))
+    with pytest.raises(ValueError, match=r"Invalid readings \[300\.0, 300\.2\] K of 'blackbody'"):
+        protocols.open_sweep(recorded[0], "plate", frames=8)
+
+
+def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
+    """What is complete is kept, what is cut short is refused by its name, the rest is recorded."""
+    log: list[float] = []
+
+    def interrupt(_: Preview) -> None:
+        if len(log) > 1:
+            raise KeyboardInterrupt
+
+    with rig(Session.from_yaml(TWO)) as devices:
+        devices.prepare()
+        with pytest.raises(KeyboardInterrupt):
+            swept(devices, tmp_path, log, preview=interrupt)
+        cut = tmp_path / "plate_01_9.5.zarr"
+        with pytest.raises(ValueError, match=r"Incomplete recording '.*plate_01_9\.5\.zarr'"):
+            swept(devices, tmp_path, log)
+        cut.rename(tmp_path / "cut.zarr")
+        was = {path: path.stat().st_mtime_ns for path in tmp_path.glob("plate_00_*/zarr.json")}
+        assert len(was) == 2
+        log.clear()
+        steps = swept(devices, tmp_path, log)
+        assert log == [290.0]
+        assert {path: path.stat().st_mtime_ns for path in was} == was
+        assert (len(steps), steps[0].summary.ended) == (4, "duration")
+        assert steps[0].summary.totals["8-14"]["frames"] > 8
+        assert swept(devices, tmp_path, log) == steps
+    other = Session.from_yaml(replaced(("[300.0, 290.0, 310.0]", "[301.0, 290.0]")))
+    with rig(other) as devices, pytest.raises(ValueError, match=r"Must be of 301\.0 K"):
+        swept(devices, tmp_path)
+
+
+def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
+    """A recording through two filters is neither taken nor, later, opened."""
+    with rig(Session.from_yaml(ONE)) as devices:
+        devices.prepare()
+        wheel, world, calls = devices.wheel, devices.world, iter(range(9))
+        assert wheel is not None
+        assert world is not None
+
+        def read() -> float:
+            if next(calls, 9) == 5:  # four readings are waited for
+                wheel.move_to(2)
+            return world.blackbody_temperature
+
+        for _ in range(2):
+            with pytest.raises(ValueError, match=r"Invalid slots .* of filter '9\.5' throughout"):
+                swept(devices, tmp_path, read=read)
+
+
+def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
+    """A camera that is pulled out leaves a recording that says so, and no further one."""
+    with rig(Session.from_yaml(ONE)) as devices:
+        devices.prepare()
+        assert devices.world is not None
+        devices.sources["8-14"].faults = Faults(unplugged=3)  # type: ignore[attr-defined]
+        with pytest.raises(SourceLostError, match=r"plate_00_9\.5\.zarr' ended: source lost"):
+            swept(devices, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["plate_00_9.5.zarr"]
+
+
+def test_blackbody_must_be_read(tmp_path: Path) -> None:
+    """Without a thermocouple at the blackbody, or a function that reads it, nothing begins."""
+    text = replaced(("{1: blackbody, 4: plate}", "{4: plate}"))
+    with (
+        rig(Session.from_yaml(text)) as devices,
+        pytest.raises(ValueError, match="Must have and read a blackbody"),
+    ):
+        swept(devices, tmp_path)
+
+
+def test_sweep_without_a_wheel(tmp_path: Path) -> None:
+    """Two cameras of fixed bands have one recording at each temperature."""
+    lines = [line for line in ONE.splitlines() if "filter" not in line and "wheel" not in line]
+    text = "\n".join(line for line in lines if not line.startswith("sweep"))
+    session = Session.from_yaml(text)
+    with rig(session) as devices:
+        devices.prepare()
+        steps = swept(devices, tmp_path)
+    assert [(step.band, step.summary.path.name) for step in steps] == [(None, "plate_00.zarr")]
+    movies = protocols.open_sweep(tmp_path, "plate", frames=8)
+    np.testing.assert_array_equal(movies["counts"][:, 0, 0, 0, 0], [4000, 23_000])
+
+
+def test_scene_begins_with_its_recording(tmp_path: Path) -> None:
+    """Everything is recorded beside the frames, whose scene began just before the first of them."""
+    session = Session.from_yaml(scene_text())
+    world = bench(session, waits=True)
+    with rig(session, world) as devices:
+        with pytest.raises(RuntimeError, match="Must be homed"):
+            protocols.record_scene(devices, tmp_path / "a.zarr")
+        devices.prepare()
+        assert world.scene_began == np.inf
+        summary = protocols.record_scene(devices, tmp_path / "a.zarr", limits=QUICK)
+        assert devices.wheel is not None
+        devices.wheel.select("11")
+        with pytest.raises(ValueError, match=r"Must be '9\.5': prepare the devices"):
+            protocols.record_scene(devices, tmp_path / "b.zarr")
+    capture = open_capture(summary.path)
+    assert 0 <= capture.attrs["clock_origin"] - world.scene_began < 1
+    assert float(capture["exposure_time"].min()) >= 0
+    assert capture.attrs["identities"]["9.5"]["serial_number"] == "93589"
+    assert {"plate", "blackbody", "fpa 9.5"} <= {note[2] for note in notes(summary.path)}
+
+
+def wait(readings: list[float], clock: Clock) -> float:
+    """Wait for 300 K with these readings, one a second; the last one stays."""
+    values = iter(readings)
+    return protocols.wait_stable(
+        Session.from_yaml(TEXT),
+        300.0,
+        lambda: next(values, readings[-1]),
+        clock=clock,
+        sleep=clock.sleep,
+    )
+
+
+def test_rest_is_waited_for() -> None:
+    """A window of readings near the goal and near one another is rest, and its mean is given."""
+    clock = Clock()
+    found = wait([299.0, 299.5, 300.02, 300.0, 300.04, 300.02], clock)
+    assert found == pytest.approx(300.02)
+    assert clock.now == 5.0
+
+
+@pytest.mark.parametrize("readings", [[310.0], [300.0, 300.3] * 20])
+def test_no_rest_is_an_error(readings: list[float]) -> None:
+    """A temperature that rests elsewhere, or swings, is not taken for the step."""
+    with pytest.raises(TimeoutError, match=r"No rest at 300\.0 K within 20 s"):
+        wait(readings, Clock())
+
+
+def test_blackbody_takes_its_time() -> None:
+    """The emulated blackbody is waited for until it is near, and no longer."""
+    clock = Clock()
+    world = World(clock=clock, blackbody_temperature=290.0, time_constant=2.0)
+    world.blackbody_temperature = 300.0
+    found = protocols.wait_stable(
+        Session.from_yaml(TEXT),
+        300.0,
+        lambda: world.blackbody_temperature,
+        clock=clock,
+        sleep=clock.sleep,
+    )
+    assert clock.now == 12.0  # from 9 s on four readings differ by less than 0.1 K
+    assert found == pytest.approx(300 - 10 * np.exp(-np.arange(9, 13) / 2).mean(), abs=1e-9)
