@@ -370,7 +370,8 @@ def titles(figure: Figure) -> str:
 
 def test_every_figure_is_tested() -> None:
     """The list above is complete."""
-    assert {*figures.__all__} - {"provenance_note", "separated_film"} == DRAWN.keys()
+    elsewhere = {"LiveFigure", "Panel", "provenance_note", "separated_film"}
+    assert {*figures.__all__} - elsewhere == DRAWN.keys()
 
 
 @pytest.mark.parametrize("name", DRAWN)

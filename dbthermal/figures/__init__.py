@@ -21,6 +21,7 @@ from dbthermal.figures.comparison import (
 )
 from dbthermal.figures.films import separated_film
 from dbthermal.figures.limits import error_over_bands, error_over_bound, plan, pooling
+from dbthermal.figures.live import LiveFigure, Panel
 from dbthermal.figures.materials import condition_matrix, emissivity_bars, pooled_materials
 from dbthermal.figures.nuisances import disturbances, offsets, parallax
 from dbthermal.figures.scenes import (
@@ -32,6 +33,8 @@ from dbthermal.figures.twins import error_maps, thermocouples
 from dbthermal.figures.validity import status, validity
 
 __all__ = [
+    "LiveFigure",
+    "Panel",
     "accuracy",
     "compared_reflections",
     "condition_matrix",
