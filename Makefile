@@ -5,6 +5,7 @@ PYTHON ?= python3
 python := .venv/bin/python
 stems := $(basename $(notdir $(sort $(wildcard notebooks/*.ipynb))))
 full := $(stems:%=results/full/%.ipynb)
+recorded := $(basename $(notdir $(sort $(wildcard params/recorded/*.yaml))))
 smoke := $(stems:%=results/smoke/%.ipynb)
 sources := $(shell find dbthermal -type f -not -path '*/__pycache__/*') $(wildcard data_manifest.yaml)
 papermill := $(python) -m papermill --kernel python3 --no-progress-bar --log-level WARNING
@@ -35,7 +36,7 @@ unexport JUPYTER_PATH MPLBACKEND PYTHONHOME PYTHONPATH
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help install format check types pytest nbval test smoke reproduce verify record data bench lock clean FORCE
+.PHONY: help install format check types pytest nbval chain test smoke reproduce verify record data bench lock clean FORCE
 
 help: ## list the tasks
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -59,11 +60,13 @@ pytest: .venv/installed ## run the tests alone
 nbval: .venv/installed ## run every notebook with its own small values, as a test
 	$(if $(stems),$(python) -m pytest --nbval-lax $(stems:%=notebooks/%.ipynb),@echo "no notebooks")
 
-test: check types pytest nbval ## check everything: lint, types, tests, notebooks
+chain: $(recorded:%=results/chain/%.ipynb) ## from the bytes of the emulated rig to its separated video, with small values
+
+test: check types pytest nbval chain ## check everything: lint, types, tests, notebooks, and the chain of them
 
 smoke: $(smoke) ## run the notebooks with their own small values into results/smoke
 
-reproduce: $(full) ## run the notebooks in order, with the values in params/, into results/full
+reproduce: $(full) $(recorded:%=results/rig/%.ipynb) ## run the notebooks in order, with the values in params/, into results/full
 
 verify: .venv/installed ## compare results/full with the stored reference numbers
 	$(python) -m dbthermal.verify
@@ -119,6 +122,15 @@ results/full/%.ipynb: notebooks/%.ipynb params/%.yaml $(sources) results/inputs.
 results/smoke/%.ipynb: notebooks/%.ipynb $(sources) results/inputs.txt .venv/installed
 	$(call execute)
 
+# The same notebooks on what the emulated rig recorded: full values in results/rig, small ones in results/chain.
+results/rig/%.ipynb: notebooks/%.ipynb params/%.yaml params/recorded/%.yaml results/full/00_acquisition.ipynb
+	$(call execute,--parameters_file params/$*.yaml --parameters_file params/recorded/$*.yaml \
+	    -p run rig -p recorded results/full/00_acquisition)
+
+results/chain/%.ipynb: notebooks/%.ipynb params/recorded/%.yaml results/smoke/00_acquisition.ipynb
+	$(call execute,--parameters_file params/recorded/$*.yaml -p run chain -p recorded results/smoke/00_acquisition)
+
 # A notebook may open what an earlier one saved.
-chain = $(if $(previous),$(eval results/$(1)/$(stem).ipynb: results/$(1)/$(previous).ipynb))
-$(foreach stem,$(stems),$(call chain,full)$(call chain,smoke)$(eval previous := $(stem)))
+follow = $(if $(previous),$(eval results/$(1)/$(stem).ipynb: results/$(1)/$(previous).ipynb))
+$(foreach stem,$(stems),$(call follow,full)$(call follow,smoke)$(eval previous := $(stem)))
+$(eval previous :=)$(foreach stem,$(recorded),$(call follow,rig)$(call follow,chain)$(eval previous := $(stem)))

@@ -9,8 +9,11 @@ upwards. One stem, such as ``03_simulation``, names a notebook, its parameters a
       data/                      data()
       notebooks/NN_name.ipynb    notebook("NN_name")
       params/NN_name.yaml        params("NN_name")
+      params/sessions/           session("name")
+      recordings/<run>/          recordings(run)
       results/<run>/             results(run)
         NN_name.zarr ...         result(run, "NN_name", ".zarr")
+        NN_name/                 emulated(run, "NN_name")
 """
 
 import re
@@ -110,6 +113,73 @@ def params(stem: str) -> Path:
     """
     name = f"{_stem(stem)}.yaml"
     return root() / "params" / name
+
+
+def session(name: str) -> Path:
+    """Description of a recording session.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"scene"``.
+
+    Returns
+    -------
+    Path
+        ``params/sessions/<name>.yaml`` below the root.
+
+    Raises
+    ------
+    ValueError
+        If `name` is not lower-case letters, digits and ``_``.
+    """
+    if not re.fullmatch(r"[a-z0-9_]+", name):
+        raise ValueError(f"Invalid session {name!r}. Must be lower-case letters, digits and '_'.")
+    return root() / "params" / "sessions" / f"{name}.yaml"
+
+
+def recordings(run: str) -> Path:
+    """Folder of what hardware recorded; it need not exist. No task removes it.
+
+    Parameters
+    ----------
+    run : str
+        As for `results`.
+
+    Returns
+    -------
+    Path
+        ``recordings/<run>`` below the root.
+
+    Raises
+    ------
+    ValueError
+        As `results`.
+    """
+    return root() / "recordings" / results(run).name
+
+
+def emulated(run: str, stem: str) -> Path:
+    """Folder of what a notebook recorded from emulated devices; it need not exist.
+
+    Parameters
+    ----------
+    run : str
+        As for `results`.
+    stem : str
+        Such as ``"00_acquisition"``.
+
+    Returns
+    -------
+    Path
+        ``results/<run>/<stem>`` below the root, removed with the notebook's other results.
+
+    Raises
+    ------
+    ValueError
+        If `run` or `stem` is not a name as above.
+    """
+    return results(run) / _stem(stem)
 
 
 def results(run: str) -> Path:

@@ -10,6 +10,7 @@ from dbthermal import response as responses
 from dbthermal import simulation, store
 from dbthermal.emissivity import embedded_table
 from dbthermal.experiments import emulated_rig
+from dbthermal.experiments.emulated_bench import Bench
 from dbthermal.instruments.emulated.world import World
 
 SHAPE = (12, 16)
@@ -117,13 +118,42 @@ def test_truth_at_the_times_of_a_capture() -> None:
 
 def test_thermometers_have_their_errors() -> None:
     """Readings scatter as stated where it is stated, and are exact elsewhere."""
-    world = emulated_rig.Bench(np.random.default_rng(3), {"blackbody": 0.1})
+    world = Bench(np.random.default_rng(3), {"blackbody": 0.1})
     world.thermocouples.update({1: "blackbody", 2: "room"})
     read = np.array([world.thermocouple_temperature(1) for _ in range(2000)])
     assert read.std() == pytest.approx(0.1, rel=0.06)  # four deviations of 2000 samples
     assert read.mean() == pytest.approx(world.blackbody_temperature, abs=0.01)  # [K]
     assert {world.thermocouple_temperature(2) for _ in range(5)} == {296.15}
     assert np.isnan(world.thermocouple_temperature(3))
+
+
+def test_samples_are_heated_step_by_step() -> None:
+    """Each step sets the blackbody, and the samples anywhere within their ends."""
+    ends = dict.fromkeys(MATERIALS, (318.0, 343.0))
+    world = Bench(np.random.default_rng(4), {}, ends)
+    seen = []
+    for temperature in (290.0, 300.0, 310.0):
+        world.step(temperature)
+        here = world.scene_temperatures()
+        assert here["blackbody"] == temperature
+        seen += [here[name] for name in MATERIALS]
+    assert len(set(seen)) == 6
+    assert 318.0 <= min(seen) < max(seen) <= 343.0
+
+
+def test_thermocouple_follows_what_it_touches() -> None:
+    """A course over the scene's time is read where the scene is, and rests before it begins."""
+    now = [100.0]
+    course = xr.DataArray([300.0, 310.0], dims="time", coords={"time": [0.0, 10.0]})
+    world = Bench(
+        np.random.default_rng(5), {}, touched={"plate": course}, clock=lambda: now[0], waits=True
+    )
+    world.thermocouples[2] = "plate"
+    now[0] = 105.0
+    assert world.thermocouple_temperature(2) == 300.0
+    world.begin()
+    now[0] = 107.5
+    assert world.thermocouple_temperature(2) == pytest.approx(302.5, abs=1e-9)  # [K]
 
 
 def test_truth_lies_beside_the_recordings(tmp_path: Path) -> None:

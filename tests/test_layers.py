@@ -15,7 +15,8 @@ LAYERS = (
     "response bands frames alignment metrics figures store provenance manifest readers paper",
     "calibration emissivity separation",
     "simulation verify published instruments",
-    "experiments",
+    "experiments live",
+    "acquire",
 )
 LEVEL = {module: level for level, row in enumerate(LAYERS) for module in row.split()}
 PLACES = {

@@ -29,7 +29,7 @@ def cells(path: Path, kind: str) -> list[NotebookNode]:
 
 def test_stems_are_equal() -> None:
     """Every notebook has its parameters, and there are no others."""
-    names = {path.stem for path in (ROOT / "params").glob("*")}
+    names = {path.stem for path in (ROOT / "params").glob("*.yaml")}
     assert names == {path.stem for path in NOTEBOOKS}
 
 

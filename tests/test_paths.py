@@ -51,6 +51,19 @@ def test_fixed_places(project: Path) -> None:
     """The manifest and the fetched files lie at the root."""
     assert paths.manifest() == project / "data_manifest.yaml"
     assert paths.data() == project / "data"
+    assert paths.session("scene") == project / "params" / "sessions" / "scene.yaml"
+    with pytest.raises(ValueError, match="Invalid session 'a/b'"):
+        paths.session("a/b")
+
+
+def test_what_was_measured_lies_apart(project: Path) -> None:
+    """No task removes recordings of hardware; emulated ones go with their notebook's results."""
+    assert paths.recordings("lab") == project / "recordings" / "lab"
+    made = paths.emulated("full", "00_acquisition")
+    assert made == project / "results" / "full" / "00_acquisition"
+    for run in ("..", "a/b"):
+        with pytest.raises(ValueError, match="Invalid run"):
+            paths.recordings(run)
 
 
 @pytest.mark.usefixtures("project")

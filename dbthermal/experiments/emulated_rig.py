@@ -31,51 +31,6 @@ Places = Mapping[str, tuple[slice, slice]]
 _TRUTH: Final = "truth_"
 
 
-class Bench(World):
-    """
-    An emulated bench whose thermometers have errors.
-
-    Parameters
-    ----------
-    rng : Generator
-        Source of the errors.
-    reading_std : mapping
-        Standard deviation of one reading of what is named, as in `thermocouples` [K]; what is not
-        named is read without error.
-    **world
-        As for `World`.
-    """
-
-    def __init__(
-        self, rng: np.random.Generator, reading_std: Mapping[str, float], **world: Any
-    ) -> None:
-        super().__init__(**world)
-        self._rng, self._std = rng, dict(reading_std)
-
-    def thermocouple_temperature(self, channel: int) -> float:
-        """
-        Temperature of the tip of one thermocouple, with the error of one reading.
-
-        Parameters
-        ----------
-        channel : int
-            Of the logger.
-
-        Returns
-        -------
-        float
-            Temperature [K]; NaN if it is open or there is none.
-
-        Raises
-        ------
-        KeyError
-            If it is at something that the scene does not have.
-        """
-        std = self._std.get(self.thermocouples.get(channel, "open"), 0.0)
-        with self.lock:
-            return super().thermocouple_temperature(channel) + std * float(self._rng.normal())
-
-
 @dataclass(frozen=True)
 class Views:
     """

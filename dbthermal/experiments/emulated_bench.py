@@ -1,0 +1,124 @@
+"""An emulated bench as a laboratory has one: its thermometers err, its samples are heated."""
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+import xarray as xr
+
+from dbthermal.instruments.devices import furnish
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.session import Session
+
+
+class Bench(World):
+    """
+    An emulated bench whose thermometers have errors, and whose samples are heated.
+
+    Parameters
+    ----------
+    rng : Generator
+        Source of the errors, and of the samples' temperatures.
+    reading_std : mapping
+        Standard deviation of one reading of what is named, as in `thermocouples` [K]; what is not
+        named is read without error.
+    samples : mapping, optional
+        Sample to the lowest and highest temperature to which it is heated [K].
+    touched : mapping, optional
+        What else a thermocouple touches, to its temperature (time) [K] over the scene's time [s].
+    **world
+        As for `World`.
+    """
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        reading_std: Mapping[str, float],
+        samples: Mapping[str, tuple[float, float]] | None = None,
+        touched: Mapping[str, xr.DataArray] | None = None,
+        **world: Any,
+    ) -> None:
+        super().__init__(scene=self._warmth, **world)
+        self._rng, self._std, self._samples = rng, dict(reading_std), dict(samples or {})
+        self._touched = dict(touched or {})
+        self._temperatures = {name: low for name, (low, _) in self._samples.items()}
+
+    @classmethod
+    def of(
+        cls,
+        session: Session,
+        rng: np.random.Generator,
+        errors: Mapping[str, float],
+        *,
+        samples: Mapping[str, tuple[float, float]] | None = None,
+        touched: Mapping[str, xr.DataArray] | None = None,
+    ) -> Self:
+        """
+        Bench of an emulated session; its scene waits for `begin`.
+
+        Parameters
+        ----------
+        session : Session
+            Its cameras, filters and thermocouples are on the bench.
+        rng : Generator
+            As for `Bench`.
+        errors : mapping
+            Standard deviation of one reading of the ``blackbody`` and of any other
+            ``thermocouple`` [K].
+        samples, touched : mapping, optional
+            As for `Bench`.
+
+        Returns
+        -------
+        Bench
+            For `dbthermal.instruments.devices.open_devices`.
+        """
+        std = dict.fromkeys(session.thermocouples.values(), errors["thermocouple"])
+        std["blackbody"] = errors["blackbody"]
+        bench = cls(rng, std, samples, touched, filters=session.filters, waits=True)
+        furnish(bench, session)
+        return bench
+
+    def step(self, temperature: float) -> None:
+        """
+        Set the blackbody, and heat every sample to a temperature of its own.
+
+        Parameters
+        ----------
+        temperature : float
+            Of the blackbody [K].
+        """
+        self.blackbody_temperature = temperature
+        self._temperatures = {
+            name: float(self._rng.uniform(*ends)) for name, ends in self._samples.items()
+        }
+
+    def thermocouple_temperature(self, channel: int) -> float:
+        """
+        Temperature of the tip of one thermocouple, with the error of one reading.
+
+        Parameters
+        ----------
+        channel : int
+            Of the logger.
+
+        Returns
+        -------
+        float
+            Temperature [K]; NaN if it is open or there is none.
+
+        Raises
+        ------
+        KeyError
+            If it is at something that the scene does not have.
+        """
+        std = self._std.get(self.thermocouples.get(channel, "open"), 0.0)
+        with self.lock:
+            return super().thermocouple_temperature(channel) + std * float(self._rng.normal())
+
+    def _warmth(self, time: float) -> Mapping[str, float]:
+        touched = {
+            name: float(np.interp(time, course["time"], course))
+            for name, course in self._touched.items()
+        }
+        return {**self._temperatures, **touched}
