@@ -36,7 +36,7 @@ unexport JUPYTER_PATH MPLBACKEND PYTHONHOME PYTHONPATH
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help install format check types pytest nbval chain test smoke reproduce verify record data bench lock clean FORCE
+.PHONY: help install format check types pytest nbval chain interop test smoke reproduce verify record data bench lock clean FORCE
 
 help: ## list the tasks
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -61,6 +61,13 @@ nbval: .venv/installed ## run every notebook with its own small values, as a tes
 	$(if $(stems),$(python) -m pytest --nbval-lax $(stems:%=notebooks/%.ipynb),@echo "no notebooks")
 
 chain: $(recorded:%=results/chain/%.ipynb) ## from the bytes of the emulated rig to its separated video, with small values
+
+interop: ## compare emulators and codecs with independent software, in an environment of its own, which it downloads
+	"$(PYTHON)" -m venv .venv/interop
+	.venv/interop/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
+	.venv/interop/bin/python -m pip install --quiet --group interop --editable '.[instruments,test]'
+	.venv/interop/bin/python -c "import flirpy, thermocouple_its90, thorlabs_apt_protocol"
+	.venv/interop/bin/python -m pytest tests/test_interop.py
 
 test: check types pytest nbval chain ## check everything: lint, types, tests, notebooks, and the chain of them
 
