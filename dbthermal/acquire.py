@@ -3,7 +3,7 @@
 The devices are opened, named and prepared, and the session's protocol is run: a scene becomes
 ``<name>.zarr`` in the folder, a sweep of the blackbody a recording for each temperature and filter,
 and where it was interrupted it goes on. The blackbody is set by the one who sits at it. With
-``--simulate`` the same drivers talk to emulated devices, whose cameras see an even blackbody.
+``--simulate`` the same drivers talk to emulated devices, whose cameras see a blackbody.
 
 Exit status: 0 if all was recorded, 1 if a device or a recording failed, 2 if the session is none,
 130 if it was interrupted; what was recorded is kept. Nothing here was ever run on hardware.
@@ -12,21 +12,23 @@ Exit status: 0 if all was recorded, 1 if a device or a recording failed, 2 if th
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from scipy.constants import zero_Celsius
 
-from dbthermal import response as responses
 from dbthermal import simulation
+from dbthermal.experiments.emulated_rig import Views
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.boson import BosonError
-from dbthermal.instruments.boson.commands import ZERO_CELSIUS
 from dbthermal.instruments.devices import Devices, emulated_world, open_devices
+from dbthermal.instruments.emulated import usb
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import ROOM, World
-from dbthermal.instruments.frames_source import Counts
 from dbthermal.instruments.record import Preview, Summary
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08Error
@@ -74,7 +76,7 @@ class Progress:
 
 def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     """
-    What emulated cameras see of an even blackbody, by the simulation's response.
+    What emulated cameras see of a blackbody that fills the view, by the simulated rig.
 
     Parameters
     ----------
@@ -94,33 +96,58 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
         If a band is not known.
     """
     bands = tuple(dict.fromkeys((*session.bands, *session.filters.values())))
-    response = simulation.Rig(bands=bands, noise=(NOISE,) * len(bands)).response()
-
-    def picture(number: int, band: str) -> Picture:
-        curve, rng = responses.curve(response, band), np.random.default_rng(number)
-        noise = np.float32(response["noise"].sel(band=band))
-
-        def show(_: float) -> Counts:
-            level = float(curve.counts(np.array(world.blackbody_temperature)))
-            frame = level + noise * rng.standard_normal(session.shape, dtype=np.float32)
-            counts: Counts = np.rint(frame).astype(np.uint16)
-            return counts
-
-        return show
-
-    return {band: picture(number, band) for number, band in enumerate(bands)}
+    rig = simulation.Rig(bands=bands, noise=(NOISE,) * len(bands))
+    detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
+    return dict(Views(rig, detector, seed=0).blackbody(world))
 
 
-def ask_for_blackbody(temperature: float) -> None:
+def ask_for_blackbody(name: str, temperature: float) -> None:
     """
     Ask who sits at the blackbody to set it, and wait for Enter.
 
     Parameters
     ----------
+    name : str
+        Of the session.
     temperature : float
         What it is to be set to [K].
+
+    Raises
+    ------
+    RuntimeError
+        If there is no keyboard, as under papermill.
     """
-    input(f"\nSet the blackbody to {temperature - ZERO_CELSIUS:.2f} degC, and press Enter: ")
+    celsius = f"{temperature - zero_Celsius:.2f} degC"
+    question = f"\n{name}: set the blackbody to {celsius} and press Enter; its rest is awaited. "
+    try:
+        input(question)
+    except (EOFError, NotImplementedError) as error:
+        raise RuntimeError(
+            f"Nobody at a keyboard sets the blackbody to {celsius}. Must be run in a terminal, or "
+            "in Jupyter."
+        ) from error
+
+
+def plugged_in(session: Session) -> str:
+    """
+    Say what is on the bus; the devices may open even where it cannot be looked at.
+
+    Parameters
+    ----------
+    session : Session
+        Its frame rate says which bandwidth is needed; if it is simulated, so is the bus.
+
+    Returns
+    -------
+    str
+        See `dbthermal.instruments.inventory.describe`; without libusb, what is missing.
+    """
+    plugged: AbstractContextManager[dict[str, Any]] = nullcontext({})
+    with usb.rig() if session.simulated else plugged as bus:
+        try:
+            return inventory.describe(inventory.find(**bus, frame_rate=session.frame_rate))
+        except inventory.LibusbMissingError as error:
+            return f"The bus was not looked at: {error}"
 
 
 def main(
@@ -185,7 +212,7 @@ def _run(
         world = _world(session) if world is None else world
         seen = pictures(session, world)
     else:
-        print(_inventory(session))
+        print(plugged_in(session))
     with open_devices(session, world, seen) as devices:
         for name, identity in devices.identities().items():
             print(f"{name}: " + ", ".join(f"{key} {value}" for key, value in identity.items()))
@@ -218,10 +245,10 @@ def _setter(devices: Devices) -> Callable[[float], None]:
     """What sets the blackbody: the emulated one by itself, the real one by who sits at it."""
     world = devices.world
     if world is None:
-        return ask_for_blackbody
+        return partial(ask_for_blackbody, devices.session.name)
 
     def set_temperature(temperature: float) -> None:
-        print(f"\nSetting the emulated blackbody to {temperature - ZERO_CELSIUS:.2f} degC.")
+        print(f"\nSetting the emulated blackbody to {temperature - zero_Celsius:.2f} degC.")
         world.blackbody_temperature = temperature
 
     return set_temperature
@@ -231,14 +258,6 @@ def _world(session: Session) -> World:
     """Bench on which all but the blackbody is as warm as the room."""
     places = dict.fromkeys(session.thermocouples.values(), ROOM)
     return emulated_world(session, scene=lambda _: places, waits=True)
-
-
-def _inventory(session: Session) -> str:
-    """Say what is on the bus; the devices may open even where it cannot be looked at."""
-    try:
-        return inventory.describe(inventory.find(frame_rate=session.frame_rate))
-    except inventory.LibusbMissingError as error:
-        return f"The bus was not looked at: {error}"
 
 
 if __name__ == "__main__":

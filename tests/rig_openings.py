@@ -82,14 +82,14 @@ def port_wheel(stack: ExitStack) -> Opened:
     port: Any = stack.enter_context(start_wheel({"model": "BSC101"}, None))
     port.device.faults.slow = 0.01
     url = f"pty://{port.path}"
-    return Opened(FilterWheel.open(url, QUICK), True, lambda: FilterWheel.open(url, QUICK))
+    return Opened(FilterWheel.from_url(url, QUICK), True, lambda: FilterWheel.from_url(url, QUICK))
 
 
 def real_wheel(_: ExitStack) -> Opened:
     """A wheel."""
     url, settings = address("DBTHERMAL_WHEEL"), Settings(filters=FILTERS)
-    opened = FilterWheel.open(url, settings)
-    return Opened(opened, False, lambda: FilterWheel.open(url, settings))
+    opened = FilterWheel.from_url(url, settings)
+    return Opened(opened, False, lambda: FilterWheel.from_url(url, settings))
 
 
 def stub_logger(_: ExitStack) -> Opened:

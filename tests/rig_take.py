@@ -15,13 +15,19 @@ from dbthermal.instruments.capture import notes
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.fetching import Limits, Reading
-from dbthermal.instruments.frames_source import UNTIMED, Counts, Frame, FrameFlag, FrameSource
+from dbthermal.instruments.frames_source import (
+    DAMAGED,
+    UNTIMED,
+    Counts,
+    Frame,
+    FrameFlag,
+    FrameSource,
+)
 from dbthermal.instruments.session import Camera, Device, Session
 
 BANDS, SHAPE, RATE, MILLI = ("8-14", "9.5"), (16, 24), 100.0, 1e-3
 LIMITS = Limits(chunk=5, queue=10_000, reserve=0, reading_period=0.02)
 PATTERN = np.random.default_rng(1).integers(5000, 6000, SHAPE).astype(np.uint16)
-DAMAGED = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
 SOURCES_OWN = 0x0F  # flags that are the source's to set
 
 Read = Callable[[], float]
@@ -104,6 +110,8 @@ class Take:
         np.testing.assert_array_equal(kept["device_time"], [frame.device_time for frame in given])
         flags = kept["frame_flags"].values
         np.testing.assert_array_equal(flags & SOURCES_OWN, [int(frame.flags) for frame in given])
+        same = [np.array_equal(a.counts, b.counts) for a, b in pairwise(given)]
+        np.testing.assert_array_equal(flags[1:] & int(FrameFlag.IMAGE_REPEATED) > 0, same)
         self.check_times(kept, flags, self.cameras[band].faults)
         self.check_losses(band, given, flags)
 

@@ -130,7 +130,32 @@ def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("builtins.input", asked.append)
     devices = Devices(Session.from_yaml(TEXT), {})
     acquire._setter(devices)(300.0)
-    assert asked == ["\nSet the blackbody to 26.85 degC, and press Enter: "]
+    assert asked == [
+        "\nplate: set the blackbody to 26.85 degC and press Enter; its rest is awaited. "
+    ]
+
+
+@pytest.mark.parametrize("error", [EOFError, NotImplementedError])
+def test_nobody_at_the_keyboard(error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing can be typed, as under papermill, the error says where it can."""
+
+    def refuse(_: str) -> str:
+        raise error
+
+    monkeypatch.setattr("builtins.input", refuse)
+    with pytest.raises(RuntimeError, match=r"26\.85 degC\. Must be run in a terminal, or in Jup"):
+        acquire.ask_for_blackbody("plate", 300.0)
+
+
+def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without libusb that is said, and is no end: the devices are opened by their nodes."""
+
+    def missing(**_: object) -> list[inventory.Device]:
+        raise inventory.LibusbMissingError("no libusb")
+
+    monkeypatch.setattr(inventory, "find", missing)
+    session = Session.from_yaml(TEXT)
+    assert acquire.plugged_in(session) == "The bus was not looked at: no libusb"
 
 
 def test_progress_is_a_line() -> None:

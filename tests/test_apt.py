@@ -209,6 +209,13 @@ def test_what_does_not_fit_is_refused(message: apt.Message, error: str) -> None:
         apt.move_absolute(1, 2**31, destination=apt.BAY_1)
 
 
+@pytest.mark.parametrize("wrong", [1.5, float("nan"), "1", None])
+def test_a_number_must_be_whole(wrong: object) -> None:
+    """Nothing is rounded into a field."""
+    with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
+        apt.home(wrong, destination=apt.UNIT)  # type: ignore[arg-type]
+
+
 known = st.sampled_from([INFO, *map(bytes.fromhex, (STATUS, LONG_STATUS, LONG_COMPLETED))])
 cut_short = st.tuples(known, st.integers(0, 90)).map(lambda pair: pair[0][: pair[1]])
 streams = st.lists(st.one_of(st.binary(max_size=9), known, cut_short), max_size=8).map(b"".join)
@@ -268,9 +275,21 @@ def test_lengths_that_no_message_has(header: str) -> None:
 
 def test_what_a_host_sends_is_not_heard_by_a_host() -> None:
     """An echo of the host's own messages is no answer."""
-    decoder = apt.Decoder()
+    decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
     assert decoder.feed(apt.request_info(destination=apt.UNIT) + bytes(6)) == []
     assert decoder.dropped == 7
+
+
+@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
+def test_a_line_is_read_in_both_directions(kind: type) -> None:
+    """Every request, and the reply to it, is found on a line that was noted, byte by byte."""
+    decoder, reply = apt.Decoder(), bytes.fromhex(LONG_COMPLETED)
+    for expected in REQUESTS:
+        line = bytes.fromhex(expected) + reply
+        found = [m for place in range(len(line)) for m in decoder.feed(kind(line[place:][:1]))]
+        assert [apt.encode(message) for message in found] == [line[: -len(reply)], reply]
+    assert decoder.feed(kind(b"")) == []
+    assert (decoder.dropped, decoder.pending) == (0, 0)
 
 
 def test_identifiers_and_lengths_are_the_published_ones() -> None:
@@ -289,7 +308,7 @@ def test_bits_are_the_published_ones() -> None:
 )
 def test_a_computer_hears_controllers_alone(source: int, heard: int) -> None:
     """The rack, its ten bays and a unit are heard; from any other address it is noise."""
-    decoder = apt.Decoder()
+    decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
     assert len(decoder.feed(bytes((0x64, 0x04, 1, 0, 1, source)))) == heard
     assert decoder.dropped == 1 - heard
 

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rig_devices import BosonBench, Clock
-from test_boson import SERIAL, SERIAL_REQUEST, SET_GAIN
+from test_boson import SERIAL, SET_GAIN
+from test_fslp import SERIAL_REQUEST
 
 from dbthermal.instruments import fslp
 from dbthermal.instruments.boson import (
@@ -290,3 +291,11 @@ def test_a_pseudo_terminal_brings_every_reply_until_it_hangs_up() -> None:
         world.camera("boson").plugged = False
         with pytest.raises(TransportError, match="must stay connected"):
             camera.serial_number()
+
+
+def test_the_largest_numbers_are_said_as_they_are() -> None:
+    """The largest serial number and temperature have room in the emulator's answers."""
+    with Boson.from_url("sim://boson?sn=4294967295&fpa=655") as camera:
+        assert camera.serial_number() == 2**32 - 1
+        assert camera.read(commands.FPA_TEMPERATURE_KELVIN) == 655.0
+        assert camera.read(commands.FPA_COUNTS) == 65500

@@ -25,7 +25,7 @@ from dbthermal.instruments.tc08 import TC08, Flag
 from dbthermal.instruments.transport import TransportError
 
 CLOSED = (TransportError, RuntimeError, SourceLostError)
-NAMES = {"model", "part_number", "serial", "serial_number"}
+NAMES = {"model", "part_number", "serial_number"}
 
 
 def opens(*ways: Opening) -> pytest.MarkDecorator:
@@ -49,9 +49,11 @@ def opened(request: pytest.FixtureRequest) -> Iterator[Opened]:
 
 def identity(device: Any) -> Mapping[str, object]:
     """What a device says it is, by name."""
-    if isinstance(device, Boson):
-        return vars(device.identity())
-    return vars(device.info()) if isinstance(device, TC08) else device.identity
+    return (
+        vars(device.identity())
+        if isinstance(device, Boson | FilterWheel | TC08)
+        else device.identity
+    )
 
 
 def ask(device: Any) -> object:
@@ -62,7 +64,7 @@ def ask(device: Any) -> object:
         case FilterWheel():
             return device.status()
         case TC08():
-            return device.info()
+            return device.identity()
         case _:
             return device.read()
 

@@ -47,7 +47,7 @@ def test_whole_rig_is_opened_and_closed() -> None:
         with pytest.raises(ConnectionError, match="it is closed"):
             source.read()
     with pytest.raises(RuntimeError, match="closed"):
-        devices.logger.info()
+        devices.logger.identity()
 
 
 def test_opening_changes_nothing(devices: Devices) -> None:
@@ -66,7 +66,7 @@ def test_every_device_says_what_it_is(devices: Devices) -> None:
     assert found["9.5"]["serial_number"] == "93589"
     assert found["9.5"]["device"] == "sim://camera/narrow"
     assert found["9.5"]["software_revision"] == "0.0.0"
-    assert (found["filter_wheel"]["model"], found["thermocouples"]["serial"]) == (
+    assert (found["filter_wheel"]["model"], found["thermocouples"]["serial_number"]) == (
         "BSC201",
         "EMULATED",
     )

@@ -70,11 +70,13 @@ def test_damaged_frames(name: str, tmp_path: Path) -> None:
 
 
 def test_a_repeated_image(tmp_path: Path) -> None:
-    """The recording keeps it as it came; it is found beside the frame before, and taken out."""
+    """The recording keeps it as it came and says so, and afterwards it is found and taken out."""
     take = Take(tmp_path / "a.zarr", {"9.5": Faults(repeated=OFTEN)}).record(0.4)
     capture = open_capture(take.path).isel(time=slice(0, len(take.cameras["9.5"].given)))
     found = frames.find_shutter(capture).query(event="band == '9.5'")
     repeated = np.isin(capture["sequence"].sel(band="9.5"), [*OFTEN])
+    flagged = capture["frame_flags"].sel(band="9.5").values & int(FrameFlag.IMAGE_REPEATED)
+    np.testing.assert_array_equal(flagged > 0, repeated)
     assert found["frames"].sum() == np.count_nonzero(repeated) > 0
     assert not found["renewed"].any()
 

@@ -52,7 +52,7 @@ def test_every_slot_turns_into_the_beam(model: str) -> None:
         wheel.move_to(position)
         assert (wheel.position(), bench.world.wheel_position) == (position, position)
     assert wheel.is_simulated
-    assert wheel.identity["model"] == model
+    assert wheel.identity().model == model
 
 
 def test_filters_are_called_by_their_band() -> None:
@@ -148,7 +148,7 @@ def test_addresses_are_looked_for(model: str) -> None:
     bench = WheelBench(model)
     bench.wheel.connect()
     expected = "0x11, 0x21" if model == "BSC201" else "0x50, 0x50"
-    assert bench.wheel.identity["addresses"] == expected
+    assert bench.wheel.identity().addresses == expected
     wrong = WheelBench(model, addresses=((0x22, 0x23),))
     with pytest.raises(NoReplyError, match=r"No APT controller answered at 0x22. It must be on"):
         wrong.wheel.connect()
@@ -184,6 +184,11 @@ def test_wrong_devices() -> None:
         ({"tolerance": float("nan")}, "Invalid tolerance nan"),
         ({"home_offset": 400.0}, "Invalid home_offset 400.0"),
         ({"home_direction": 3}, "Invalid home_direction 3"),
+        ({"reply_timeout": 0.0}, r"Invalid reply_timeout 0\.0 of the wheel. Must be positive"),
+        ({"poll_interval": -0.1}, r"Invalid poll_interval -0\.1"),
+        ({"stall_timeout": float("nan")}, "Invalid stall_timeout nan"),
+        ({"tolerance": 30.0}, r"Invalid tolerance 30\.0 deg. Must be less than 30"),
+        ({"addresses": ()}, r"Invalid addresses \(\)"),
     ],
 )
 def test_settings_are_checked(options: dict[str, object], error: str) -> None:
@@ -206,11 +211,11 @@ def _port() -> Iterator[EmulatedPort]:
 def test_over_a_pseudo_terminal(port: EmulatedPort) -> None:
     """Through a serial port, which here has no RTS to raise, in real time."""
     chosen = Settings(filters=FILTERS, reply_timeout=0.3, poll_interval=0.005)
-    with FilterWheel.open(f"pty://{port.path}", chosen) as wheel:
+    with FilterWheel.from_url(f"pty://{port.path}", chosen) as wheel:
         wheel.home()
         wheel.select("LW")
         assert wheel.band() == "LW"
-        assert wheel.identity["serial_number"] == "40000123"
+        assert wheel.identity().serial_number == 40_000_123
         port.device.plugged = False  # type: ignore[misc]
         port.close()
         with pytest.raises(TransportError, match=f"'pty://{port.path}'"):
@@ -221,11 +226,17 @@ def test_by_name_of_an_emulator() -> None:
     """A wheel in a world is opened by its name, and turns what the world's camera sees."""
     world = World(filters=FILTERS, wheel_position=3)
     chosen = Settings(filters=FILTERS, reply_timeout=0.3, velocity=50.0, acceleration=500.0)
-    with FilterWheel.open("sim://apt?offset=0", chosen, world=world) as wheel:
+    with FilterWheel.from_url("sim://apt?offset=0", chosen, world=world) as wheel:
         assert wheel.is_simulated
         with pytest.raises(NotHomedError):
             wheel.select("LW")
     with pytest.raises(ValueError, match="Unknown option 'colour'"):
-        FilterWheel.open("sim://apt?colour=red", chosen)
+        FilterWheel.from_url("sim://apt?colour=red", chosen)
     with pytest.raises(ValueError, match="Invalid model 'X'"):
-        FilterWheel.open("sim://apt?model=X", chosen)
+        FilterWheel.from_url("sim://apt?model=X", chosen)
+
+
+def test_the_largest_number_of_a_controller() -> None:
+    """The largest serial number has room in the emulator's answer."""
+    device = EmulatedApt(World(), serial_number=2**32 - 1)
+    assert len(device._info.pack()) == 84

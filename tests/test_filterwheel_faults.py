@@ -195,14 +195,20 @@ def test_errors_of_the_controller() -> None:
         wheel.home()
 
 
-def test_overload() -> None:
-    """A motor whose controller reports an overload is stopped."""
+def test_an_overload_costs_the_position() -> None:
+    """After an overload steps may be lost: the wheel has to be homed before it turns again."""
     bench = WheelBench()
     wheel = bench.homed()
     bench.device.faults.stuck = apt.StatusBits.OVERLOAD
-    with pytest.raises(WheelError, match=r"The controller reports .*OVERLOAD"):
+    with pytest.raises(StalledWheelError, match="reports OVERLOAD, and the wheel was stopped"):
         wheel.move_to(3)
     assert bench.sent(apt.Id.MOT_MOVE_STOP)
+    bench.device.faults.stuck = apt.StatusBits(0)
+    with pytest.raises(NotHomedError):
+        wheel.move_to(3)
+    wheel.home()
+    wheel.move_to(3)
+    assert bench.world.wheel_position == 3
 
 
 def test_answers_that_come_too_late() -> None:

@@ -98,6 +98,23 @@ def test_what_does_not_fit_is_refused(field: dict[str, int], message: str) -> No
         encode(**{"sequence": 0, "command": 0, **field})  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
+def test_any_kind_of_bytes_is_taken(kind: type) -> None:
+    """Data and stream may be of any kind that holds bytes; no bytes complete no frame."""
+    decoder = Decoder()
+    assert decoder.feed(kind(encode(1, 0x00050002, kind(b"\x8e"), 0))) == [
+        Frame(0, 1, 0x00050002, 0, b"\x8e")
+    ]
+    assert decoder.feed(kind(b"")) == []
+
+
+@pytest.mark.parametrize("wrong", [1.5, float("nan"), "1", None])
+def test_a_number_must_be_whole(wrong: object) -> None:
+    """Nothing is rounded into a field."""
+    with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
+        encode(wrong, 0x00050002)  # type: ignore[arg-type]
+
+
 @given(st.lists(frames, max_size=4), st.lists(st.integers(0, 999), max_size=6), blobs)
 def test_frames_survive_any_cutting(sent: list[Frame], places: list[int], noise: bytes) -> None:
     """Frames come back in their order however the stream is cut, past noise between them."""

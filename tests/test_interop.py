@@ -9,6 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import apt, thermocouple
 from dbthermal.instruments.emulated.boson import EmulatedBoson
@@ -139,9 +140,9 @@ def test_type_t_agrees() -> None:
     other = pytest.importorskip("thermocouple_its90").TypeT
     celsius = np.arange(-270.0, 400.5, 0.5)
     voltage = [other.emf(float(value)) for value in celsius]
-    inside = np.clip(celsius + thermocouple.ICE_POINT, 3.15, 673.15)  # the sum's rounding
+    inside = np.clip(celsius + zero_Celsius, 3.15, 673.15)  # the sum's rounding
     assert_allclose(thermocouple.emf(inside), voltage, rtol=0, atol=1e-9)  # [mV]
     emf = np.arange(-5.0, 19.5, 0.1)
     tips = [other.temperature(float(value), reference=25.0) for value in emf]
-    found = thermocouple.temperature(emf, 298.15) - thermocouple.ICE_POINT
+    found = thermocouple.temperature(emf, 298.15) - zero_Celsius
     assert_allclose(found, tips, rtol=0, atol=1e-6)  # [K]

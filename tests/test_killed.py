@@ -13,6 +13,7 @@ import xarray as xr
 from dbthermal import store
 from dbthermal.instruments import record, tape
 from dbthermal.instruments.capture import notes, open_capture
+from dbthermal.instruments.contents import Note
 from dbthermal.instruments.emulated.frames import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.fetching import Limits, Reading
@@ -226,7 +227,7 @@ def test_power_loss_costs_the_last_chunk(
     recorded = two_bands(tmp_path / "disk" / "a.zarr")
     for number in range(15):
         band = BANDS[number % 2 if number < 14 else 0]
-        recorded.note(tape.Note.READING, "plate", number / RATE, number)
+        recorded.note(Note.READING, "plate", number / RATE, number)
         recorded.frame(band, frame(number // 2))
         committed = list(recorded.recording.frames.values())
     recorded.close(complete=True, ended="stopped")

@@ -193,6 +193,9 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         assert (len(steps), steps[0].summary.ended) == (4, "duration")
         assert steps[0].summary.totals["8-14"]["frames"] > 8
         assert swept(devices, tmp_path, log) == steps
+        # Offsets are corrected before the sweep, and at each temperature that is recorded.
+        assert devices.world is not None
+        assert {camera.ffc_count for camera in devices.world.cameras.values()} == {4}
     other = Session.from_yaml(replaced(("[300.0, 290.0, 310.0]", "[301.0, 290.0]")))
     with rig(other) as devices, pytest.raises(ValueError, match=r"Must be of 301\.0 K"):
         swept(devices, tmp_path)
@@ -291,7 +294,14 @@ def test_rest_is_waited_for() -> None:
     assert clock.now == 5.0
 
 
-@pytest.mark.parametrize("readings", [[310.0], [300.0, 300.3] * 20])
+def test_thermocouple_may_be_off() -> None:
+    """A rest half a kelvin from where it was set is one: what counts is what is read."""
+    clock = Clock()
+    assert wait([300.6], clock) == pytest.approx(300.6)
+    assert clock.now == 3.0
+
+
+@pytest.mark.parametrize("readings", [[301.6], [300.0, 300.3] * 20])
 def test_no_rest_is_an_error(readings: list[float]) -> None:
     """A temperature that rests elsewhere, or swings, is not taken for the step."""
     with pytest.raises(TimeoutError, match=r"No rest at 300\.0 K within 20 s"):

@@ -215,8 +215,8 @@ def test_numbers_that_stand_are_flagged(tmp_path: Path) -> None:
     short.frame("8-14", shot(1, at=0.05))
     short.close(complete=True, ended="stopped")
     flags = open_capture(tmp_path / "a.zarr")["frame_flags"][0]
-    both = FrameFlag.SEQUENCE_STANDS | FrameFlag.TIME_STANDS
-    expected = [0, 0, both, FrameFlag.TIME_STANDS, 0, FrameFlag.SEQUENCE_STANDS, 0]
+    again = FrameFlag.SEQUENCE_STANDS | FrameFlag.TIME_STANDS | FrameFlag.IMAGE_REPEATED
+    expected = [0, 0, again, FrameFlag.TIME_STANDS, 0, FrameFlag.SEQUENCE_STANDS, 0]
     np.testing.assert_array_equal(flags, expected)
     assert [note[3] for note in notes(tmp_path / "a.zarr")] == [0, -3]
 

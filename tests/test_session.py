@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from rig_session import TEXT, replaced
 
+from dbthermal import paths
 from dbthermal.instruments.session import Session
 
 SWEEP, FILTERS = "sweep: [9.5, 11]\n", 'filters: {1: 9.5, 3: "11"}\n'
@@ -122,3 +123,13 @@ def test_one_temperature_is_no_calibration_twice() -> None:
     assert Session.from_yaml(bench).blackbody is not None
     with pytest.raises(ValueError, match=r"Repeated temperature \[K\] '300\.0'"):
         Session.from_yaml(replaced(twice))
+
+
+@pytest.mark.parametrize("name", ["response", "emissivity_bench", "scene"])
+def test_rig_of_the_project_has_one_switch(name: str) -> None:
+    """All its sessions are emulated as they come, until the one file that they share says not."""
+    path = paths.session(name)
+    assert "simulated" not in path.read_text(encoding="utf-8")
+    assert Session.load(path).simulated
+    hardware = Session.load(path, {"simulated": False})
+    assert hardware.url(hardware.cameras["8-14"].video) == "v4l2:///dev/video0"

@@ -124,8 +124,8 @@ def test_any_answer_of_the_library(raw: list[float], bits: int, conversion: str)
 def test_identity(rig: LoggerBench) -> None:
     """The unit says that it is emulated, and so does the driver."""
     with rig.driver as driver:
-        info = driver.info()
-    assert (info.serial, info.driver, info.is_simulated) == ("EMULATED", "emulated", True)
+        info = driver.identity()
+    assert (info.serial_number, info.driver, info.is_simulated) == ("EMULATED", "emulated", True)
     assert info.calibration_date == "01Jan00"
 
 
@@ -134,14 +134,14 @@ def test_nothing_happens_before_it_is_opened(rig: LoggerBench) -> None:
     rig.unit.faults.unplugged = True
     TC08(rig.unit)
     with pytest.raises(RuntimeError, match=r"closed\. Must be opened first"):
-        rig.driver.info()
+        rig.driver.identity()
 
 
 def test_close_is_idempotent(rig: LoggerBench) -> None:
     """A second close does nothing, and the unit can be opened again."""
     rig.ready().close()
     rig.driver.close()
-    assert rig.driver.open().info().serial == "EMULATED"
+    assert rig.driver.open().identity().serial_number == "EMULATED"
     with pytest.raises(RuntimeError, match="open already"):
         rig.driver.open()
 
@@ -171,7 +171,7 @@ def test_wrong_unit(rig: LoggerBench) -> None:
     """A unit of another serial number is named, and left closed."""
     with pytest.raises(ConnectionError, match=r"No TC-08 'AB/123'; found: \['EMULATED'\]"):
         rig.driver.open("AB/123")
-    assert rig.driver.open("EMULATED").info().serial == "EMULATED"
+    assert rig.driver.open("EMULATED").identity().serial_number == "EMULATED"
 
 
 @pytest.mark.parametrize("code", range(1, 17))
@@ -197,10 +197,19 @@ def test_each_failing_step_of_opening_is_seen(rig: LoggerBench, function: str) -
         rig.driver.single()
 
 
-def test_numbers_15_and_16_are_not_exchanged() -> None:
-    """16 is the lost communication; 15 is a driver function."""
-    assert "communication" in tc08.ERRORS[16]
-    assert "communication" not in tc08.ERRORS[15]
+# What the vendor's header says of each error number, in a word.
+MEANINGS = (
+    *("no error", "operating system", "no channels", "argument", "version", "mode", "enumerated"),
+    *("respond", "firmware", "EEPROM", "not found", "threading", "pipes", "calibration", "picopp"),
+    *("function of Pico's driver", "communication"),
+)
+
+
+def test_error_numbers_are_the_published_ones() -> None:
+    """Each number has its meaning, from 0 to 16; 15 and 16 are not exchanged."""
+    assert [*tc08.ERRORS] == [*range(17)]
+    wrong = [code for code, word in enumerate(MEANINGS) if word not in tc08.ERRORS[code]]
+    assert (len(MEANINGS), wrong) == (17, [])
 
 
 def test_unplugging(rig: LoggerBench) -> None:
@@ -282,3 +291,14 @@ def test_url_is_checked(url: str) -> None:
     """A URL names the library, or the emulated unit of a world."""
     with pytest.raises(ValueError, match="Invalid URL"):
         TC08.from_url(url)
+
+
+def test_flags_keep_their_numbers() -> None:
+    """They are stored with recordings, so that each is a bit of its own for ever."""
+    assert {flag.name: flag.value for flag in Flag} == {
+        "OVERFLOW": 1,
+        "MISSING": 2,
+        "OUT_OF_RANGE": 4,
+        "NO_JUNCTION": 8,
+        "VOLTAGE": 16,
+    }

@@ -4,11 +4,13 @@ import ctypes
 import shutil
 import subprocess
 import sys
+from ctypes import c_int8, c_int16, c_int32
 from pathlib import Path
 
 import pytest
 
 from dbthermal.instruments.tc08 import TC08, Flag, TC08Error, library
+from dbthermal.instruments.tc08.library import SIGNATURES
 
 
 def test_missing_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -25,6 +27,18 @@ def test_importing_the_driver_loads_no_library() -> None:
     code = "import sys, dbthermal.instruments.tc08; print({'usb', 'serial'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_types_of_the_library_are_those_of_its_header() -> None:
+    """Four functions return 32 bits, where the vendor's own wrapper has 16; a letter is 8 bits."""
+    names = {
+        name.removeprefix("usb_tc08_")
+        for name, (result, _) in SIGNATURES.items()
+        if result is c_int32
+    }
+    assert names == {"get_minimum_interval_ms", "run", "get_temp", "get_temp_deskew"}
+    assert {result for result, _ in SIGNATURES.values()} == {c_int16, c_int32}
+    assert SIGNATURES["usb_tc08_set_channel"][1] == [c_int16, c_int16, c_int8]
 
 
 STUB = r"""
@@ -83,9 +97,9 @@ def test_types_of_a_real_library(stub: str) -> None:
         assert not driver.is_simulated
         driver.set_mains(60)
         driver.set_channels({2: "T", 8: "T"})
-        info, scan = driver.info(), driver.single()
+        info, scan = driver.identity(), driver.single()
         assert driver.minimum_interval() == 70.0
-    assert (info.serial, info.calibration_date) == ("STUB/00/123", "01Jan2000")
+    assert (info.serial_number, info.calibration_date) == ("STUB/00/123", "01Jan2000")
     assert (info.driver, info.variant) == ("2.0.17.1441", 1)
     assert (scan.temperature[0], scan.temperature[2]) == (290.0, 292.0)
     assert list(scan.flag[[1, 8]]) == [Flag.MISSING, Flag.OVERFLOW]

@@ -10,7 +10,7 @@ from test_tc08 import FLOAT32
 
 from dbthermal.instruments.emulated.tc08 import EmulatedTC08
 from dbthermal.instruments.tc08 import TC08, Flag, TC08Error
-from dbthermal.instruments.tc08.stream import Timeline
+from dbthermal.instruments.tc08.stream import LONGEST, Timeline
 
 
 @pytest.fixture
@@ -166,3 +166,19 @@ def test_unplugging_while_streaming(rig: LoggerBench) -> None:
         rig.driver.close()
     stream.close()
     assert not stream.is_running
+
+
+def test_a_cold_junction_that_is_too_old_is_none() -> None:
+    """A sample 1.4 intervals away counts, one 1.6 intervals away does not."""
+    timeline = Timeline(2.0)
+    timeline.add_junction(np.array([10.0]), np.array([296.15]))
+    assert np.isnan(timeline.junction_at(np.array([13.2]))).all()
+    assert timeline.junction_at(np.array([12.8])).tolist() == [296.15]
+
+
+@pytest.mark.parametrize("interval", [np.nan, np.inf, -1.0, LONGEST + 1.0, 1.0005])
+def test_an_interval_that_does_not_fit_is_refused(interval: float) -> None:
+    """No interval is wrapped to fit 32 bits, and none that is no number reaches the library."""
+    driver = LoggerBench().ready()
+    with pytest.raises(ValueError, match=r"Must be 0\.3 s or longer, to 2147483\.647 s"):
+        driver.stream(interval)

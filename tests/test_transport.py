@@ -1,16 +1,22 @@
-"""Byte streams: names, pseudo-terminals, unplugging, dialogues and recordings."""
+"""Byte streams: names, pseudo-terminals, unplugging, and lines that fail."""
 
-import io
-import json
+import errno
 import math
+import os
+import pkgutil
+import pty
 import subprocess
 import sys
+import tty
 from collections.abc import Iterator
 
 import pytest
 
-from dbthermal.instruments.dialogue import Dialogue, Pair, Recording
-from dbthermal.instruments.emulated.port import EmulatedPort, Loop
+from dbthermal import instruments
+from dbthermal.instruments import transport
+from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.emulated.port import EmulatedPort
+from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import SerialTransport, TransportError, open_serial
 
 AWKWARD = bytes.fromhex("8E 0A 0D 11 13 00 FF AE 03 04 1A 7F")
@@ -127,6 +133,39 @@ def test_a_wrong_name_is_refused(url: str, message: str) -> None:
         open_serial(url, baudrate=115200)
 
 
+@pytest.mark.parametrize(
+    ("url", "message"),
+    [
+        ("sim://boson?sn", "Must have each option once, as option=value"),
+        ("sim://boson?sn=", "Must have each option once"),
+        ("sim://boson?sn=1&sn=2", "Must have each option once"),
+        ("sim://boson/a?name=b", "Must have each option once"),
+        ("sim://boson#wide", "Must have each option once"),
+        ("sim://boson?sn=abc", r"Invalid option sn=abc .* \(int\) in 0 to 4294967295"),
+        ("sim://boson?sn=-3", "Invalid option sn=-3"),
+        ("sim://boson?sn=7.5", "Invalid option sn=7.5"),
+        ("sim://boson?fpa=nan", r"Invalid option fpa=nan .* \(float\) in 0.0 to 655.0"),
+        ("sim://apt?offset=inf", "Invalid option offset=inf"),
+        ("sim://apt?sn=x", "Invalid option sn=x"),
+        ("serial:///dev/ttyACM0?baud=9600", "with options. Must have none"),
+        ("pty:///dev/pts/0#1", "with options. Must have none"),
+    ],
+)
+def test_a_name_says_nothing_in_vain(url: str, message: str) -> None:
+    """What is not understood in a name is an error that shows it, and nothing is left out."""
+    with pytest.raises(ValueError, match=message):
+        open_serial(url, baudrate=115200)
+
+
+def test_the_path_of_an_emulator_is_its_name() -> None:
+    """Of two emulated cameras, the one that the address names is opened."""
+    world = World()
+    for name, number in (("boson", 1), ("wide", 2)):
+        world.add_camera(name, number)
+    with Boson.from_url("sim://boson/wide", world=world) as camera:
+        assert camera.serial_number() == 2
+
+
 def test_an_emulator_cannot_pass_for_hardware(port: EmulatedPort) -> None:
     """A pseudo-terminal under the name of a serial port is refused."""
     with pytest.raises(ValueError, match=r"a pseudo-terminal\. Must begin with pty://"):
@@ -148,69 +187,65 @@ def test_a_simulated_device_ends_with_its_line() -> None:
         open_serial(f"pty://{path}", baudrate=921600)
 
 
-def test_a_loop_in_memory_is_a_transport() -> None:
-    """The echo answers at once, silence takes no time on an injected clock, an end is an end."""
-    times = iter(range(100))
-    loop = Loop(Echo(), clock=lambda: float(next(times)), sleep=lambda _: None)
-    loop.write(b"abc")
-    assert (loop.read(2, 1.0), loop.read(2, 1.0), loop.read(2, 5.0)) == (b"ab", b"c", b"")
-    loop.close()
-    with pytest.raises(TransportError, match="It must stay connected and open"):
-        loop.write(b"x")
+def test_a_line_that_takes_no_bytes_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writing ends, too, where nobody reads."""
+    monkeypatch.setattr(transport, "WRITE_TIMEOUT", 0.05)
+    master, slave = pty.openpty()
+    try:
+        tty.setraw(slave)
+        with open_serial(f"pty://{os.ttyname(slave)}", baudrate=9600) as line:
+            with pytest.raises(TransportError, match=r"Could not write to .*timeout"):
+                line.write(bytes(1 << 20))
+            line._port.reset_output_buffer()
+    finally:
+        os.close(master)
+        os.close(slave)
 
 
-def test_a_recording_plays_back() -> None:
-    """What was noted, with times and directions, is a dialogue."""
-    stream, times = io.StringIO(), iter([0.5, 0.75, 1.0])
-    with Dialogue([(b"\x01", [b"\x02", b"", b"\x03"])]) as device:
-        line = Recording(device, stream, clock=lambda: next(times))
-        line.write(b"\x01")
-        assert [line.read(9, 1.0) for _ in range(3)] == [b"\x02", b"", b"\x03"]
-        assert line.is_simulated
-    lines = stream.getvalue().splitlines()
-    assert json.loads(lines[1]) == {"time": 0.75, "direction": "read", "hex": "02"}
-    with Dialogue.from_lines(lines) as again:
-        again.write(b"\x01")
-        assert again.read(9, 1.0) + again.read(9, 1.0) == b"\x02\x03"
+class Port:
+    """A serial port that fails as it is told."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name == "rts":
+            raise OSError(self.number, os.strerror(self.number))
+        super().__setattr__(name, value)
+
+    def close(self) -> None:
+        """Fail, too."""
+        raise OSError(self.number, os.strerror(self.number))
 
 
-@pytest.mark.parametrize(
-    ("pairs", "steps", "message"),
-    [
-        ([(b"a", b"b")], ["a"], "Left unread"),
-        ([(b"a", None)], [], "Left unwritten"),
-        ([(b"ab", None)], ["a"], "Cut short"),
-        ([(b"a", None)], ["b"], "Unexpected 62 was written. Must be 61"),
-        ([], ["a"], "Must be nothing more"),
-        ([(b"a", b"b"), (b"c", None)], ["a", "c"], "Unread .* but 63 was written"),
-        ([(None, b"a")], [], "Left unread"),
-    ],
-)
-def test_a_dialogue_allows_no_rest(pairs: list[Pair], steps: list[str], message: str) -> None:
-    """What is not read, not written, or not expected fails."""
-
-    def talk() -> None:
-        with Dialogue(pairs) as line:
-            for step in steps:
-                line.write(step.encode())
-
-    with pytest.raises(AssertionError, match=message):
-        talk()
+def test_only_a_missing_line_is_no_rts() -> None:
+    """A terminal without RTS says so; a port that was pulled out is an error."""
+    lines = {
+        number: SerialTransport(Port(number), "serial:///dev/ttyUSB0", is_simulated=False)
+        for number in (errno.ENOTTY, errno.EIO)
+    }
+    assert not lines[errno.ENOTTY].set_rts(level=True)
+    with pytest.raises(TransportError, match="Could not set RTS of 'serial:///dev/ttyUSB0'"):
+        lines[errno.EIO].set_rts(level=True)
 
 
-def test_a_dialogue_speaks_unasked_and_in_pieces() -> None:
-    """Answers come in the pieces given, after writes in any pieces, and by themselves."""
-    with Dialogue([(None, b"hi"), (b"ab", [b"c", b"de"]), (None, b"!")]) as line:
-        assert line.read(9, 1.0) == b"hi"
-        line.write(b"a")
-        line.write(b"b")
-        assert [line.read(1, 1.0) for _ in range(5)] == [b"c", b"d", b"e", b"!", b""]
+def test_an_emulator_ends_though_its_port_does_not_close() -> None:
+    """Whatever happens at the end of a line, its emulator does not go on."""
+    ended = []
+    line = SerialTransport(
+        Port(errno.EIO), "sim://boson", is_simulated=True, after=lambda: ended.append(1)
+    )
+    with pytest.raises(TransportError, match=f"Could not close .*{os.strerror(errno.EIO)}"):
+        line.close()
+    assert ended == [1]
 
 
-def test_another_error_is_not_hidden_by_leftovers() -> None:
-    """An error inside a dialogue is shown rather than what it left behind."""
-    with pytest.raises(KeyError, match="first thing"), Dialogue([(b"a", None)]):
+def test_what_went_wrong_is_not_hidden_by_closing() -> None:
+    """Where a line does not close after an error, the error is raised, and says so."""
+    line = SerialTransport(Port(errno.EIO), "serial:///dev/ttyUSB0", is_simulated=False)
+    with pytest.raises(KeyError, match="first thing") as caught, line:
         raise KeyError("the first thing that went wrong")
+    assert caught.value.__notes__[0].startswith("Closing failed too. Could not close 'serial://")
 
 
 def test_importing_the_instruments_is_light() -> None:
@@ -218,3 +253,9 @@ def test_importing_the_instruments_is_light() -> None:
     code = "import sys, dbthermal.instruments; print({'serial', 'usb', 'numpy'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_every_module_is_on_the_map() -> None:
+    """The package says what each of its modules is for."""
+    names = {module.name for module in pkgutil.iter_modules(instruments.__path__)}
+    assert {name for name in names if f"`{name}`" not in (instruments.__doc__ or "")} == set()

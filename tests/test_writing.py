@@ -1,8 +1,9 @@
-"""Whoever looks on, or interrupts, a recording is written to its end."""
+"""A recording is written to its end, whoever looks on or interrupts, and says how it ended."""
 
 import signal
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,20 @@ import pytest
 from test_record import BANDS, CHUNK, SMALL, bench, session
 
 from dbthermal import store
-from dbthermal.instruments import record, tape
+from dbthermal.instruments import record, tape, writing
 from dbthermal.instruments.capture import notes, open_capture
-from dbthermal.instruments.emulated.frames import EmulatedCamera
+from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
+from dbthermal.instruments.emulated.world import CameraState
 from dbthermal.instruments.fetching import Limits
-from dbthermal.instruments.frames_source import Frame, FrameFlag
+from dbthermal.instruments.frames_source import Frame, FrameFlag, FrameSource
 from dbthermal.instruments.record import Preview
+
+
+def interrupt(_: Preview | None = None) -> None:
+    """Interrupt the main thread as the keyboard does."""
+    main = threading.main_thread().ident
+    assert main is not None
+    signal.pthread_kill(main, signal.SIGINT)
 
 
 def slow_down(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,10 +77,11 @@ def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
     assert seen[0] >= 1
 
 
+@pytest.mark.parametrize("drawing", [True, False])
 def test_keyboard_interrupt_keeps_everything(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, drawing: bool
 ) -> None:
-    """Interrupted while the disk is slow, all frames that came are written, and it says so."""
+    """Interrupted, while it draws or waits, all frames that came are written, and it says so."""
     slow_down(monkeypatch)
     came: list[int] = []
     read = EmulatedCamera.read
@@ -79,11 +89,11 @@ def test_keyboard_interrupt_keeps_everything(
     def counting(camera: EmulatedCamera, timeout: float = 1.0) -> Frame:
         frame = read(camera, timeout)
         came.append(frame.sequence)
+        if len(came) == 40 and not drawing:
+            interrupt()
         return frame
 
     monkeypatch.setattr(EmulatedCamera, "read", counting)
-    main = threading.main_thread().ident
-    assert main is not None
     limits, path = Limits(chunk=CHUNK, reserve=0, preview_period=0.3), tmp_path / "a.zarr"
     with pytest.raises(KeyboardInterrupt):
         record.record(
@@ -91,10 +101,89 @@ def test_keyboard_interrupt_keeps_everything(
             bench(),
             path,
             limits=limits,
-            preview=lambda _: signal.pthread_kill(main, signal.SIGINT),
+            preview=interrupt if drawing else None,
         )
     opened = store.open_dataset(path)
     assert (opened.attrs["closed"], opened.attrs["ended"]) == (True, "interrupted")
     assert written(path) == len(came)
     found = opened["sequence"].values
     assert sorted(found[found >= 0]) == sorted(came)
+
+
+def state(sources: dict[str, FrameSource], band: str) -> CameraState:
+    """State of an emulated camera."""
+    camera = sources[band]
+    assert isinstance(camera, EmulatedCamera)
+    return camera.world.camera(band)
+
+
+def test_a_lost_camera_is_told_though_it_was_stopped(tmp_path: Path) -> None:
+    """Who stops a recording that lost a camera has none that is complete."""
+    stop, path, sources = threading.Event(), tmp_path / "a.zarr", bench(Faults(unplugged=5))
+
+    def look(_: Preview) -> None:
+        if not state(sources, "8-14").plugged:
+            stop.set()
+
+    summary = record.record(session(9.0), sources, path, limits=SMALL, preview=look, stop=stop)
+    assert (summary.ended, store.open_dataset(path).attrs["complete"]) == ("source lost", False)
+
+
+def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
+    """A band without a frame is no complete recording, and the log says how long it was mute."""
+    sources, path = bench(), tmp_path / "a.zarr"
+    state(sources, "9.5").streaming = False
+    summary = record.record(session(), sources, path, limits=SMALL)
+    assert (summary.ended, summary.totals["9.5"]["frames"]) == ("no frames", 0)
+    assert store.open_dataset(path).attrs["complete"] is False
+    assert ("no_frame", "9.5", 0.1) in [note[1:] for note in notes(path)]
+
+
+def test_wrong_stamps_cost_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera whose stamps are all of long ago is recorded, without times, once none is held."""
+    monkeypatch.setattr(writing, "_HELD", 0.1)
+    read = EmulatedCamera.read
+
+    def stampless(camera: EmulatedCamera, timeout: float = 1.0) -> Frame:
+        frame = read(camera, timeout)
+        return replace(frame, device_time=0.0) if camera.name == "9.5" else frame
+
+    monkeypatch.setattr(EmulatedCamera, "read", stampless)
+    record.record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)
+    opened = store.open_dataset(tmp_path / "a.zarr")
+    frames = slice(0, opened.attrs["frames_written"]["9.5"])
+    one = opened.sel(band="9.5").isel(time=frames)
+    assert one.sizes["time"] > 5
+    assert (one["frame_flags"] & int(FrameFlag.TIME_WRONG)).all()
+    assert np.isnan(one["exposure_time"]).all()
+
+
+def test_second_interrupt_stops_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted again while it waits for the writer, it returns; the writer ends its work."""
+    path, free, close = tmp_path / "a.zarr", threading.Event(), tape.Tape.close
+
+    def interrupted_close(own: tape.Tape, *, complete: bool, ended: str) -> None:
+        interrupt()
+        free.wait(20)
+        close(own, complete=complete, ended=ended)
+
+    monkeypatch.setattr(tape.Tape, "close", interrupted_close)
+    with pytest.raises(KeyboardInterrupt):
+        record.record(session(60.0), bench(), path, limits=SMALL, preview=interrupt)
+    assert store.open_dataset(path).attrs["closed"] is False
+    free.set()
+    (writer,) = (thread for thread in threading.enumerate() if thread.name == "writer")
+    writer.join(20)
+    assert store.open_dataset(path).attrs["ended"] == "interrupted"
+
+
+def test_a_thread_that_exits_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What ends a camera's thread without a usual error is no end as planned, either."""
+
+    def leave(*_: object) -> Frame:
+        raise SystemExit("left")
+
+    monkeypatch.setattr(EmulatedCamera, "read", leave)
+    with pytest.raises(SystemExit, match="left"):
+        record.record(session(9.0), bench(), tmp_path / "a.zarr", limits=SMALL)
+    assert store.open_dataset(tmp_path / "a.zarr").attrs["ended"] == "error"

@@ -1,11 +1,19 @@
 """The rig: cameras, filter wheel, thermocouples, and the recording of a capture.
 
 A device has one name like an address, ``serial:///dev/ttyACM0`` or ``sim://boson``, and a driver
-in a module of its own that speaks its protocol through `dbthermal.instruments.transport`. What
-turns bytes into messages (`fslp`, `apt`) does no input or output at all. Below the real drivers,
-`dbthermal.instruments.emulated` answers in place of the hardware, and says so.
+that speaks its protocol. What turns bytes into messages does no input or output at all, and below
+the real drivers `emulated` answers in place of the hardware, and says so:
 
-The drivers were written from public descriptions of the protocols and tested against public byte
-vectors and emulators, never against hardware. The modules that talk to a device need the optional
-packages of ``dbthermal[instruments]``; importing this package loads none of them.
+- `boson` over `fslp`, `filterwheel` over `apt`: both on the byte streams of `transport`, which
+  `dialogue` notes and plays back; `tc08`, with `thermocouple` for type T;
+- `v4l2` over `v4l2_calls`: the frames, with `telemetry`; `frames_source` is what any camera gives;
+- `inventory` and `permissions`: what is plugged in, and what stands in the way;
+- `session` of `entries`: what is to be recorded; `devices` opens its `rig`, `protocols` use it;
+- `record`, with `fetching`, `tape` and `writing`: a recording, whose `contents` become a `capture`,
+  and several of them a `sweep`.
+
+Each device, line and emulator is closed as `closing` says. The drivers were written from public
+descriptions of the protocols and tested against public byte vectors and emulators, never against
+hardware. The modules that talk to a device need the optional packages of
+``dbthermal[instruments]``; importing this package loads none of them.
 """

@@ -30,9 +30,9 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     -------
     Dataset
         Stage `capture`: `counts` (band, time, y, x) [count], read when used, `exposure_time` (band,
-        time) [s], NaN for a frame that is damaged, repeated or missing, and what is in
-        `dbthermal.instruments.tape.VARIABLES` but the log, see `notes`. `time` is when the first
-        band was exposed. Where it was fitted, attribute ``clock_rates`` has b of each band.
+        time) [s], NaN for a frame that is damaged, missing or of no new number, and what is in
+        `dbthermal.instruments.contents.VARIABLES` but the log, see `notes`. `time` is when the
+        first band was exposed. Where it was fitted, attribute ``clock_rates`` has b of each band.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
     Returns
     -------
     list of tuple
-        Time [s], kind (a name of `dbthermal.instruments.tape.Note` in lower case), source and
+        Time [s], kind (a name of `dbthermal.instruments.contents.Note` in lower case), source and
         value of each note, in the order of writing.
 
     Raises

@@ -1,79 +1,145 @@
-"""What a recording holds: its variables, the bits of its flags, the kinds of its notes."""
+"""What a recording holds: its variables, the bits of its flags, the kinds of its notes.
 
-from dataclasses import dataclass
-from enum import IntEnum
+All of it is written into the store, too, in words: who opens it may have no more than the store.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
 from types import MappingProxyType
 from typing import Any, Final
 
 from dbthermal.alignment import clocks
+from dbthermal.instruments import telemetry
 from dbthermal.instruments.frames_source import MEANINGS
 from dbthermal.schema import STAGES, Variable
 
 
+class Note(IntEnum):
+    """Kinds of notes in the log; `NOTES` says what the value of each is."""
+
+    READING = 0
+    READING_FAILED = 1
+    FRAMES_LOST = 2
+    FRAMES_REFUSED = 3
+    SEQUENCE_STANDS = 4
+    DAMAGED = 5
+    SHUTTER_CLOSED = 6
+    SHUTTER_OPEN = 7
+    CORRECTION = 8
+    NO_FRAME = 9
+    SOURCE_LOST = 10
+
+
+NOTES: Final = MappingProxyType(
+    {
+        Note.READING: "the reading",
+        Note.READING_FAILED: "NaN, the instrument gave none",
+        Note.FRAMES_LOST: "number of frames missing by the driver's numbers",
+        Note.FRAMES_REFUSED: "number of frames that came, but for which the queue was full",
+        Note.SEQUENCE_STANDS: "step of the driver's number, 0 or less",
+        Note.DAMAGED: "flags of the frame",
+        Note.SHUTTER_CLOSED: "driver's number of the first frame with a closed shutter",
+        Note.SHUTTER_OPEN: "driver's number of the first frame with an open one",
+        Note.CORRECTION: "frame_counter at which the camera renewed its offsets, from telemetry",
+        Note.NO_FRAME: "time without a frame [s]",
+        Note.SOURCE_LOST: "NaN, the source gives no more frames",
+    }
+)
+"""What the value of a note is, by its kind."""
+
+
 @dataclass(frozen=True)
-class Flags(Variable):
-    """A variable of which each bit says something, with the attributes of the CF conventions."""
+class Explained(Variable):
+    """A variable with more attributes than unit and meaning."""
+
+    more: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def attrs(self) -> dict[str, Any]:
         """Attributes to write on the variable."""
-        names = " ".join(str(flag.name).lower() for flag in MEANINGS)
-        masks = [int(flag) for flag in MEANINGS]
-        return {**super().attrs, "flag_masks": masks, "flag_meanings": names}
+        return {**super().attrs, **self.more}
 
+
+def _codes(meanings: Mapping[Any, str]) -> dict[str, Any]:
+    """Attributes of numbers with meanings, by the CF conventions, and a sentence for each."""
+    said = {str(code.name).lower(): text for code, text in meanings.items()}
+    masks = all(isinstance(code, IntFlag) for code in meanings)
+    return {
+        "flag_masks" if masks else "flag_values": [int(code) for code in meanings],
+        "flag_meanings": " ".join(said),
+        "comment": "; ".join(f"{name}: {text}" for name, text in said.items()),
+    }
+
+
+ABOUT: Final = (
+    "Raw frames as they came. Frame n of one band and frame n of another are not of one moment: "
+    "each has its exposure_time, and the coordinate time is the first band's, without holes. "
+    "exposure_time, host_time and log_time count from attribute clock_origin on the host's "
+    "monotonic clock, which was attribute started in UTC; device_time is as the device gave it. "
+    "exposure_time is NaN where a frame is no measurement; frame_flags say why. A band has the "
+    "number of frames that frames_written says; what follows is its last one, repeated. "
+    "Note n of the log is of log_sources[log_source], and its log_value is what log_kind says; a "
+    "reading is in the unit that log_units says. totals: frames of each band, those lost by the "
+    "driver's numbers, refused by a full queue, damaged. ended: why it ended; complete: as was "
+    "planned; closed: false if it is being written or was cut short, and then only frames_written "
+    "and log_written are valid."
+)
+"""What a reader of the store must know; its attribute ``comment``."""
+
+_LAYOUT: Final = (
+    "16-bit words of a Boson; likely, not certain, are the words (of a longer number the high one "
+    "first; value = number / steps + zero): "
+    + ", ".join(
+        f"{name} {place.word} to {place.word + place.words - 1}"
+        + (f" (steps {place.steps}, zero {place.zero:g})" if place.steps else "")
+        for name, place in telemetry.FIELDS.items()
+    )
+)
 
 VARIABLES: Final = MappingProxyType(
     {
         "counts": STAGES["capture"]["counts"],
         "exposure_time": clocks.EXPOSURE_TIME,
-        "device_time": Variable(("band", "time"), "float64", "s", "device's stamp of the frame"),
-        "host_time": Variable(("band", "time"), "float64", "s", "when the host had the frame"),
+        "device_time": Variable(
+            ("band", "time"), "float64", "s", "device's stamp of the frame, as it came"
+        ),
+        "host_time": Variable(
+            ("band", "time"), "float64", "s", "when the host had the frame, since clock_origin"
+        ),
         "sequence": Variable(("band", "time"), "int64", "1", "number of the frame by its driver"),
-        "frame_flags": Flags(("band", "time"), "uint16", "1", "flags of the frame, 0 is good"),
-        "log_time": Variable(("log",), "float64", "s", "time of the note"),
-        "log_kind": Variable(("log",), "int16", "1", "what is noted"),
-        "log_source": Variable(("log",), "int16", "1", "whose note it is"),
-        "log_value": Variable(("log",), "float64", "1", "value of the note, in the source's unit"),
+        "frame_flags": Explained(
+            ("band", "time"), "uint16", "1", "flags of the frame, 0 is good", _codes(MEANINGS)
+        ),
+        "log_time": Variable(("log",), "float64", "s", "time of the note, since clock_origin"),
+        "log_kind": Explained(("log",), "int16", "1", "what is noted", _codes(NOTES)),
+        "log_source": Variable(
+            ("log",), "int16", "1", "whose note it is: place in attribute log_sources"
+        ),
+        "log_value": Variable(
+            ("log",), "float64", "1", "value of the note by its kind; see attribute log_units"
+        ),
     }
 )
-"""What every recording holds. Times are on the host's clock since ``clock_origin``; `device_time`
-is as it came. The attributes name kinds, sources and flags."""
+"""What every recording holds; `ABOUT` says how it hangs together."""
 
 TELEMETRY: Final = MappingProxyType(
     {
-        "telemetry": Variable(
-            ("band", "time", "telemetry_row", "x"), "uint16", "1", "telemetry rows as they came"
+        "telemetry": Explained(
+            ("band", "time", "telemetry_row", "x"),
+            "uint16",
+            "1",
+            "telemetry rows as they came",
+            {"comment": _LAYOUT},
         ),
         "fpa_temperature": Variable(
             ("band", "time"), "float32", "K", "temperature of the focal-plane array"
         ),
+        "frame_counter": Variable(
+            ("band", "time"), "int64", "1", "camera's own number of the frame, -1 if not known"
+        ),
     }
 )
-"""What a recording holds besides, if the cameras give telemetry."""
-
-
-class Note(IntEnum):
-    """Kinds of notes in the log, by what their value is."""
-
-    READING = 0
-    """The reading."""
-    READING_FAILED = 1
-    """NaN: the instrument gave none."""
-    FRAMES_LOST = 2
-    """Number of frames that the driver or the camera lost."""
-    FRAMES_REFUSED = 3
-    """Number of frames that came, but for which the queue was full."""
-    SEQUENCE_STANDS = 4
-    """Step of the sequence number, 0 or less."""
-    DAMAGED = 5
-    """Flags of the frame."""
-    SHUTTER_CLOSED = 6
-    """Sequence number of the first frame."""
-    SHUTTER_OPEN = 7
-    """Sequence number of the first frame."""
-    CORRECTION = 8
-    """Camera's number of the frame at which it renewed its offsets, from the telemetry."""
-    NO_FRAME = 9
-    """Time without a frame [s]."""
-    SOURCE_LOST = 10
-    """NaN: the source gives no more frames."""
+"""What a recording holds besides, if the cameras give telemetry. Where `frame_counter` leaps and
+`sequence` does not, frames were lost before the driver saw them; its usual step is not documented
+for all rates, so that the recorder draws no conclusion."""

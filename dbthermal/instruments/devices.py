@@ -162,7 +162,7 @@ def _control(url: str, world: World | None) -> Boson:
         if not url.startswith("sim://boson/"):
             raise ValueError(f"Invalid address '{url}' of a camera. Must be 'sim://boson/<name>'.")
         world.camera(_name(url))
-        url = f"sim://boson?camera={_name(url)}&frames=source"
+        url = f"{url}?frames=source"
     return Boson.from_url(url, world=world)
 
 
@@ -170,7 +170,7 @@ def _wheel(session: Session, world: World | None) -> FilterWheel:
     known = {entry.name for entry in fields(filterwheel.Settings)} - {"filters"}
     check_one_of("setting of the wheel", session.wheel, sorted(known))
     settings = filterwheel.Settings(filters=session.filters, **session.wheel)
-    return FilterWheel.open(session.url(session.devices["filter_wheel"]), settings, world=world)
+    return FilterWheel.from_url(session.url(session.devices["filter_wheel"]), settings, world=world)
 
 
 def _logger(session: Session, world: World | None) -> TC08:

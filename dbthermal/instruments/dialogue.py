@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Final, TextIO
 
-from dbthermal.instruments.transport import Closing, Transport
+from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import Transport
 
 Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]
 """What a driver must write, or None, and what the device answers, in one piece or in several."""

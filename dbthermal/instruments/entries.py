@@ -61,6 +61,9 @@ class Blackbody:
         Largest range of the readings in the window [K].
     window : float
         How long the readings must stay within it [s].
+    tolerance : float
+        Largest distance of their mean from where it was set [K]; a thermocouple, and its logger,
+        are off by half a kelvin or so each, and the recordings keep what was read.
     timeout : float
         How long to wait for it [s].
     """
@@ -68,6 +71,7 @@ class Blackbody:
     temperatures: tuple[float, ...]
     stability: float = 0.05
     window: float = 30.0
+    tolerance: float = 1.5
     timeout: float = 1800.0
 
     def __post_init__(self) -> None:
@@ -76,7 +80,7 @@ class Blackbody:
             raise ValueError(
                 f"Invalid blackbody temperatures {list(self.temperatures)} K. Must be positive."
             )
-        for name in ("stability", "window", "timeout"):
+        for name in ("stability", "window", "tolerance", "timeout"):
             check_positive(name, getattr(self, name))
 
 

@@ -10,8 +10,9 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from dbthermal.instruments.contents import Note
 from dbthermal.instruments.frames_source import Frame, FrameSource, NoFrameError, SourceLostError
-from dbthermal.instruments.tape import CHUNK, Note
+from dbthermal.instruments.tape import CHUNK
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Run:
     notes: queue.SimpleQueue[tuple[Note, str, float, float]] = field(
         default_factory=queue.SimpleQueue
     )
-    errors: list[Exception] = field(default_factory=list)
+    errors: list[BaseException] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     refused: dict[str, int] = field(default_factory=dict)
     over: threading.Event = field(default_factory=threading.Event)
@@ -146,7 +147,7 @@ def fetch(run: Run, band: str, source: FrameSource) -> None:
     except SourceLostError:
         run.lost.append(band)
         run.notes.put((Note.SOURCE_LOST, band, run.clock(), math.nan))
-    except Exception as error:  # noqa: BLE001 - raised again in the caller's thread
+    except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
         run.errors.append(error)
         run.over.set()
     finally:
@@ -173,6 +174,6 @@ def ask(run: Run, readings: Mapping[str, Reading]) -> None:
                     value, kind = math.nan, Note.READING_FAILED
                 run.notes.put((kind, name, run.clock(), value))
             run.over.wait(min(run.limits.reading_period, max(0.0, run.deadline - run.clock())))
-    except Exception as error:  # noqa: BLE001 - raised again in the caller's thread
+    except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
         run.errors.append(error)
         run.over.set()

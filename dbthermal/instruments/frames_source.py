@@ -30,8 +30,9 @@ class FrameFlag(IntFlag):
     FRAMES_LOST_BEFORE = 16
     SEQUENCE_STANDS = 32
     TIME_STANDS = 64
-    TIME_AHEAD = 128
+    TIME_WRONG = 128
     PADDED = 256
+    IMAGE_REPEATED = 512
 
 
 GOOD: Final = FrameFlag(0)
@@ -46,8 +47,9 @@ MEANINGS: Final = MappingProxyType(
         FrameFlag.FRAMES_LOST_BEFORE: "the sequence number leaps: frames are missing before it",
         FrameFlag.SEQUENCE_STANDS: "the sequence number does not rise: repeated, or started anew",
         FrameFlag.TIME_STANDS: "the device time does not rise, or is not known",
-        FrameFlag.TIME_AHEAD: "the device time is later than the host had the frame",
+        FrameFlag.TIME_WRONG: "the device time is before the start, or after the host's",
         FrameFlag.PADDED: "no frame: the band has fewer than another, and its last one is repeated",
+        FrameFlag.IMAGE_REPEATED: "no pixel differs from the frame before: frozen, or saturated",
     }
 )
 """The first four are the source's to set, the others the recorder's, who sees the frame before."""
@@ -57,10 +59,14 @@ UNTIMED: Final = (
     | FrameFlag.WRONG_SIZE
     | FrameFlag.SEQUENCE_STANDS
     | FrameFlag.TIME_STANDS
-    | FrameFlag.TIME_AHEAD
+    | FrameFlag.TIME_WRONG
     | FrameFlag.PADDED
 )
-"""A frame with one of these is recorded but is no measurement: it gets no exposure time."""
+"""A frame with one of these is recorded but is no measurement: it gets no exposure time. A repeated
+image keeps its time, for a closed aperture looks so, too; see `dbthermal.frames.find_shutter`."""
+
+DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
+"""A frame with one of these has wrong counts, and maybe wrong telemetry."""
 
 
 class NoFrameError(TimeoutError):

@@ -12,6 +12,7 @@ LJMUAstroecology/flirpy issue 21.
 """
 
 import binascii
+import operator
 import struct
 from dataclasses import dataclass
 from typing import Final
@@ -111,8 +112,8 @@ def encode(
 
     Raises
     ------
-    ValueError
-        If a number does not fit its field, or there are too many data.
+    TypeError, ValueError
+        If a number is not whole, or does not fit its field, or there are too many data.
     """
     for name, value, bits in (
         ("channel", channel, 8),
@@ -120,7 +121,7 @@ def encode(
         ("command", command, 32),
         ("status", status, 32),
     ):
-        if not 0 <= value < 1 << bits:
+        if not 0 <= operator.index(value) < 1 << bits:
             raise ValueError(f"Invalid {name} {value}. Must lie in 0 to {(1 << bits) - 1}.")
     if len(data) > MAXIMUM_DATA:
         raise ValueError(f"Invalid data of {len(data)} bytes. Must be at most {MAXIMUM_DATA}.")

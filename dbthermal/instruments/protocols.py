@@ -79,7 +79,7 @@ def wait_stable(
     Parameters
     ----------
     session : Session
-        With a blackbody: its `stability` [K], `window` [s] and `timeout` [s].
+        With a blackbody: its `stability` and `tolerance` [K], `window` and `timeout` [s].
     temperature : float
         Where it was set [K].
     read : callable
@@ -96,7 +96,7 @@ def wait_stable(
     ------
     TimeoutError
         If within `timeout` the readings of no window lay within `stability` of one another and
-        their mean as near to `temperature`.
+        their mean within `tolerance` of `temperature`.
     ValueError
         If the session has no blackbody.
     """
@@ -108,7 +108,7 @@ def wait_stable(
         readings.append((clock(), read()))
         values = np.array([value for _, value in readings])
         whole = readings[-1][0] - readings[0][0] >= steps.window
-        near = abs(values.mean() - temperature) <= steps.stability
+        near = abs(values.mean() - temperature) <= steps.tolerance
         if whole and near and np.ptp(values) <= steps.stability:
             return float(values.mean())
         while whole and readings[-1][0] - readings[0][0] >= steps.window:
@@ -116,7 +116,7 @@ def wait_stable(
         sleep(STABILITY_PERIOD)
     raise TimeoutError(
         f"No rest at {temperature} K within {steps.timeout} s: last {values[-1]} K. Must stay "
-        f"within {steps.stability} K for {steps.window} s."
+        f"within {steps.stability} K for {steps.window} s, and within {steps.tolerance} K of it."
     )
 
 
@@ -134,8 +134,10 @@ def record_sweep(
     """
     Record at each temperature of the blackbody, as soon as it rests there, through each filter.
 
-    Recordings of this sweep that are in the folder and complete are kept, so that a sweep that was
-    interrupted goes on where it was. Call `Devices.prepare` before.
+    The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep,
+    and a scene too is recorded after a correction. Recordings of this sweep that are in the folder
+    and complete are kept, so that a sweep that was interrupted goes on where it was. Call
+    `Devices.prepare` before.
 
     Parameters
     ----------
@@ -167,8 +169,8 @@ def record_sweep(
         As `wait_stable`; the steps before are kept.
     SourceLostError
         If a camera is lost on the way.
-    WheelError, ReadingError, OSError
-        As `Devices.select`, as `Devices.readings`, and as `record`.
+    BosonError, WheelError, ReadingError, OSError
+        As `Devices.correct_offsets`, `Devices.select`, `Devices.readings` and `record`.
     """
     session = devices.session
     extra = {} if read_blackbody is None else {BLACKBODY: Reading(read_blackbody)}
@@ -183,6 +185,7 @@ def record_sweep(
         if was is None and resting != number:
             set_temperature(temperature)
             wait_stable(session, temperature, known[BLACKBODY].read, clock=clock, sleep=sleep)
+            devices.correct_offsets()
             resting = number
         summary = was or _record_step(devices, band, path, extra, limits, preview)
         steps.append(Step(number, temperature, mean_reading(path, BLACKBODY), band, summary))

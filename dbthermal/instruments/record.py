@@ -64,8 +64,8 @@ class Summary:
     path : Path
         Where it is.
     ended : str
-        Why it ended: ``"duration"``, ``"stopped"``, ``"source lost"``, which
-        does not end it before the last source is lost.
+        Why it ended: ``"duration"``, ``"stopped"``, ``"source lost"``, which does not end it before
+        the last source is lost, or ``"no frames"`` where a band had none.
     totals : mapping
         As in `Preview`.
     """
@@ -91,7 +91,7 @@ def record(  # noqa: PLR0913 - the one entrance; all but the first three are by 
     Record until the session's duration is over, `stop` is set or no source is left.
 
     Frames that a driver held from before the start, as their stamps say, are not taken: they show
-    another filter, or another scene.
+    another filter, or another scene. Two seconds later such a stamp is taken for a wrong one.
 
     Parameters
     ----------
@@ -129,7 +129,8 @@ def record(  # noqa: PLR0913 - the one entrance; all but the first three are by 
         If the sources are not the session's, or are emulated where it says hardware, or vice versa.
     Exception
         What a source, a reading or the preview raised; what was recorded is kept. So it is when
-        the keyboard interrupts, but then the writer may need a moment to end.
+        the keyboard interrupts: what came is written first. A second interrupt ends the wait, not
+        the writing.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
@@ -151,14 +152,14 @@ def record(  # noqa: PLR0913 - the one entrance; all but the first three are by 
     )
     try:
         writer.start()
-        _look_on(run, written, writer, preview, units)
+        _look_on(run, written, preview, units)
     except BaseException:
         written.interrupted = True
         raise
     finally:
         run.over.set()
         if writer.ident is not None:  # None only where an interrupt came before its start
-            writer.join()
+            written.done.wait()
     if run.errors:
         raise run.errors[0]
     return Summary(Path(path), written.ended, written.totals)
@@ -225,14 +226,13 @@ def _tape(
 def _look_on(
     run: Run,
     written: Written,
-    writer: threading.Thread,
     preview: Callable[[Preview], None] | None,
     units: Mapping[str, str],
 ) -> None:
     """Show what is recorded, until there is no more."""
     period = _POLL  # until there is something to show
-    while writer.is_alive():
-        writer.join(period)
+    # Not `Thread.join`: interrupted, that of Python 3.11 takes a running thread for an ended one.
+    while not written.done.wait(period):
         if preview and written.frames and run.going():
             period = max(_POLL, run.limits.preview_period)
             time = run.clock() - written.start

@@ -188,10 +188,9 @@ class Devices:
                 identity |= control
             found[band] = identity
         if self.wheel is not None:
-            own = self.wheel.identity
-            found[WHEEL] = {**own, "is_simulated": self.wheel.is_simulated}
+            found[WHEEL] = _record(self.wheel.identity())
         if self.logger is not None:
-            found["thermocouples"] = _record(self.logger.info())
+            found["thermocouples"] = _record(self.logger.identity())
         return found
 
     def prepare(self) -> None:
@@ -199,8 +198,8 @@ class Devices:
         Make the devices ready to measure: set the cameras, correct their offsets, turn the wheel.
 
         Each camera gives 16-bit counts, corrects its offsets on command only, and gives telemetry
-        as the session says; each setting is read back. One flat-field correction is run and
-        awaited. The wheel is homed if it has to be, and turned to the session's band.
+        as the session says; each setting is read back. Then the offsets are corrected, and the
+        wheel is homed if it has to be, and turned to the session's band.
 
         Raises
         ------
@@ -218,9 +217,21 @@ class Devices:
                         f"Invalid {setting.name} {found!r} of the camera of band '{band}', set "
                         f"to {value!r}. Must be as it was set."
                     )
-            camera.run_ffc()
+        self.correct_offsets()
         if self.wheel is not None and self.session.filtered is not None:
             self._turn(self.wheel, self.session.filtered)
+
+    def correct_offsets(self) -> None:
+        """
+        Run a flat-field correction of each camera before its shutter, and wait until it is over.
+
+        Raises
+        ------
+        BosonError, OSError
+            If a camera refuses, fails or is gone.
+        """
+        for camera in self.cameras.values():
+            camera.run_ffc()
 
     def select(self, band: str) -> "Devices":
         """

@@ -249,7 +249,8 @@ def _agreed(paths: list[Path], source: str, stability: float) -> float:
     if np.ptp(means) > stability:
         raise ValueError(
             f"Invalid readings {means} K of '{source}' in the recordings "
-            f"{[path.name for path in paths]}. Must agree within {stability} K."
+            f"{[path.name for path in paths]}. Must agree within {stability} K: move them "
+            "away, and this step is recorded again."
         )
     return float(np.mean(means))
 

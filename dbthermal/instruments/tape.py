@@ -1,7 +1,8 @@
 """Frames and notes on their way into a recording: numbered, flagged, gathered into chunks.
 
 A `Tape` looks at each frame beside the one before: a number that leaps is a loss, one that does not
-rise a repetition, and a time that does not rise, or is still to come, is none. Nothing is left out:
+rise a repetition, a time that does not rise, or cannot be, is none, and an image without a changed
+pixel was not taken anew. Nothing is left out:
 a damaged frame is written with its flags, and only its exposure time is NaN, so that
 `dbthermal.alignment` passes over it. What is no frame goes into the log: losses, shutter events,
 readings of other instruments.
@@ -20,25 +21,25 @@ import numpy.typing as npt
 from dbthermal import store
 from dbthermal.alignment import clocks
 from dbthermal.instruments import telemetry
-from dbthermal.instruments.contents import TELEMETRY, VARIABLES, Note
+from dbthermal.instruments.contents import ABOUT, TELEMETRY, VARIABLES, Note
 from dbthermal.instruments.frames_source import (
+    DAMAGED,
     GOOD,
-    MEANINGS,
     UNTIMED,
+    Counts,
     Frame,
     FrameFlag,
     FrameSource,
 )
-
-__all__ = ["CHUNK", "TELEMETRY", "VARIABLES", "Note", "Tape"]
 
 CHUNK: Final = 30
 """Frames of a chunk: half a second at 60 Hz, which is what a kill may cost."""
 
 _AHEAD: Final = 1e-3  # by how much a stamp may be later than the frame was there [s]
 _HELD: Final = 1.0  # how long a note may wait for a chunk before it is written without one [s]
-_DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
-_FILLS: Final = MappingProxyType({"frame_flags": int(FrameFlag.PADDED), "sequence": -1})
+_FILLS: Final = MappingProxyType(
+    {"frame_flags": int(FrameFlag.PADDED), "sequence": -1, "frame_counter": -1}
+)
 
 
 @dataclass
@@ -47,6 +48,7 @@ class _Band:
 
     block: dict[str, npt.NDArray[Any]]
     filled: int = 0
+    image: Counts | None = None
     sequence: int | None = None
     device_time: float = -math.inf
     closed: bool = False
@@ -138,7 +140,7 @@ class Tape:
         """
         state = self._bands[band]
         flags = frame.flags | self._compared(band, frame, refused)
-        if flags & _DAMAGED:
+        if flags & DAMAGED:
             state.counts["damaged"] += 1
             self.note(Note.DAMAGED, band, frame.host_time, int(flags))
         self._watch_shutter(band, frame)
@@ -226,14 +228,16 @@ class Tape:
             state.counts["lost"] += lost
             self.note(Note.FRAMES_LOST, band, frame.host_time, lost)
         flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else GOOD
-        state.sequence = frame.sequence
+        if state.image is not None and np.array_equal(frame.counts, state.image):
+            flags |= FrameFlag.IMAGE_REPEATED
+        state.sequence, state.image = frame.sequence, frame.counts
         return flags | self._timed(state, frame)
 
     def _timed(self, state: _Band, frame: Frame) -> FrameFlag:
         """Flag of a stamp that is none; one of the future must not spoil those that follow."""
-        own_clock = FrameFlag.FOREIGN_CLOCK in frame.flags
-        if not own_clock and frame.device_time > frame.host_time + _AHEAD:
-            return FrameFlag.TIME_AHEAD
+        own_clock, time = FrameFlag.FOREIGN_CLOCK in frame.flags, frame.device_time
+        if not own_clock and (time < self._origin or time > frame.host_time + _AHEAD):
+            return FrameFlag.TIME_WRONG
         if not frame.device_time > state.device_time:  # NaN too
             return FrameFlag.TIME_STANDS
         state.device_time = frame.device_time
@@ -251,13 +255,15 @@ class Tape:
         """Telemetry as it came, and what of it is of use frame by frame."""
         if frame.telemetry is None:
             return {}
-        if frame.flags & _DAMAGED:  # its telemetry may be, too: it is kept, but not believed
-            return {"telemetry": frame.telemetry, "fpa_temperature": math.nan}
+        if frame.flags & DAMAGED:  # its telemetry may be, too: it is kept, but not believed
+            unknown = {"fpa_temperature": math.nan, "frame_counter": -1}
+            return {"telemetry": frame.telemetry, **unknown}
         state, fields = self._bands[band], telemetry.decode(frame.telemetry)
         if state.last_correction not in {None, fields.last_ffc_frame}:
             self.note(Note.CORRECTION, band, frame.host_time, fields.last_ffc_frame)
         state.last_correction = fields.last_ffc_frame
-        return {"telemetry": frame.telemetry, "fpa_temperature": fields.fpa_temperature}
+        names = ("fpa_temperature", "frame_counter")
+        return {"telemetry": frame.telemetry, **{name: getattr(fields, name) for name in names}}
 
     def _write(self, band: str) -> None:
         state = self._bands[band]
@@ -302,11 +308,11 @@ def _common_format(sources: Mapping[str, FrameSource]) -> tuple[tuple[int, int],
 
 
 def _legend(names: list[str], readings: Mapping[str, str], origin: float) -> dict[str, Any]:
-    """Attributes that say what the numbers in log and flags mean."""
+    """Attributes that say what the numbers in times and log mean."""
     return {
+        "comment": ABOUT,
         "clock_origin": origin,
         "log_sources": names,
         "log_units": dict(readings),
         "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
-        "frame_flag_masks": {str(flag.name).lower(): int(flag) for flag in MEANINGS},
     }

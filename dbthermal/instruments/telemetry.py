@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.constants import zero_Celsius
 
 Words = npt.NDArray[np.uint16]
 
@@ -27,7 +28,6 @@ WORDS: Final = 142
 """Least number of words that hold all the fields."""
 
 _WORD_BITS: Final = 16
-_ICE: Final = 273.15  # 0 degrees Celsius [K]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Telemetry:
     ffc_frames: int = 0
     nuc_table: int = 0
     desired_nuc_table: int = 0
-    core_temperature: float = _ICE
+    core_temperature: float = zero_Celsius
     uptime: float = 0.0
 
 
@@ -127,7 +127,7 @@ FIELDS: Final = MappingProxyType(
         "ffc_frames": Field(57),
         "nuc_table": Field(79),
         "desired_nuc_table": Field(80),
-        "core_temperature": Field(81, 2, signed=True, steps=1000, zero=_ICE),
+        "core_temperature": Field(81, 2, signed=True, steps=1000, zero=zero_Celsius),
         "uptime": Field(140, 2, steps=1000),
     }
 )

@@ -19,11 +19,9 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.constants import zero_Celsius
 
 Array = npt.NDArray[np.float64]
-
-ICE_POINT: Final = 273.15
-"""0 °C [K], the zero of E(t)."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +170,7 @@ def emf(temperature: npt.ArrayLike) -> Array:
     .. [2] Burns, Scroger, Strouse, Croarkin, Guthrie (1993), NIST Monograph 175,
        doi:10.6028/NIST.MONO.175
     """
-    return _forward(TEMPERATURE.require("temperature", temperature) - ICE_POINT)
+    return _forward(TEMPERATURE.require("temperature", temperature) - zero_Celsius)
 
 
 def sensitivity(temperature: npt.ArrayLike) -> Array:
@@ -195,7 +193,7 @@ def sensitivity(temperature: npt.ArrayLike) -> Array:
     ValueError
         As `emf`.
     """
-    return _slope(TEMPERATURE.require("temperature", temperature) - ICE_POINT)
+    return _slope(TEMPERATURE.require("temperature", temperature) - zero_Celsius)
 
 
 def temperature(emf_mV: npt.ArrayLike, junction_temperature: npt.ArrayLike) -> Array:  # noqa: N803
@@ -239,7 +237,7 @@ def temperature(emf_mV: npt.ArrayLike, junction_temperature: npt.ArrayLike) -> A
     celsius = _where(total, _polynomial(BELOW.inverse, total), _polynomial(ABOVE.inverse, total))
     for _ in range(_STEPS):
         celsius = celsius - (_forward(celsius) - total) / _slope(celsius)
-    return celsius + ICE_POINT
+    return np.asarray(celsius + zero_Celsius)
 
 
 def _forward(celsius: Array) -> Array:

@@ -11,11 +11,13 @@ import errno
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
 import serial
+
+from dbthermal.instruments.closing import Closing
 
 if TYPE_CHECKING:
     from dbthermal.instruments.emulated.world import World
@@ -59,26 +61,7 @@ class Transport(Protocol):
         """
 
     def close(self) -> None:
-        """Give the line back; a second time does nothing."""
-
-
-class Closing:
-    """Context manager that closes at its end."""
-
-    def close(self) -> None:
-        """Give back what is held; a second time does nothing."""
-        raise NotImplementedError
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+        """Give the line back; a second time does nothing. `TransportError` if it cannot."""
 
 
 class SerialTransport(Closing):
@@ -186,10 +169,19 @@ class SerialTransport(Closing):
         return True
 
     def close(self) -> None:
-        """Give the port back and end its emulator; a second time does nothing."""
+        """
+        Give the port back and end its emulator; a second time does nothing.
+
+        Raises
+        ------
+        TransportError
+            If the port does not close; its emulator is ended all the same.
+        """
         after, self._after = self._after, None
         try:
             self._port.close()
+        except OSError as error:
+            raise self._lost("close", error) from error
         finally:
             if after is not None:
                 after()

@@ -10,12 +10,12 @@ calls, not against a camera.
 import errno
 import struct
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
 
 from dbthermal.instruments import v4l2_calls as calls
+from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.frames_source import (
     FRAME_TIMEOUT,
     GOOD,
@@ -35,7 +35,7 @@ _MICRO: Final = 1e-6
 _TYPE: Final = struct.pack("=I", calls.CAPTURE)
 
 
-class Capture:
+class Capture(Closing):
     """
     A camera's node that streams Y16 frames; open one with `Capture.open`.
 
@@ -112,17 +112,6 @@ class Capture:
     def frame_rate(self) -> float:
         """Rate that was agreed on [Hz]."""
         return self.stream.frame_rate
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """
@@ -220,9 +209,7 @@ class Capture:
         try:
             self._kernel.ask(file, calls.QBUF, buffer)
         except OSError as error:
-            if (
-                error.errno not in _GONE
-            ):  # the frame came: the next `read` tells that it was the last
+            if error.errno not in _GONE:  # else the next `read` tells that this frame was the last
                 raise
 
     def _frame(self, buffer: bytearray, host_time: float) -> Frame:

@@ -20,6 +20,7 @@ from dbthermal.instruments.frames_source import Frame, FrameFlag
 from dbthermal.instruments.tape import Tape
 
 _POLL: Final = 0.05  # how long the writer waits before it looks whether all is over [s]
+_HELD: Final = 2.0  # how long after the start a frame may still come that a driver held [s]
 
 
 @dataclass
@@ -41,6 +42,8 @@ class Written:
         To be set before `Run.over` where neither time nor a wish ended the recording.
     ended : str
         Why it ended, once it did.
+    done : Event
+        Set when nothing more is written.
     """
 
     start: float
@@ -49,6 +52,7 @@ class Written:
     readings: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
     ended: str = ""
+    done: threading.Event = field(default_factory=threading.Event)
 
 
 def write(
@@ -77,11 +81,11 @@ def write(
     asking : Thread
         Of all other instruments.
     """
-    for thread in (*fetching, asking):
-        thread.start()
     try:
+        for thread in (*fetching, asking):
+            thread.start()
         _write(run, tape, written, fetching)
-    except Exception as error:  # noqa: BLE001 - raised again in the caller's thread
+    except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
         run.errors.append(error)
     run.over.set()
     _join(run, (*fetching, asking))
@@ -91,9 +95,11 @@ def write(
             written.ended = _reason(run, written)
             complete = written.ended in {"duration", "stopped"}
             tape.close(complete=complete, ended=written.ended)
-    except Exception as error:  # noqa: BLE001 - as above
+    except BaseException as error:  # noqa: BLE001 - as above
         run.errors.append(error)
-    written.totals = tape.totals
+    finally:
+        written.totals = tape.totals
+        written.done.set()
 
 
 def free(path: Path) -> int:
@@ -131,7 +137,8 @@ def _write(run: Run, tape: Tape, written: Written, fetching: Sequence[threading.
 def _take(tape: Tape, written: Written, band: str, frame: Frame, refused: int) -> None:
     """Take a frame, unless it is one that the driver held from before the start."""
     own_clock = FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
-    if band not in written.frames and frame.device_time < written.start and not own_clock:
+    early = frame.device_time < written.start and frame.host_time < written.start + _HELD
+    if band not in written.frames and early and not own_clock:
         return
     tape.frame(band, frame, refused)
     written.frames[band] = frame
@@ -161,14 +168,16 @@ def _reason(run: Run, written: Written) -> str:
         return "no space" if getattr(run.errors[0], "errno", 0) == errno.ENOSPC else "error"
     if written.interrupted:
         return "interrupted"
-    if run.stop.is_set():
-        return "stopped"
-    return "source lost" if run.lost else "duration"
+    if run.lost:
+        return "source lost"
+    if len(written.frames) < len(run.room):
+        return "no frames"
+    return "stopped" if run.stop.is_set() else "duration"
 
 
 def _join(run: Run, threads: Sequence[threading.Thread]) -> None:
     """Wait for the threads; one that hangs in its device must not keep what was recorded."""
-    for thread in threads:
+    for thread in (thread for thread in threads if thread.ident is not None):
         thread.join(run.limits.patience)
         if thread.is_alive():
             run.errors.append(

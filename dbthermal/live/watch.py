@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import telemetry
-from dbthermal.instruments.boson.commands import ZERO_CELSIUS, FfcStatus
+from dbthermal.instruments.boson.commands import FfcStatus
 from dbthermal.instruments.frames_source import Counts, Frame, FrameFlag
 from dbthermal.instruments.record import Preview
 
@@ -50,7 +51,7 @@ def celsius(temperature: float) -> str:
     """
     if math.isnan(temperature):
         return "unknown"
-    return f"{temperature - ZERO_CELSIUS:.1f} \N{DEGREE SIGN}C"
+    return f"{temperature - zero_Celsius:.1f} \N{DEGREE SIGN}C"
 
 
 def ffc_state(reading: float) -> str:

@@ -14,7 +14,9 @@ Facts alone were taken, no code: yaq-project/thorlabs-apt-protocol 29.0.0, moons
 """
 
 from dbthermal.instruments.apt.codec import (
+    ADDRESSES,
     BAY_1,
+    CONTROLLERS,
     HOST,
     RACK,
     UNIT,
@@ -64,7 +66,9 @@ from dbthermal.instruments.apt.requests import (
 )
 
 __all__ = [
+    "ADDRESSES",
     "BAY_1",
+    "CONTROLLERS",
     "HOST",
     "RACK",
     "UNIT",

@@ -10,6 +10,7 @@ References
 See `dbthermal.instruments.apt`.
 """
 
+import operator
 import struct
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -30,7 +31,10 @@ UNIT: Final = 0x50
 """Address of a controller that is no rack."""
 
 CONTROLLERS: Final = frozenset({RACK, *range(BAY_1, BAY_1 + 10), UNIT})
-"""Addresses from which a computer hears."""
+"""Addresses of racks, of their ten bays, and of units."""
+
+ADDRESSES: Final = CONTROLLERS | {HOST}
+"""All addresses."""
 
 HEADER: Final = 6
 """Length of a header, and of a message without data [byte]."""
@@ -152,8 +156,9 @@ def encode(message: Message) -> bytes:
 
     Raises
     ------
-    ValueError
-        If a number does not fit its field, there are too many data, or both parameters and data.
+    TypeError, ValueError
+        If a number is not whole, or does not fit its field, there are too many data, or both
+        parameters and data.
     """
     for name, value, most in (
         ("identifier", message.id, 0xFFFF),
@@ -163,7 +168,7 @@ def encode(message: Message) -> bytes:
         ("source", message.source, 0xFF),
         ("number of data", len(message.data), MAXIMUM_DATA),
     ):
-        if not 0 <= value <= most:
+        if not 0 <= operator.index(value) <= most:
             raise ValueError(f"Invalid {name} {value} of a message. Must lie in 0 to {most}.")
     if not message.data:
         fields = (message.id, message.param1, message.param2, message.destination, message.source)
@@ -186,7 +191,8 @@ class Decoder:
     Parameters
     ----------
     destinations, sources : collection of int
-        Addresses that are possible; by default what a computer hears.
+        Addresses that are possible; by default all, so that a noted line is read in both
+        directions. Who knows whom it talks to says so, and takes less noise for a message.
 
     Attributes
     ----------
@@ -196,8 +202,8 @@ class Decoder:
 
     def __init__(
         self,
-        destinations: Collection[int] = (HOST,),
-        sources: Collection[int] = CONTROLLERS,
+        destinations: Collection[int] = ADDRESSES,
+        sources: Collection[int] = ADDRESSES,
     ) -> None:
         self.dropped = 0
         self._destinations = frozenset(destinations)

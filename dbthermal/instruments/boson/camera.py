@@ -22,7 +22,8 @@ from dbthermal.instruments.boson.link import (
     Link,
     Statistics,
 )
-from dbthermal.instruments.transport import Closing, Transport, open_serial
+from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import Transport, open_serial
 
 if TYPE_CHECKING:
     from dbthermal.instruments.emulated.world import World

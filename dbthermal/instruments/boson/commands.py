@@ -18,13 +18,12 @@ from enum import IntEnum
 from types import MappingProxyType
 from typing import Any, Final, Generic, TypeVar
 
+from scipy.constants import zero_Celsius
+
 from dbthermal.instruments.fslp import REQUEST
 
 T = TypeVar("T")
 IntT = TypeVar("IntT", bound=int)
-
-ZERO_CELSIUS: Final = 273.15
-"""Zero degrees Celsius [K]."""
 
 
 class Switch(IntEnum):
@@ -228,7 +227,7 @@ def _tenths(raw: int) -> float:
 
 
 def _tenths_celsius(raw: int) -> float:
-    return raw / 10.0 + ZERO_CELSIUS
+    return float(raw / 10.0 + zero_Celsius)
 
 
 def _revision(major: int, minor: int, patch: int) -> tuple[int, int, int]:

@@ -14,7 +14,8 @@ from typing import Final
 
 from dbthermal.instruments import fslp
 from dbthermal.instruments.boson.commands import meaning
-from dbthermal.instruments.transport import Closing, Transport
+from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import Transport
 
 REPLY_TIMEOUT: Final = 1.0
 """Longest wait for a reply [s], as in the vendor's own software."""

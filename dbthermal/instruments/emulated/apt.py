@@ -17,10 +17,10 @@ from dataclasses import replace
 from typing import Final
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.apt.codec import CONTROLLERS
 from dbthermal.instruments.emulated.apt_faults import MODELS, Faults
 from dbthermal.instruments.emulated.apt_motor import Drive, Motor
-from dbthermal.instruments.emulated.port import EmulatedPort, number
+from dbthermal.instruments.emulated.options import number, require_known
+from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.emulated.world import World
 
 SERIAL_NUMBER: Final = 40_000_000
@@ -97,7 +97,7 @@ class EmulatedApt:
         self.motor = Motor(turn, ((slot - 1) / 6 + slot_offset / 360.0) * turn)
         self._velocity = apt.VelocityParameters(1, 0, 0, 0)
         self._home = apt.HomeParameters(1, 2, 1, 0, 0)
-        self._decoder = apt.Decoder(CONTROLLERS, (apt.HOST,))
+        self._decoder = apt.Decoder(apt.CONTROLLERS, (apt.HOST,))
         self._waiting: list[tuple[float, bytes]] = []
         self._updates: float | None = None  # when the next report is due
         self._updates_began = 0.0
@@ -333,9 +333,7 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     ValueError
         If an option is not known or is no number.
     """
-    unknown = sorted(options.keys() - {"model", "sn", "offset", "name"})
-    if unknown:
-        raise ValueError(f"Unknown option '{unknown[0]}'. Must be model, sn, offset or name.")
+    require_known(options, ("model", "sn", "offset", "name"))
     device = EmulatedApt(
         World() if world is None else world,
         model=options.get("model", "BSC201"),

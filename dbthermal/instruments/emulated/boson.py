@@ -14,11 +14,14 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
+from scipy.constants import zero_Celsius
+
 from dbthermal.instruments import fslp
 from dbthermal.instruments.boson import commands
 from dbthermal.instruments.boson.commands import FfcMode, FfcStatus, Setting, SyncMode
 from dbthermal.instruments.emulated.boson_faults import Fault, Faults, misshapen
-from dbthermal.instruments.emulated.port import EmulatedPort, number
+from dbthermal.instruments.emulated.options import number, require_known
+from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.emulated.world import FFC_DURATION, FPA, CameraState, World
 
 SERIAL_NUMBER: Final = 93588
@@ -261,9 +264,7 @@ class EmulatedBoson:
             commands.SENSOR_SERIAL_NUMBER.command: lambda: (camera.serial_number,),
             commands.SENSOR_PART_NUMBER.command: lambda: (b"EMULATED-SENSOR",),
             commands.SOFTWARE_REVISION.command: lambda: (0, 0, 0),
-            commands.FPA_TEMPERATURE.command: lambda: (
-                round(10 * (fpa() - commands.ZERO_CELSIUS)),
-            ),
+            commands.FPA_TEMPERATURE.command: lambda: (round(10 * (fpa() - zero_Celsius)),),
             commands.FPA_TEMPERATURE_KELVIN.command: lambda: (round(10 * fpa()),),
             commands.FPA_COUNTS.command: lambda: (round(100 * fpa()),),
             commands.FFC_IN_PROGRESS.command: lambda: (world.ffc_in_progress(self._name),),
@@ -314,9 +315,9 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     Parameters
     ----------
     options : mapping
-        ``camera`` or ``name``, its name in the world (``"boson"`` unless given); ``sn``, its serial
-        number, and ``fpa``, the temperature of its focal-plane array [K], if the world has no such
-        camera; ``frames``, ``"source"`` where an emulated frame source counts the frames.
+        ``name``, its name in the world (``"boson"`` unless given); ``sn``, its serial number, and
+        ``fpa``, the temperature of its focal-plane array [K], if the world has no such camera;
+        ``frames``, ``"source"`` where an emulated frame source counts the frames.
     world : World or None
         What it is part of, or None for one of its own.
 
@@ -330,12 +331,9 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     ValueError
         If an option is not known, is no number, or disagrees with the world.
     """
-    unknown = sorted(options.keys() - {"camera", "name", "sn", "fpa", "frames"})
-    if unknown or {"camera", "name"} <= options.keys():
-        wrong = unknown[0] if unknown else "camera' beside 'name"
-        raise ValueError(f"Unknown option '{wrong}'. Must be camera (or name), sn, fpa or frames.")
+    require_known(options, ("name", "sn", "fpa", "frames"))
     world = World() if world is None else world
-    name = options.get("camera", options.get("name", "boson"))
+    name = options.get("name", "boson")
     serial_number = number(options, "sn", SERIAL_NUMBER, _SERIAL_NUMBERS)
     fpa_temperature = number(options, "fpa", FPA, _FPA_TEMPERATURES)
     if name not in world.cameras:

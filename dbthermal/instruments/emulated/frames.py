@@ -11,13 +11,13 @@ import math
 import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from dbthermal.instruments import telemetry
+from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.frames_source import (
     FRAME_TIMEOUT,
@@ -132,7 +132,7 @@ class Faults:
 
 
 @dataclass
-class EmulatedCamera:
+class EmulatedCamera(Closing):
     """
     A `FrameSource` without a camera; its frames begin with the first `read`.
 
@@ -177,17 +177,6 @@ class EmulatedCamera:
         self._last: Counts = np.full(self.shape, CLOSED, dtype=np.uint16)
         self._offsets: tuple[int, npt.NDArray[np.int32]] = 0, np.zeros(self.shape, np.int32)
         self._open = True
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     @property
     def identity(self) -> Mapping[str, str]:

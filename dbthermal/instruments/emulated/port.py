@@ -11,17 +11,16 @@ import threading
 import time as system_time
 import tty
 from collections import deque
-from collections.abc import Callable, Mapping
-from typing import Final, Protocol, TypeVar
+from collections.abc import Callable
+from typing import Final, Protocol
 
-from dbthermal.instruments.transport import Closing, TransportError
+from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import TransportError
 
 TICK: Final = 0.01
 """Longest time after which a port looks whether it is to end, or the device was pulled out [s]."""
 
 _READ_SIZE = 4096
-
-Number = TypeVar("Number", bound=float)
 
 
 class Device(Protocol):
@@ -164,46 +163,3 @@ class Loop(Closing):
     def _check(self) -> None:
         if self._closed or not self._device.plugged:
             raise TransportError("Lost the emulated device. It must stay connected and open.")
-
-
-def number(
-    options: Mapping[str, str], name: str, default: Number, limits: tuple[Number, Number]
-) -> Number:
-    """
-    Number that an option of an emulator's address gives, as in ``sim://boson?sn=7``.
-
-    Parameters
-    ----------
-    options : mapping
-        Text of each option by its name.
-    name : str
-        Of the option.
-    default : int or float
-        Without it; a whole number if only such ones are allowed.
-    limits : tuple
-        Least and largest number that is allowed.
-
-    Returns
-    -------
-    int or float
-        As `default` is.
-
-    Raises
-    ------
-    ValueError
-        If it is no such number.
-    """
-    if name not in options:
-        return default
-    lowest, highest = limits
-    try:
-        value = type(default)(options[name])
-        allowed = lowest <= value <= highest  # which NaN is not
-    except ValueError:
-        allowed = False
-    if not allowed:
-        raise ValueError(
-            f"Invalid option {name}={options[name]} of an emulator. "
-            f"Must be a number ({type(default).__name__}) in {lowest} to {highest}."
-        )
-    return value

@@ -12,9 +12,10 @@ import math
 from collections import deque
 from collections.abc import Callable, MutableSequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, Protocol, Self
+from typing import Any, Final, Literal, Self
 
 from dbthermal.instruments import thermocouple
+from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.tc08.library import CHANNELS, KELVIN, SAMPLES
 
 Numbers = MutableSequence[Any]
@@ -30,16 +31,6 @@ _HANDLE = 1
 _WRAP = 2**31
 # Factor and shift from kelvin to °C, °F, K, °R.
 _UNITS: tuple[tuple[float, float], ...] = ((1.0, -273.15), (1.8, -459.67), (1.0, 0.0), (1.8, 0.0))
-
-
-class Bench(Protocol):
-    """What the unit needs of a `dbthermal.instruments.emulated.world.World`."""
-
-    def clock(self) -> float:
-        """Time [s]."""
-
-    def thermocouple_temperature(self, channel: int) -> float:
-        """Temperature of a tip [K], NaN if it is open."""
 
 
 @dataclass
@@ -118,7 +109,7 @@ class EmulatedTC08:
         temperature: Callable[[int, float], float],
         *,
         clock: Callable[[], float],
-        sleep: Callable[[float], object] | None = None,
+        sleep: Callable[[float], None] | None = None,
         junction_temperature: float = 296.15,
         noise: Callable[[], float] | None = None,
         conversion_error: float = 0.0,
@@ -136,13 +127,13 @@ class EmulatedTC08:
         self._rings: dict[int, deque[tuple[int, float, float, bool]]] = {}
 
     @classmethod
-    def from_world(cls, world: Bench, **settings: Any) -> Self:
+    def from_world(cls, world: World, **settings: Any) -> Self:
         """
         Put the thermocouples where the world has them.
 
         Parameters
         ----------
-        world : Bench
+        world : World
             Its thermocouples are asked when a reading is made; in a stream, when it is fetched.
         **settings
             As of the class.

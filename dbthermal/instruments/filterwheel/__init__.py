@@ -21,7 +21,7 @@ from dbthermal.instruments.filterwheel.link import (
     WrongDeviceError,
 )
 from dbthermal.instruments.filterwheel.settings import BSC10X, BSC20X, MODELS, Scale, Settings
-from dbthermal.instruments.filterwheel.wheel import FilterWheel
+from dbthermal.instruments.filterwheel.wheel import FilterWheel, Identity
 
 __all__ = [
     "BSC10X",
@@ -29,6 +29,7 @@ __all__ = [
     "MODELS",
     "ControllerError",
     "FilterWheel",
+    "Identity",
     "Link",
     "NoReplyError",
     "NotHomedError",

@@ -233,7 +233,9 @@ class Controller:
 
     def _known(self) -> tuple[apt.Info, Scale]:
         if self._found is None:
-            raise WheelError("The wheel is not connected. Must be opened by `FilterWheel.open`.")
+            raise WheelError(
+                "The wheel is not connected. Must be opened by `FilterWheel.from_url`."
+            )
         return self._found
 
 

@@ -80,7 +80,7 @@ class Link:
         reply_timeout: float,
         clock: Callable[[], float] = system_time.monotonic,
     ) -> None:
-        self.decoder = apt.Decoder()
+        self.decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
         self._transport = transport
         self._reply_timeout = reply_timeout
         self._clock = clock

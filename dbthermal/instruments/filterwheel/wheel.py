@@ -2,15 +2,17 @@
 
 import logging
 import time as system_time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
 from dbthermal.instruments import apt
+from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.filterwheel.controller import Controller
 from dbthermal.instruments.filterwheel.link import NotHomedError, StalledWheelError, WheelError
 from dbthermal.instruments.filterwheel.motion import MOVING, Motion
 from dbthermal.instruments.filterwheel.settings import Settings
-from dbthermal.instruments.transport import Closing, SerialTransport, Transport, open_serial
+from dbthermal.instruments.transport import SerialTransport, Transport, open_serial
 
 if TYPE_CHECKING:
     from dbthermal.instruments.emulated.world import World
@@ -24,9 +26,35 @@ SETTLING: Final = 0.05
 _LOGGER = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class Identity:
+    """
+    Which controller turns the wheel, for a capture's record.
+
+    Attributes
+    ----------
+    model : str
+        As it says, which is not always what is on the label.
+    serial_number : int
+        On its label.
+    firmware : str
+        Version.
+    addresses : str
+        Where it was found, and its motor.
+    is_simulated : bool
+        Whether it is an emulated one.
+    """
+
+    model: str
+    serial_number: int
+    firmware: str
+    addresses: str
+    is_simulated: bool
+
+
 class FilterWheel(Closing):
     """
-    A filter wheel whose line is open, for one thread at a time; see `open`.
+    A filter wheel whose line is open, for one thread at a time; see `from_url`.
 
     Parameters
     ----------
@@ -53,15 +81,7 @@ class FilterWheel(Closing):
         self._is_lost = False  # the counter may not be where the wheel is
 
     @classmethod
-    def open(
-        cls,
-        url: str,
-        settings: Settings,
-        *,
-        world: "World | None" = None,
-        clock: Callable[[], float] = system_time.monotonic,
-        sleep: Callable[[float], None] = system_time.sleep,
-    ) -> Self:
+    def from_url(cls, url: str, settings: Settings, *, world: "World | None" = None) -> Self:
         """
         Open the line and `connect`; the wheel does not move.
 
@@ -73,8 +93,6 @@ class FilterWheel(Closing):
             Of this wheel.
         world : World, optional
             What a ``sim://`` wheel is part of.
-        clock, sleep : callable
-            As of the class.
 
         Returns
         -------
@@ -89,9 +107,9 @@ class FilterWheel(Closing):
             As `connect`; the line is closed again.
         """
         transport = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
-        wheel = cls(transport, settings, clock=clock, sleep=sleep)
+        wheel = cls(transport, settings)
         try:
-            _toggle_rts(transport, sleep)
+            _toggle_rts(transport)
             wheel.connect()
         except BaseException:
             wheel.close()
@@ -127,16 +145,11 @@ class FilterWheel(Closing):
         """Whether no hardware is at the other end."""
         return self._transport.is_simulated
 
-    @property
-    def identity(self) -> Mapping[str, str]:
-        """What it is: model, serial number, firmware, addresses; text by name."""
-        controller = self._controller
-        return {
-            "model": controller.info.model,
-            "serial_number": str(controller.info.serial_number),
-            "firmware": controller.info.firmware,
-            "addresses": f"0x{controller.unit:02X}, 0x{controller.motor:02X}",
-        }
+    def identity(self) -> Identity:
+        """Which controller it is, for a capture's record; `WheelError` if it is not connected."""
+        controller, info = self._controller, self._controller.info
+        addresses = f"0x{controller.unit:02X}, 0x{controller.motor:02X}"
+        return Identity(info.model, info.serial_number, info.firmware, addresses, self.is_simulated)
 
     def status(self) -> apt.Status:
         """
@@ -318,9 +331,9 @@ class FilterWheel(Closing):
             )
 
 
-def _toggle_rts(transport: SerialTransport, sleep: Callable[[float], None]) -> None:
+def _toggle_rts(transport: SerialTransport) -> None:
     """Take RTS down and up again, where the line has one; a pseudo-terminal has none."""
     transport.set_rts(level=False)
-    sleep(SETTLING)
+    system_time.sleep(SETTLING)
     if not transport.set_rts(level=True):
         _LOGGER.info("The line %s has no RTS.", transport.url)

@@ -14,9 +14,9 @@ signatures, not against hardware.
 """
 
 from dbthermal.instruments.tc08.library import ERRORS, TC08Error, load
-from dbthermal.instruments.tc08.opening import Info
+from dbthermal.instruments.tc08.opening import Identity
 from dbthermal.instruments.tc08.readings import Flag, Samples, Scan
 from dbthermal.instruments.tc08.stream import Stream
 from dbthermal.instruments.tc08.unit import TC08
 
-__all__ = ["ERRORS", "TC08", "Flag", "Info", "Samples", "Scan", "Stream", "TC08Error", "load"]
+__all__ = ["ERRORS", "TC08", "Flag", "Identity", "Samples", "Scan", "Stream", "TC08Error", "load"]

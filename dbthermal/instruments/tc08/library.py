@@ -13,8 +13,9 @@ library object and against a stub compiled from the public signatures, not again
 import ctypes
 import ctypes.util
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from ctypes import POINTER, c_char, c_float, c_int8, c_int16, c_int32
+from types import MappingProxyType
 from typing import Any, Final
 
 Library = Any
@@ -35,25 +36,27 @@ CHANNELS: Final = 9
 KELVIN: Final = 2
 """Number of the unit of temperature; 0 °C, 1 °F, 3 °R."""
 
-ERRORS: Final[Mapping[int, str]] = {
-    0: "no error",
-    1: "the operating system is not supported",
-    2: "no channels are set",
-    3: "an argument is invalid",
-    4: "the hardware version is not supported; a newer library may know it",
-    5: "incorrect mode: a single reading while streaming, or old and new functions mixed",
-    6: "the units are still being enumerated",
-    7: "the unit does not respond",
-    8: "its firmware could not be downloaded",
-    9: "its EEPROM is missing or corrupt",
-    10: "the enumerated unit is not found: it was pulled out, or another program has it",
-    11: "a threading function failed",
-    12: "the USB pipes of the unit could not be had",
-    13: "no calibration date was found",
-    14: "the installed kernel driver (picopp) is too old",
-    15: "a function of Pico's driver failed",
-    16: "the communication with the unit is lost",
-}
+ERRORS: Final[Mapping[int, str]] = MappingProxyType(
+    {
+        0: "no error",
+        1: "the operating system is not supported",
+        2: "no channels are set",
+        3: "an argument is invalid",
+        4: "the hardware version is not supported; a newer library may know it",
+        5: "incorrect mode: a single reading while streaming, or old and new functions mixed",
+        6: "the units are still being enumerated",
+        7: "the unit does not respond",
+        8: "its firmware could not be downloaded",
+        9: "its EEPROM is missing or corrupt",
+        10: "the enumerated unit is not found: it was pulled out, or another program has it",
+        11: "a threading function failed",
+        12: "the USB pipes of the unit could not be had",
+        13: "no calibration date was found",
+        14: "the installed kernel driver (picopp) is too old",
+        15: "a function of Pico's driver failed",
+        16: "the communication with the unit is lost",
+    }
+)
 """Meaning of the library's error numbers; 15 and 16 are often taken for one another."""
 
 
@@ -108,21 +111,23 @@ class UnitInfo(ctypes.Structure):
 _SHORT, _LONG, _FLOAT = POINTER(c_int16), POINTER(c_int32), POINTER(c_float)
 _STREAM = [c_int16, _FLOAT, _LONG, c_int32, _SHORT, c_int16, c_int16, c_int16]
 
-SIGNATURES: Final[Mapping[str, tuple[Any, list[Any]]]] = {
-    "usb_tc08_open_unit_async": (c_int16, []),
-    "usb_tc08_open_unit_progress": (c_int16, [_SHORT, _SHORT]),
-    "usb_tc08_set_mains": (c_int16, [c_int16, c_int16]),
-    "usb_tc08_set_channel": (c_int16, [c_int16, c_int16, c_int8]),
-    "usb_tc08_get_minimum_interval_ms": (c_int32, [c_int16]),
-    "usb_tc08_get_single": (c_int16, [c_int16, _FLOAT, _SHORT, c_int16]),
-    "usb_tc08_run": (c_int32, [c_int16, c_int32]),
-    "usb_tc08_stop": (c_int16, [c_int16]),
-    "usb_tc08_get_temp": (c_int32, _STREAM),
-    "usb_tc08_get_temp_deskew": (c_int32, _STREAM),
-    "usb_tc08_get_unit_info": (c_int16, [c_int16, POINTER(UnitInfo)]),
-    "usb_tc08_get_last_error": (c_int16, [c_int16]),
-    "usb_tc08_close_unit": (c_int16, [c_int16]),
-}
+SIGNATURES: Final[Mapping[str, tuple[Any, list[Any]]]] = MappingProxyType(
+    {
+        "usb_tc08_open_unit_async": (c_int16, []),
+        "usb_tc08_open_unit_progress": (c_int16, [_SHORT, _SHORT]),
+        "usb_tc08_set_mains": (c_int16, [c_int16, c_int16]),
+        "usb_tc08_set_channel": (c_int16, [c_int16, c_int16, c_int8]),
+        "usb_tc08_get_minimum_interval_ms": (c_int32, [c_int16]),
+        "usb_tc08_get_single": (c_int16, [c_int16, _FLOAT, _SHORT, c_int16]),
+        "usb_tc08_run": (c_int32, [c_int16, c_int32]),
+        "usb_tc08_stop": (c_int16, [c_int16]),
+        "usb_tc08_get_temp": (c_int32, _STREAM),
+        "usb_tc08_get_temp_deskew": (c_int32, _STREAM),
+        "usb_tc08_get_unit_info": (c_int16, [c_int16, POINTER(UnitInfo)]),
+        "usb_tc08_get_last_error": (c_int16, [c_int16]),
+        "usb_tc08_close_unit": (c_int16, [c_int16]),
+    }
+)
 """Result type and argument types of every function that is used."""
 
 
@@ -163,27 +168,3 @@ def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -
         getattr(library, function).restype = result
         getattr(library, function).argtypes = arguments
     return library
-
-
-def close_noting(close: Callable[[], None], error: BaseException | None) -> None:
-    """
-    Close at the end of a ``with``, without hiding what went wrong in it.
-
-    Parameters
-    ----------
-    close : callable
-        What closes.
-    error : BaseException, optional
-        What went wrong; a failure to close is noted on it.
-
-    Raises
-    ------
-    TC08Error
-        If closing fails and nothing went wrong before.
-    """
-    try:
-        close()
-    except TC08Error as closing:
-        if error is None:
-            raise
-        error.add_note(f"Closing failed too. {closing}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from dbthermal.instruments.tc08.library import Library, TC08Error, UnitInfo, load
 
 if TYPE_CHECKING:
-    from dbthermal.instruments.emulated.tc08 import Bench
+    from dbthermal.instruments.emulated.world import World
 
 OPEN_TIMEOUT: Final = 30.0
 """How long opening a unit may take [s]; the library downloads its firmware first."""
@@ -22,13 +22,13 @@ _POLL = 0.05  # [s] between two looks at the progress
 
 
 @dataclass(frozen=True)
-class Info:
+class Identity:
     """
     Identity of a unit.
 
     Attributes
     ----------
-    serial, calibration_date, driver : str
+    serial_number, calibration_date, driver : str
         As the library gives them; the date's format is the vendor's.
     hardware, variant : int
         Versions.
@@ -36,7 +36,7 @@ class Info:
         True if the library is an emulated one.
     """
 
-    serial: str
+    serial_number: str
     calibration_date: str
     driver: str
     hardware: int
@@ -49,7 +49,7 @@ def open_unit(
     timeout: float,
     *,
     clock: Callable[[], float],
-    sleep: Callable[[float], object],
+    sleep: Callable[[float], None],
 ) -> int:
     """
     Open the next free unit.
@@ -91,7 +91,7 @@ def open_unit(
     return int(handle[0])
 
 
-def identify(library: Library, handle: int) -> Info:
+def identify(library: Library, handle: int) -> Identity:
     """
     Ask a unit what it is.
 
@@ -104,7 +104,7 @@ def identify(library: Library, handle: int) -> Info:
 
     Returns
     -------
-    Info
+    Identity
         Its identity.
 
     Raises
@@ -118,7 +118,7 @@ def identify(library: Library, handle: int) -> Info:
         raise TC08Error("tell what it is", library.usb_tc08_get_last_error(handle))
     texts = (unit[0].serial, unit[0].calibration_date, unit[0].driver)
     serial, date, driver = (text.decode("ascii", "backslashreplace") for text in texts)
-    return Info(serial, date, driver, unit[0].hardware, unit[0].variant, is_simulated(library))
+    return Identity(serial, date, driver, unit[0].hardware, unit[0].variant, is_simulated(library))
 
 
 def is_simulated(library: Library) -> bool:
@@ -138,7 +138,7 @@ def is_simulated(library: Library) -> bool:
     return bool(getattr(library, "is_simulated", False))
 
 
-def library_of(url: str, world: "Bench | None" = None) -> Library:
+def library_of(url: str, world: "World | None" = None) -> Library:
     """
     Library that a URL names.
 

@@ -8,11 +8,12 @@ against hardware.
 import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.tc08 import library as usbtc08
 from dbthermal.instruments.tc08 import readings
 from dbthermal.instruments.tc08.channels import Channels
@@ -121,7 +122,7 @@ class Timeline:
         return np.where(near, temperatures[nearest], np.nan)
 
 
-class Stream:
+class Stream(Closing):
     """
     A stream that runs; made by `TC08.stream`, ended by `close` or by ``with``.
 
@@ -214,12 +215,6 @@ class Stream:
     def abandon(self) -> None:
         """Forget the stream of a unit that is being closed, which ends it."""
         self._handle = 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        usbtc08.close_noting(self.close, error)
 
     def _fetch(self, channel: int, deskew: bool) -> Fetched:  # noqa: FBT001
         """Return times [ms], values and the overflow flag of a channel."""

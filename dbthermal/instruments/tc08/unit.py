@@ -10,22 +10,23 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.tc08 import library as usbtc08
 from dbthermal.instruments.tc08 import opening
 from dbthermal.instruments.tc08.channels import Channels, Conversion
 from dbthermal.instruments.tc08.library import CHANNELS, Library, TC08Error
-from dbthermal.instruments.tc08.opening import OPEN_TIMEOUT, Info
+from dbthermal.instruments.tc08.opening import OPEN_TIMEOUT, Identity
 from dbthermal.instruments.tc08.readings import Scan
 from dbthermal.instruments.tc08.stream import LONGEST, Stream
 
 if TYPE_CHECKING:
-    from dbthermal.instruments.emulated.tc08 import Bench
+    from dbthermal.instruments.emulated.world import World
 
 _WHOLE = 1e-6  # [ms] rounding of an interval
 _MAINS = (50, 60)  # [Hz], in the library's order
 
 
-class TC08:
+class TC08(Closing):
     """
     A TC-08; opened by `open`, `from_url` or ``with``, for one thread at a time.
 
@@ -42,7 +43,7 @@ class TC08:
         library: Library,
         *,
         clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], object] = time.sleep,
+        sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self._library = library
         self._clock, self._sleep = clock, sleep
@@ -51,7 +52,7 @@ class TC08:
         self._stream: Stream | None = None
 
     @classmethod
-    def from_url(cls, url: str = "tc08:", *, world: "Bench | None" = None) -> Self:
+    def from_url(cls, url: str = "tc08:", *, world: "World | None" = None) -> Self:
         """
         Find the library and open the first unit.
 
@@ -82,14 +83,14 @@ class TC08:
         """True if the library is an emulated one."""
         return opening.is_simulated(self._library)
 
-    def open(self, serial: str | None = None, *, timeout: float = OPEN_TIMEOUT) -> Self:
+    def open(self, serial_number: str | None = None, *, timeout: float = OPEN_TIMEOUT) -> Self:
         """
         Open the first free unit, or that of a serial number; others are closed again.
 
         Parameters
         ----------
-        serial : str, optional
-            Its serial number, as in `Info`.
+        serial_number : str, optional
+            As in `Identity`.
         timeout : float
             How long each unit may take [s].
 
@@ -115,14 +116,14 @@ class TC08:
         try:
             while handle := self._open_unit(timeout):
                 opened[handle] = "unknown"
-                opened[handle] = opening.identify(self._library, handle).serial
-                if serial in {None, opened[handle]}:
+                opened[handle] = opening.identify(self._library, handle).serial_number
+                if serial_number in {None, opened[handle]}:
                     self._handle = handle
                     return self
         finally:
             for handle in opened.keys() - {self._handle}:
                 self._library.usb_tc08_close_unit(handle)
-        wanted = "" if serial is None else f" '{serial}'"
+        wanted = "" if serial_number is None else f" '{serial_number}'"
         raise ConnectionError(
             f"No TC-08{wanted}; found: {sorted(opened.values())}. "
             "Must be plugged in, and free: no other program may have it."
@@ -146,16 +147,13 @@ class TC08:
     def __enter__(self) -> Self:
         return self if self._handle else self.open()
 
-    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        usbtc08.close_noting(self.close, error)
-
-    def info(self) -> Info:
+    def identity(self) -> Identity:
         """
         Identity of the unit, for provenance.
 
         Returns
         -------
-        Info
+        Identity
             Serial number, date of calibration, versions.
 
         Raises

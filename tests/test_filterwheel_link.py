@@ -1,13 +1,14 @@
-"""The filter wheel's line and its limits: talk without end, faults, what a wheel forgets."""
+"""The filter wheel's line: talk without end, unplugging, and what is not to be believed."""
 
 import logging
 from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-from rig_devices import FILTERS, Clock, WheelBench
+from rig_devices import Clock, WheelBench
 
 from dbthermal.instruments import apt
+from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.filterwheel import (
     BSC20X,
     FilterWheel,
@@ -19,7 +20,7 @@ from dbthermal.instruments.filterwheel import (
 )
 from dbthermal.instruments.filterwheel.link import MAXIMUM_UNASKED
 from dbthermal.instruments.filterwheel.motion import Motion
-from dbthermal.instruments.transport import Closing, TransportError
+from dbthermal.instruments.transport import TransportError
 
 
 class Endless(Closing):
@@ -97,21 +98,6 @@ def test_unplugging_at_any_step(steps: int) -> None:
         use()
     for _ in range(2):
         wheel.close()
-
-
-def test_an_overload_costs_the_position() -> None:
-    """After an overload steps may be lost: the wheel has to be homed before it turns again."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    bench.device.faults.stuck = apt.StatusBits.OVERLOAD
-    with pytest.raises(StalledWheelError, match="reports OVERLOAD, and the wheel was stopped"):
-        wheel.move_to(3)
-    bench.device.faults.stuck = apt.StatusBits(0)
-    with pytest.raises(NotHomedError):
-        wheel.move_to(3)
-    wheel.home()
-    wheel.move_to(3)
-    assert bench.world.wheel_position == 3
 
 
 def fail_to_home(bench: WheelBench) -> None:
@@ -201,22 +187,6 @@ def test_passing_a_target_is_no_arrival() -> None:
     with pytest.raises(StalledWheelError, match=r"stood at 60\.01 deg for 1\.0 s"):
         motion.move(target)
     assert controller.stopped
-
-
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ({"reply_timeout": 0.0}, r"Invalid reply_timeout 0\.0 of the wheel. Must be positive"),
-        ({"poll_interval": -0.1}, r"Invalid poll_interval -0\.1"),
-        ({"stall_timeout": float("nan")}, "Invalid stall_timeout nan"),
-        ({"tolerance": 30.0}, r"Invalid tolerance 30\.0 deg. Must be less than 30"),
-        ({"addresses": ()}, r"Invalid addresses \(\)"),
-    ],
-)
-def test_limits_of_time_are_checked(option: dict[str, object], message: str) -> None:
-    """What would wait for ever, never wait, or take one slot for the next is refused."""
-    with pytest.raises(ValueError, match=message):
-        Settings(filters=FILTERS, **option)  # type: ignore[arg-type]
 
 
 def test_a_motor_that_runs_on_counts_in_32_bits() -> None:

@@ -1,0 +1,62 @@
+"""Dialogues that allow no rest, and recordings that play back as one."""
+
+import io
+import json
+
+import pytest
+
+from dbthermal.instruments.dialogue import Dialogue, Pair, Recording
+
+
+def test_a_recording_plays_back() -> None:
+    """What was noted, with times and directions, is a dialogue."""
+    stream, times = io.StringIO(), iter([0.5, 0.75, 1.0])
+    with Dialogue([(b"\x01", [b"\x02", b"", b"\x03"])]) as device:
+        line = Recording(device, stream, clock=lambda: next(times))
+        line.write(b"\x01")
+        assert [line.read(9, 1.0) for _ in range(3)] == [b"\x02", b"", b"\x03"]
+        assert line.is_simulated
+    lines = stream.getvalue().splitlines()
+    assert json.loads(lines[1]) == {"time": 0.75, "direction": "read", "hex": "02"}
+    with Dialogue.from_lines(lines) as again:
+        again.write(b"\x01")
+        assert again.read(9, 1.0) + again.read(9, 1.0) == b"\x02\x03"
+
+
+@pytest.mark.parametrize(
+    ("pairs", "steps", "message"),
+    [
+        ([(b"a", b"b")], ["a"], "Left unread"),
+        ([(b"a", None)], [], "Left unwritten"),
+        ([(b"ab", None)], ["a"], "Cut short"),
+        ([(b"a", None)], ["b"], "Unexpected 62 was written. Must be 61"),
+        ([], ["a"], "Must be nothing more"),
+        ([(b"a", b"b"), (b"c", None)], ["a", "c"], "Unread .* but 63 was written"),
+        ([(None, b"a")], [], "Left unread"),
+    ],
+)
+def test_a_dialogue_allows_no_rest(pairs: list[Pair], steps: list[str], message: str) -> None:
+    """What is not read, not written, or not expected fails."""
+
+    def talk() -> None:
+        with Dialogue(pairs) as line:
+            for step in steps:
+                line.write(step.encode())
+
+    with pytest.raises(AssertionError, match=message):
+        talk()
+
+
+def test_a_dialogue_speaks_unasked_and_in_pieces() -> None:
+    """Answers come in the pieces given, after writes in any pieces, and by themselves."""
+    with Dialogue([(None, b"hi"), (b"ab", [b"c", b"de"]), (None, b"!")]) as line:
+        assert line.read(9, 1.0) == b"hi"
+        line.write(b"a")
+        line.write(b"b")
+        assert [line.read(1, 1.0) for _ in range(5)] == [b"c", b"d", b"e", b"!", b""]
+
+
+def test_another_error_is_not_hidden_by_leftovers() -> None:
+    """An error inside a dialogue is shown rather than what it left behind."""
+    with pytest.raises(KeyError, match="first thing"), Dialogue([(b"a", None)]):
+        raise KeyError("the first thing that went wrong")
