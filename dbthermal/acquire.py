@@ -29,7 +29,7 @@ from dbthermal.instruments.devices import Devices, emulated_world, open_devices
 from dbthermal.instruments.emulated import usb
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import ROOM, World
-from dbthermal.instruments.record import Preview, Summary
+from dbthermal.instruments.recording.record import Preview, Summary
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08Error
 from dbthermal.live import Watch

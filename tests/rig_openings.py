@@ -11,7 +11,6 @@ from rig_devices import FILTERS, BosonBench, Clock, LoggerBench, WheelBench
 from rig_stubs import StubCamera, StubController, StubLibrary
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
-from dbthermal.instruments import v4l2
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated.apt import start as start_wheel
 from dbthermal.instruments.emulated.boson import start as start_camera
@@ -19,7 +18,8 @@ from dbthermal.instruments.emulated.frames import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
-from dbthermal.instruments.v4l2_calls import Stream
+from dbthermal.instruments.video import v4l2
+from dbthermal.instruments.video.v4l2_calls import Stream
 
 QUICK = Settings(filters=FILTERS, reply_timeout=5.0, poll_interval=0.005)
 

@@ -10,12 +10,13 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import store
-from dbthermal.instruments import record
-from dbthermal.instruments.capture import notes
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.fetching import Limits, Reading
-from dbthermal.instruments.frames_source import (
+from dbthermal.instruments.recording import record
+from dbthermal.instruments.recording.capture import notes
+from dbthermal.instruments.recording.fetching import Limits, Reading
+from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.video.source import (
     DAMAGED,
     UNTIMED,
     Counts,
@@ -23,7 +24,6 @@ from dbthermal.instruments.frames_source import (
     FrameFlag,
     FrameSource,
 )
-from dbthermal.instruments.session import Camera, Device, Session
 
 BANDS, SHAPE, RATE, MILLI = ("8-14", "9.5"), (16, 24), 100.0, 1e-3
 LIMITS = Limits(chunk=5, queue=10_000, reserve=0, reading_period=0.02)

@@ -10,11 +10,11 @@ from rig_session import LEVELS, TEXT, bench, pictures, replaced, scene_text
 from dbthermal import acquire
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.boson.commands import FfcStatus
-from dbthermal.instruments.capture import open_capture
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.record import Preview
+from dbthermal.instruments.recording.capture import open_capture
+from dbthermal.instruments.recording.record import Preview
 from dbthermal.instruments.session import Session
 
 TWO = replaced(

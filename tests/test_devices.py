@@ -22,9 +22,9 @@ from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.filterwheel import NotHomedError
-from dbthermal.instruments.frames_source import NoFrameError
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan
+from dbthermal.instruments.video.source import NoFrameError
 
 
 @pytest.fixture

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from dbthermal.instruments import telemetry
 from dbthermal.instruments.emulated import frames as emulated
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.frames_source import (
+from dbthermal.instruments.video import telemetry
+from dbthermal.instruments.video.source import (
     Counts,
     Frame,
     FrameFlag,

@@ -24,7 +24,6 @@ from dbthermal.instruments.boson import (
     BosonStatusError,
     BosonTimeoutError,
 )
-from dbthermal.instruments.capture import open_capture
 from dbthermal.instruments.devices import Devices, Thermocouples
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.boson_faults import Fault
@@ -37,9 +36,10 @@ from dbthermal.instruments.filterwheel import (
     StalledWheelError,
     WheelError,
 )
-from dbthermal.instruments.frames_source import FrameFlag
+from dbthermal.instruments.recording.capture import open_capture
 from dbthermal.instruments.tc08 import TC08, TC08Error
 from dbthermal.instruments.transport import TransportError
+from dbthermal.instruments.video.source import FrameFlag
 
 # Cameras: what goes wrong with their frames.
 

@@ -11,14 +11,14 @@ import pytest
 import xarray as xr
 
 from dbthermal import store
-from dbthermal.instruments import record, tape
-from dbthermal.instruments.capture import notes, open_capture
-from dbthermal.instruments.contents import Note
 from dbthermal.instruments.emulated.frames import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.fetching import Limits, Reading
-from dbthermal.instruments.frames_source import Counts, Frame
+from dbthermal.instruments.recording import record, tape
+from dbthermal.instruments.recording.capture import notes, open_capture
+from dbthermal.instruments.recording.contents import Note
+from dbthermal.instruments.recording.fetching import Limits, Reading
 from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.video.source import Counts, Frame
 from dbthermal.store import durable
 
 SHAPE, RATE, CHUNK = (32, 40), 200.0, 6
@@ -56,7 +56,9 @@ def record_until_killed(path: Path, duration: float, pipe: Connection) -> None:
 def killed(path: Path, delay: float, duration: float = 60.0) -> list[int]:
     """Kill a recording some time after its first frame; frames that it had taken by then."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__, "dbthermal.store", "dbthermal.instruments.record"])
+    context.set_forkserver_preload(
+        [__name__, "dbthermal.store", "dbthermal.instruments.recording.record"]
+    )
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=record_until_killed, args=(path, duration, theirs))
     process.start()

@@ -16,13 +16,13 @@ from matplotlib.image import AxesImage
 
 from dbthermal import live
 from dbthermal.figures import LiveFigure, Panel
-from dbthermal.instruments import telemetry
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.fetching import Limits, Reading
-from dbthermal.instruments.frames_source import GOOD, Counts, Frame, FrameFlag
-from dbthermal.instruments.record import Preview, Summary, record
+from dbthermal.instruments.recording.fetching import Limits, Reading
+from dbthermal.instruments.recording.record import Preview, Summary, record
 from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.video import telemetry
+from dbthermal.instruments.video.source import GOOD, Counts, Frame, FrameFlag
 
 BANDS = ("8-14", "9.5")
 DEGREE = "\N{DEGREE SIGN}C"

@@ -9,15 +9,16 @@ import xarray as xr
 from rig_session import LEVELS, QUICK, SHAPE, TEXT, bench, replaced, rig, scene_text
 
 from dbthermal import store
-from dbthermal.instruments import protocols, sweep
-from dbthermal.instruments.capture import notes, open_capture
+from dbthermal.instruments import protocols
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.emulated.frames import Faults
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.frames_source import SourceLostError
 from dbthermal.instruments.protocols import Step
-from dbthermal.instruments.record import Preview
+from dbthermal.instruments.recording import sweep
+from dbthermal.instruments.recording.capture import notes, open_capture
+from dbthermal.instruments.recording.record import Preview
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.video.source import SourceLostError
 
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"))
 TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"))

@@ -10,14 +10,14 @@ import pytest
 import xarray as xr
 
 from dbthermal import alignment, frames, store
-from dbthermal.instruments import record, tape, writing
-from dbthermal.instruments.capture import notes, open_capture
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.fetching import Limits, Reading
-from dbthermal.instruments.frames_source import Counts, Frame, FrameFlag, FrameSource
-from dbthermal.instruments.record import Preview
+from dbthermal.instruments.recording import record, tape, writing
+from dbthermal.instruments.recording.capture import notes, open_capture
+from dbthermal.instruments.recording.fetching import Limits, Reading
+from dbthermal.instruments.recording.record import Preview
 from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.video.source import Counts, Frame, FrameFlag, FrameSource
 
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
 BANDS = ("8-14", "9.5")

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from dbthermal import store
-from dbthermal.instruments import telemetry
-from dbthermal.instruments.capture import notes
-from dbthermal.instruments.contents import NOTES, Note
 from dbthermal.instruments.emulated.frames import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.frames_source import DAMAGED, MEANINGS, Frame, FrameFlag
-from dbthermal.instruments.tape import Tape
-from dbthermal.instruments.telemetry import Telemetry
+from dbthermal.instruments.recording.capture import notes
+from dbthermal.instruments.recording.contents import NOTES, Note
+from dbthermal.instruments.recording.tape import Tape
+from dbthermal.instruments.video import telemetry
+from dbthermal.instruments.video.source import DAMAGED, MEANINGS, Frame, FrameFlag
+from dbthermal.instruments.video.telemetry import Telemetry
 
 SHAPE, RATE, BANDS = (4, 80), 100.0, ("8-14", "9.5")
 IMAGE = np.full(SHAPE, 5000, dtype=np.uint16)

@@ -4,7 +4,7 @@ import ctypes
 
 import pytest
 
-from dbthermal.instruments import v4l2_calls
+from dbthermal.instruments.video import v4l2_calls
 
 
 class Buffer(ctypes.Structure):

@@ -11,13 +11,13 @@ import pytest
 from test_record import BANDS, CHUNK, SMALL, bench, session
 
 from dbthermal import store
-from dbthermal.instruments import record, tape, writing
-from dbthermal.instruments.capture import notes, open_capture
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import CameraState
-from dbthermal.instruments.fetching import Limits
-from dbthermal.instruments.frames_source import Frame, FrameFlag, FrameSource
-from dbthermal.instruments.record import Preview
+from dbthermal.instruments.recording import record, tape, writing
+from dbthermal.instruments.recording.capture import notes, open_capture
+from dbthermal.instruments.recording.fetching import Limits
+from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.video.source import Frame, FrameFlag, FrameSource
 
 
 def interrupt(_: Preview | None = None) -> None:

@@ -6,11 +6,10 @@ the real drivers `emulated` answers in place of the hardware, and says so:
 
 - `boson` over `fslp`, `filterwheel` over `apt`: both on the byte streams of `transport`, which
   `dialogue` notes and plays back; `tc08`, with `thermocouple` for type T;
-- `v4l2` over `v4l2_calls`: the frames, with `telemetry`; `frames_source` is what any camera gives;
+- `video`: the frames, by V4L2, with their telemetry;
 - `inventory` and `permissions`: what is plugged in, and what stands in the way;
 - `session` of `entries`: what is to be recorded; `devices` opens its `rig`, `protocols` use it;
-- `record`, with `fetching`, `tape` and `writing`: a recording, whose `contents` become a `capture`,
-  and several of them a `sweep`.
+- `recording`: how that is written, and opened again.
 
 Each device, line and emulator is closed as `closing` says. The drivers were written from public
 descriptions of the protocols and tested against public byte vectors and emulators, never against

@@ -19,10 +19,10 @@ from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Pictur
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.entries import check_one_of
 from dbthermal.instruments.filterwheel import FilterWheel
-from dbthermal.instruments.frames_source import FrameSource
 from dbthermal.instruments.rig import Devices, ReadingError, Thermocouples
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.video.source import FrameSource
 
 __all__ = ["Devices", "ReadingError", "Thermocouples", "emulated_world", "open_devices"]
 
@@ -144,7 +144,7 @@ def _source(
     url = session.url(session.cameras[band].video)
     form = session.shape, session.frame_rate, session.telemetry_rows
     if url.startswith("v4l2:///") and world is None:
-        from dbthermal.instruments import v4l2, v4l2_calls  # noqa: PLC0415 - Linux only
+        from dbthermal.instruments.video import v4l2, v4l2_calls  # noqa: PLC0415 - Linux only
 
         return v4l2.Capture.open(urlsplit(url).path, v4l2_calls.Stream(*form))
     if not url.startswith("sim://camera/") or world is None:

@@ -4,7 +4,7 @@ Gain, offset and response are calibrated before a blackbody that goes through se
 the emissivity bench goes through them with samples. At each temperature the wheel goes through its
 filters, and each of these is a recording of its own, begun only when the temperature rests. What
 was recorded is opened by `open_sweep` and `bench_series`, a scene by
-`dbthermal.instruments.capture.open_capture`.
+`dbthermal.instruments.recording.capture.open_capture`.
 """
 
 import threading
@@ -18,13 +18,10 @@ from typing import Final
 import numpy as np
 
 from dbthermal import store
-from dbthermal.instruments.capture import mean_reading
-from dbthermal.instruments.fetching import Limits, Reading
-from dbthermal.instruments.frames_source import SourceLostError
-from dbthermal.instruments.record import Preview, Summary, record
-from dbthermal.instruments.rig import Devices
-from dbthermal.instruments.session import Session
-from dbthermal.instruments.sweep import (
+from dbthermal.instruments.recording.capture import mean_reading
+from dbthermal.instruments.recording.fetching import Limits, Reading
+from dbthermal.instruments.recording.record import Preview, Summary, record
+from dbthermal.instruments.recording.sweep import (
     BLACKBODY,
     bench_series,
     is_complete,
@@ -32,6 +29,9 @@ from dbthermal.instruments.sweep import (
     require_filter,
     step_path,
 )
+from dbthermal.instruments.rig import Devices
+from dbthermal.instruments.session import Session
+from dbthermal.instruments.video.source import SourceLostError
 
 __all__ = ["Step", "bench_series", "open_sweep", "record_scene", "record_sweep", "wait_stable"]
 
@@ -150,8 +150,8 @@ def record_sweep(
     read_blackbody : callable, optional
         Reads it [K]; by default the thermocouple named ``"blackbody"`` does.
     limits, preview : optional
-        As for `dbthermal.instruments.record.record`. The camera behind the wheel is called by the
-        band of the filter in the beam.
+        As for `instruments.recording.record.record`. The camera behind the wheel is called by
+        the band of the filter in the beam.
     clock, sleep : callable
         Time [s], for the wait.
 
@@ -212,7 +212,7 @@ def record_scene(
     path : str or Path
         Store to make, ``*.zarr``.
     limits, preview, stop : optional
-        As for `dbthermal.instruments.record.record`.
+        As for `dbthermal.instruments.recording.record.record`.
 
     Returns
     -------

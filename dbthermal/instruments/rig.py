@@ -22,11 +22,11 @@ from dbthermal.instruments.boson.commands import (
     TelemetryLocation,
 )
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.fetching import Reading
 from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
-from dbthermal.instruments.frames_source import FrameFlag, FrameSource, NoFrameError
+from dbthermal.instruments.recording.fetching import Reading
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
+from dbthermal.instruments.video.source import FrameFlag, FrameSource, NoFrameError
 
 SCAN_AGE: Final = 1.0
 """Longest time for which a scan of all thermocouples gives the readings of its channels [s]."""
@@ -141,7 +141,7 @@ class Devices:
 
     def readings(self) -> dict[str, Reading]:
         """
-        What is asked beside the frames, for `dbthermal.instruments.record.record`.
+        What is asked beside the frames, for `dbthermal.instruments.recording.record.record`.
 
         Returns
         -------

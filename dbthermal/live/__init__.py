@@ -1,6 +1,6 @@
 """A recording while it goes on: its pictures, its losses, and how its cameras are.
 
-A `View` is handed to `dbthermal.instruments.record.record` as `preview`, and shows one picture of
+A `View` is handed to `instruments.recording.record.record` as `preview`, and shows one picture of
 each band, in place, in a notebook or nowhere::
 
     from IPython.display import DisplayHandle

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from dbthermal.instruments.record import Preview
+from dbthermal.instruments.recording.record import Preview
 from dbthermal.live.watch import FFC, FPA, WINDOW, Status, Watch, celsius, ffc_state
 
 if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it

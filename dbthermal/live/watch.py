@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments import telemetry
 from dbthermal.instruments.boson.commands import FfcStatus
-from dbthermal.instruments.frames_source import Counts, Frame, FrameFlag
-from dbthermal.instruments.record import Preview
+from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.video import telemetry
+from dbthermal.instruments.video.source import Counts, Frame, FrameFlag
 
 WINDOW: Final = 3.0
 """Time over which a frame rate is measured [s]."""

@@ -1,6 +1,6 @@
 """FLIR Boson: read its temperatures and counters, set its modes, run its shutter.
 
-The driver of the camera's command port; `dbthermal.instruments.v4l2` takes its frames. It was
+The driver of the camera's command port; `dbthermal.instruments.video.v4l2` takes its frames. It was
 written from public descriptions (see `boson.commands`) and tested against public byte vectors and
 an emulator, not against hardware. Connecting sends nothing and resets nothing, and nothing is
 written to the camera's flash memory unless `Boson.save_defaults` is called.

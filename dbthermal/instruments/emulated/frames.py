@@ -16,10 +16,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments import telemetry
 from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.frames_source import (
+from dbthermal.instruments.video import telemetry
+from dbthermal.instruments.video.source import (
     FRAME_TIMEOUT,
     GOOD,
     Counts,
@@ -151,7 +151,7 @@ class EmulatedCamera(Closing):
     frame_rate : float
         [Hz].
     telemetry_rows : int
-        0, or `dbthermal.instruments.telemetry.ROWS`.
+        0, or `dbthermal.instruments.video.telemetry.ROWS`.
     faults : Faults
         What goes wrong.
     sleep : callable
@@ -193,7 +193,7 @@ class EmulatedCamera(Closing):
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """
-        Wait for the next frame; see `dbthermal.instruments.frames_source.FrameSource.read`.
+        Wait for the next frame; see `dbthermal.instruments.video.source.FrameSource.read`.
 
         Parameters
         ----------

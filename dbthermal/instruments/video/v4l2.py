@@ -1,6 +1,6 @@
 """Raw 16-bit frames of a camera on Linux, with the kernel's stamps, numbers and flags.
 
-A thin use of Video4Linux2, in a few calls (see `dbthermal.instruments.v4l2_calls`). The kernel's
+A thin use of Video4Linux2, in a few calls (see `video.v4l2_calls`). The kernel's
 stamp of a frame is on CLOCK_MONOTONIC. That of uvcvideo claims to be of the start of the exposure
 (https://docs.kernel.org/userspace-api/media/v4l/buffer.html); likely, unless that module is told to
 use the camera's clock, it is of the frame's first packet. Tested with a stand-in for the kernel's
@@ -14,9 +14,9 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from dbthermal.instruments import v4l2_calls as calls
 from dbthermal.instruments.closing import Closing
-from dbthermal.instruments.frames_source import (
+from dbthermal.instruments.video import v4l2_calls as calls
+from dbthermal.instruments.video.source import (
     FRAME_TIMEOUT,
     GOOD,
     Counts,
@@ -25,7 +25,7 @@ from dbthermal.instruments.frames_source import (
     NoFrameError,
     SourceLostError,
 )
-from dbthermal.instruments.v4l2_calls import Kernel, Stream
+from dbthermal.instruments.video.v4l2_calls import Kernel, Stream
 
 _ERROR: Final = 0x40  # V4L2_BUF_FLAG_ERROR
 _CLOCK_MASK: Final = 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_MASK
@@ -115,7 +115,7 @@ class Capture(Closing):
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """
-        Wait for the next frame; see `dbthermal.instruments.frames_source.FrameSource.read`.
+        Wait for the next frame; see `dbthermal.instruments.video.source.FrameSource.read`.
 
         Parameters
         ----------

@@ -20,9 +20,9 @@ import numpy.typing as npt
 
 from dbthermal import store
 from dbthermal.alignment import clocks
-from dbthermal.instruments import telemetry
-from dbthermal.instruments.contents import ABOUT, TELEMETRY, VARIABLES, Note
-from dbthermal.instruments.frames_source import (
+from dbthermal.instruments.recording.contents import ABOUT, TELEMETRY, VARIABLES, Note
+from dbthermal.instruments.video import telemetry
+from dbthermal.instruments.video.source import (
     DAMAGED,
     GOOD,
     UNTIMED,

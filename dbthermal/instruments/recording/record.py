@@ -2,7 +2,7 @@
 
 A thread for each camera fetches its frames, one more asks the other instruments, so that none waits
 for another; what they bring goes through a queue of bounded length to the thread that writes (see
-`dbthermal.instruments.writing`). If the disk is too slow the queue fills, frames are refused, and
+`recording.writing`). If the disk is too slow the queue fills, frames are refused, and
 the recording says how many and when. The caller's thread shows the preview. Whatever ends it, also
 an interrupt by the keyboard, the frames that came are on the disk.
 """
@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Final
 
 from dbthermal import provenance
-from dbthermal.instruments import writing
-from dbthermal.instruments.fetching import Limits, Reading, Run, ask, fetch
-from dbthermal.instruments.frames_source import Frame, FrameSource
+from dbthermal.instruments.recording import writing
+from dbthermal.instruments.recording.fetching import Limits, Reading, Run, ask, fetch
+from dbthermal.instruments.recording.tape import Tape
+from dbthermal.instruments.recording.writing import Written
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.tape import Tape
-from dbthermal.instruments.writing import Written
+from dbthermal.instruments.video.source import Frame, FrameSource
 
 _POLL: Final = 0.01  # least wait of the one who looks on [s]
 _BYTES: Final = 2  # of a pixel
@@ -100,7 +100,7 @@ def record(  # noqa: PLR0913 - the one entrance; all but the first three are by 
     sources : mapping
         Band to an open source, in the session's order; they stay open.
     path : str or Path
-        Store to make, ``*.zarr``; see `dbthermal.instruments.capture.open_capture`.
+        Store to make, ``*.zarr``; see `dbthermal.instruments.recording.capture.open_capture`.
     readings : mapping, optional
         Name to what else is asked: thermocouples, the cameras' temperatures, the blackbody.
     identities : mapping, optional

@@ -14,7 +14,7 @@ import xarray as xr
 
 from dbthermal import schema, store
 from dbthermal.frames import correct
-from dbthermal.instruments.capture import good_frames, mean_reading, notes, open_capture
+from dbthermal.instruments.recording.capture import good_frames, mean_reading, notes, open_capture
 
 BLACKBODY = "blackbody"
 """Name of the reading that is the blackbody's temperature [K]."""

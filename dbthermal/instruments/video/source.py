@@ -1,6 +1,6 @@
 """What every camera gives, whatever is behind it: frames with two clocks, a number and flags.
 
-A `FrameSource` is the V4L2 driver (`dbthermal.instruments.v4l2`) or the emulated camera
+A `FrameSource` is the V4L2 driver (`dbthermal.instruments.video.v4l2`) or the emulated camera
 (`dbthermal.instruments.emulated.frames`); the recorder knows only this. A frame that is damaged is
 handed on and says so in its flags: to hide it, or to mend it, is not the driver's matter.
 """
@@ -95,7 +95,7 @@ class Frame:
     flags : FrameFlag
         What is wrong with it; 0 is good.
     telemetry : ndarray of uint16, shape (row, x), or None
-        Telemetry rows as they came; see `dbthermal.instruments.telemetry.decode`.
+        Telemetry rows as they came; see `dbthermal.instruments.video.telemetry.decode`.
     """
 
     counts: Counts

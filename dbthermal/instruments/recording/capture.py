@@ -8,7 +8,7 @@ import xarray as xr
 
 from dbthermal import schema, store
 from dbthermal.alignment import clocks
-from dbthermal.instruments.frames_source import UNTIMED, FrameFlag
+from dbthermal.instruments.video.source import UNTIMED, FrameFlag
 
 Array = npt.NDArray[np.float64]
 
@@ -20,7 +20,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     Parameters
     ----------
     path : str or Path
-        Folder ``*.zarr``, from `dbthermal.instruments.record.record`.
+        Folder ``*.zarr``, from `dbthermal.instruments.recording.record.record`.
     fitted : bool
         Whether exposure times come from a line through both clocks, :math:`h = a + b d` with the
         device's time d and the host's h, by least squares, for a camera whose stamps are on a clock
@@ -31,7 +31,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     Dataset
         Stage `capture`: `counts` (band, time, y, x) [count], read when used, `exposure_time` (band,
         time) [s], NaN for a frame that is damaged, missing or of no new number, and what is in
-        `dbthermal.instruments.contents.VARIABLES` but the log, see `notes`. `time` is when the
+        `contents.VARIABLES` but the log, see `notes`. `time` is when the
         first band was exposed. Where it was fitted, attribute ``clock_rates`` has b of each band.
 
     Raises
@@ -64,7 +64,7 @@ def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
     Returns
     -------
     list of tuple
-        Time [s], kind (a name of `dbthermal.instruments.contents.Note` in lower case), source and
+        Time [s], kind (a name of `contents.Note` in lower case), source and
         value of each note, in the order of writing.
 
     Raises

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from dbthermal.instruments.contents import Note
-from dbthermal.instruments.fetching import Run
-from dbthermal.instruments.frames_source import Frame, FrameFlag
-from dbthermal.instruments.tape import Tape
+from dbthermal.instruments.recording.contents import Note
+from dbthermal.instruments.recording.fetching import Run
+from dbthermal.instruments.recording.tape import Tape
+from dbthermal.instruments.video.source import Frame, FrameFlag
 
 _POLL: Final = 0.05  # how long the writer waits before it looks whether all is over [s]
 _HELD: Final = 2.0  # how long after the start a frame may still come that a driver held [s]
@@ -35,7 +35,7 @@ class Written:
     frames : dict
         Band to its last frame.
     totals : mapping
-        Band to numbers of frames, see `dbthermal.instruments.tape.Tape.totals`.
+        Band to numbers of frames, see `dbthermal.instruments.recording.tape.Tape.totals`.
     readings : dict
         Name to the last value of each reading, NaN if it failed.
     interrupted : bool
