@@ -92,7 +92,7 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
     return figure
 
 
-def emissivity_by_contact(measured: xr.Dataset, truth: xr.DataArray | None = None) -> Figure:
+def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
     """
     Emissivities from thermocouple and blackbody with their standard deviations.
 
@@ -100,8 +100,8 @@ def emissivity_by_contact(measured: xr.Dataset, truth: xr.DataArray | None = Non
     ----------
     measured : Dataset
         `emissivity`, `emissivity_std` (material, band) [1].
-    truth : DataArray, optional
-        (material, band) [1], drawn as crosses.
+    table : DataArray, optional
+        Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
 
     Returns
     -------
@@ -124,9 +124,9 @@ def emissivity_by_contact(measured: xr.Dataset, truth: xr.DataArray | None = Non
             color=COLORS[index],
             label=band_label(band),
         )
-        if truth is not None:
-            label = "truth" if index == 0 else None
-            axis.plot(shifted, truth.sel(band=band), "x", color="black", markersize=7, label=label)
+        if table is not None:
+            label = "table" if index == 0 else None
+            axis.plot(shifted, table.sel(band=band), "x", color="black", markersize=7, label=label)
     axis.set_xticks(place, [str(name).replace(" ", "\n") for name in measured["material"].values])
     axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
     figure.legend(frameon=False, loc="outside right center", fontsize=8)
