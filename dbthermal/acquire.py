@@ -68,7 +68,7 @@ class Progress:
         """
         self._watch.note(preview)
         bands = "; ".join(
-            f"{band}: {' '.join((status.text + ' ' + status.warning).split())}"
+            f"{band}: " + ", ".join([*status.text.splitlines(), *status.warning.splitlines()])
             for band, status in self._watch.status().items()
         )
         self.write(f"\r{preview.time:6.1f} s  {bands}")
