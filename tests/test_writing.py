@@ -3,6 +3,7 @@
 import signal
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,14 @@ from dbthermal.instruments.recording.capture import notes, open_capture
 from dbthermal.instruments.recording.fetching import Limits
 from dbthermal.instruments.recording.record import Preview
 from dbthermal.instruments.video.source import Frame, FrameFlag, FrameSource
+
+
+@pytest.fixture(autouse=True)
+def keyboard() -> Iterator[None]:
+    """Let the keyboard interrupt: what a shell starts in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def interrupt(_: Preview | None = None) -> None:
