@@ -11,7 +11,7 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments.boson.commands import FfcStatus
 from dbthermal.instruments.recording.record import Preview
 from dbthermal.instruments.video import telemetry
-from dbthermal.instruments.video.source import Counts, Frame, FrameFlag
+from dbthermal.instruments.video.source import DAMAGED, Counts, Frame, FrameFlag
 
 WINDOW: Final = 3.0
 """Time over which a frame rate is measured [s]."""
@@ -30,7 +30,6 @@ FFC: Final = "ffc "
 
 _RANGE: Final = np.iinfo(np.uint16)
 _STEP: Final = 4  # every fourth pixel of every fourth row is enough for percentiles
-_DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
 _FFC_STATES: Final = {float(state): state.name.lower().replace("_", " ") for state in FfcStatus}
 _IN_PROGRESS: Final = _FFC_STATES[FfcStatus.IN_PROGRESS]
 
@@ -255,7 +254,7 @@ def _is_other(before: Preview, now: Preview) -> bool:
 def _telemetry(band: str, preview: Preview | None) -> telemetry.Telemetry | None:
     """Telemetry of the last frame, if it has any and is whole."""
     frame = preview.frames.get(band) if preview else None
-    if frame is None or frame.telemetry is None or frame.flags & _DAMAGED:
+    if frame is None or frame.telemetry is None or frame.flags & DAMAGED:
         return None
     return telemetry.decode(frame.telemetry)
 
