@@ -67,7 +67,7 @@ interop: ## compare emulators and codecs with independent software, in an enviro
 	.venv/interop/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
 	.venv/interop/bin/python -m pip install --quiet --group interop --editable '.[instruments,test]'
 	.venv/interop/bin/python -c "import flirpy, thermocouple_its90, thorlabs_apt_protocol"
-	.venv/interop/bin/python -m pytest tests/test_interop.py
+	.venv/interop/bin/python -m pytest tests/instruments/test_interop.py
 
 test: check types pytest nbval chain ## check everything: lint, types, tests, notebooks, and the chain of them
 

@@ -22,15 +22,15 @@ import numpy as np
 from scipy.constants import zero_Celsius
 
 from dbthermal import simulation
-from dbthermal.experiments.emulated_rig import Views
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.devices import Devices, emulated_world, open_devices
 from dbthermal.instruments.emulated import usb
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import ROOM, World
+from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording.record import Preview, Summary
 from dbthermal.instruments.session import Session
-from dbthermal.live import Watch
+from reproduction.experiments.emulated_rig import Views
 
 NOISE: Final = 0.1
 """Noise of the emulated cameras of `blackbody_pictures`, as NETD near 25 degrees Celsius [K]."""

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.special import ndtri
 from scipy.stats import chi2
 
-from dbthermal import smooth
+from dbthermal import _smooth as smooth
 
 Array = npt.NDArray[np.float64]
 

@@ -6,6 +6,7 @@ and an emissivity table stand beside it.
 """
 
 from dataclasses import dataclass
+from enum import IntFlag
 from types import MappingProxyType
 from typing import Final
 
@@ -132,7 +133,7 @@ STAGES: Final = MappingProxyType(
             **_with_std("background_temperature", _FRAMES, "K", "background temperature"),
             **_with_std("emissivity", ("band", "y", "x"), "1", "band emissivity"),
             **_with_std("reflection_ratio", ("band", "y", "x"), "1", "reflection ratio"),
-            "status": Variable(_IMAGE, "uint16", "1", "validity flags, 0 is good"),
+            "status": Variable(_IMAGE, "uint32", "1", "validity flags, 0 is good"),
         },
     }
 )
@@ -148,26 +149,29 @@ EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
 The extremes of the libraries are -0.16 (trona) and 1.014 (maple bark), from reflectances of 116 %
 and -1.4 % relative to the reference."""
 
-FLAGS: Final = MappingProxyType(
-    {
-        "no_background_motion": 1,
-        "constant_object": 2,
-        "gray": 4,
-        "background_never_rests": 8,
-        "nonphysical_emissivity": 16,
-        "invalid_samples": 32,
-        "constant_signal": 64,
-        "saturated": 128,
-        "object_not_smooth": 256,
-        "outside_response": 512,
-        "dead_pixel": 1024,
-        "frozen_frames": 2048,
-        "not_converged": 4096,
-        "object_jump": 8192,
-        "bands_apart": 16384,
-        "roles_may_be_swapped": 32768,
-    }
-)
+
+class Status(IntFlag):
+    """Bits of `status`, the validity of a pixel; 0 is good. `FLAG_MEANINGS` explains each."""
+
+    NO_BACKGROUND_MOTION = 1 << 0
+    CONSTANT_OBJECT = 1 << 1
+    GRAY = 1 << 2
+    BACKGROUND_NEVER_RESTS = 1 << 3
+    NONPHYSICAL_EMISSIVITY = 1 << 4
+    INVALID_SAMPLES = 1 << 5
+    CONSTANT_SIGNAL = 1 << 6
+    SATURATED = 1 << 7
+    OBJECT_NOT_SMOOTH = 1 << 8
+    OUTSIDE_RESPONSE = 1 << 9
+    DEAD_PIXEL = 1 << 10
+    FROZEN_FRAMES = 1 << 11
+    NOT_CONVERGED = 1 << 12
+    OBJECT_JUMP = 1 << 13
+    BANDS_APART = 1 << 14
+    ROLES_MAY_BE_SWAPPED = 1 << 15
+
+
+FLAGS: Final = MappingProxyType({str(bit.name).lower(): int(bit) for bit in Status})
 """Bits of `status`, by name."""
 
 FLAG_MEANINGS: Final = MappingProxyType(
@@ -210,11 +214,11 @@ def status_attrs() -> dict[str, object]:
     Returns
     -------
     dict
-        `flag_masks` (uint16), `flag_meanings` (names, blank-separated), units and long_name.
+        `flag_masks` (uint32), `flag_meanings` (names, blank-separated), units and long_name.
     """
     return {
         **STAGES["separated"]["status"].attrs,
-        "flag_masks": np.array(list(FLAGS.values()), dtype=np.uint16),
+        "flag_masks": np.array(list(FLAGS.values()), dtype=np.uint32),
         "flag_meanings": " ".join(FLAGS),
     }
 

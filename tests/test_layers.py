@@ -10,21 +10,21 @@ import dbthermal
 
 PACKAGE = Path(dbthermal.__file__).parent
 LAYERS = (
-    "paths schema planck heat mixing smooth",
+    "schema planck mixing _smooth",
     "curves noise",
-    "response bands frames alignment metrics figures store provenance manifest readers paper",
-    "calibration emissivity separation",
-    "simulation verify published instruments",
-    "experiments live",
+    "response bands correction alignment metrics figures store readers",
+    "calibration emissivity limits",
+    "separation",
+    "simulation",
+    "instruments",
     "acquire",
 )
 LEVEL = {module: level for level, row in enumerate(LAYERS) for module in row.split()}
 PLACES = {
     "zarr": {"store"},
     "av": {"readers", "store"},
-    "pooch": {"manifest"},
     "torch": {"separation"},
-    "robust_laplacian": {"heat"},
+    "robust_laplacian": {"simulation"},
     "trimesh": {"simulation"},
     "cv2": {"alignment"},
     "skimage": {"separation"},

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dbthermal import smooth
+from dbthermal import _smooth as smooth
 
 TIMES = st.lists(st.floats(0.01, 10.0), min_size=12, max_size=40).map(np.cumsum)
 ORDERS = st.integers(1, 6)

@@ -3,7 +3,7 @@
 Registration needs OpenCV and is imported by name: `alignment.registration`.
 """
 
-from dbthermal.alignment.offset import time_offset
-from dbthermal.alignment.resampling import align
+from dbthermal.alignment._offset import time_offset
+from dbthermal.alignment._resampling import align
 
 __all__ = ["align", "time_offset"]

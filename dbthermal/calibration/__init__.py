@@ -5,10 +5,10 @@ emissivity of a material follows from thermocouple readings and a reflected blac
 standards' reflector method, with its uncertainty.
 """
 
-from dbthermal.calibration.bias import NO_BIAS, Bias
-from dbthermal.calibration.emissivity import fit_emissivity
-from dbthermal.calibration.reflector import reflector_emissivity
-from dbthermal.calibration.response import AMBIENT, MINIMUM_TEMPERATURES, fit_response
+from dbthermal.calibration._bias import NO_BIAS, Bias
+from dbthermal.calibration._contact import fit_emissivity
+from dbthermal.calibration._reflector import reflector_emissivity
+from dbthermal.calibration._response import AMBIENT, MINIMUM_TEMPERATURES, fit_response
 
 __all__ = [
     "AMBIENT",

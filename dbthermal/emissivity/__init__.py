@@ -4,14 +4,14 @@ Spectra become a table of Planck-weighted band averages; from the table follow t
 of the mixing matrix for each pair of bands, and the filter to set beside the camera's own band.
 """
 
-from dbthermal.emissivity.filters import (
+from dbthermal.emissivity._filters import (
     choose_filter,
     condition_numbers,
     filter_noise,
     pair_summary,
     single_frame_std,
 )
-from dbthermal.emissivity.table import MINIMUM_COVERAGE, band_table, embedded_table
+from dbthermal.emissivity._table import MINIMUM_COVERAGE, band_table, embedded_table
 
 __all__ = [
     "MINIMUM_COVERAGE",

@@ -4,14 +4,9 @@ Everything made here carries `origin = "simulated"`. What casts rays or needs me
 name: `simulation.twins` (the paper's scenes), `rays`, `surroundings`, `people`, `props`.
 """
 
-from dbthermal.simulation.bench import (
-    Bench,
-    bench_series,
-    contact_measurements,
-    reflector_series,
-)
-from dbthermal.simulation.clocks import drop_frames, expose, repeat_frames
-from dbthermal.simulation.nuisances import (
+from dbthermal.simulation._bench import Bench, bench_series, contact_measurements, reflector_series
+from dbthermal.simulation._clocks import drop_frames, expose, repeat_frames
+from dbthermal.simulation._nuisances import (
     SPOILED,
     drift_pattern,
     fire_shutter,
@@ -19,14 +14,9 @@ from dbthermal.simulation.nuisances import (
     lose_frames,
     spoil_pixels,
 )
-from dbthermal.simulation.procedures import (
-    PROCEDURES,
-    compare_procedures,
-    reflector_sensitivity,
-)
-from dbthermal.simulation.rig import Rig, blackbody_movies, capture, observe, pattern
-from dbthermal.simulation.samples import OBJECTS, Sample, band_emissivity
-from dbthermal.simulation.scenes import (
+from dbthermal.simulation._rig import Rig, blackbody_movies, capture, observe, pattern
+from dbthermal.simulation._samples import OBJECTS, Sample, band_emissivity
+from dbthermal.simulation._scenes import (
     Background,
     independent_pixels,
     scene,
@@ -36,7 +26,6 @@ from dbthermal.simulation.scenes import (
 
 __all__ = [
     "OBJECTS",
-    "PROCEDURES",
     "SPOILED",
     "Background",
     "Bench",
@@ -46,7 +35,6 @@ __all__ = [
     "bench_series",
     "blackbody_movies",
     "capture",
-    "compare_procedures",
     "contact_measurements",
     "drift_pattern",
     "drop_frames",
@@ -57,7 +45,6 @@ __all__ = [
     "lose_frames",
     "observe",
     "pattern",
-    "reflector_sensitivity",
     "reflector_series",
     "repeat_frames",
     "scene",

@@ -1,7 +1,7 @@
 """What is kept on disk: results, and recordings while they grow. Nothing else touches zarr."""
 
-from dbthermal.store.recording import Recording, recover
-from dbthermal.store.results import (
+from dbthermal.store._recording import Recording, recover
+from dbthermal.store._results import (
     CHUNK_BYTES,
     Number,
     chunks,

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema, store
-from dbthermal.alignment import clocks
+from dbthermal.alignment import _clocks as clocks
 from dbthermal.instruments.video.source import UNTIMED, FrameFlag
 
 Array = npt.NDArray[np.float64]

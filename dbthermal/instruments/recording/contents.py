@@ -9,7 +9,7 @@ from enum import IntEnum, IntFlag
 from types import MappingProxyType
 from typing import Any, Final
 
-from dbthermal.alignment import clocks
+from dbthermal.alignment import _clocks as clocks
 from dbthermal.instruments.video import telemetry
 from dbthermal.instruments.video.source import MEANINGS
 from dbthermal.schema import STAGES, Variable

@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import schema, store
-from dbthermal.frames import correct
+from dbthermal.correction import correct
 from dbthermal.instruments.recording.capture import good_frames, mean_reading, notes, open_capture
 
 BLACKBODY = "blackbody"
@@ -185,7 +185,7 @@ def bench_series(
     region : mapping
         Material to its rows and columns. The thermocouple named like it is the object's.
     correction : Dataset, optional
-        From `dbthermal.frames.fit_correction`, of all bands. With it, the counts are corrected, and
+        From `dbthermal.correction.fit_correction`, of all bands. With it, the counts are corrected, and
         pixels that are bad or saturated are left out.
 
     Returns

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import store
-from dbthermal.alignment import clocks
+from dbthermal.alignment import _clocks as clocks
 from dbthermal.instruments.recording.contents import ABOUT, TELEMETRY, VARIABLES, Note
 from dbthermal.instruments.video import telemetry
 from dbthermal.instruments.video.source import (

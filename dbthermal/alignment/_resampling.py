@@ -1,0 +1,268 @@
+"""Two cameras or more onto one clock and one grid, the frame count kept."""
+
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import map_coordinates
+from scipy.special import ndtri
+
+from dbthermal import noise as noises
+from dbthermal import schema
+from dbthermal.alignment import _clocks as clocks
+from dbthermal.alignment._offset import present, sample, time_offset
+
+Array = npt.NDArray[np.float64]
+Movie = npt.NDArray[np.float32]
+
+TRANSFORM: Final = schema.Variable(
+    ("band", "row", "column"), "float64", "1", "pixel of the first view to pixel of this one"
+)
+"""What registration gives: for each band a 3x3 homography on (x, y, 1), in pixels."""
+
+# Median absolute deviation -> standard deviation of a normal distribution.
+# Deviations of noise beyond which a step lies between two frames.
+_STEP: Final = 5.0
+_MAD: Final = 1.0 / float(ndtri(0.75))
+# A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
+_DIGITS: Final = 9
+
+
+def align(
+    corrected: xr.Dataset,
+    *,
+    offset: float | xr.DataArray | None = None,
+    transform: xr.DataArray | None = None,
+    clock: str | None = None,
+) -> xr.Dataset:
+    r"""
+    Bring all bands onto one clock, and onto the first band's grid.
+
+    The samples of one band are not touched in time, and its noise stays white: the noisiest, by
+    its noise relative to its signal, unless `clock` names another. The other bands are
+    interpolated at its exposure times, on the line between the frames before and after: for a
+    background that moves in steps or at random the expected value, see `clocks.Interpolation`. An
+    offset of whole frames is a pure shift.
+
+    Frames are NaN in a band where the line would reach over a gap, over a change of `segment`, or
+    past an end, and where its camera gave none: NaN, or a copy of the frame before. Nothing is
+    extrapolated.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`. Optionally `exposure_time` (band, time) [s], each camera's
+        own stamps, which need be neither even nor of one rate, NaN behind the last frame; `segment`
+        (time), which counts shutter events; `status` (y, x).
+    offset : float or DataArray, optional
+        How much later than the first band the others were exposed, beyond what stamps say [s]: a
+        number for two bands, or (band), 0 in the first. Estimated by `time_offset` unless given,
+        from the views as registered by `transform`.
+    transform : DataArray, optional
+        (band, row, column), from `registration.register`: the views are warped by bilinear
+        interpolation. Pixels outside a view are NaN.
+    clock : str, optional
+        Band whose samples are not touched in time.
+
+    Returns
+    -------
+    Dataset
+        Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
+        the exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
+        `status` is that of all the pixels that it may be made of. Attributes tell what was done:
+        `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band), `transform` (the
+        matrices, row by row). `exposure_time` is gone, and what else was told frame by frame on the
+        clocks before, as `drift` is; other maps are handed on, not warped.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not as described, or `time_offset` finds no offset.
+
+    Notes
+    -----
+    Interpolation makes the noise of a band smaller, by up to 0.7, and correlates neighbouring
+    frames; in the quieter of two bands it hardly counts. Where a signal steps between two
+    frames, by five standard deviations of noise, nothing is interpolated: when it changed is not
+    known. Such a sample is NaN.
+    """
+    names = [str(name) for name in schema.check(corrected, "corrected")["band"].values]
+    matrices = None if transform is None else _matrices(transform, names)
+    if matrices is not None:
+        # First of all: what moves passes an unregistered view earlier or later.
+        corrected = _registered(corrected, matrices)
+    counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
+    stamps = clocks.exposures(corrected) + offsets[:, np.newaxis]
+    noise, relative = _noise(corrected, stamps)
+    kept = int(np.argmax(relative)) if clock is None else names.index(_known(clock, names))
+    times, segment = clocks.filled(stamps[kept]), clocks.segments(corrected)
+    aligned = np.empty(counts.shape, dtype=np.float32)
+    for band, own in enumerate(stamps):
+        movie = np.asarray(counts.isel(band=band).values, dtype=np.float32)
+        absent = clocks.missing(movie)
+        if absent.any():
+            movie = np.where(absent[:, np.newaxis, np.newaxis], np.float32(np.nan), movie)
+        plan = clocks.interpolation(own, ~absent, times).within(segment)
+        plan = replace(plan, known=plan.known & (plan.labels(segment) == segment))
+        plan.apply(movie, aligned[band], _largest(noise[band], movie))
+    lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
+    result = _assembled(corrected, aligned, times)
+    return result.assign_attrs(
+        clock=names[kept],
+        time_offset=offsets.tolist(),
+        frames_lost=lost.tolist(),
+        **({} if matrices is None else {"transform": matrices.ravel().tolist()}),
+    )
+
+
+def warp(frames: npt.NDArray[Any], matrix: Array) -> Movie:
+    r"""
+    Look at a view where the first view's pixels are in it, by bilinear interpolation.
+
+    .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
+
+    Parameters
+    ----------
+    frames : ndarray, shape (time, y, x)
+        Samples of the view.
+    matrix : ndarray, shape (3, 3)
+        H: from pixel (x, y) of the first view to that of this one, counted from 0 at the centre of
+        the first pixel.
+
+    Returns
+    -------
+    ndarray of float32, shape (time, y, x)
+        The samples at (x', y'); NaN outside the view.
+    """
+    places = positions(matrix, frames.shape[1:])
+    inside = np.all(
+        (places >= 0) & (places <= np.array(frames.shape[1:])[:, None, None] - 1), axis=0
+    )
+    result = np.empty(frames.shape, dtype=np.float32)
+    for frame, out in zip(frames, result, strict=True):
+        # Beside the border "nearest" only meets a weight of zero.
+        map_coordinates(frame, places, output=out, order=1, mode="nearest")
+        out[~inside] = np.nan
+    return result
+
+
+def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
+    """
+    Where the pixels of the first view are in another.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (3, 3)
+        See `warp`.
+    shape : tuple of int
+        Rows and columns.
+
+    Returns
+    -------
+    ndarray, shape (2, y, x)
+        Row and column [pixel].
+    """
+    rows, columns = np.indices(shape, dtype=np.float64)
+    across, down, scale = np.einsum(
+        "ij,jyx->iyx", matrix, np.stack([columns, rows, np.ones_like(rows)])
+    )
+    return np.asarray(np.round(np.stack([down, across]) / scale, _DIGITS))
+
+
+def _offsets(corrected: xr.Dataset, given: float | xr.DataArray | None, names: list[str]) -> Array:
+    """Offset of each band against the first [s]."""
+    if given is None:
+        found = [time_offset(corrected, band=name) for name in names[1:]]
+        return np.array([0.0, *found])
+    if isinstance(given, xr.DataArray):
+        places = schema.band_positions(given, names, "the time offset")
+        if given.attrs.get("units", "s") != "s":
+            raise ValueError(f"Invalid unit '{given.attrs['units']}' of the offset. Must be 's'.")
+        values = given.values[places].astype(np.float64)
+    else:
+        if len(names) != 2:
+            raise ValueError(
+                f"Invalid offset {given} s for bands {names}. Must be one for each, (band)."
+            )
+        values = np.array([0.0, float(given)])
+    if values[0] != 0 or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"Invalid offset {values.tolist()} s. Must be finite, and 0 in band '{names[0]}', the "
+            "first."
+        )
+    return values
+
+
+def _matrices(transform: xr.DataArray, names: list[str]) -> Array:
+    """Homographies (band, 3, 3) in the capture's order."""
+    schema.check_variable(transform, TRANSFORM, "the transform")
+    places = schema.band_positions(transform, names, "the transform")
+    values = transform.values[places].astype(np.float64)
+    if values.shape[1:] != (3, 3) or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"Invalid transform of shape {values.shape}. Must be 3x3 and finite in each band."
+        )
+    return np.asarray(values)
+
+
+def _known(name: str, names: list[str]) -> str:
+    if name not in names:
+        raise ValueError(f"Unknown clock '{name}'. Must be one of the bands {names}.")
+    return name
+
+
+def _largest(noise: float, movie: Movie) -> float:
+    """Step that noise does not make: a difference less the mean of its two neighbours [count]."""
+    rounding = 8.0 * np.finfo(np.float32).eps * np.nanmax(np.abs(movie), initial=0.0)
+    return float(_STEP * np.sqrt(3.0) * noise + rounding)
+
+
+def _noise(corrected: xr.Dataset, stamps: Array) -> Array:
+    """Noise of each band by second differences in time: in counts, and relative to its signal."""
+    levels = []
+    for frames, times in zip(sample(corrected), stamps, strict=True):
+        here = present(frames) & np.isfinite(times)
+        signal = frames[here]
+        rough = noises.second_difference(signal, times[here])
+        scatter = _MAD * np.median(np.abs(rough), axis=0)
+        levels.append((np.median(scatter), np.median(scatter / signal.std(axis=0))))
+    return np.array(levels).T
+
+
+def _registered(corrected: xr.Dataset, matrices: Array) -> xr.Dataset:
+    """All views, and the status, on the first one's grid."""
+    counts = corrected["counts"]
+    views = np.empty(counts.shape, dtype=np.float32)
+    for band, matrix in enumerate(matrices):
+        movie = counts.isel(band=band).values
+        views[band] = movie if np.array_equal(matrix, np.eye(3)) else warp(movie, matrix)
+    result = corrected.assign(counts=counts.copy(data=views))
+    if "status" in corrected:
+        status = _warped_status(corrected["status"], matrices)
+        result = result.assign(status=corrected["status"].copy(data=status))
+    return result
+
+
+def _assembled(corrected: xr.Dataset, aligned: Movie, times: Array) -> xr.Dataset:
+    counts = corrected["counts"]
+    attrs = schema.STAGES["corrected"]["counts"].attrs
+    old = [name for name, part in corrected.data_vars.items() if "time" in part.dims]
+    result = corrected.drop_vars(set(old) - {"counts", "segment"}).assign(
+        counts=(counts.dims, aligned, {**counts.attrs, **attrs})
+    )
+    result = result.assign_coords(time=("time", times, corrected["time"].attrs))
+    return schema.check(result, "corrected")
+
+
+def _warped_status(status: xr.DataArray, matrices: Array) -> npt.NDArray[Any]:
+    """Bits of every pixel that a warped one may be made of, in any of the views."""
+    result, bits = np.zeros_like(status.values), np.unique(status.values)
+    for places in (positions(matrix, status.shape) for matrix in matrices):
+        for value in bits[bits > 0]:
+            share = map_coordinates(
+                (status.values == value).astype(np.float64), places, order=1, mode="constant"
+            )
+            result[share > 0] |= value
+    return result

@@ -1,0 +1,191 @@
+"""Bad pixels that only a capture shows: noisy, stuck, and those that jump by themselves.
+
+A blackbody finds the pixels that are bad at the time of the calibration (`fit_correction`). Some
+turn bad later, or blink (random telegraph signal) too seldom for it.
+"""
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.special import ndtri
+
+from dbthermal import schema
+from dbthermal.correction._nonuniformity import OUTLIER
+
+Array = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+MINIMUM_FRAMES: Final = 16
+"""Fewest frames from which a pixel is judged."""
+
+# Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
+_QUIET = 0.8
+# Mean magnitude of that share of a standard normal distribution, and the median's scale.
+_QUIET_MEAN = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
+_MAD = 1.0 / float(ndtri(0.75))
+# A pixel is held against those around it: the median of a window this wide, and the eight nearest.
+_WINDOW = 5
+_NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
+# A neighbour shares a jump of which it shows this part, earlier or later by at most so many seconds
+# or, at slow frame rates, frames.
+_SHARED = 0.3
+_REACH_SECONDS = 0.2
+_REACH_FRAMES = 5
+# Spread of the logarithm of the noise that is rounding [1].
+_ROUNDING = 0.01
+# Samples of a block of rows.
+_BLOCK = 8_000_000
+
+
+def mark_bad(
+    corrected: xr.Dataset, *, threshold: float = OUTLIER, jump: float = OUTLIER
+) -> xr.Dataset:
+    r"""
+    Mark pixels that are noisy, stuck or jump by themselves, in any band.
+
+    Noise. A pixel's noise s is the mean magnitude of the smaller four fifths of its second
+    differences in time, so that neither object nor walkers enter. With m the median of s over 5 by
+    5 pixels, a pixel is bad whose :math:`\ln (s / m)` lies more than `threshold` robust standard
+    deviations (1.48 times the median absolute deviation over the image) off the median. A pixel
+    that never changes is bad.
+
+    Jumps. A pixel is bad that changes from one frame to the next by more than `jump` standard
+    deviations of a difference, :math:`\sqrt 2 m`, while none of its eight neighbours changes in
+    the same direction by 0.3 of it within 0.2 s or five frames, the longer. Someone walking by is
+    seen by neighbours, be it a little later, and on both sides of an edge between materials; a
+    detector that blinks is alone. Frames that are NaN, the steps between segments of
+    `mark_shutter`, and 0.2 s or five frames at either end do not count.
+
+    A scene's detail that is one pixel wide, such as a wire that reflects more than what is around
+    it, is marked, too: it cannot be told from a pixel that blinks.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`, after `mark_shutter` if there were shutter events; read in
+        blocks of rows.
+    threshold : float
+        Limit of the robust z-score of the noise [1].
+    jump : float
+        Limit of a jump, relative to the noise of a difference [1].
+
+    Returns
+    -------
+    Dataset
+        The dataset with the bit "dead_pixel" of `schema.FLAGS` set in `status` (y, x), other bits
+        as they were, the counts unchanged; and the attributes ``noisy_pixels`` and
+        ``jumping_pixels``, their numbers, ``bad_threshold`` and ``bad_jump``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the dataset is not as `schema` has it, a limit is not positive, or a band has fewer than
+        `MINIMUM_FRAMES` frames that are not NaN, or than 0.5 s have.
+    """
+    counts = schema.check(corrected, "corrected")["counts"]
+    for name, value in (("threshold", threshold), ("jump", jump)):
+        if not value > 0:
+            raise ValueError(f"Invalid {name} {value} of bad pixels. Must be positive.")
+    segment = corrected["segment"].values if "segment" in corrected else None
+    image = (counts.sizes["y"], counts.sizes["x"])
+    noisy, jumping = np.zeros(image, dtype=bool), np.zeros(image, dtype=bool)
+    reach = _reach(counts["time"].values.astype(np.float64))
+    for band in range(counts.sizes["band"]):
+        movie = counts.isel(band=band)
+        frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
+        here = np.zeros(frames.size) if segment is None else segment[frames]
+        movie, apart = movie.isel(time=frames), np.diff(here) != 0
+        level = _noise(movie)
+        usual = median_filter(level, size=_WINDOW, mode="mirror")
+        noisy |= _outliers(level, usual, threshold)
+        jumping |= _jumps(movie, jump * np.sqrt(2.0) * usual, apart, reach)
+    before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
+    status = before | np.where(noisy | jumping, schema.FLAGS["dead_pixel"], 0).astype(np.uint32)
+    return corrected.assign(status=(("y", "x"), status, schema.status_attrs())).assign_attrs(
+        noisy_pixels=int(noisy.sum()),
+        jumping_pixels=int(jumping.sum()),
+        bad_threshold=threshold,
+        bad_jump=jump,
+    )
+
+
+def _reach(time: Array) -> int:
+    """Frames by which neighbours may see something earlier or later."""
+    if time.size < MINIMUM_FRAMES:
+        return _REACH_FRAMES
+    return max(_REACH_FRAMES, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
+
+
+def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
+    """Positions of the frames of a band that are not NaN."""
+    finite = np.zeros(movie.sizes["time"], dtype=bool)
+    for rows in _blocks(movie):
+        finite |= np.isfinite(movie.isel(y=rows).values).any(axis=(1, 2))
+    if finite.sum() < fewest:
+        raise ValueError(
+            f"Invalid band '{movie['band'].item()}' of {finite.sum()} frames that are not NaN. "
+            f"Must have at least {fewest}, to judge a pixel."
+        )
+    return np.flatnonzero(finite)
+
+
+def _blocks(movie: xr.DataArray) -> list[slice]:
+    """Rows that are read at once."""
+    height = movie.sizes["y"]
+    rows = max(1, _BLOCK // (movie.sizes["time"] * movie.sizes["x"]))
+    return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
+
+
+def _noise(movie: xr.DataArray) -> Array:
+    """Noise (y, x) [count] from the quiet part of the second differences; see `mark_bad`."""
+    level = np.empty((movie.sizes["y"], movie.sizes["x"]))
+    for rows in _blocks(movie):
+        signal = movie.isel(y=rows).values.astype(np.float32)
+        second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
+        quiet = int(_QUIET * second.shape[0])
+        second.partition(quiet, axis=0)
+        level[rows] = second[:quiet].mean(axis=0, dtype=np.float64)
+    return np.asarray(level / (_QUIET_MEAN * np.sqrt(1.5)))
+
+
+def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
+    """Where the noise is off that of its surroundings."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = np.log(level / usual)  # minus infinity where nothing changes
+    finite = np.isfinite(apart)
+    if not finite.any():
+        return np.asarray(level == 0)
+    centre = np.median(apart[finite])
+    scale = max(_MAD * float(np.median(np.abs(apart[finite] - centre))), _ROUNDING)
+    return np.asarray((np.abs(apart - centre) > threshold * scale) | (level == 0))
+
+
+def _jumps(movie: xr.DataArray, limit: Array, apart: Mask, reach: int) -> Mask:
+    """Where a pixel (y, x) changes by more than its limit [count] and no neighbour does."""
+    found = np.zeros(limit.shape, dtype=bool)
+    for rows in _blocks(movie):
+        # A row more on each side: the neighbours.
+        top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
+        change = np.diff(movie.isel(y=slice(top, bottom)).values.astype(np.float32), axis=0)
+        change[apart] = 0.0  # the detector's own steps
+        change[~np.isfinite(change)] = 0.0
+        here = slice(rows.start - top, rows.stop - top)
+        for signed in (change, -change):
+            found[rows] |= _alone(signed, limit[top:bottom], reach)[here]
+    return found
+
+
+def _alone(change: Single, limit: Array, reach: int) -> Mask:
+    """Where a pixel (y, x) rises by more than its limit in a frame and no neighbour near it."""
+    shape = limit.shape
+    nearby = maximum_filter1d(change, 2 * reach + 1, axis=0, mode="constant")
+    nearby = np.pad(nearby, ((0, 0), (1, 1), (1, 1)))
+    around = np.zeros_like(change)
+    for y, x in _NEIGHBOURS:
+        np.maximum(around, nearby[:, y : y + shape[0], x : x + shape[1]], out=around)
+    alone = (change > limit) & (around < _SHARED * change)
+    return np.asarray(np.any(alone[reach:-reach], axis=0))

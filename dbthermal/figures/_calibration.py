@@ -1,0 +1,184 @@
+"""Figures of the calibration: gain and offset, response, emissivity by contact."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from scipy.constants import zero_Celsius
+
+from dbthermal.figures._canvas import (
+    COLORS,
+    band_label,
+    canvas,
+    draw_image,
+    limits_of,
+    provenance_note,
+)
+
+
+def gain_offset_maps(correction: xr.Dataset) -> Figure:
+    """
+    Gain and offset of every pixel, a row a band; bad pixels are marked.
+
+    Parameters
+    ----------
+    correction : Dataset
+        From `frames.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
+
+    Returns
+    -------
+    Figure
+        Maps and marks.
+    """
+    bands = correction["band"].values
+    figure, axes = canvas(len(bands), 2, (8.0, 2.8 * len(bands)))
+    for row, band in zip(axes, bands, strict=True):
+        here = correction.sel(band=band)
+        good = ~here["bad"]
+        bad = np.argwhere(here["bad"].values)
+        parts = (("gain", "gain [1]", "viridis"), ("offset", "offset [count]", "cividis"))
+        for axis, (name, label, cmap) in zip(row, parts, strict=True):
+            image = here[name].where(good)
+            title = f"{band_label(band)}: {name}, {len(bad)} bad pixels"
+            draw_image(figure, axis, image, title, label, cmap=cmap, limits=limits_of(image))
+            axis.plot(bad[:, 1], bad[:, 0], "x", color="red", markersize=3)
+    figure.suptitle("Gain and offset correction" + provenance_note(correction))
+    return figure
+
+
+def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
+    """
+    Response of each band with the residuals of both fits.
+
+    Parameters
+    ----------
+    response : Dataset
+        From `calibration.fit_response`.
+    fine : DataArray
+        Fitted counts (band, temperature) on a fine grid of temperatures, from `response.counts`.
+
+    Returns
+    -------
+    Figure
+        From above: counts over temperature, the line's residuals, and those of the
+        Sakuma-Hattori curve on a scale of their own, with the noise of one pixel and frame where
+        the response has it; residuals and noise over the slope of the line.
+    """
+    bands = response["band"].values
+    figure, axes = canvas(3, len(bands), (4.6 * len(bands), 7.2))
+    celsius = response["temperature"] - zero_Celsius
+    for column, band in enumerate(bands):
+        here, (top, middle, bottom) = response.sel(band=band), axes[:, column]
+        top.plot(fine["temperature"] - zero_Celsius, fine.sel(band=band), color=COLORS[0])
+        line = here["linear_slope"] * fine["temperature"] + here["linear_intercept"]
+        top.plot(fine["temperature"] - zero_Celsius, line, "--", color=COLORS[2])
+        top.plot(celsius, here["counts"], ".", color=COLORS[1])
+        top.set(title=band_label(band), ylabel="signal [count]")
+        top.legend(["Sakuma-Hattori", "linear", "blackbody"], frameon=False, fontsize=8)
+        kelvin = 1.0 / here["linear_slope"]
+        middle.plot(celsius, here["linear_residual"] * kelvin, "s--", color=COLORS[2], markersize=3)
+        middle.set(ylabel="residual of the line\n[K]")
+        millikelvin = 1e3 * here["residual"] * kelvin
+        bottom.plot(celsius, millikelvin, "o-", color=COLORS[0], markersize=3)
+        bottom.set(ylabel="residual of the curve\n[mK]")
+        bottom.set_xlabel("blackbody temperature [\N{DEGREE SIGN}C]")
+        if "noise" in here:
+            noise = 1e3 * float(here["noise"] * kelvin)
+            bottom.set_title(f"noise of one pixel and frame: {noise:.0f} mK", fontsize=8)
+        for axis in (middle, bottom):
+            axis.axhline(0.0, color="0.7", linewidth=0.8)
+    figure.suptitle("Camera response" + provenance_note(response))
+    return figure
+
+
+def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
+    """
+    Emissivities from thermocouple and blackbody with their standard deviations.
+
+    Parameters
+    ----------
+    measured : Dataset
+        `emissivity`, `emissivity_std` (material, band) [1].
+    table : DataArray, optional
+        Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
+
+    Returns
+    -------
+    Figure
+        One point a band and material.
+    """
+    figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
+    place = np.arange(measured.sizes["material"])
+    bands = measured["band"].values
+    for index, band in enumerate(bands):
+        here = measured.sel(band=band)
+        shifted = place + 0.14 * (index - (len(bands) - 1) / 2)
+        axis.errorbar(
+            shifted,
+            here["emissivity"],
+            here["emissivity_std"],
+            fmt="o",
+            markersize=4,
+            capsize=3,
+            color=COLORS[index],
+            label=band_label(band),
+        )
+        if table is not None:
+            label = "table" if index == 0 else None
+            axis.plot(shifted, table.sel(band=band), "x", color="black", markersize=7, label=label)
+    axis.set_xticks(place, [str(name).replace(" ", "\n") for name in measured["material"].values])
+    axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
+    figure.legend(frameon=False, loc="outside right center", fontsize=8)
+    axis.set_title("Emissivity by contact, one standard deviation" + provenance_note(measured))
+    return figure
+
+
+def emissivity_procedures(
+    compared: xr.Dataset, published: Mapping[str, Mapping[str, float]], band: str
+) -> Figure:
+    """
+    Emissivity of several objects by each procedure, beside the truth and the published values.
+
+    Parameters
+    ----------
+    compared : Dataset
+        `true` (object, band), `mean` and `spread` (object, procedure, band) [1].
+    published : mapping
+        Label -> object -> the paper's value [1].
+    band : str
+        The band that is drawn.
+
+    Returns
+    -------
+    Figure
+        A group of marks an object, lines of one standard deviation, and the truth as a bar.
+    """
+    here = compared.sel(band=band)
+    objects, procedures = here["object"].values, here["procedure"].values
+    figure, ((axis,),) = canvas(1, 1, (8.5, 3.8))
+    place = np.arange(objects.size)
+    axis.bar(place, here["true"], 0.85, color="0.88", label="truth")
+    marks = len(procedures) + len(published)
+    shifts = iter(0.14 * (np.arange(marks) - (marks - 1) / 2))
+    for index, name in enumerate(procedures):
+        part = here.sel(procedure=name)
+        axis.errorbar(
+            place + next(shifts),
+            part["mean"],
+            part["spread"],
+            fmt="o",
+            markersize=4,
+            color=COLORS[index],
+            label=str(name),
+        )
+    for index, (label, values) in enumerate(published.items()):
+        shown = [values[str(name)] for name in objects]
+        axis.plot(
+            place + next(shifts), shown, "sD"[index], color="0.3", label=label, fillstyle="none"
+        )
+    axis.set_xticks(place, list(objects))
+    axis.set(ylabel=f"emissivity, {band_label(band)} [1]", ylim=(0, 1.05))
+    axis.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
+    axis.set_title("Emissivity by each procedure" + provenance_note(compared))
+    return figure

@@ -1,0 +1,163 @@
+"""The figure of a recording that goes on: a picture of each band, drawn anew many times.
+
+The artists are made once. An update hands them other pictures and texts, and the layout is
+computed again only where these take other room, so that an update is cheap.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from textwrap import fill
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.text import Text
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+from dbthermal.figures._canvas import band_label, canvas, draw_image
+
+_WIDTH: Final = 4.8  # of a band [inch]
+_TEXT_HEIGHT: Final = 1.15  # of title, lines and foot [inch]
+_BAR: Final = 0.76  # of a band's width that its picture takes, beside the colour bar
+_LETTERS: Final = 75  # of a line of the foot, per band
+_TICKS: Final = 4  # intervals of the colour bar at most: every number costs a millisecond
+_ALARM: Final = "#b3001b"
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """
+    What is shown of one band.
+
+    Attributes
+    ----------
+    image : ndarray, shape (y, x), or None
+        Raw signal [count]; None as long as there is no frame.
+    limits : tuple of float
+        Counts that are black and white [count].
+    text : str
+        Lines below the picture.
+    warning : str
+        Lines across the picture, none if empty.
+    """
+
+    image: npt.NDArray[Any] | None
+    limits: tuple[float, float]
+    text: str
+    warning: str = ""
+
+
+@dataclass(frozen=True)
+class _Artists:
+    """What is drawn anew of one band."""
+
+    image: AxesImage
+    text: Text
+    warning: Text
+
+
+class LiveFigure:
+    """
+    A figure whose pictures and texts are replaced while it stays the same.
+
+    Parameters
+    ----------
+    bands : sequence of str
+        Their names, in the order of the pictures.
+    shape : tuple of int
+        Rows and columns of every picture [pixel].
+
+    Attributes
+    ----------
+    figure : Figure
+        What is drawn on.
+    bands : tuple of str
+        Their names.
+    shape : tuple of int
+        Rows and columns [pixel].
+    """
+
+    def __init__(self, bands: Sequence[str], shape: tuple[int, int]) -> None:
+        self.bands, self.shape = tuple(bands), shape
+        height = _BAR * _WIDTH * shape[0] / shape[1] + _TEXT_HEIGHT
+        self.figure, axes = canvas(1, len(bands), (_WIDTH * len(bands), height))
+        self.figure.set_layout_engine("none")
+        self._engine = ConstrainedLayoutEngine()
+        self._empty = np.full(shape, np.nan)
+        self._room: list[int] = []
+        self._title = self.figure.suptitle("")
+        self._foot = self.figure.supxlabel("", fontsize=9)
+        self._artists = {
+            band: _artists(self.figure, axis, band, shape)
+            for band, axis in zip(bands, axes[0], strict=True)
+        }
+
+    def update(self, panels: Mapping[str, Panel], *, title: str, foot: str = "") -> None:
+        """
+        Show other pictures and texts.
+
+        Parameters
+        ----------
+        panels : mapping
+            Each band to what is shown of it.
+        title : str
+            What is recorded, and whether it is emulated.
+        foot : str
+            What belongs to no band; it is broken into lines.
+
+        Raises
+        ------
+        KeyError
+            If a band is missing.
+        """
+        for band, artists in self._artists.items():
+            panel = panels[band]
+            image = self._empty if panel.image is None else panel.image
+            artists.image.set(data=image, clim=panel.limits)
+            artists.text.set_text(panel.text)
+            artists.warning.set_text(panel.warning)
+        self._title.set_text(title)
+        self._foot.set_text(fill(foot, _LETTERS * len(self._artists)))
+        self._lay_out([len(f"{limit:.0f}") for panel in panels.values() for limit in panel.limits])
+
+    def pixels(self) -> npt.NDArray[np.uint8]:
+        """
+        Draw the figure.
+
+        Returns
+        -------
+        ndarray of uint8, shape (rows, columns, 4)
+            Red, green, blue and opacity.
+        """
+        drawing: Any = FigureCanvasAgg(self.figure)  # its methods have no types
+        drawing.draw()
+        return np.asarray(drawing.buffer_rgba())
+
+    def _lay_out(self, digits: list[int]) -> None:
+        """Make room where a text has other lines than before, or a colour bar other digits."""
+        texts = [self._title, self._foot, *(artists.text for artists in self._artists.values())]
+        room = digits + [len(text.get_text().splitlines()) for text in texts]
+        if room != self._room:
+            self._engine.execute(self.figure)
+            self._room = room
+
+
+def _artists(figure: Figure, axis: Axes, band: str, shape: tuple[int, int]) -> _Artists:
+    """Make the artists of a band, which has no picture yet."""
+    empty = xr.DataArray(np.full(shape, np.nan), dims=("y", "x"))
+    draw_image(figure, axis, empty, band_label(band), "raw signal [count]", cmap="gray")
+    image = axis.images[0]
+    assert image.colorbar is not None  # draw_image gave it one
+    image.colorbar.locator = MaxNLocator(_TICKS, integer=True)
+    image.colorbar.formatter = ScalarFormatter(useOffset=False)
+    box = {"facecolor": "white", "edgecolor": _ALARM, "alpha": 0.85, "pad": 3.0}
+    warning = axis.text(
+        0.02, 0.97, "", transform=axis.transAxes, va="top", fontsize=9, color=_ALARM, bbox=box
+    )
+    return _Artists(image, axis.set_xlabel("", loc="left", fontsize=9), warning)

@@ -1,0 +1,210 @@
+r"""Blackbody channel prior: a labelled reconstruction, on whole images, frame by frame.
+
+Grimming et al. (2023) take the brightest pixels of a neighbourhood for nearly black, and so remove
+reflections from thermal images. No code of theirs is public and their equations could not be had:
+what follows is **our reconstruction**, by analogy with the dark channel prior of He et al. (2011),
+doi:10.1109/TPAMI.2010.168, and no figure published for their method is its target.
+
+With I the linearised signal of the quieter band, linear in radiance, and A the reflected signal:
+
+1. M, the largest I in the patch around a pixel, is taken for the signal of a blackbody at the
+   object's temperature there.
+2. :math:`t = (I - A) / (M - A)`, since :math:`I = t M + (1 - t) A` for an emissivity t; **clipped
+   to [0, 1]**, and smoothed by a guided filter whose guide is the image: He et al. (2013),
+   doi:10.1109/TPAMI.2012.213.
+3. :math:`I' = (I - A) / \max(t, t_0) + A` is the object's signal; its temperature follows from the
+   response.
+
+Clipping is part of the algorithm here, as it is of the dark channel prior; nothing else in this
+package clips.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from dbthermal import planck
+from dbthermal.curves import require_range
+from dbthermal.separation._problem import Method, Problem
+from dbthermal.separation._separated import Array, Separated
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    Options of the blackbody channel prior; none is published.
+
+    Attributes
+    ----------
+    patch : int
+        Side of the patch in which the brightest pixel is looked for [pixel], odd. In a patch the
+        object's temperature should not change: on a plate with a hot middle, 240 pixels wide, 5 is
+        better than 15, and 31 worse.
+    window : int
+        Side of the guided filter's window [pixel], odd.
+    regularisation : float
+        The guided filter's epsilon: variance below which the guide counts as flat, relative to the
+        square of the frame's span [1].
+    percentile : float
+        The reflected signal is this percentile of the frame [%], if no temperature is given.
+    reflected_temperature : float or None
+        Reflected apparent temperature [K], if known.
+    least_transmission : float
+        t0, below which the emissivity is not divided by [1].
+    """
+
+    patch: int = 15
+    window: int = 31
+    regularisation: float = 1e-3
+    percentile: float = 1.0
+    reflected_temperature: float | None = None
+    least_transmission: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse windows without a centre, and fractions that are none."""
+        for name in ("patch", "window"):
+            if not (getattr(self, name) >= 1 and getattr(self, name) % 2 == 1):
+                raise ValueError(
+                    f"Invalid {name} {getattr(self, name)} of method 'bcp'. Must be odd."
+                )
+        planck.require_positive("regularisation of method 'bcp'", self.regularisation)
+        if not 0 <= self.percentile <= 100:
+            raise ValueError(
+                f"Invalid percentile {self.percentile} of method 'bcp'. Must lie in [0, 100]."
+            )
+        if not 0 < self.least_transmission <= 1:
+            raise ValueError(
+                f"Invalid least_transmission {self.least_transmission} of method 'bcp'. "
+                "Must lie in (0, 1]."
+            )
+
+
+def separate(problem: Problem, settings: Settings) -> Separated:
+    """
+    Remove the reflection from a whole image, each frame by itself.
+
+    Parameters
+    ----------
+    problem : Problem
+        Signals of two bands, of an image of `problem.shape`.
+    settings : Settings
+        Sizes of the filters, and what is known of the reflection.
+
+    Returns
+    -------
+    Separated
+        Object temperature from the quieter band; background temperature, that of the reflected
+        signal A, the same in all pixels; emissivity of each band: the mean over time of its own t.
+        No deviations. Pixels without a temperature, as dead ones, are filled with the frame's
+        median before the filters, and are NaN in the result.
+
+    Raises
+    ------
+    ValueError
+        If the reflected temperature lies outside the response's range.
+    """
+    object_signal, reflected, transmission = _movie(problem, settings, 0)
+    transmissions = np.stack([transmission, _movie(problem, settings, 1)[2]])
+    usable = np.isfinite(problem.temperature(0, problem.signals[0]))
+    warm = np.where(usable, problem.temperature(0, object_signal), np.nan)
+    cold = np.tile(problem.temperature(0, reflected)[:, np.newaxis], warm.shape[1])
+    return Separated(
+        object_temperature=warm,
+        object_temperature_std=np.full_like(warm, np.nan),
+        background_temperature=cold,
+        background_temperature_std=np.full_like(cold, np.nan),
+        emissivity=transmissions,
+        emissivity_std=np.full_like(transmissions, np.nan),
+        status=np.zeros(warm.shape[1], dtype=np.uint32),
+    ).ranged(problem.curves[0], deviations=False)
+
+
+def _movie(problem: Problem, settings: Settings, band: int) -> tuple[Array, Array, Array]:
+    """Object signal (time, pixel), reflected signal (time), mean t (pixel), of one band."""
+    clean = np.empty_like(problem.signals[band])
+    reflected, total = np.empty(problem.time.size), np.zeros(clean.shape[1])
+    given = _given(problem, settings, band)
+    for frame, signal in enumerate(problem.signals[band]):
+        image = _filled(problem, band, signal).reshape(problem.shape)
+        level = float(np.percentile(image, settings.percentile)) if given is None else given
+        transmission = _transmission(image, level, settings)
+        above = (image - level) / np.maximum(transmission, settings.least_transmission)
+        clean[frame], reflected[frame] = (above + level).ravel(), level
+        total += transmission.ravel()
+    return clean, reflected, total / problem.time.size
+
+
+def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Array:
+    r"""
+    Smooth an image along the edges of a guide.
+
+    In every window the result is :math:`a\,\mathrm{guide} + b` with
+    :math:`a = \mathrm{cov}(\mathrm{guide}, \mathrm{image}) / (\mathrm{var}(\mathrm{guide}) +
+    \epsilon)`; a pixel takes the mean of all windows that hold it.
+
+    Parameters
+    ----------
+    guide, image : ndarray, shape (y, x)
+        Guide [its own unit] and image [another].
+    window : int
+        Side of the window [pixel].
+    epsilon : float
+        Variance of the guide below which it counts as flat [square of the guide's unit].
+
+    Returns
+    -------
+    ndarray, shape (y, x)
+        The smooth image. Beyond the border both are mirrored.
+
+    References
+    ----------
+    .. [1] He, Sun, Tang (2013), IEEE TPAMI 35, 1397, doi:10.1109/TPAMI.2012.213
+    """
+    guide = guide - guide.mean()  # the variance is a difference of squares
+    mean_guide, mean_image = uniform_filter(guide, window), uniform_filter(image, window)
+    covariance = uniform_filter(guide * image, window) - mean_guide * mean_image
+    variance = uniform_filter(guide * guide, window) - mean_guide**2
+    slope = covariance / (variance + epsilon)
+    intercept = mean_image - slope * mean_guide
+    return np.asarray(uniform_filter(slope, window) * guide + uniform_filter(intercept, window))
+
+
+def _given(problem: Problem, settings: Settings, band: int) -> float | None:
+    """Signal of the given reflected temperature, if there is one."""
+    if settings.reflected_temperature is None:
+        return None
+    curve = problem.curves[band]
+    level = require_range(settings.reflected_temperature, curve, "reflected_temperature")
+    return float(problem.blackbody(band, level))
+
+
+def _filled(problem: Problem, band: int, image: Array) -> Array:
+    """The frame with its median in place of pixels that no temperature gives."""
+    usable = np.isfinite(problem.temperature(band, image))
+    if not np.any(usable):
+        return image
+    return np.where(usable, image, np.median(image[usable]))
+
+
+def _transmission(image: Array, level: float, settings: Settings) -> Array:
+    """The smooth t of one frame; 1 where nothing in the patch is brighter than the reflection."""
+    brightest = maximum_filter(image, settings.patch)
+    coarse = np.ones_like(image)
+    np.divide(image - level, brightest - level, out=coarse, where=brightest > level)
+    span = float(np.ptp(image))
+    if span == 0:  # one value: neither a guide, nor anything to smooth
+        return np.clip(coarse, 0.0, 1.0)
+    epsilon = settings.regularisation * span**2
+    fine = guided_filter(image, np.clip(coarse, 0.0, 1.0), settings.window, epsilon)
+    return np.clip(fine, 0.0, 1.0)
+
+
+METHOD: Final = Method(
+    separate,
+    settings=Settings,
+    whole_image=True,
+    not_estimated=("object_temperature_std", "background_temperature_std", "emissivity_std"),
+)
+"""The reconstructed blackbody channel prior, for `solve`."""

@@ -1,0 +1,1 @@
+"""Materials whose pixels share their emissivities."""

@@ -1,0 +1,327 @@
+r"""Pixels of one material, found from a first separation, to pool a second one over.
+
+The reflection ratio :math:`k_m = (1-e_m)/(1-e_{ref})` belongs to the material alone, but of one
+pixel it is known to a few percent only. So the pictures propose and the statistics decide:
+
+1. `superpixels` cuts the image into cells, along the edges of the ratio and of the difference of
+   the bands' mean signals. A pattern of the object's temperature shows in that difference, which is
+   0 for a gray body, far less than a border of emissivity.
+2. A cell whose ratios scatter more than their deviations allow lies across a border: it is cut
+   into smaller ones.
+3. Neighbours whose pooled ratios and emissivities agree are joined, the most alike first
+   (`regions`), as long as a difference that matters would be seen.
+4. A cell whose own ratio says too little, as where nothing moved, joins a neighbour towards which
+   the pictures have no step.
+
+A material is connected: two bodies that do not touch are never pooled, however alike. Wrong
+pooling is a bias that no deviation tells of, while a body in two parts costs a little noise.
+"""
+
+import importlib
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.stats import chi2
+
+from dbthermal import response as responses
+from dbthermal import schema
+from dbthermal.separation._pooling import feature_maps as pictures
+from dbthermal.separation._pooling import region_merging as regions
+from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+NONE: Final = -1
+"""Label of pixels that belong to no material: they are pooled with nobody."""
+
+_SPACINGS: Final = (8, 4, 2)
+"""Sizes of the cells, and of those that a mixed cell is cut into [pixel]."""
+
+_STEP_RATE: Final = 0.1
+"""Probability that a step is seen where there is none [1]. A link that is refused in error is made
+elsewhere; one that is made in error bleeds: this is no small number."""
+
+_MISFIT_RATE: Final = 0.01
+"""Probability that two cells without a border are said to hold one [1]."""
+
+_LEAST: Final = 0.05
+"""Step at a border, relative to the change of the reference band's signal, that must be visible
+before its absence tells anything [1]."""
+
+_POWERS: Final = tuple((i, j) for i in range(4) for j in range(4 - i))
+"""Powers of x and y in the smooth function that a step is told from."""
+
+_TOLERANCE: Final = 0.0025
+"""Standard deviation of the ratio, relative to it, that pooling does not take away [1]: the parts
+of the object's and the background's curves that the separator's model leaves."""
+
+_VAGUE: Final = 0.3
+"""Standard deviation of a pixel's ratio, relative to it, beyond which it says nothing [1]: neither
+its own distribution nor that of the emissivity is a normal one there."""
+
+_NEEDED: Final = tuple(
+    name + ending
+    for name in ("reflection_ratio", "emissivity", "background_temperature")
+    for ending in ("", "_std")
+)
+
+_UNUSABLE: Final = ("invalid_samples", "constant_signal", "dead_pixel")
+"""Flags of pixels that have no signal."""
+
+_SMALLEST: Final = 16
+"""Fewest pixels of a material: what is left over at a border, and stands out by its errors, has
+fewer."""
+
+
+def materials(
+    result: xr.Dataset,
+    corrected: xr.Dataset,
+    response: xr.Dataset,
+    *,
+    error_rate: float = 0.01,
+    resolution: float = 0.1,
+) -> xr.DataArray:
+    r"""
+    Label the pixels by material, for `solve(..., pool=labels)`.
+
+    Parameters
+    ----------
+    result : Dataset
+        From `solve` without labels, of the same capture, with `reflection_ratio` and `emissivity`
+        (band, y, x) [1], `background_temperature` (time, y, x) [K], their deviations, `noise` and
+        `status`. Pixels with a ratio that is NaN are told by the picture alone.
+    corrected : Dataset
+        The capture: `counts` (band, time, y, x) [count]. May be lazy; only means over time are
+        kept. Frames that are NaN are left out, and of a capture with a `segment` all but the
+        longest.
+    response : Dataset
+        As given to `solve`.
+    error_rate : float
+        Probability, in the whole image, that cells of one material are cut or held apart by
+        chance [1]. It is shared out among the tests.
+    resolution : float
+        Relative difference of the ratio that must be seen before two regions are joined by their
+        ratios [1]; materials closer than this may be joined.
+
+    Returns
+    -------
+    DataArray
+        `material` (y, x), int32: connected regions from 0, the largest first; `NONE` (-1) for
+        pixels without a signal, for regions in which no pixel has a ratio and that no neighbour
+        takes in, and for regions of less than 16 pixels.
+
+    Raises
+    ------
+    ImportError
+        If scikit-image is not installed, see `superpixels`.
+    ValueError
+        If a rate is not in (0, 1), a variable is missing, or bands or sizes differ.
+
+    Notes
+    -----
+    Two regions are compared by the pooled ratio of each band, an inverse-variance mean, and by the
+    emissivity of the reference band. The error of an emissivity is one that neighbours share (the
+    background's slow part), so its mean is taken to be no surer than that of one pixel. The
+    deviations of the ratios of several bands are taken as independent.
+
+    Borders are found within 2 pixels, single pixels apart; at one, a few pixels may belong to none.
+    Where nothing moved and the object hardly changed, no picture shows a border, and pixels belong
+    to none too.
+    A ratio that is withheld by its own value, as for being close to 1, biases the pooled one.
+    """
+    _check(result, corrected, error_rate, resolution)
+    frames = _longest_segment(corrected)
+    corrected, result = corrected.isel(time=frames), result.isel(time=frames)
+    bands, noise = _order(result, response)
+    means, variances = pictures.means(corrected, response, bands, noise)
+    change = pictures.change(corrected, response, bands[0])
+    reflected, of_reflected = pictures.reflected(result, bands)
+    of_ratio, features = _features(result, bands)
+    bits = sum(schema.FLAGS[name] for name in _UNUSABLE)
+    valid = np.all(np.isfinite(means), axis=0) & (result["status"].values & bits == 0)
+    cells = _cells(of_ratio, means, variances, valid, error_rate)
+    found = Regions(cells, features, error_rate)
+    pairs = regions.neighbours(cells)
+    found.join_alike(pairs, resolution)
+    roots = found.roots()[pairs]
+    apart = (roots[:, 0] != roots[:, 1]) & (found.compare(*roots.T)[1] > resolution)
+    emitted = means[1:] - means[0] - reflected
+    spread = variances[1:] + variances[0] + of_reflected
+    linked, steps = _links(cells, pairs[apart], emitted, spread, change)
+    found.join_in_order(linked, steps)
+    found.join_alike(pairs, resolution)
+    return _labelled(cells, found, result)
+
+
+def _check(result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolution: float) -> None:
+    schema.check(corrected, "corrected")
+    for name, value in (("error_rate", error_rate), ("resolution", resolution)):
+        if not 0 < value < 1:
+            raise ValueError(f"Invalid {name} {value}. Must lie in (0, 1).")
+    for name in _NEEDED:
+        if name not in result:
+            raise ValueError(f"Missing '{name}' in the result. Must be one of `solve`.")
+    if "reflection_ratio" in result.attrs.get("not_estimated", "").split():
+        raise ValueError(
+            f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
+            "reflection ratio. Must be of one that does, as 'subspace'."
+        )
+    names, wanted = ([str(name) for name in part["band"].values] for part in (result, corrected))
+    if names != wanted:
+        raise ValueError(f"Invalid bands {names} of the result. Must be the capture's, {wanted}.")
+    for dim in ("y", "x"):
+        if result.sizes[dim] != corrected.sizes[dim]:
+            raise ValueError(
+                f"Invalid size {result.sizes[dim]} of '{dim}' of the result. "
+                f"Must be the capture's, {corrected.sizes[dim]}."
+            )
+
+
+def _longest_segment(corrected: xr.Dataset) -> Mask:
+    """Frames between two shutter events: means across one would show the pattern's step."""
+    if "segment" not in corrected:
+        return np.ones(corrected.sizes["time"], dtype=bool)
+    names, counts = np.unique(corrected["segment"], return_counts=True)
+    return np.asarray(corrected["segment"].values == names[np.argmax(counts)])
+
+
+def _order(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
+    """Bands from the quietest, which is the reference, and their noise in that order [K]."""
+    names = [str(name) for name in result["band"].values]
+    slopes = np.array([responses.curve(response, name).reference_slope for name in names])
+    noise = result["noise"].values / slopes
+    bands = [int(band) for band in np.argsort(noise, kind="stable")]
+    return bands, noise[bands]
+
+
+def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:
+    """Ratios of all bands but the reference; and the reference's emissivity with them."""
+    ratio, ratio_std, emissivity, emissivity_std = (
+        result[name].values.astype(np.float64)
+        for name in ("reflection_ratio", "reflection_ratio_std", "emissivity", "emissivity_std")
+    )
+    others, reference = bands[1:], bands[:1]
+    vague = ~(ratio_std[others] < _VAGUE * np.abs(ratio[others]))
+    ratio[others] = np.where(vague, np.nan, ratio[others])
+    emissivity = np.where(np.any(vague, axis=0), np.nan, emissivity)
+    none = np.zeros(len(others), dtype=bool)
+    alone = Features(ratio[others], ratio_std[others] ** 2, none, np.full(len(others), _TOLERANCE))
+    both = Features(
+        np.concatenate([alone.values, emissivity[reference]]),
+        np.concatenate([alone.variances, emissivity_std[reference] ** 2]),
+        np.append(none, True),
+        np.append(alone.tolerance, 0.0),
+    )
+    return alone, both
+
+
+def _cells(
+    of_ratio: Features, means: Array, variances: Array, valid: Mask, error_rate: float
+) -> Labels:
+    """Cells of which none is seen to lie across a border, or that are of the smallest size."""
+    superpixels = importlib.import_module("dbthermal.separation._pooling.superpixels")
+    strength = superpixels.edges(
+        np.concatenate([of_ratio.values, means[1:] - means[0]]),
+        np.concatenate([of_ratio.variances, variances[1:] + variances[0]]),
+    )
+    cells: Labels = superpixels.cells(strength, valid, _SPACINGS[0])
+    for spacing in _SPACINGS[1:]:
+        mixed = regions.mixed(cells, of_ratio, error_rate)[cells]
+        finer = cells.max() + superpixels.cells(strength, valid, spacing)
+        cells = superpixels.connected(np.where(mixed, finer, cells))
+    return cells
+
+
+def _links(
+    cells: Labels, pairs: Labels, emitted: Array, variances: Array, change: Array
+) -> tuple[Labels, Array]:
+    """
+    Pairs of cells with no step between them in what is emitted, and the steps' significances.
+
+    A border shows in proportion to the object's change: no step is no proof where there was none.
+    """
+    places, shape = _places(cells), (len(emitted), -1)
+    flat, noise, steps = emitted.reshape(shape), variances.reshape(shape), np.empty(len(pairs))
+    for index, pair in enumerate(pairs):
+        first, second = (places[cell] for cell in pair)
+        both = np.concatenate([first, second])
+        least = _LEAST * np.abs(np.mean(change.ravel()[both]))
+        where = np.divmod(both, cells.shape[1])
+        steps[index] = step(where, flat[:, both], noise[:, both].mean(axis=1), first.size, least)
+    fine = steps < chi2.isf(_STEP_RATE, len(emitted))
+    return pairs[fine], steps[fine]
+
+
+def _places(cells: Labels) -> list[Labels]:
+    """Flat indices of each cell's pixels, those of no cell first."""
+    order = np.argsort(cells, axis=None, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(cells.ravel()))[:-1])
+
+
+def step(
+    places: tuple[Labels, Labels], values: Array, variance: Array, first: int, least: float
+) -> float:
+    r"""
+    Significance of a step between two cells, beside a cubic function of the place.
+
+    .. math:: f(x, y) = \sum_{i + j \le 3} c_{ij} x^i y^j + h [p \in \mathrm{second}]
+
+    by least squares. Where the residual is more than noise, a border lies elsewhere than between
+    the cells, and the step is called infinite.
+
+    Parameters
+    ----------
+    places : tuple of ndarray of int, shape (pixel,)
+        Rows and columns, the first cell's before the second's.
+    values : ndarray, shape (picture, pixel)
+        What may have a step [K].
+    variance : ndarray, shape (picture,)
+        Variance of the noise of one pixel [K2].
+    first : int
+        Number of the first cell's pixels.
+    least : float
+        Step that must be visible, at three standard deviations [K].
+
+    Returns
+    -------
+    float
+        Sum over the pictures of :math:`h^2 / \mathrm{var}(h)`; infinite too where the
+        pixels are too few to tell, or too noisy.
+    """
+    pixels = places[0].size
+    y, x = ((place - place.mean()) / _SPACINGS[0] for place in places)
+    second = np.arange(pixels) >= first
+    design = np.stack([*(x**i * y**j for i, j in _POWERS), second], axis=1)
+    if pixels < 3 * design.shape[1]:
+        return np.inf
+    orthonormal, triangle = np.linalg.qr(design)
+    # The step comes last: its coefficient is a quotient by this corner, and so is its deviation.
+    if np.any(9.0 * variance > (least * triangle[-1, -1]) ** 2):
+        return np.inf
+    heights = values @ orthonormal
+    left = np.sum((values - heights @ orthonormal.T) ** 2, axis=1) / variance
+    if np.any(left > chi2.isf(_MISFIT_RATE, pixels - design.shape[1])):
+        return np.inf
+    return float(np.sum(heights[:, -1] ** 2 / variance))
+
+
+def _labelled(cells: Labels, found: Regions, result: xr.Dataset) -> xr.DataArray:
+    """Regions with a ratio, numbered by size."""
+    roots = found.roots()[cells]
+    roots[(cells == 0) | ~found.known()[roots]] = 0
+    sizes = np.bincount(roots.ravel())
+    sizes[0] = 0
+    sizes[sizes < _SMALLEST] = 0
+    number = np.full(sizes.size, NONE)
+    largest = np.argsort(-sizes, kind="stable")[: np.count_nonzero(sizes)]
+    number[largest] = np.arange(largest.size)
+    return xr.DataArray(
+        number[roots].astype(np.int32),
+        dims=("y", "x"),
+        coords={dim: result[dim] for dim in ("y", "x") if dim in result.coords},
+        name="material",
+        attrs={"units": "1", "long_name": "material, -1 for none"},
+    )

@@ -1,0 +1,1 @@
+"""The subspace separator: kernels of its five steps."""

@@ -1,0 +1,323 @@
+"""A simulated rig: response from Planck's law, fixed pattern, noise, 16-bit counts."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import bands, calibration, mixing, planck, schema
+from dbthermal import correction as frames
+from dbthermal import response as responses
+from dbthermal.curves import require_range
+
+_CALIBRATION_POINTS: Final = 25
+_SLOPE_TEMPERATURE: Final = 300.0
+
+
+@dataclass(frozen=True)
+class Rig:
+    """
+    Two cameras of which one looks through a filter, as counts.
+
+    The defaults are round figures for the camera of the paper: a 16-bit 640x512 microbolometer,
+    about 115 counts/K near 300 K and NETD 20-40 mK without a filter; behind a filter the counts
+    shrink with the band's share of dB/dT while the noise in counts stays.
+
+    Attributes
+    ----------
+    bands : tuple of str
+        Names in `bands.FILTERS`.
+    noise : tuple of float
+        Noise of each band, as NETD near 25 degrees Celsius [K].
+    counts_per_kelvin : float
+        Slope of the 8-14 um band at 300 K [count/K].
+    offset : float
+        Counts of a body at 0 K [count].
+    lowest, highest : float
+        Range of the simulated response [K].
+    gain_std, offset_std : float
+        Fixed pattern from pixel to pixel: relative gain [1] and offset [count].
+    bad_fraction : float
+        Fraction of dead pixels [1].
+    """
+
+    bands: tuple[str, ...] = ("8-14", "9.5")
+    noise: tuple[float, ...] = (0.03, 0.35)
+    counts_per_kelvin: float = 115.0
+    offset: float = 15500.0
+    lowest: float = 263.15
+    highest: float = 353.15
+    gain_std: float = 0.02
+    offset_std: float = 40.0
+    bad_fraction: float = 0.001
+
+    def __post_init__(self) -> None:
+        """Refuse bands that do not exist and numbers that are no rig."""
+        for name in self.bands:
+            bands.get(name)
+        if len(self.noise) != len(self.bands):
+            raise ValueError(f"Invalid noise {self.noise} K. Must be one for each of {self.bands}.")
+        planck.require_positive("noise [K]", self.noise)
+        if not 0 <= self.bad_fraction < 1:
+            raise ValueError(f"Invalid bad_fraction {self.bad_fraction}. Must lie in [0, 1).")
+
+    def response(self) -> xr.Dataset:
+        """
+        Response of the rig, from Planck's law in each band.
+
+        Returns
+        -------
+        Dataset
+            Stage `response` with `noise`: the Sakuma-Hattori curve through exact in-band
+            radiances, which it meets within 0.05 mK between -10 and 80 Celsius.
+        """
+        temperature = np.linspace(self.lowest, self.highest, _CALIBRATION_POINTS)
+        unit = self.counts_per_kelvin / bands.get("8-14").slope(_SLOPE_TEMPERATURE)
+        counts = xr.DataArray(
+            [self.offset + unit * bands.get(name).radiance(temperature) for name in self.bands],
+            dims=("band", "temperature"),
+            coords={"band": list(self.bands), "temperature": temperature},
+        )
+        noiseless = calibration.fit_response(counts)
+        slopes = [responses.curve(noiseless, name).reference_slope for name in self.bands]
+        noise = xr.DataArray(
+            np.array(self.noise) * slopes, dims="band", coords={"band": list(self.bands)}
+        )
+        result = calibration.fit_response(counts, noise)
+        return result.assign_attrs(origin="simulated")
+
+
+def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
+    """Counts of a blackbody in each band; a temperature may be one for each of the bands."""
+    names = [str(name) for name in response["band"].values]
+    curves = [responses.curve(response, name) for name in names]
+    parts = _of_bands(temperature, names)
+    checked = [
+        require_range(part.values, curve, str(temperature.name))
+        for part, curve in zip(parts, curves, strict=True)
+    ]
+    return [curve.counts(values) for curve, values in zip(curves, checked, strict=True)]
+
+
+def _of_bands(temperature: xr.DataArray, names: list[str]) -> list[xr.DataArray]:
+    """Temperature in each band: its own where there is a dimension band, else the same in all."""
+    if "band" not in temperature.dims:
+        return [temperature] * len(names)
+    places = schema.band_positions(temperature, names, str(temperature.name))
+    return [temperature.isel(band=place) for place in places]
+
+
+def observe(
+    scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator, dtype: str = "float32"
+) -> xr.Dataset:
+    r"""
+    What a perfectly corrected rig would see of a scene: the stage `corrected`.
+
+    .. math:: I_m = e_m U_m(x) + (1 - e_m) U_m(y) + \mathrm{noise}
+
+    Parameters
+    ----------
+    scene : Dataset
+        From `scenes` or `twins`: object and background temperature (time, y, x) [K], emissivity
+        (band, y, x) [1]. The background may be one for each band, (band, time, y, x), as two
+        cameras see it that stand side by side.
+    response : Dataset
+        With `noise`, e.g. from `Rig.response`.
+    rng : Generator
+        Source of the noise.
+    dtype : str
+        Floating dtype of the counts.
+
+    Returns
+    -------
+    Dataset
+        `counts` (band, time, y, x) [count], `origin = "simulated"`, and of a twin its `twin`.
+
+    Raises
+    ------
+    ValueError
+        If a temperature lies outside the response, or a band is missing.
+    """
+    emitted = _blackbody(response, scene["object_temperature"])
+    reflected = _blackbody(response, scene["background_temperature"])
+    names = [str(name) for name in response["band"].values]
+    schema.band_positions(scene, names, "the scene")
+    movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
+    for index, name in enumerate(names):
+        emissivity = scene["emissivity"].sel(band=name).values
+        clean = mixing.leaving(emissivity, emitted[index], reflected[index])
+        noise = float(response["noise"].sel(band=name))
+        movie[index] = clean + rng.normal(0.0, noise, clean.shape)
+    return xr.Dataset(
+        {"counts": (schema.STAGES["corrected"]["counts"].dims, movie)},
+        coords={"band": names, **{name: scene[name] for name in ("time", "y", "x")}},
+        attrs={"origin": "simulated", **_twin(scene)},
+    ).pipe(_describe, "corrected")
+
+
+def _twin(scene: xr.Dataset) -> dict[str, str]:
+    """Attribute that names what a scene is a simulated twin of, if it is one."""
+    return {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
+
+
+def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
+    """
+    Fixed pattern of the rig's detectors.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+    shape : tuple of int
+        Rows and columns.
+    rng : Generator
+        Source of the pattern.
+
+    Returns
+    -------
+    Dataset
+        `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies,
+        relative to the mean of the live pixels, a smooth vignette (narcissus) included; `dead`
+        (band, y, x).
+    """
+    size = (len(rig.bands), *shape)
+    rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
+    vignette = rows**2 + columns**2
+    dead = rng.random(size) < rig.bad_fraction
+    gain = rig.gain_std * (rng.standard_normal(size) - vignette)
+    offset = rig.offset_std * (rng.standard_normal(size) + 2.0 * vignette)
+    mean_gain, mean_offset = (
+        np.mean(part, axis=(1, 2), where=~dead, keepdims=True) for part in (gain, offset)
+    )
+    dims = ("band", "y", "x")
+    return xr.Dataset(
+        {
+            "gain": (dims, 1.0 + gain - mean_gain, {"units": "1"}),
+            "offset": (dims, offset - mean_offset, {"units": "count"}),
+            "dead": (dims, dead),
+        },
+        coords={"band": list(rig.bands)},
+        attrs={"origin": "simulated"},
+    )
+
+
+def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
+    """
+    Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        From `observe`.
+    detector : Dataset
+        From `pattern`, with the same bands and shape.
+
+    Returns
+    -------
+    Dataset
+        Stage `capture`: `counts` uint16 (band, time, y, x).
+
+    Raises
+    ------
+    ValueError
+        If the detector lacks a band, or a count does not fit into 16 bits; a real detector would
+        saturate, which a simulation must ask for rather than meet by accident.
+    """
+    counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
+    for index, movie in enumerate(corrected["counts"]):
+        counts[index] = digitise(movie.values, _of_band(detector, str(movie["band"].item())))
+    return corrected.assign(counts=(corrected["counts"].dims, counts)).pipe(_describe, "capture")
+
+
+def blackbody_movies(
+    rig: Rig,
+    temperatures: np.ndarray,
+    frames: int,
+    detector: xr.Dataset,
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """
+    Raw movies of a blackbody that fills the view, at several temperatures.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+    temperatures : ndarray
+        Blackbody temperatures [K], increasing.
+    frames : int
+        Frames at each.
+    detector : Dataset
+        From `pattern`.
+    rng : Generator
+        Source of the noise.
+
+    Returns
+    -------
+    Dataset
+        `counts` uint16 (band, temperature, frame, y, x) [count].
+
+    Raises
+    ------
+    ValueError
+        If a temperature lies outside the rig's range, the detector lacks a band, or a count does
+        not fit into 16 bits.
+    """
+    response = rig.response()
+    shape = (frames, *detector["gain"].shape[1:])
+    level = xr.DataArray(temperatures, dims="temperature", name="temperature")
+    movies = np.empty((len(rig.bands), len(temperatures), *shape), dtype=np.uint16)
+    for index, counts in enumerate(_blackbody(response, level)):
+        noise, here = float(response["noise"][index]), _of_band(detector, rig.bands[index])
+        for place, mean in enumerate(counts):
+            movies[index, place] = digitise(mean + rng.normal(0.0, noise, shape), here)
+    return xr.Dataset(
+        {"counts": (("band", "temperature", "frame", "y", "x"), movies, {"units": "count"})},
+        coords={
+            "band": list(rig.bands),
+            "temperature": ("temperature", temperatures, {"units": "K"}),
+        },
+        attrs={"origin": "simulated"},
+    )
+
+
+def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
+    """
+    Raw counts of one band: fixed pattern, rounding, dead pixels at 0.
+
+    Parameters
+    ----------
+    counts : ndarray, shape (..., y, x)
+        Corrected counts [count].
+    detector : Dataset
+        From `pattern`, of this band: (y, x).
+
+    Returns
+    -------
+    ndarray of uint16, shape (..., y, x)
+        Raw counts [count].
+
+    Raises
+    ------
+    ValueError
+        If a count does not fit into 16 bits.
+    """
+    raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
+    if not (raw.min() >= 0 and raw.max() <= frames.DETECTOR_MAXIMUM):  # a NaN fails it, too
+        raise ValueError(
+            f"Invalid counts {raw.min()} to {raw.max()} in band '{detector['band'].item()}'. "
+            f"Must lie in [0, {frames.DETECTOR_MAXIMUM}]."
+        )
+    return np.where(detector["dead"].values, 0, raw).astype(np.uint16)
+
+
+def _of_band(detector: xr.Dataset, band: str) -> xr.Dataset:
+    schema.band_positions(detector, [band], "the detector")
+    return detector.sel(band=band)
+
+
+def _describe(dataset: xr.Dataset, stage: str) -> xr.Dataset:
+    dataset["counts"].attrs.update(schema.STAGES[stage]["counts"].attrs)
+    dataset["time"].attrs.setdefault("units", "s")
+    return schema.check(dataset, stage)

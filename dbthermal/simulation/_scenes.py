@@ -1,0 +1,317 @@
+"""Scenes with known truth: an object that changes smoothly before a background that does not."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import planck, schema
+from dbthermal.simulation._times import increasing
+
+Array = npt.NDArray[np.float64]
+
+BACKGROUNDS: Final = ("pulses", "random walk", "still")
+"""Kinds of background."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """
+    How the background moves.
+
+    Attributes
+    ----------
+    kind : {"pulses", "random walk", "still"}
+        Someone walking by now and then; a background that never rests (a first-order
+        autoregressive process); or none.
+    level : float
+        Resting temperature [K].
+    amplitude : float
+        Height of a pulse, or standard deviation of the walk [K].
+    count : tuple of int
+        Fewest and most pulses in the capture.
+    duration : tuple of float
+        Shortest and longest pulse [s].
+    memory : float
+        Correlation time of the walk [s].
+    drift : float
+        Change of the resting temperature over the capture, linear in time [K].
+    """
+
+    kind: str = "pulses"
+    level: float = 295.15
+    amplitude: float = 3.0
+    count: tuple[int, int] = (6, 9)
+    duration: tuple[float, float] = (1.0, 3.0)
+    memory: float = 3.0
+    drift: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse kinds that do not exist, and numbers that are no background."""
+        if self.kind not in BACKGROUNDS:
+            raise ValueError(f"Unknown background '{self.kind}'. Must be one of {BACKGROUNDS}.")
+        if not 0 <= self.count[0] <= self.count[1]:
+            raise ValueError(f"Invalid count {self.count} of pulses. Must be two, not falling.")
+        if not 0 < self.duration[0] <= self.duration[1]:
+            raise ValueError(f"Invalid duration {self.duration} s. Must be positive, not falling.")
+        if not self.memory > 0:
+            raise ValueError(f"Invalid memory {self.memory} s. Must be positive.")
+
+    def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
+        """
+        Draw one realisation for each pixel.
+
+        Parameters
+        ----------
+        time : ndarray, shape (time,)
+            Times [s], two or more.
+        pixels : int
+            Number of pixels.
+        rng : Generator
+            Source of randomness.
+
+        Returns
+        -------
+        ndarray, shape (time, pixels)
+            Background temperature [K].
+
+        Raises
+        ------
+        ValueError
+            If there are fewer than two times, or they do not increase.
+        """
+        increasing(time, "a background")
+        change = np.zeros((time.size, pixels))
+        if self.kind == "pulses":
+            change = self._pulses(time, pixels, rng)
+        elif self.kind == "random walk":
+            change = self._walk(time, pixels, rng)
+        ramp = self.drift * (time - time[0]) / (time[-1] - time[0])
+        return np.asarray(self.level + ramp[:, np.newaxis] + change)
+
+    def _pulses(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
+        change = np.zeros((time.size, pixels))
+        number = rng.integers(self.count[0], self.count[1] + 1, pixels)
+        for pulse in range(self.count[1]):
+            start = rng.uniform(time[0], time[-1], pixels)
+            stop = start + rng.uniform(*self.duration, pixels)
+            inside = (time[:, np.newaxis] >= start) & (time[:, np.newaxis] < stop)
+            change += self.amplitude * (inside & (pulse < number))
+        return change
+
+    def _walk(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
+        change = np.empty((time.size, pixels))
+        change[0] = rng.standard_normal(pixels)
+        for frame in range(1, time.size):
+            kept = np.exp(-(time[frame] - time[frame - 1]) / self.memory)
+            fresh = np.sqrt(1.0 - kept**2) * rng.standard_normal(pixels)
+            change[frame] = kept * change[frame - 1] + fresh
+        return self.amplitude * change
+
+
+def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike) -> Array:
+    r"""
+    Temperature of a body that relaxes exponentially, from start to stop over the capture.
+
+    .. math:: T(t) = T_0 + (T_1 - T_0) \frac{1 - e^{-t / \tau}}{1 - e^{-t_1 / \tau}}
+
+    the solution of Newton's law of heating, the object prior of the paper
+    (doi:10.48550/arXiv.2509.11334).
+
+    Parameters
+    ----------
+    time : ndarray, shape (time,)
+        Times [s], two or more.
+    start, stop : float
+        First and last temperature [K].
+    time_constant : array_like, shape (...)
+        Time constants [s].
+
+    Returns
+    -------
+    ndarray, shape (time, ...)
+        Temperature [K].
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two times, they do not increase, or a time constant is not positive.
+    """
+    increasing(time, "a heating")
+    constant = planck.require_positive("time_constant [s]", time_constant)
+    elapsed = (time - time[0]).reshape(-1, *(1,) * constant.ndim)
+    rise = np.expm1(-elapsed / constant) / np.expm1(-elapsed[-1] / constant)
+    return np.asarray(start + (stop - start) * rise)
+
+
+def scene(
+    time: Array, object_temperature: Array, background_temperature: Array, emissivity: xr.DataArray
+) -> xr.Dataset:
+    """
+    Put a scene together.
+
+    Parameters
+    ----------
+    time : ndarray, shape (time,)
+        Times [s].
+    object_temperature, background_temperature : ndarray, shape (time, y, x)
+        Temperatures [K].
+    emissivity : DataArray
+        (band) or (band, y, x) [1].
+
+    Returns
+    -------
+    Dataset
+        The truth: names, dims and units of the stage `separated` without its deviations.
+    """
+    stage = schema.STAGES["separated"]
+    height, width = object_temperature.shape[1:]
+    rows, columns = np.arange(height), np.arange(width)
+    spread = emissivity.values.reshape(emissivity.shape[0], *emissivity.shape[1:] or (1, 1))
+    spread = np.broadcast_to(spread, (emissivity.shape[0], height, width))
+    return xr.Dataset(
+        {
+            "object_temperature": (("time", "y", "x"), object_temperature),
+            "background_temperature": (("time", "y", "x"), background_temperature),
+            "emissivity": (("band", "y", "x"), spread),
+        },
+        coords={
+            "band": emissivity["band"].values,
+            "time": ("time", time, {"units": "s"}),
+            "y": rows,
+            "x": columns,
+        },
+        attrs={"origin": "simulated"},
+    ).map(lambda variable: variable.assign_attrs(stage[str(variable.name)].attrs))
+
+
+def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArray:
+    """
+    Panels of several materials from left to right, of equal width.
+
+    Parameters
+    ----------
+    emissivity : DataArray
+        (material, band) [1].
+    shape : tuple of int
+        Rows and columns of the image.
+
+    Returns
+    -------
+    DataArray
+        (band, y, x) [1].
+    """
+    panel = np.arange(shape[1]) * emissivity.sizes["material"] // shape[1]
+    columns = emissivity.values[panel].T[:, np.newaxis, :]
+    spread = np.broadcast_to(columns, (emissivity.sizes["band"], *shape))
+    return xr.DataArray(
+        spread,
+        dims=("band", "y", "x"),
+        coords={"band": emissivity["band"].values},
+        attrs={"units": "1"},
+    )
+
+
+def independent_pixels(
+    time: Array,
+    emissivity: xr.DataArray,
+    background: Background,
+    pixels: int,
+    rng: np.random.Generator,
+    *,
+    start: float,
+    stop: float,
+    time_constant: tuple[float, float] = (8.0, 20.0),
+) -> xr.Dataset:
+    """
+    Many pixels of one material, each with a heating curve and a background of its own.
+
+    Parameters
+    ----------
+    time : ndarray, shape (time,)
+        Times [s].
+    emissivity : DataArray
+        (band) [1].
+    background : Background
+        How the background moves.
+    pixels : int
+        Number of pixels.
+    rng : Generator
+        Source of randomness.
+    start, stop : float
+        First and last object temperature [K].
+    time_constant : tuple of float
+        Range of the heating's time constant [s].
+
+    Returns
+    -------
+    Dataset
+        A scene one row high.
+    """
+    constants = rng.uniform(*time_constant, pixels)
+    warm = heating(time, start, stop, constants)
+    cold = background.draw(time, pixels, rng)
+    return scene(time, warm[:, np.newaxis], cold[:, np.newaxis], emissivity)
+
+
+def walkers(
+    time: Array,
+    shape: tuple[int, int],
+    emissivity: xr.DataArray,
+    rng: np.random.Generator,
+    *,
+    temperatures: Sequence[float] = (295.15, 305.15, 333.15),
+    crossings: int = 7,
+    time_constant: float = 12.0,
+) -> xr.Dataset:
+    """
+    A plate heated in its middle, in which people who walk by are reflected: a simulated twin.
+
+    Each person is an upright ellipse with a head, warmer than the room, that crosses the view
+    once at a steady pace. Along an edge of the silhouette the reflection is abrupt.
+
+    Parameters
+    ----------
+    time : ndarray, shape (time,)
+        Times [s].
+    shape : tuple of int
+        Rows and columns.
+    emissivity : DataArray
+        (band) or (band, y, x) [1].
+    rng : Generator
+        Source of the paths.
+    temperatures : sequence of float
+        Of the room, of people, and of the plate's middle at the end [K].
+    crossings : int
+        Number of people.
+    time_constant : float
+        Of the heating [s].
+
+    Returns
+    -------
+    Dataset
+        The scene.
+    """
+    level, skin, hottest = temperatures
+    height, width = shape
+    rows, columns = np.meshgrid(
+        np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij"
+    )
+    profile = np.exp(-(rows**2 + columns**2) / (2 * 0.5**2))
+    curve = heating(time, 0.0, hottest - level, time_constant)
+    warm = level + curve[:, np.newaxis, np.newaxis] * profile
+    cold = np.full(warm.shape, level)
+    starts = (
+        time[0] + (time[-1] - time[0]) * (np.arange(crossings) + rng.random(crossings)) / crossings
+    )
+    for start in starts:
+        pace = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2)
+        centre = np.sign(pace) * -1.6 + pace * (time - start)
+        apart = columns - centre[:, np.newaxis, np.newaxis]
+        body = (apart / 0.30) ** 2 + ((rows - 0.55) / 0.75) ** 2 < 1
+        head = (apart / 0.14) ** 2 + ((rows + 0.35) / 0.2) ** 2 < 1
+        cold[body | head] = skin
+    return scene(time, warm, cold, emissivity)

@@ -1,0 +1,152 @@
+"""What made a result: parameters, versions, commit, and the checksums of the input.
+
+The record goes into every saved result (see `dbthermal.store`). It holds no date, no host and no
+folder, so that the same input, parameters and code give the same record, and the same bytes.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from dbthermal import __version__
+
+_PACKAGES = ("numpy", "scipy", "xarray", "zarr")
+
+
+def record(
+    parameters: Mapping[str, object], inputs: Mapping[str, str | Path] | None = None
+) -> dict[str, Any]:
+    """Provenance of a result, to be handed to `dbthermal.store`.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Name to value, as in the notebook's parameters cell: finite numbers, strings, booleans,
+        None, and lists and mappings of these.
+    inputs : mapping, optional
+        Name to path of each file, or folder such as a zarr store, that was read. Only its checksum
+        is kept.
+
+    Returns
+    -------
+    dict
+        ``parameters``, ``versions`` (Python, dbthermal and its core dependencies), ``commit`` (see
+        `commit`) and ``inputs`` (name to sha256).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a parameter is of another type, or not finite; the message names it.
+    FileNotFoundError
+        If an input does not exist.
+    """
+    return {
+        "parameters": {name: _plain(name, value) for name, value in parameters.items()},
+        "versions": {
+            "python": platform.python_version(),
+            "dbthermal": __version__,
+            **{package: version(package) for package in _PACKAGES},
+        },
+        "commit": commit(),
+        "inputs": {name: checksum(path) for name, path in (inputs or {}).items()},
+    }
+
+
+def source() -> str:
+    """SHA-256 of this package's source code: names and contents of its modules and tables.
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits.
+    """
+    folder, total = Path(__file__).parent, hashlib.sha256()
+    files = [path for path in folder.rglob("*") if path.suffix in (".py", ".csv")]
+    for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
+        total.update(f"{path.relative_to(folder).as_posix()} {checksum(path)}\n".encode())
+    return total.hexdigest()
+
+
+def checksum(path: str | Path) -> str:
+    """SHA-256 of a file, or of a folder's file names and contents.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file; or a folder, whose files are taken in the order of their names, whatever the file
+        system's order.
+
+    Returns
+    -------
+    str
+        64 hexadecimal digits. For a file, what ``sha256sum`` prints.
+
+    Raises
+    ------
+    FileNotFoundError
+        If `path` does not exist.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return _file_checksum(path)
+    lines = (
+        f"{_file_checksum(file)}  {file.relative_to(path).as_posix()}\n" for file in _files(path)
+    )
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def commit() -> str:
+    """Commit of the code that runs.
+
+    Returns
+    -------
+    str
+        40 hexadecimal digits, followed by ``-dirty`` where tracked files differ from the commit;
+        ``"unknown"`` where this package is not a tracked part of a git work tree (an installed
+        copy, an archive) or git is not there.
+    """
+    folder = Path(__file__).parent
+    tracked = _git(folder, "ls-files", "--error-unmatch", Path(__file__).name)
+    described = _git(folder, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    return described.strip() if tracked and described else "unknown"
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    """Return what a git command prints in `folder`; nothing if it fails or git is absent."""
+    command = ["git", "-C", str(folder), *arguments]
+    environment = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    except FileNotFoundError:
+        return ""
+    return done.stdout if done.returncode == 0 else ""
+
+
+def _plain(name: str, value: object) -> Any:
+    """Return the value as JSON gives it back: tuples are lists, keys are strings."""
+    try:
+        return json.loads(json.dumps(value, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        message = (
+            f"Invalid parameter {name!r} = {value!r}. Must be JSON with finite numbers: {error}."
+        )
+        raise type(error)(message) from error
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Yield the files below `folder`, ordered by their relative names."""
+    yield from sorted(
+        (path for path in folder.rglob("*") if path.is_file()),
+        key=lambda path: path.relative_to(folder).as_posix(),
+    )
+
+
+def _file_checksum(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,332 @@
+"""Results on disk: datasets as zarr, headline numbers as JSON, figures as PNG, films as MP4.
+
+Each function writes beside its goal and renames, so that what bears a result's name is whole,
+whatever happens on the way. Each result carries the record of what made it (see
+`dbthermal.store._provenance`) and nothing that differs between two runs of the same code on the same
+input. No other package opens or writes zarr.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal.store import _progress as progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Number = float | int | str | bool
+
+CHUNK_BYTES = 2**20
+"""Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
+
+
+def chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
+    """Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
+
+    Every stage works pixel by pixel on all frames and bands, so a chunk holds the full story of a
+    nearly square tile of pixels, the smallest that has `CHUNK_BYTES` before compression.
+
+    Parameters
+    ----------
+    variable : Variable or DataArray
+        Of any dims; without both ``y`` and ``x`` it is one chunk.
+
+    Returns
+    -------
+    tuple of int
+        One size [element] per dimension, at least 1.
+    """
+    sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
+    if not {"y", "x"} <= sizes.keys():
+        return tuple(sizes.values())
+    pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
+    pixels = math.ceil(CHUNK_BYTES / pixel_bytes)
+    height = min(sizes["y"], math.ceil(math.sqrt(pixels)))
+    width = min(sizes["x"], math.ceil(pixels / height))
+    sizes |= {"y": min(sizes["y"], math.ceil(pixels / width)), "x": width}
+    return tuple(sizes.values())
+
+
+def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:
+    """Write a dataset as zarr (format 3, not consolidated), in place of what the path held.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Of any stage; it is not changed. Encodings left from an earlier file are not used.
+    path : str or Path
+        Folder to write, ``*.zarr``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.store._provenance.record`; becomes ``attrs["provenance"]``.
+
+    Raises
+    ------
+    ValueError
+        If `path` does not end in ``.zarr``, or `provenance` holds a number that is not finite.
+    """
+    plain = _with_variable_length_strings(dataset.drop_encoding())
+    plain.attrs = {**dataset.attrs, "provenance": json.loads(_json(provenance))}
+    encoding = {name: {"chunks": chunks(variable)} for name, variable in plain.variables.items()}
+    with _whole(path, ".zarr") as part:
+        plain.to_zarr(part, mode="w-", encoding=encoding, zarr_format=3, consolidated=False)
+
+
+def open_dataset(path: str | Path) -> xr.Dataset:
+    """Open what `save` or a `Recording` wrote; values are read when they are used.
+
+    A recording that was cut short, or is being written, opens as far as all bands are valid; its
+    attributes say ``complete`` = False and, in ``frames_written``, where each band ends.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``.
+
+    Returns
+    -------
+    Dataset
+        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
+        fixed-length kind.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no folder at `path`.
+    """
+    if not Path(path).is_dir():
+        raise FileNotFoundError(
+            f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
+        )
+    attrs = progress.attributes(path)
+    cut_short = not attrs.get("closed", True)
+    dataset = _open_valid_part(Path(path), attrs) if cut_short else _open(path)
+    return _with_fixed_length_strings(dataset)
+
+
+def _open(path: str | Path, leave: Iterable[str] = ()) -> xr.Dataset:
+    dataset: xr.Dataset = xr.open_zarr(
+        path, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
+    )
+    return dataset
+
+
+def _open_valid_part(path: Path, attrs: Mapping[str, Any]) -> xr.Dataset:
+    """Open the variables of a recording one by one, for their room differs while it grows."""
+    ends = progress.valid_part(attrs)
+    names = {array.parent.name for array in path.glob("*/zarr.json")}
+    parts = []
+    for name in sorted(names):
+        part = _open(path, leave=names - {name})
+        parts.append(part.isel({dim: end for dim, end in ends.items() if dim in part.dims}))
+    # The attributes as read first, for they may have gone on since.
+    return xr.merge(parts, combine_attrs="override").assign_attrs(attrs)
+
+
+def save_numbers(
+    numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
+) -> None:
+    """Write a notebook's headline numbers as strict JSON, with sorted names.
+
+    Parameters
+    ----------
+    numbers : mapping
+        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean; NumPy
+        scalars too.
+    path : str or Path
+        File to write, ``*.json``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.store._provenance.record`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a value is of another type or not finite, or `path` does not end in ``.json``.
+    """
+    content = {
+        "numbers": {name: _number(name, value) for name, value in numbers.items()},
+        "provenance": dict(provenance),
+    }
+    with _whole(path, ".json") as part:
+        part.write_text(_json(content, indent=2) + "\n", encoding="utf-8")
+
+
+def read_numbers(path: str | Path) -> dict[str, Number]:
+    """Read the headline numbers that `save_numbers` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ``*.json``.
+
+    Returns
+    -------
+    dict
+        Name to value.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not strict JSON, or holds no numbers.
+    """
+
+    def refuse(constant: str) -> NoReturn:
+        raise ValueError(f"Invalid number {constant} in '{path}'. Must be finite.")
+
+    content = json.loads(Path(path).read_text(encoding="utf-8"), parse_constant=refuse)
+    if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
+        raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
+    return {name: _number(name, value) for name, value in content["numbers"].items()}
+
+
+def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
+    """Write a text in Markdown, the record of what made it in a comment at its end.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+    path : str or Path
+        File to write, ``*.md``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.store._provenance.record`.
+
+    Raises
+    ------
+    ValueError
+        If `path` does not end in ``.md``, or `provenance` holds a number that is not finite.
+    """
+    comment = f"\n<!-- {_json(provenance)} -->\n"
+    with _whole(path, ".md") as part:
+        part.write_text(text + comment, encoding="utf-8")
+
+
+def save_figure(
+    figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
+) -> None:
+    """Write a figure as PNG, the same bytes for the same figure.
+
+    Parameters
+    ----------
+    figure : Figure
+        Of matplotlib; it stays open.
+    path : str or Path
+        File to write, ``*.png``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.store._provenance.record`; becomes the text chunk ``Comment``, as JSON.
+    dpi : int
+        Resolution [pixel/inch], for that of the figure depends on where it is shown.
+
+    Raises
+    ------
+    ValueError
+        If `path` does not end in ``.png``, or `provenance` holds a number that is not finite.
+    """
+    metadata = {"Software": "dbthermal", "Comment": _json(provenance)}
+    with _whole(path, ".png") as part:
+        figure.savefig(part, dpi=dpi, metadata=metadata)
+
+
+def save_video(
+    frames: Iterable[npt.NDArray[np.uint8]],
+    path: str | Path,
+    provenance: Mapping[str, Any],
+    *,
+    rate: float,
+) -> None:
+    """Write a film as H.264 in MP4, as browsers play it.
+
+    Parameters
+    ----------
+    frames : iterable of ndarray of uint8, shape (rows, columns, 3)
+        Colours; at least one frame, all of one size, both sizes even.
+    path : str or Path
+        File to write, ``*.mp4``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.store._provenance.record`; becomes the file's comment, as JSON.
+    rate : float
+        Frame rate [Hz].
+
+    Raises
+    ------
+    ValueError
+        If `path` does not end in ``.mp4``, there is no frame, or a size is odd or changes.
+    """
+    import av  # noqa: PLC0415 - optional, and nothing else here needs it
+
+    with _whole(path, ".mp4") as part, av.open(part, "w") as film:
+        film.metadata["comment"] = _json(provenance)
+        stream = film.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
+        stream.pix_fmt, stream.width = "yuv420p", 0
+        for frame in frames:
+            height, width = frame.shape[:2]
+            if stream.width == 0:
+                stream.height, stream.width = height, width
+            if (stream.height, stream.width) != (height, width) or height % 2 or width % 2:
+                raise ValueError(
+                    f"Invalid frame of {height} x {width} pixels. Must be of even size, "
+                    f"as all others: {stream.height} x {stream.width}."
+                )
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        if stream.width == 0:
+            raise ValueError("Invalid film without frames. Must have at least one.")
+        film.mux(stream.encode())
+
+
+@contextmanager
+def _whole(path: str | Path, suffix: str) -> Iterator[Path]:
+    """Give a place beside `path` to write to; move it there if nothing was raised, else drop it."""
+    path = Path(path)
+    if path.suffix != suffix:
+        raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+        part = Path(folder) / path.name
+        yield part
+        if path.is_dir():  # a folder cannot be renamed onto another
+            path.rename(Path(folder) / "replaced")
+        part.replace(path)
+
+
+def _json(content: Mapping[str, Any], indent: int | None = None) -> str:
+    return json.dumps(content, allow_nan=False, ensure_ascii=True, indent=indent, sort_keys=True)
+
+
+def _number(name: str, value: object) -> Number:
+    """Return a headline value as a plain Python one."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(plain, (bool, int, float, str)):
+        raise TypeError(f"Invalid {name!r} = {value!r}. Must be a number, a string or a boolean.")
+    if isinstance(plain, float) and not math.isfinite(plain):
+        raise ValueError(f"Invalid {name!r} = {value!r}. Must be finite.")
+    return plain
+
+
+def _with_variable_length_strings(dataset: xr.Dataset) -> xr.Dataset:
+    """Convert text to the only kind that zarr's format 3 specifies."""
+    return _with_text_as(dataset, "U", np.dtypes.StringDType())
+
+
+def _with_fixed_length_strings(dataset: xr.Dataset) -> xr.Dataset:
+    """Convert text to the kind that NumPy makes of Python's strings."""
+    return _with_text_as(dataset, "T", np.dtype(str))
+
+
+def _with_text_as(dataset: xr.Dataset, kind: str, dtype: np.dtype[Any]) -> xr.Dataset:
+    texts = {
+        name: (variable.dims, variable.to_numpy().astype(object).astype(dtype), variable.attrs)
+        for name, variable in dataset.variables.items()
+        if variable.dtype.kind == kind
+    }
+    return dataset.assign(texts)

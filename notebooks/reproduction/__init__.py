@@ -1,0 +1,1 @@
+"""The reproduction of the paper: its scenes, experiments and tables."""

@@ -1,0 +1,330 @@
+"""Seeded experiments that print what they measure: the separation's accuracy case by case."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.constants import zero_Celsius
+
+from dbthermal import _smooth as smooth
+from dbthermal import limits, separation, simulation
+from dbthermal.simulation import Background, Rig
+from dbthermal.simulation import _clocks as clocks
+
+Array = npt.NDArray[np.float64]
+Case = Mapping[str, Any]
+
+STEPS: Final = 20
+"""Steps of the finer clock in a frame, on which bands that are not exposed together are drawn."""
+
+_NEEDED: Final = frozenset({"emissivity", "start", "stop"})
+_OPTIONAL: Final = frozenset(
+    {"background", "case", "following", "frames", "jump", "noise", "noise_known", "offset"}
+    | {"response_kind", "swapped"}
+)
+
+
+@dataclass(frozen=True)
+class Jump:
+    """
+    A change of the object that is no smooth curve, as when a palm is laid on a bulb.
+
+    Attributes
+    ----------
+    height : float
+        Change that stays [K].
+    between : tuple of float
+        Earliest and latest beginning, drawn for each pixel [s].
+    duration : float
+        Time in which it is reached, linearly; 0 is sudden [s].
+    """
+
+    height: float = 6.0
+    between: tuple[float, float] = (10.0, 25.0)
+    duration: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that are no jump."""
+        if not self.between[0] <= self.between[1]:
+            raise ValueError(f"Invalid between {self.between} s of a jump. Must not fall.")
+        if not self.duration >= 0:
+            raise ValueError(f"Invalid duration {self.duration} s of a jump. Must not be negative.")
+
+    def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
+        """
+        Draw one realisation for each pixel.
+
+        Parameters
+        ----------
+        time : ndarray, shape (time,)
+            Times [s].
+        pixels : int
+            Number of pixels.
+        rng : Generator
+            Source of the beginnings.
+
+        Returns
+        -------
+        ndarray, shape (time, pixels)
+            What is added to the object temperature [K].
+        """
+        elapsed = time[:, np.newaxis] - rng.uniform(*self.between, pixels)
+        if self.duration == 0:
+            return np.where(elapsed >= 0, self.height, 0.0)
+        return np.asarray(self.height * np.interp(elapsed / self.duration, [0.0, 1.0], [0.0, 1.0]))
+
+
+def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
+    """
+    Errors of one separation, over the pixels that have a value.
+
+    Parameters
+    ----------
+    truth : Dataset
+        A scene of `simulation`.
+    result : Dataset
+        From `separation.solve`.
+
+    Returns
+    -------
+    Dataset
+        `object_temperature_rmse` [K]: root mean square over time, median over pixels;
+        `emissivity_error` (band) [1]: median magnitude; `object_coverage`, and
+        `emissivity_coverage` (band) [1]: share of errors within one standard deviation, 0.683 if
+        the error bars are true; `good` and `with_temperature` [1]: share of pixels with no flag,
+        and with an object temperature.
+    """
+    error = result["object_temperature"] - truth["object_temperature"]
+    of_emissivity = abs(result["emissivity"] - truth["emissivity"])
+    known, covered = error.notnull(), abs(error) < result["object_temperature_std"]
+    within = (of_emissivity < result["emissivity_std"]).where(of_emissivity.notnull())
+    pixels = ("y", "x")
+    found = {
+        "object_temperature_rmse": ((error**2).mean("time") ** 0.5).median(pixels),
+        "emissivity_error": of_emissivity.median(pixels),
+        "object_coverage": covered.where(known).mean(),
+        "emissivity_coverage": within.mean(pixels),
+        "good": (result["status"] == 0).mean(),
+        "with_temperature": known.any("time").mean(),
+    }
+    units = {"object_temperature_rmse": "K"}
+    return xr.Dataset(
+        {
+            name: value.reset_coords(drop=True).assign_attrs(units=units.get(name, "1"))
+            for name, value in found.items()
+        }
+    )
+
+
+def efficiency(
+    truth: xr.Dataset, result: xr.Dataset, noise: tuple[float, float], order: int
+) -> float:
+    """
+    Scatter of the reflection ratio over its Cramer-Rao bound.
+
+    Parameters
+    ----------
+    truth : Dataset
+        A scene of one material.
+    result : Dataset
+        From `separation.solve`.
+    noise : tuple of float
+        Standard deviation of the two bands' signals [K].
+    order : int
+        Size of the smooth subspace for the bound, see `limits.ratio_variance`.
+
+    Returns
+    -------
+    float
+        Robust standard deviation of error over bound [1]; 1 is the best possible.
+    """
+    emissivity = truth["emissivity"].values[:, 0, 0]
+    background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
+    functions = smooth.basis(truth["time"].values, order)
+    pair = (float(emissivity[0]), float(emissivity[1]))
+    bound = np.sqrt(limits.ratio_variance(pair, noise, background, functions))
+    found = limits.reflection_ratio(result["emissivity"].values.reshape(2, -1))
+    scaled = (found - limits.reflection_ratio(emissivity)) / bound
+    scaled = scaled[np.isfinite(scaled)]
+    return float(np.diff(np.quantile(scaled, [0.1587, 0.8413]))[0] / 2)
+
+
+def run_case(
+    case: Case, rig: Rig, time: np.ndarray, pixels: int, seed: int
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """
+    Simulate and separate one case.
+
+    Parameters
+    ----------
+    case : mapping
+        See `simulate`; and `noise_known` (default true) and `response_kind` (default "exact") for
+        the separation.
+    rig : Rig
+        The rig.
+    time : ndarray
+        Times [s].
+    pixels : int
+        Number of pixels.
+    seed : int
+        Of the random numbers.
+
+    Returns
+    -------
+    tuple of Dataset
+        The scene, and the result.
+
+    Raises
+    ------
+    ValueError
+        As `simulate`.
+    """
+    scene, capture, response = simulate(case, rig, time, pixels, seed)
+    if not case.get("noise_known", True):
+        response = response.drop_vars(["noise", "netd"])
+    kind = case.get("response_kind", "exact")
+    return scene, separation.solve(capture, response, response_kind=kind)
+
+
+def simulate(
+    case: Case, rig: Rig, time: np.ndarray, pixels: int, seed: int
+) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
+    r"""
+    Scene, capture and response of one case.
+
+    Parameters
+    ----------
+    case : mapping
+        `emissivity` (one a band [1]), `start` and `stop` of the object [degree Celsius]; and
+        optionally: a name `case`; `background`, arguments of `simulation.Background`; `jump` of the
+        object, arguments of `Jump`; `following` [1], the c of a background that drifts along with
+        the object's own curve, :math:`y(t) + c (x(t) - x(t_0))`; `swapped` (default false): the
+        object then moves as the background would, and the other way round; `offset` of the other
+        bands [frame], a multiple of 1 / `STEPS`: they are exposed so much later; `frames`: only
+        the first of the times; `noise` of the bands [K], in place of the rig's.
+    rig, time, pixels, seed
+        See `run_case`. With an `offset` the times must be even.
+
+    Returns
+    -------
+    tuple of Dataset
+        The scene, as it is when the first band is exposed; the capture, without stamps; the
+        response.
+
+    Raises
+    ------
+    ValueError
+        If the case has a key that is not listed here or in `run_case`, or lacks one; or a value is
+        none of those described.
+    """
+    _check_keys(case)
+    rng = np.random.default_rng(seed)
+    noise = tuple(case.get("noise", rig.noise))
+    response = replace(rig, noise=noise).response()
+    time = _first(time, int(case.get("frames", time.size)))
+    later = _steps(case.get("offset", 0.0))
+    clock = _finer(time, later) if later else time
+    scene = _draw(case, rig.bands, clock, pixels, rng)
+    if not later:
+        return scene, simulation.observe(scene, response, rng), response
+    frames, starts = time.size, [0, *[later] * (len(rig.bands) - 1)]
+    seen = clocks.expose(scene, response, rng, every=STEPS, offsets=starts, frames=frames)
+    first = scene.isel(time=slice(0, (frames - 1) * STEPS + 1, STEPS))
+    return first, seen.drop_vars("exposure_time"), response
+
+
+def _check_keys(case: Case) -> None:
+    if not case.keys() >= _NEEDED or not case.keys() <= _NEEDED | _OPTIONAL:
+        raise ValueError(
+            f"Invalid case with keys {sorted(case)}. Must have {sorted(_NEEDED)}, "
+            f"may have {sorted(_OPTIONAL)}."
+        )
+
+
+def _first(time: np.ndarray, frames: int) -> np.ndarray:
+    """The first of the times."""
+    if not 2 <= frames <= time.size:
+        raise ValueError(f"Invalid number of frames {frames}. Must lie in [2, {time.size}].")
+    return time[:frames]
+
+
+def _steps(offset: float) -> int:
+    """An offset [frame] in steps of the finer clock."""
+    steps = round(offset * STEPS)
+    if offset < 0 or abs(steps - offset * STEPS) > 1e-9:
+        raise ValueError(
+            f"Invalid offset {offset} frames. Must be zero or positive, a multiple of 1/{STEPS}."
+        )
+    return steps
+
+
+def _finer(time: np.ndarray, later: int) -> Array:
+    """Times [s] of the finer clock, on until the last frame of the band that is exposed later."""
+    step = (time[-1] - time[0]) / (time.size - 1) / STEPS
+    if not np.allclose(np.diff(time), step * STEPS, rtol=0, atol=1e-6 * step):
+        raise ValueError("Invalid times of bands that are exposed apart. Must be even.")
+    return np.asarray(time[0] + step * np.arange((time.size - 1) * STEPS + later + 1))
+
+
+def _draw(
+    case: Case, bands: tuple[str, ...], time: Array, pixels: int, rng: np.random.Generator
+) -> xr.Dataset:
+    """The scene of a case: independent pixels, with what the case changes of them."""
+    pair = np.asarray(case["emissivity"], dtype=np.float64)
+    emissivity = xr.DataArray(pair, dims="band", coords={"band": list(bands)})
+    background = Background(**case.get("background", {}))
+    ends = {name: case[name] + zero_Celsius for name in ("start", "stop")}
+    scene = simulation.independent_pixels(time, emissivity, background, pixels, rng, **ends)
+    warm, cold = scene["object_temperature"], scene["background_temperature"]
+    cold = cold + case.get("following", 0.0) * (warm - warm.isel(time=0))
+    if "jump" in case:
+        warm = warm + Jump(**case["jump"]).draw(time, pixels, rng)[:, np.newaxis]
+    roles = (cold, warm) if case.get("swapped", False) else (warm, cold)
+    return scene.assign(
+        {
+            name: values.assign_attrs(scene[name].attrs)
+            for name, values in zip(
+                ("object_temperature", "background_temperature"), roles, strict=True
+            )
+        }
+    )
+
+
+def sweep(
+    cases: Iterable[Case],
+    rig: Rig,
+    time: np.ndarray,
+    pixels: int,
+    seed: int,
+    *,
+    order: int = 5,
+) -> xr.Dataset:
+    """
+    Run and score many cases, all with the same seed.
+
+    Parameters
+    ----------
+    cases : iterable of mapping
+        See `run_case`; each with a name `case`.
+    rig, time, pixels, seed
+        See `run_case`.
+    order : int
+        See `efficiency`.
+
+    Returns
+    -------
+    Dataset
+        Variables of `score`, and `efficiency` [1], over `case`.
+    """
+    rows, names = [], []
+    for case in cases:
+        scene, result = run_case(case, rig, time, pixels, seed)
+        first, second = case.get("noise", rig.noise)
+        scatter = efficiency(scene, result, (first, second), order)
+        rows.append(score(scene, result).assign(efficiency=scatter))
+        names.append(str(case["case"]))
+    together = xr.concat(rows, dim=xr.DataArray(names, dims="case", name="case"))
+    return together.assign_attrs(origin="simulated", pixels=pixels, seed=seed)

@@ -1,0 +1,205 @@
+"""All methods on the same simulated pixels, over materials and noise: the paper's comparison."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import separation, simulation
+from dbthermal.separation import _methods as methods
+from dbthermal.simulation import Rig
+
+MOVING: Final = 0.5
+"""Standard deviation of the background from which a pixel takes part [K]."""
+
+WRONG: Final = 0.1
+"""Error of an emissivity from which it is called wrong [1]."""
+
+Options = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Plate:
+    """
+    The scene of `compare`.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames.
+    rate : float
+        Frame rate [Hz].
+    shape : sequence of int
+        Rows and columns.
+    crossings : int
+        Number of people who walk by.
+    bands : tuple of str
+        Names of the two bands.
+    """
+
+    frames: int = 350
+    rate: float = 10.0
+    shape: Sequence[int] = (36, 48)
+    crossings: int = 8
+    bands: tuple[str, str] = ("8-14", "9.5")
+
+
+def compare(
+    emissivity: Sequence[float],
+    noise: Sequence[float],
+    variants: Mapping[str, Options],
+    *,
+    plate: Options,
+    pixels: int,
+    seed: int,
+) -> xr.Dataset:
+    """
+    Errors of several methods on one simulated scene: a heated plate, people walking by.
+
+    The scene is an image, for methods that look at a pixel's neighbours. All are scored on the
+    same pixels, drawn from those in which the reflection moves by more than `MOVING`; methods that
+    treat each pixel alone are given these only. The noise is known to all.
+
+    Parameters
+    ----------
+    emissivity : sequence of float
+        Of the plate in the two bands [1].
+    noise : sequence of float
+        Standard deviation of the two bands' signals [K].
+    variants : mapping
+        Label -> `method` of `separation.solve` and its options; "calibrated" is given the true
+        emissivities, and an `oracle` the true temperature.
+    plate : mapping
+        Fields of `Plate`.
+    pixels : int
+        Number of pixels that are scored.
+    seed : int
+        Of scene, noise, pixels and random starts.
+
+    Returns
+    -------
+    Dataset
+        `object_temperature_rmse` (variant, pixel) [K], NaN where a frame has no value;
+        `emissivity_error` (variant, band, pixel) [1], a magnitude; `status` (variant, pixel).
+    """
+    rng, settings = np.random.default_rng(seed), Plate(**plate)
+    rig = Rig(bands=settings.bands, noise=tuple(noise))
+    response = rig.response()
+    value = xr.DataArray(list(emissivity), dims="band", coords={"band": list(rig.bands)})
+    time = np.arange(settings.frames) / settings.rate
+    shape = (settings.shape[0], settings.shape[1])
+    scene = simulation.walkers(time, shape, value, rng, crossings=settings.crossings)
+    capture = simulation.observe(scene, response, rng)
+    chosen = _choose(scene, pixels, rng)
+    truth = _strip(scene, chosen)
+    images, strips = (scene, capture), (truth, _strip(capture, chosen))
+    rows = []
+    for options in variants.values():
+        whole = methods.get(options["method"]).whole_image
+        given, seen = images if whole else strips
+        found = separation.solve(seen, response, seed=seed, **_known(given, options))
+        rows.append(judge(truth, _strip(found, chosen) if whole else found))
+    label = xr.DataArray(list(variants), dims="variant", name="variant")
+    together = xr.concat(rows, dim=label, coords="minimal", compat="override")
+    return together.assign_attrs(origin="simulated", seed=seed)
+
+
+def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
+    """
+    Errors of one separation, pixel by pixel.
+
+    Parameters
+    ----------
+    truth : Dataset
+        A scene of `simulation`, one row high.
+    result : Dataset
+        From `separation.solve`.
+
+    Returns
+    -------
+    Dataset
+        `object_temperature_rmse` (pixel) [K], NaN where a frame has no value; `emissivity_error`
+        (band, pixel) [1]; `status` (pixel).
+    """
+    squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
+    of_emissivity = abs(result["emissivity"] - truth["emissivity"])
+    found = {
+        "object_temperature_rmse": (squared.mean("time", skipna=False) ** 0.5).assign_attrs(
+            units="K"
+        ),
+        "emissivity_error": of_emissivity.assign_attrs(units="1"),
+        "status": result["status"],
+    }
+    flat = xr.Dataset(found).isel(y=0).rename(x="pixel")
+    return flat.drop_vars(["y", "pixel"], errors="ignore")
+
+
+def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
+    """
+    Median errors over pixels, of every variant over the pixels that the default can solve.
+
+    A pixel that a variant loses there counts as its worst, and does not flatter it.
+
+    Parameters
+    ----------
+    comparison : Dataset
+        Variables of `compare` over any further dims; over `seed` too the median is taken.
+    default : str
+        The variant that decides which pixels count.
+
+    Returns
+    -------
+    Dataset
+        `object_temperature_rmse` [K] and `emissivity_error` (band) [1]: medians, NaN where the
+        default has no pixel or the variant loses half of them; `wrong` [1]: share of these pixels
+        with an emissivity off by more than `WRONG`, or lost; `solved` [1]: share of all pixels with
+        an object temperature; `good` [1]: share of all without any flag.
+    """
+    over = [dim for dim in ("pixel", "seed") if dim in comparison.dims]
+    known = comparison["object_temperature_rmse"].notnull()
+    counted = known.sel(variant=default)
+    parts = {}
+    for name in ("object_temperature_rmse", "emissivity_error"):
+        worst = comparison[name].fillna(np.inf).where(counted)
+        median = worst.median(over)
+        parts[name] = median.where(np.isfinite(median)).assign_attrs(comparison[name].attrs)
+    off = ~(comparison["emissivity_error"].max("band", skipna=False) <= WRONG)
+    shares = {
+        "wrong": off.where(counted).mean(over),
+        "solved": known.mean(over),
+        "good": (comparison["status"] == 0).mean(over),
+    }
+    parts |= {name: part.assign_attrs(units="1") for name, part in shares.items()}
+    return xr.Dataset(parts, attrs=comparison.attrs)
+
+
+def _choose(scene: xr.Dataset, pixels: int, rng: np.random.Generator) -> np.ndarray:
+    """Flat indices of pixels in which the background moves, drawn without replacement."""
+    moving = scene["background_temperature"].std("time").values.ravel() > MOVING
+    there = np.flatnonzero(moving)
+    if there.size < pixels:
+        raise ValueError(
+            f"Invalid number of pixels {pixels}. Must be at most {there.size}, those in which the "
+            f"background moves by {MOVING} K."
+        )
+    return np.sort(rng.choice(there, pixels, replace=False))
+
+
+def _strip(dataset: xr.Dataset, chosen: np.ndarray) -> xr.Dataset:
+    """Some pixels of an image, as an image one row high."""
+    rows, columns = np.divmod(chosen, dataset.sizes["x"])
+    listed = dataset.isel(y=xr.DataArray(rows, dims="pixel"), x=xr.DataArray(columns, dims="pixel"))
+    row = listed.drop_vars(["y", "x"]).rename(pixel="x").expand_dims(y=[0])
+    return row.transpose(..., "y", "x").assign_coords(x=np.arange(chosen.size))
+
+
+def _known(scene: xr.Dataset, options: Options) -> dict[str, Any]:
+    """Arguments of `solve`: the options, with the truth for those who may know it."""
+    given = dict(options)
+    if methods.get(options["method"]).knows_emissivity:
+        given["emissivity"] = scene["emissivity"]
+    if options.get("oracle"):
+        given["truth"] = scene["object_temperature"]
+    return given

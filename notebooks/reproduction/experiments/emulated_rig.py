@@ -1,0 +1,273 @@
+"""What the cameras of the emulated rig see, from the simulation and with its truth.
+
+The emulators of `dbthermal.instruments.emulated` know positions and protocols, and the simulation
+knows what a scene looks like; here they meet. The pictures of `Views` are mixed, and given noise,
+fixed pattern and 16 bits, frame by frame when a camera takes them, from the temperatures that the
+world has at that moment. Everything here is simulated.
+"""
+
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import mixing, store
+from dbthermal import response as responses
+from dbthermal.curves import Curve
+from dbthermal.instruments.emulated.world import World
+from dbthermal.simulation._rig import Rig, digitise
+
+Array = npt.NDArray[np.float64]
+Counts = npt.NDArray[np.uint16]
+Picture = Callable[[float], Counts]
+Look = Callable[[float], Array]
+Places = Mapping[str, tuple[slice, slice]]
+
+_TRUTH: Final = "truth_"
+
+
+@dataclass(frozen=True)
+class Views:
+    """
+    What the cameras of a simulated rig see.
+
+    Attributes
+    ----------
+    rig : Rig
+        The rig.
+    detector : Dataset
+        From `simulation.pattern`.
+    seed : int
+        Of the noise.
+    response : Dataset
+        The rig's.
+    """
+
+    rig: Rig
+    detector: xr.Dataset
+    seed: int
+    response: xr.Dataset = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Work out the rig's response, once."""
+        object.__setattr__(self, "response", self.rig.response())
+
+    def blackbody(self, world: World) -> dict[str, Picture]:
+        """
+        Pictures of the world's blackbody, which fills the view.
+
+        Parameters
+        ----------
+        world : World
+            Its `blackbody_temperature` must lie within the rig's range.
+
+        Returns
+        -------
+        dict
+            Band to picture.
+        """
+        curves = self._curves().items()
+        return self._pictures({band: _bench(world, it, {}, {}, self._shape) for band, it in curves})
+
+    def samples(self, world: World, emissivity: xr.DataArray, places: Places) -> dict[str, Picture]:
+        """
+        Pictures of samples that reflect the world's blackbody, as on the emissivity bench.
+
+        Parameters
+        ----------
+        world : World
+            Its scene has a temperature for each material.
+        emissivity : DataArray
+            (material, band) [1].
+        places : mapping
+            Material to its rows and columns; elsewhere is the blackbody itself.
+
+        Returns
+        -------
+        dict
+            Band to picture.
+        """
+        looks = {}
+        for band, curve in self._curves().items():
+            own = {name: float(emissivity.sel(material=name, band=band)) for name in places}
+            looks[band] = _bench(world, curve, own, places, self._shape)
+        return self._pictures(looks)
+
+    def movie(self, scene: xr.Dataset) -> dict[str, Picture]:
+        """
+        Pictures of a scene, on the line between its frames.
+
+        Parameters
+        ----------
+        scene : Dataset
+            From the simulation: evenly sampled from time 0 on.
+
+        Returns
+        -------
+        dict
+            Band to picture, for each band of the scene.
+        """
+        curves = self._curves()
+        names = [str(name) for name in scene["band"].values]
+        return self._pictures({name: _shown(scene, curves[name], name) for name in names})
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.detector.sizes["y"], self.detector.sizes["x"]
+
+    def _curves(self) -> dict[str, Curve]:
+        return {band: responses.curve(self.response, band) for band in self.rig.bands}
+
+    def _pictures(self, looks: Mapping[str, Look]) -> dict[str, Picture]:
+        return {band: self._picture(band, look) for band, look in looks.items()}
+
+    def _picture(self, band: str, look: Look) -> Picture:
+        """What is looked at, with noise, fixed pattern and 16 bits."""
+        rng = np.random.default_rng([self.seed, self.rig.bands.index(band)])
+        noise = float(self.response["noise"].sel(band=band))
+        detector = self.detector.sel(band=band)
+
+        def picture(time: float) -> Counts:
+            clean = look(time)
+            return digitise(clean + rng.normal(0.0, noise, clean.shape), detector)
+
+        return picture
+
+
+def _bench(
+    world: World,
+    curve: Curve,
+    emissivity: Mapping[str, float],
+    places: Places,
+    shape: tuple[int, int],
+) -> Look:
+    """Counts of samples before a blackbody, at the temperatures that the world has now."""
+
+    def look(_: float) -> Array:
+        here = world.scene_temperatures()
+        blackbody = curve.counts(np.array(here["blackbody"]))
+        counts = np.full(shape, float(blackbody))
+        for name, place in places.items():
+            emitted = curve.counts(np.array(here[name]))
+            counts[place] = mixing.leaving(emissivity[name], emitted, blackbody)
+        return counts
+
+    return look
+
+
+def _shown(scene: xr.Dataset, curve: Curve, band: str) -> Look:
+    """Counts of a movie at a time, on the line between the frames before and after."""
+    emitted = curve.counts(scene["object_temperature"].values)
+    reflected = curve.counts(scene["background_temperature"].values)
+    emissivity = scene["emissivity"].sel(band=band).values
+    movie = mixing.leaving(emissivity, emitted, reflected).astype(np.float32)
+    rate = 1.0 / float(scene["time"][1] - scene["time"][0])
+
+    def look(time: float) -> Array:
+        place = time * rate
+        number = int(place)
+        if not 0 <= place <= len(movie) - 1:
+            raise ValueError(
+                f"Invalid time {time} s of a scene. Must lie in [0, {(len(movie) - 1) / rate}] s."
+            )
+        after = movie[min(number + 1, len(movie) - 1)]
+        return np.asarray(movie[number] + (place - number) * (after - movie[number]))
+
+    return look
+
+
+def shown(scene: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
+    """
+    Truth of a scene at the times of a capture.
+
+    Parameters
+    ----------
+    scene : Dataset
+        As for `Views.movie`, with attribute ``began``, when time 0 was on the host's clock [s].
+    capture : Dataset
+        From `dbthermal.instruments.recording.capture.open_capture`, or made of it.
+
+    Returns
+    -------
+    Dataset
+        The scene on the line between its frames, at the capture's times and with its coordinates.
+
+    Raises
+    ------
+    ValueError
+        If the capture begins before the scene, or goes on after it.
+    """
+    times = capture["time"] + (capture.attrs["clock_origin"] - scene.attrs["began"])
+    found = scene.interp(time=times.values, assume_sorted=True).assign_coords(time=capture["time"])
+    if bool(found["object_temperature"].isnull().any()):
+        raise ValueError(
+            f"Invalid times {float(times[0])} to {float(times[-1])} s of the scene. "
+            f"Must lie in {float(scene['time'][0])} to {float(scene['time'][-1])} s."
+        )
+    return found
+
+
+def keep_truth(folder: Path, record: Mapping[str, Any], **truth: xr.Dataset) -> None:
+    """
+    Keep beside recordings what was simulated.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the recordings.
+    record : mapping
+        Provenance.
+    **truth : Dataset
+        By name.
+    """
+    for name, dataset in truth.items():
+        store.save(dataset, folder / f"{_TRUTH}{name}.zarr", record)
+
+
+def truth(folder: Path) -> dict[str, xr.Dataset]:
+    """
+    Open what was simulated, if it was.
+
+    Parameters
+    ----------
+    folder : Path
+        Of recordings.
+
+    Returns
+    -------
+    dict
+        As given to `keep_truth`; empty for recordings of hardware.
+    """
+    found = sorted(folder.glob(f"{_TRUTH}*.zarr"))
+    return {path.stem.removeprefix(_TRUTH): store.open_dataset(path).load() for path in found}
+
+
+def clear(folder: Path) -> None:
+    """
+    Remove emulated recordings with their truth, so that they can be made anew.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the recordings; it need not exist.
+
+    Raises
+    ------
+    FileExistsError
+        If there is anything in it that was not simulated: then nothing is removed.
+    """
+    for path in sorted(folder.glob("*")):
+        if path.suffix != ".zarr" or not _simulated(path):
+            raise FileExistsError(f"Invalid folder '{folder}' with '{path.name}', not emulated.")
+    if folder.exists():
+        shutil.rmtree(folder)
+
+
+def _simulated(path: Path) -> bool:
+    attrs = store.open_dataset(path).attrs
+    return bool(attrs.get("is_simulated", path.name.startswith(_TRUTH)))

@@ -1,0 +1,330 @@
+"""How near to the statistical limit the separation comes: noise, bands, and pixels that agree."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import distance_transform_edt
+
+from dbthermal import alignment, limits, separation
+from dbthermal.simulation import Rig
+from reproduction.experiments import cases, stress
+
+KNOWING: Final = ("nothing", "slope", "rest")
+"""What a bound is told of the background: nothing; the slope of the response there, as if it were
+a line (reflection ratio only); or, with the exact response, in which frames it rests."""
+
+BEFOREHAND: Final = 0.29
+"""Standard deviation of an emissivity of which nothing is known, uniform in (0, 1) [1]."""
+
+BORDER: Final = 2.0
+"""Distance from a border of two materials within which no label is judged [pixel]."""
+
+_BOUNDED: Final = {
+    "reflection_ratio": "reflection_ratio_std",
+    "object_temperature": "object_temperature_std",
+}
+_UNITS: Final = {"object_temperature": "K"}
+
+
+def near_bound(
+    emissivity: Sequence[float],
+    noise: Sequence[float],
+    *,
+    bands: Sequence[str],
+    ends: Sequence[float],
+    clock: Sequence[float],
+    pixels: int,
+    seed: int,
+) -> xr.Dataset:
+    r"""
+    Errors of the separation of independent pixels of one material, beside their bounds.
+
+    Noise and smooth subspace are unknown to the method and known to the bounds. Of those there are
+    three (`KNOWING`), for a bound depends on what is known of the background:
+
+    - "nothing": `limits.bounds` with one free number a frame and emissivities anywhere in (0, 1).
+      At low noise it is loose, for the data tell the emissivities, and with them the level of
+      the background and the ratio of the bands' slopes there, which this bound does not know;
+    - "slope": the closed form `limits.ratio_variance`, one free number a frame, but the slopes are
+      known: of the three the one that fits the reflection ratio. It says nothing of the object;
+    - "rest": `limits.bounds` told in which frames the background rests, which the method is not.
+
+    Parameters
+    ----------
+    emissivity : sequence of float
+        Of the bands [1].
+    noise : sequence of float
+        Standard deviation of the bands' signals [K].
+    bands : sequence of str
+        Their names; the first is the reference of the ratio and must be the quietest.
+    ends : sequence of float
+        First and last temperature of the object [degree Celsius].
+    clock : sequence of float
+        Number of frames, and their rate [Hz].
+    pixels, seed : int
+        Number of pixels; of the random numbers.
+
+    Returns
+    -------
+    Dataset
+        `reflection_ratio_error` (pixel) [1], signed, of the second band, and
+        `reflection_ratio_bound` (knowing, pixel); `object_temperature_error` (pixel) [K], root mean
+        square over time, and `object_temperature_bound` (knowing, pixel), NaN for "slope"; NaN
+        in pixels without an object temperature. `status` (pixel).
+
+    Raises
+    ------
+    ValueError
+        As `cases.simulate` and `limits.bounds`.
+    """
+    rig = Rig(bands=tuple(bands), noise=tuple(noise))
+    case = {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1], "noise_known": False}
+    truth, result = cases.run_case(case, rig, _times(clock), pixels, seed)
+    known = result["object_temperature"].notnull().all("time")
+    response = rig.response()
+    free = limits.bounds(truth, response, resting=False, emissivity_std=BEFOREHAND)
+    slope = limits.bounds(
+        truth, _as_line(response, rig), resting=False, response_kind="linear"
+    ).assign(object_temperature_std=np.nan * free["object_temperature_std"])
+    told = xr.concat(
+        [part[list(_BOUNDED.values())] for part in (free, slope, limits.bounds(truth, response))],
+        xr.DataArray(list(KNOWING), dims="knowing", name="knowing"),
+    )
+    second = (1.0 - truth["emissivity"]) / (1.0 - truth["emissivity"].isel(band=0))
+    squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
+    found = {
+        "reflection_ratio_error": (result["reflection_ratio"] - second).isel(band=1),
+        "reflection_ratio_bound": told["reflection_ratio_std"].isel(band=1),
+        "object_temperature_error": squared.mean("time", skipna=False) ** 0.5,
+        "object_temperature_bound": (told["object_temperature_std"] ** 2).mean("time") ** 0.5,
+    }
+    flat = {name: _row(part.where(known), name) for name, part in found.items()}
+    return xr.Dataset(flat | {"status": _row(result["status"], "status")}).assign_attrs(
+        origin="simulated", seed=seed
+    )
+
+
+def summary(measured: xr.Dataset) -> xr.Dataset:
+    r"""
+    Errors in units of their bounds, over the pixels that have a value.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Variables of `near_bound` over any further dims.
+
+    Returns
+    -------
+    Dataset
+        `reflection_ratio_error` [1] and `object_temperature_error` [K], root mean square over the
+        pixels, and `reflection_ratio_bound`, `object_temperature_bound` (knowing), of the same
+        pixels; `scatter` (knowing) [1], standard deviation over the pixels of each one's error of
+        the ratio over its own bound; `excess` (knowing) [1], the object's error over its bound;
+        `solved` and `flagged` [1], shares of the pixels with a temperature, and with a flag.
+    """
+    parts = {
+        name: _rms(measured[name])
+        for name in (f"{what}_{which}" for what in _BOUNDED for which in ("error", "bound"))
+    }
+    shares = {
+        "scatter": (measured["reflection_ratio_error"] / measured["reflection_ratio_bound"]).std(
+            "pixel"
+        ),
+        "excess": parts["object_temperature_error"] / parts["object_temperature_bound"],
+        "solved": measured["object_temperature_error"].notnull().mean("pixel"),
+        "flagged": (measured["status"] != 0).mean("pixel"),
+    }
+    shares = {name: part.assign_attrs(units="1") for name, part in shares.items()}
+    return xr.Dataset(parts | shares, attrs=measured.attrs)
+
+
+def pooled(
+    size: int,
+    emissivity: Sequence[float],
+    *,
+    ends: Sequence[float],
+    clock: Sequence[float],
+    pixels: int,
+    seed: int,
+) -> xr.Dataset:
+    r"""
+    Error of the reflection ratio where so many pixels are known to be of one material.
+
+    All pixels are of one material, in groups that share their ratio and know nothing of the
+    others. The error of a group should fall as :math:`1/\sqrt{n}` until a bias that all pixels
+    have in common is left.
+
+    Parameters
+    ----------
+    size : int
+        Pixels in a group; 1 is no pooling.
+    emissivity, ends, clock, pixels, seed
+        See `near_bound`; the bands are those of the default `Rig`. The scene depends on neither
+        `size` nor what is found.
+
+    Returns
+    -------
+    Dataset
+        `reflection_ratio_error` [1], of the median of a group's pixels, root mean square over the
+        groups, and `reflection_ratio_bound`, a single pixel's ("slope") over :math:`\sqrt{n}`;
+        `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
+        separation's own standard deviation of the ratio, root mean square; `flagged` [1].
+
+    Raises
+    ------
+    ValueError
+        If the pixels do not come in whole groups.
+    """
+    if size < 1 or pixels % size:
+        raise ValueError(f"Invalid size {size} of a group. Must divide the {pixels} pixels.")
+    rig, case = Rig(), {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1]}
+    truth, capture, response = cases.simulate(case, rig, _times(clock), pixels, seed)
+    labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
+    result = separation.solve(capture, response, pool=None if size == 1 else labels)
+    linear = _as_line(response, rig)
+    bound = limits.bounds(truth, linear, resting=False, response_kind="linear")
+    of_groups = {
+        "reflection_ratio_error": result["reflection_ratio"]
+        - limits.reflection_ratio(list(emissivity)).item(),
+        "stated": result["reflection_ratio_std"],
+    }
+    # The median, for a pixel that the separation leaves out of its group keeps a ratio of its own.
+    found = {
+        name: _rms(_row(part.isel(band=1).coarsen(x=size).median(), "reflection_ratio"))
+        for name, part in of_groups.items()
+    }
+    single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
+    error = result["object_temperature"] - truth["object_temperature"]
+    found["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
+    found["object_temperature_error"] = _rms(error.stack(pixel=error.dims)).assign_attrs(units="K")
+    found["flagged"] = (result["status"] != 0).mean().assign_attrs(units="1")
+    return xr.Dataset(found).drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
+
+
+def stressed(
+    case: Mapping[str, Any],
+    *,
+    clock: Sequence[float],
+    pixels: int,
+    seed: int,
+    aligned: bool = False,
+) -> xr.Dataset:
+    """
+    Run and judge one case.
+
+    Parameters
+    ----------
+    case : mapping
+        See `cases.simulate`.
+    clock, pixels, seed
+        See `near_bound`.
+    aligned : bool
+        Bring the bands onto one clock first, by `alignment.align`.
+
+    Returns
+    -------
+    Dataset
+        See `stress.judge`; `frames_lost` [1], those that the alignment leaves empty in a band.
+    """
+    rig, time = Rig(), _times(clock)
+    if not aligned:
+        judged = stress.judge(*cases.run_case(case, rig, time, pixels, seed))
+        return judged.assign(frames_lost=((), 0, {"units": "1"}))
+    truth, capture, response = cases.simulate(case, rig, time, pixels, seed)
+    together = alignment.align(capture)
+    result = separation.solve(together, response)
+    judged = stress.judge(on_clock(truth, result["time"]), result)
+    lost = max(together.attrs["frames_lost"])
+    return judged.assign(frames_lost=((), lost, {"units": "1"}))
+
+
+def on_clock(truth: xr.Dataset, time: xr.DataArray) -> xr.Dataset:
+    """
+    Truth at other times, on the line between its own.
+
+    Parameters
+    ----------
+    truth : Dataset
+        A scene whose object is smooth.
+    time : DataArray
+        Times [s].
+
+    Returns
+    -------
+    Dataset
+        The scene; NaN past its ends, which are then not judged.
+    """
+    return truth.interp(time=time).assign_attrs(truth.attrs)
+
+
+def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
+    """
+    Hold labels of materials against the true ones.
+
+    Parameters
+    ----------
+    labels : DataArray
+        (y, x), from `separation.materials`; -1 is no material.
+    truth : DataArray
+        (y, x) of whole numbers, which panel a pixel is of.
+
+    Returns
+    -------
+    Dataset
+        `right` [1], share of the pixels farther than `BORDER` from a border that carry the label
+        most frequent in their panel; `bleeding` [1], number of labels that are on both sides of a
+        border, that far from it; `distance` (y, x) [pixel], from the nearest pixel of another
+        panel.
+
+    Raises
+    ------
+    ValueError
+        If the images differ in size, or there is one panel only.
+    """
+    found, panels = labels.values, np.unique(truth.values)
+    if found.shape != truth.shape or panels.size < 2:
+        raise ValueError(
+            f"Invalid images of {found.shape} and {truth.shape} pixels, {panels.size} panels. "
+            "Must be alike, of two panels or more."
+        )
+    distance = np.zeros(found.shape)
+    for panel in panels:
+        distance += distance_transform_edt(truth.values == panel)
+    inner = [found[(truth.values == panel) & (distance > BORDER)] for panel in panels]
+    right = sum(int(np.bincount(part[part >= 0], minlength=1).max()) for part in inner)
+    sides = [set(np.unique(part[part >= 0])) for part in inner]
+    bleeding = sum(sum(label in side for side in sides) > 1 for label in set().union(*sides))
+    units = {"units": "1"}
+    return xr.Dataset(
+        {
+            "right": ((), right / sum(part.size for part in inner), units),
+            "bleeding": ((), bleeding, units),
+            "distance": (("y", "x"), distance, {"units": "pixel"}),
+        }
+    )
+
+
+def _times(clock: Sequence[float]) -> npt.NDArray[np.float64]:
+    """Times of a clock of so many frames, and so many a second [s]."""
+    return np.arange(int(clock[0])) / clock[1]
+
+
+def _as_line(response: xr.Dataset, rig: Rig) -> xr.Dataset:
+    """The response with the noise [count] that is the rig's [K] by the linear slopes."""
+    slopes = response["linear_slope"].sel(band=list(rig.bands))
+    linear = (slopes * list(rig.noise)).assign_attrs(response["noise"].attrs)
+    return response.assign(noise=linear)
+
+
+def _row(image: xr.DataArray, name: str) -> xr.DataArray:
+    """Pixels of an image one row high, as a dimension of their own."""
+    row = image.isel(y=0).rename(x="pixel").drop_vars(["y", "pixel", "band"], errors="ignore")
+    return row.assign_attrs(units=_UNITS.get(name.rsplit("_", 1)[0], "1"))
+
+
+def _rms(part: xr.DataArray) -> xr.DataArray:
+    """Root mean square over the pixels that have a value."""
+    return ((part**2).mean("pixel") ** 0.5).assign_attrs(part.attrs)

@@ -1,0 +1,335 @@
+"""What the nuisances of a real rig cost, and what is left of it when they are undone."""
+
+import importlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import alignment, separation, simulation
+from dbthermal import correction as frames
+from dbthermal.simulation import Background, Rig
+from dbthermal.simulation import _clocks as clocks
+from reproduction.experiments.cases import STEPS
+from reproduction.experiments.limits import on_clock
+from reproduction.experiments.stress import INTERVAL
+
+TREATMENTS: Final = ("as recorded", "undone", "without")
+"""A capture with the nuisance as it is; with the nuisance undone; and one that never had it."""
+
+VIEWS: Final = ("registered", "shift known", "one view")
+"""Two views registered from the capture; by their true shift; and both bands from one place."""
+
+NUISANCES: Final = ("lost frames", "shutter", "lost frames and shutter")
+"""What `disturbed` puts into a capture."""
+
+GLASS: Final = (0.86, 0.72)
+"""Emissivities of plate glass in the two bands of the default `Rig` [1]."""
+
+COLUMNS: Final = 4
+"""Columns of the scene in a pixel of `parallax`, over which its sides see the mean."""
+
+# Pixels around the scene of `parallax`.
+_MARGIN: Final = 12
+_KELVIN: Final = MappingProxyType({"units": "K"})
+_SHARE: Final = MappingProxyType({"units": "1"})
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """
+    Independent pixels of one material before a moving background.
+
+    Attributes
+    ----------
+    emissivity : sequence of float
+        Of the two bands of the default `Rig` [1].
+    ends : sequence of float
+        First and last temperature of the object [K].
+    clock : sequence of float
+        Number of frames, and their rate [Hz].
+    pixels : int
+        Number of pixels.
+    background : mapping
+        Fields of `simulation.Background`.
+    """
+
+    emissivity: Sequence[float] = GLASS
+    ends: Sequence[float] = (293.15, 318.15)
+    clock: Sequence[float] = (350, 10.0)
+    pixels: int = 400
+    background: Mapping[str, Any] = field(default_factory=dict)
+
+    def scene(self, rng: np.random.Generator, *, later: int = 0, steps: int = 1) -> xr.Dataset:
+        """
+        Draw a scene.
+
+        Parameters
+        ----------
+        rng : Generator
+            Source of the heating and of the background.
+        later : int
+            Steps that the scene goes on beyond the last frame.
+        steps : int
+            Steps in a frame.
+
+        Returns
+        -------
+        Dataset
+            See `simulation.independent_pixels`.
+        """
+        count, rate = int(self.clock[0]), self.clock[1]
+        time = np.arange((count - 1) * steps + 1 + later) / (rate * steps)
+        value = xr.DataArray(list(self.emissivity), dims="band", coords={"band": list(Rig().bands)})
+        background = Background(**self.background)
+        start, stop = self.ends
+        return simulation.independent_pixels(
+            time, value, background, self.pixels, rng, start=start, stop=stop
+        )
+
+
+def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
+    """
+    Record two bands a delay apart, find the delay and undo it.
+
+    Parameters
+    ----------
+    delay : float
+        How much later the second band is exposed [frame], zero or positive; rounded to
+        1 / `cases.STEPS`.
+    pixels : mapping
+        Fields of `Pixels`.
+    seed : int
+        Of scene and noise.
+
+    Returns
+    -------
+    Dataset
+        `found` [frame], the offset that `alignment.time_offset` finds; and over `treatment`
+        the variables of `cost`. "without" is a capture of both bands at the later time.
+
+    Raises
+    ------
+    ValueError
+        If the delay is negative, or as `alignment.time_offset`.
+    """
+    if delay < 0:
+        raise ValueError(f"Invalid delay {delay} frames. Must be zero or positive.")
+    kind, later = Pixels(**pixels), round(delay * STEPS)
+    rng, response = np.random.default_rng(seed), Rig().response()
+    scene = kind.scene(rng, later=later, steps=STEPS)
+    captures = [
+        clocks.expose(
+            scene,
+            response,
+            np.random.default_rng(seed + 1),
+            every=STEPS,
+            offsets=offsets,
+            frames=int(kind.clock[0]),
+        ).drop_vars("exposure_time")
+        for offsets in ((0, later), (later, later))
+    ]
+    found = alignment.time_offset(captures[0])
+    aligned = alignment.align(captures[0], offset=found)
+    result = _compare(scene, (captures[0], aligned, captures[1]), response, TREATMENTS)
+    frame = {"units": "frame", "long_name": "time offset of the second band"}
+    return result.assign(found=((), found * kind.clock[1], frame))
+
+
+def disturbed(
+    name: str, *, pixels: Mapping[str, Any], nuisance: Mapping[str, Any], seed: int
+) -> xr.Dataset:
+    """
+    Put a nuisance into a capture, and mark it.
+
+    Parameters
+    ----------
+    name : {"lost frames", "shutter", "lost frames and shutter"}
+        The nuisance: a share of each band's frames lost, its driver handing out the last one
+        again; or both cameras' shutters closing.
+    pixels : mapping
+        Fields of `Pixels`.
+    nuisance : mapping
+        `share` of the frames lost [1]; `shutter`, when the shutters close, as shares of the capture
+        [1].
+    seed : int
+        Of scene, noise and nuisance.
+
+    Returns
+    -------
+    Dataset
+        Over `treatment`, the variables of `cost`. "undone" has been through
+        `frames.mark_shutter`.
+
+    Raises
+    ------
+    ValueError
+        If the nuisance is unknown.
+    """
+    if name not in NUISANCES:
+        raise ValueError(f"Unknown nuisance '{name}'. Must be one of {NUISANCES}.")
+    kind, rng = Pixels(**pixels), np.random.default_rng(seed)
+    scene, response = kind.scene(rng), Rig().response()
+    capture = simulation.observe(scene, response, rng)
+    spoiled = capture
+    if "lost frames" in name:
+        spoiled = simulation.lose_frames(spoiled, nuisance["share"], rng).drop_vars("repeated")
+    if "shutter" in name:
+        last = float(capture["time"][-1])
+        spoiled = simulation.fire_shutter(spoiled, last * np.array(nuisance["shutter"]), rng)
+    return _compare(scene, (spoiled, frames.mark_shutter(spoiled), capture), response, TREATMENTS)
+
+
+def parallax(
+    distance: float,
+    *,
+    shape: Sequence[int],
+    clock: Sequence[float],
+    shift: Sequence[float],
+    seed: int,
+) -> xr.Dataset:
+    """
+    Two cameras side by side: the object is registered, what it reflects is not.
+
+    A plate of glass, heated in its middle, people walking by; a second camera sees the plate
+    shifted, and what it mirrors shifted by some pixels more. A registration (translation) brings
+    the plate together and leaves the reflection apart.
+
+    Parameters
+    ----------
+    distance : float
+        How far apart the reflection is in the registered views, along x [pixel]; a multiple of
+        1 / `COLUMNS`.
+    shape : sequence of int
+        Rows and columns.
+    clock : sequence of float
+        Number of frames, and their rate [Hz].
+    shift : sequence of float
+        How far the second camera looks to the right, a multiple of 1 / `COLUMNS`, and down, a
+        whole number [pixel].
+    seed : int
+        Of scene and noise.
+
+    Returns
+    -------
+    Dataset
+        `misregistered` [pixel], distance of the transform that `registration.register` finds from
+        the true one; and over `treatment`, one of `VIEWS`, the variables of `cost`.
+
+    Raises
+    ------
+    ImportError
+        If OpenCV is not installed.
+    ValueError
+        If a shift or the parallax is no such multiple, or they are beyond the margin of the
+        scene, 12 pixels together.
+    """
+    places = np.array([COLUMNS * shift[0], COLUMNS * distance, shift[1]])
+    if np.any(places % 1) or max(abs(shift[0]) + abs(distance), abs(shift[1])) > _MARGIN:
+        raise ValueError(
+            f"Invalid shift {list(shift)} and parallax {distance} pixels. Must be multiples of "
+            f"1/{COLUMNS} along x and of 1 along y, within {_MARGIN} together."
+        )
+    registration = importlib.import_module("dbthermal.alignment._registration")
+    wide, known = _plate(shape, clock, np.random.default_rng(seed)), Rig().response()
+    capture, single = (
+        _two_views(wide, moved, more, known, np.random.default_rng(seed + 1))
+        for moved, more in ((shift, distance), ((0.0, 0.0), 0.0))
+    )
+    found = registration.register(capture, model="translation")
+    true = found.copy(data=np.stack([np.eye(3), np.eye(3)]))
+    true[1, :2, 2] = -np.array(shift)
+    captures = [alignment.align(capture, offset=0.0, transform=matrix) for matrix in (found, true)]
+    # Bilinear interpolation lowers the noise of a view: it is taken from the capture.
+    response = known.drop_vars(["noise", "netd"])
+    result = _compare(_view(wide, (0.0, 0.0)), (*captures, single), response, VIEWS)
+    away = float(np.hypot(*(found - true).values[1, :2, 2]))
+    return result.assign(misregistered=((), away, {"units": "pixel"}))
+
+
+def cost(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
+    """
+    What a separation is worth.
+
+    Parameters
+    ----------
+    truth : Dataset
+        A scene, on the clock of the result.
+    result : Dataset
+        From `separation.solve`.
+
+    Returns
+    -------
+    Dataset
+        `object_temperature_rmse` [K], root mean square over time, median over the pixels with a
+        value; of them `flagged` [1], the share with any flag, and `covered` [1], share of the
+        samples of those without whose 95 % interval holds the truth, NaN if there is none.
+    """
+    error = result["object_temperature"] - truth["object_temperature"]
+    solved, good = error.notnull().any("time"), result["status"] == 0
+    inside = abs(error) < INTERVAL * result["object_temperature_std"]
+    return xr.Dataset(
+        {
+            "object_temperature_rmse": _with(((error**2).mean("time") ** 0.5).median(), _KELVIN),
+            "flagged": _with((~good).where(solved).mean(), _SHARE),
+            "covered": _with(inside.where(error.notnull() & good).mean(), _SHARE),
+        }
+    )
+
+
+def _with(value: xr.DataArray, attrs: Mapping[str, str]) -> xr.DataArray:
+    """A number with nothing but its unit."""
+    return value.reset_coords(drop=True).drop_attrs().assign_attrs(attrs)
+
+
+def _compare(
+    scene: xr.Dataset,
+    captures: Iterable[xr.Dataset],
+    response: xr.Dataset,
+    names: tuple[str, ...],
+) -> xr.Dataset:
+    """Cost of the separation of each capture of a scene."""
+    results = [separation.solve(capture, response) for capture in captures]
+    rows = [cost(on_clock(scene, result["time"]), result) for result in results]
+    label = xr.DataArray(list(names), dims="treatment", name="treatment")
+    return xr.concat(rows, label).assign_attrs(origin="simulated")
+
+
+def _plate(shape: Sequence[int], clock: Sequence[float], rng: np.random.Generator) -> xr.Dataset:
+    """People walking by a plate of glass: a margin around the view, and several columns a pixel."""
+    value = xr.DataArray(list(GLASS), dims="band", coords={"band": list(Rig().bands)})
+    time = np.arange(int(clock[0])) / clock[1]
+    height, width = (size + 2 * _MARGIN for size in shape)
+    return simulation.walkers(time, (height, width * COLUMNS), value, rng)
+
+
+def _view(wide: xr.Dataset, shift: Sequence[float]) -> xr.Dataset:
+    """Part of a wide scene within its margin, so far to the right and down [pixel]."""
+    right, down = (
+        round((_MARGIN + moved) * n) for moved, n in zip(shift, (COLUMNS, 1), strict=True)
+    )
+    width, height = (wide.sizes["x"] - 2 * _MARGIN * COLUMNS), wide.sizes["y"] - 2 * _MARGIN
+    seen = wide.isel(x=slice(right, right + width), y=slice(down, down + height))
+    mean = seen.coarsen(x=COLUMNS).mean()
+    places = {dim: np.arange(mean.sizes[dim]) for dim in ("x", "y")}
+    return mean.assign_coords(places).assign_attrs(wide.attrs)
+
+
+def _two_views(
+    wide: xr.Dataset,
+    shift: Sequence[float],
+    parallax: float,
+    response: xr.Dataset,
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """Capture of a scene in the first band, and of a shifted one in the second."""
+    other = _view(wide, shift)
+    moved = _view(wide, (shift[0] + parallax, shift[1]))["background_temperature"]
+    views = (_view(wide, (0.0, 0.0)), other.assign(background_temperature=moved))
+    parts = [
+        simulation.observe(view, response.isel(band=[band]), rng) for band, view in enumerate(views)
+    ]
+    return xr.concat(parts, "band", combine_attrs="override")

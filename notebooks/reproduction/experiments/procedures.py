@@ -1,0 +1,169 @@
+"""Two procedures for an emissivity side by side: the paper's bench, and the reflector method."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import calibration
+from dbthermal.simulation._bench import Bench, bench_series, reflector_series
+from dbthermal.simulation._samples import OBJECTS, Sample, band_emissivity
+
+PROCEDURES: Final = ("bench", "bench, plain fit", "reflector")
+"""Procedures that `compare_procedures` compares: the paper's bench with the common errors in the
+fit, and without as the paper's equation has it; and the reflector method, which is told the
+thermocouple's. ("Method" is a word of xarray's own.)"""
+
+
+def compare_procedures(
+    response: xr.Dataset,
+    rng: np.random.Generator,
+    *,
+    bench: Bench | None = None,
+    samples: tuple[Sample, ...] = OBJECTS,
+    repeats: int = 100,
+) -> xr.Dataset:
+    """
+    Measure objects on the bench and by the reflector method, many times over.
+
+    Parameters
+    ----------
+    response : Dataset
+        With `noise`.
+    rng : Generator
+        Source of the errors; a series' common errors are drawn anew each time.
+    bench : Bench, optional
+        Steps and errors; the defaults of `Bench` if not given.
+    samples : tuple of Sample
+        The objects.
+    repeats : int
+        Series of each.
+
+    Returns
+    -------
+    Dataset
+        `true` (object, band); over (object, procedure, band): `mean` of the estimates, their
+        standard deviation `spread`, their root mean square `error` and `largest` error, root mean
+        square `stated` of the stated standard deviations, and `coverage`, the share of errors
+        within one, 0.68 if the error bars are true [1].
+
+    Raises
+    ------
+    ValueError
+        If there is no sample, or fewer than two repeats.
+    """
+    true, here = _true(response, samples, repeats), Bench() if bench is None else bench
+    found = np.array(
+        [[_measured(response, sample, here, rng) for _ in range(repeats)] for sample in samples]
+    )  # (object, repeat, value or deviation, procedure, band)
+    value, std = found[:, :, 0], found[:, :, 1]
+    error = value - true.values[:, np.newaxis, np.newaxis]
+    statistics = {
+        "mean": value.mean(axis=1),
+        "spread": value.std(axis=1, ddof=1),
+        "error": np.sqrt(np.mean(error**2, axis=1)),
+        "largest": np.abs(error).max(axis=1),
+        "stated": np.sqrt(np.mean(std**2, axis=1)),
+        "coverage": np.mean(np.abs(error) < std, axis=1),
+    }
+    unit = {"units": "1"}
+    return xr.Dataset(
+        {
+            "true": true,
+            **{
+                name: (("object", "procedure", "band"), part, unit)
+                for name, part in statistics.items()
+            },
+        },
+        coords={"procedure": list(PROCEDURES)},
+        attrs={"origin": "simulated twin", "repeats": repeats},
+    )
+
+
+def reflector_sensitivity(
+    response: xr.Dataset,
+    rng: np.random.Generator,
+    excesses: Sequence[float] = (0.0, 5.0, 11.0),
+    samples: tuple[Sample, ...] = OBJECTS,
+    repeats: int = 100,
+) -> xr.Dataset:
+    """
+    What the reflector method finds, by how much the mirrored direction is warmer than the room.
+
+    Parameters
+    ----------
+    response : Dataset
+        With `noise`.
+    rng : Generator
+        Source of the errors.
+    excesses : sequence of float
+        Largest excess of what a smooth object mirrors [K]; a series' own is drawn evenly from 0.
+    samples : tuple of Sample
+        The objects.
+    repeats : int
+        Series of each.
+
+    Returns
+    -------
+    Dataset
+        `mean` of the estimates (object, excess, band), `true` (object, band) [1]. With 0 K the
+        foil gives what the object mirrors, and the method is right; what it is off by beyond is
+        the emissivity's share in the excess, whatever the foil.
+
+    Raises
+    ------
+    ValueError
+        If there is no sample, there are fewer than two repeats, or an excess is negative.
+    """
+    true = _true(response, samples, repeats)
+    benches = [replace(Bench(), direction=(0.0, float(excess))) for excess in excesses]
+    mean = [
+        [
+            np.mean([_by_reflector(response, it, bench, rng)[0] for _ in range(repeats)], axis=0)
+            for bench in benches
+        ]
+        for it in samples
+    ]
+    return xr.Dataset(
+        {"true": true, "mean": (("object", "excess", "band"), np.array(mean), {"units": "1"})},
+        coords={"excess": ("excess", [float(excess) for excess in excesses], {"units": "K"})},
+        attrs={"origin": "simulated twin", "repeats": repeats},
+    )
+
+
+def _true(response: xr.Dataset, samples: tuple[Sample, ...], repeats: int) -> xr.DataArray:
+    """True emissivity (object, band) of samples that can be compared."""
+    if not samples or repeats < 2:
+        raise ValueError(
+            f"Invalid comparison of {len(samples)} samples, {repeats} times. Must be at least one, "
+            "twice."
+        )
+    names = [str(name) for name in response["band"].values]
+    return xr.DataArray(
+        [band_emissivity(sample, names).values for sample in samples],
+        coords={"object": [sample.name for sample in samples], "band": names},
+        attrs={"units": "1"},
+    )
+
+
+def _by_reflector(
+    response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Emissivity (band,) of one series by the reflector method, and its deviation."""
+    series = reflector_series(response, sample, bench, rng)
+    stds = (bench.reading_std, bench.foil_std)
+    found = calibration.reflector_emissivity(series, response, stds, bench.bias(sample))
+    return found["emissivity"].values, found["emissivity_std"].values
+
+
+def _measured(
+    response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
+) -> np.ndarray:
+    """Emissivity and its deviation by every procedure, (2, procedure, band)."""
+    bias, stds = bench.bias(sample), (bench.reading_std, bench.blackbody_std)
+    series = bench_series(response, sample, bench, rng)
+    fits = [calibration.fit_emissivity(series, response, stds, *known) for known in ((bias,), ())]
+    found = [(fit["emissivity"].values, fit["emissivity_std"].values) for fit in fits]
+    return np.stack([*found, _by_reflector(response, sample, bench, rng)], axis=1)

@@ -1,0 +1,167 @@
+"""Are the error bars true, and is every wrong pixel flagged? Case by case, on simulated pixels.
+
+Two promises are judged. An error bar: 95 % intervals hold the truth in 95 of 100 cases. A status
+of 0: what has no flag is right; a pixel whose error is far beyond its error bar should have one.
+"""
+
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from scipy.special import ndtri
+
+from dbthermal import schema
+from dbthermal.simulation import Rig
+from reproduction.experiments.cases import Case, run_case, score
+
+INTERVAL: Final = float(ndtri(0.975))
+"""Half-width of a 95 % interval, in standard deviations [1]."""
+
+FAR: Final = 4.0
+"""Standard deviations of error from which a pixel is bad [1]; of normal errors 1 of 16,000 is."""
+
+AMONG: Final = ("unflagged", "all")
+"""Whose intervals are counted: of pixels with status 0, or of all that have a value."""
+
+KINDS: Final = ("object", "any")
+"""What makes a pixel bad: its object temperature; or that, or an emissivity."""
+
+_PIXELS: Final = ("y", "x")
+_INNER: Final = (0.1587, 0.8413)
+
+
+def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
+    r"""
+    Hold the error bars and flags of one separation against the truth.
+
+    A pixel is **bad** in its `object` where
+
+    .. math:: \sqrt{\overline{(\hat x - x)^2}} > 4 \sqrt{\overline{s_x^2}}
+
+    over the frames, and bad in `any` where that is so or the error of an emissivity exceeds four
+    of its standard deviations. What has no value is not bad.
+
+    Parameters
+    ----------
+    truth : Dataset
+        A scene of `simulation`.
+    result : Dataset
+        From `separation.solve`.
+
+    Returns
+    -------
+    Dataset
+        Over all pixels, in [1] but for the error in [K]; NaN where there is nothing to count:
+
+        - `object_coverage` (among): share of samples whose 95 % interval holds the truth;
+          `emissivity_coverage` (among, band): share of pixels;
+        - `width` (band): stated standard deviation of the emissivity over the robust standard
+          deviation of its error, both of all pixels with a value; 1 if the bars are true;
+        - `object_temperature_rmse` [K] and `emissivity_error` (band), see `cases.score`;
+        - `flagged`, and `by_flag` (flag): share of pixels with any flag, with this flag;
+        - `bad_pixels` (kind): their number; `bad_flagged` (kind): share of them with a flag;
+        - `status` (pixel), and `bad` (kind, pixel), true where bad: what the shares come from.
+    """
+    found = {**_coverage(truth, result), **_flags(result["status"])}
+    bad, flagged = _bad(truth, result), _flat(result["status"] != 0)
+    found |= {
+        "width": _width(truth, result),
+        "bad_pixels": bad.sum("pixel"),
+        "bad_flagged": _share(flagged, bad, ("pixel",)),
+        "status": _flat(result["status"]),
+        "bad": bad,
+    }
+    units = {name: value.assign_attrs(units="1") for name, value in found.items()}
+    errors = score(truth, result)[["object_temperature_rmse", "emissivity_error"]]
+    return xr.Dataset(units).merge(errors).assign_attrs(origin="simulated")
+
+
+def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: int) -> xr.Dataset:
+    """
+    Run and judge many cases, all with the same seed.
+
+    Parameters
+    ----------
+    cases : iterable of mapping
+        See `cases.run_case`; each with a name `case` of its own.
+    rig, time, pixels, seed
+        See `cases.run_case`.
+
+    Returns
+    -------
+    Dataset
+        Variables of `judge`, over `case`.
+
+    Raises
+    ------
+    ValueError
+        If a case has no name, or one that another has; and as `cases.run_case`.
+    """
+    cases = list(cases)
+    names = [str(case.get("case", "")) for case in cases]
+    for name in names:
+        if not name or names.count(name) > 1:
+            raise ValueError(f"Invalid name '{name}' of a case. Must be there, and unique.")
+    rows = [judge(*run_case(case, rig, time, pixels, seed)) for case in cases]
+    together = xr.concat(rows, dim=xr.DataArray(names, dims="case", name="case"))
+    return together.assign_attrs(pixels=pixels, seed=seed)
+
+
+def _share(holds: xr.DataArray, counted: xr.DataArray, over: tuple[str, ...]) -> xr.DataArray:
+    """Share of what is counted for which it holds; NaN where nothing is counted."""
+    number = counted.sum(over)
+    return (holds & counted).sum(over) / number.where(number > 0)
+
+
+def _flat(image: xr.DataArray) -> xr.DataArray:
+    """Pixels of an image in a row."""
+    return image.stack(pixel=_PIXELS).drop_vars(["pixel", *_PIXELS])
+
+
+def _coverage(truth: xr.Dataset, result: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Share of 95 % intervals that hold the truth, among the unflagged and among all."""
+    label = xr.DataArray(list(AMONG), dims="among", coords={"among": list(AMONG)})
+    chosen = (result["status"] == 0) | (label == "all")
+    found = {}
+    for name, over in (("object", ("time", *_PIXELS)), ("emissivity", _PIXELS)):
+        full = "object_temperature" if name == "object" else name
+        error, std = abs(result[full] - truth[full]), result[f"{full}_std"]
+        counted = error.notnull() & chosen
+        found[f"{name}_coverage"] = _share(error < INTERVAL * std, counted, over)
+    return found
+
+
+def _width(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
+    """Median stated deviation of the emissivities over the robust one of their errors."""
+    error = result["emissivity"] - truth["emissivity"]
+    known = error.notnull().all("band")
+    shape = (error.sizes["band"], -1)
+    errors = error.where(known).values.reshape(shape)[:, known.values.ravel()]
+    stds = result["emissivity_std"].values.reshape(shape)[:, known.values.ravel()]
+    width = np.full(shape[0], np.nan)
+    if errors.size:
+        lower, upper = np.quantile(errors, _INNER, axis=1)
+        np.divide(2.0 * np.median(stds, axis=1), upper - lower, out=width, where=upper > lower)
+    return xr.DataArray(width, dims="band", coords={"band": error["band"]})
+
+
+def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
+    """Where an error exceeds four standard deviations (kind, pixel)."""
+    squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
+    allowed = (result["object_temperature_std"] ** 2).where(squared.notnull())
+    of_object = squared.mean("time") > FAR**2 * allowed.mean("time")
+    apart = abs(result["emissivity"] - truth["emissivity"])
+    of_any = of_object | (apart > FAR * result["emissivity_std"]).any("band")
+    label = xr.DataArray(list(KINDS), dims="kind", name="kind")
+    return xr.concat([_flat(of_object), _flat(of_any)], label)
+
+
+def _flags(status: xr.DataArray) -> dict[str, xr.DataArray]:
+    """Share of pixels with any flag, and with each."""
+    bits = xr.DataArray(
+        np.array(list(schema.FLAGS.values()), dtype=status.dtype),
+        dims="flag",
+        coords={"flag": list(schema.FLAGS)},
+    )
+    return {"flagged": (status != 0).mean(), "by_flag": ((status & bits) != 0).mean(_PIXELS)}

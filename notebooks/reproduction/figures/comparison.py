@@ -1,0 +1,177 @@
+"""Figures that set methods beside one another: over noise, materials, emissivities, settings."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dbthermal.figures._canvas import COLORS, band_label, canvas, draw_image, provenance_note
+
+_MARKERS = "osD^vPX*"
+
+
+def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
+    """
+    Error of the object temperature over noise, a line a method, a panel a material.
+
+    Parameters
+    ----------
+    errors : DataArray
+        Median error (material, noise, variant) [K]; without the dimension `material`, one panel.
+        `noise` is that of the quieter band [K]. A missing value is left out.
+    title : str
+        Title.
+
+    Returns
+    -------
+    Figure
+        Both axes logarithmic.
+    """
+    panels = errors if "material" in errors.dims else errors.expand_dims(material=[""])
+    columns = min(4, panels.sizes["material"])
+    rows = -(-panels.sizes["material"] // columns)
+    width = 3.0 if panels.sizes["material"] > 1 else 5.5
+    figure, axes = canvas(rows, columns, (width * columns + 1.6, 0.85 * width * rows + 0.5))
+    for axis in axes.ravel()[1:]:
+        axis.sharey(axes[0, 0])
+    names = panels["material"].values
+    for axis, name in zip(axes.ravel().tolist(), names, strict=False):
+        _lines(axis, panels.sel(material=name))
+        axis.set_title(str(name), fontsize=9)
+    for axis in axes.flat[panels.sizes["material"] :]:
+        axis.remove()
+    axes[0, 0].set_ylim(_decades(panels))
+    for axis in axes[:, 0]:
+        axis.set_ylabel("median error [K]")
+    for axis in axes[-1]:
+        axis.set_xlabel("noise of the quieter band [K]")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=8)
+    figure.suptitle(title + provenance_note(errors))
+    return figure
+
+
+def _decades(errors: xr.DataArray) -> tuple[float, float]:
+    """Limits a little beyond the least and the largest positive value."""
+    values = errors.values[errors.values > 0]
+    return (0.6 * float(values.min()), 1.6 * float(values.max())) if values.size else (0.1, 10.0)
+
+
+def _lines(axis: Axes, errors: xr.DataArray) -> None:
+    """One line a variant, over the noise."""
+    for index, name in enumerate(errors["variant"].values):
+        axis.loglog(
+            errors["noise"],
+            errors.sel(variant=name),
+            color=COLORS[index % len(COLORS)],
+            marker=_MARKERS[index % len(_MARKERS)],
+            markersize=4,
+            linewidth=1,
+            linestyle="-" if index < len(COLORS) else "--",
+            label=str(name),
+        )
+    axis.grid(visible=True, which="major", color="0.9")
+    levels = errors["noise"].values
+    axis.set_xticks(levels, [f"{level:g}" for level in levels], fontsize=8)
+    axis.set_xticks([], minor=True)
+
+
+def emissivity_errors(errors: xr.DataArray, *, title: str) -> Figure:
+    """
+    Error of the emissivity over emissivity and noise, a map a method.
+
+    Parameters
+    ----------
+    errors : DataArray
+        Median error (variant, emissivity, noise) [1]; gray where there is none.
+    title : str
+        Title.
+
+    Returns
+    -------
+    Figure
+        Maps with their numbers.
+    """
+    count = errors.sizes["variant"]
+    figure, axes = canvas(1, count, (4.6 * count, 4.0))
+    highest = float(np.nanpercentile(errors.values, 98))
+    for axis, name in zip(axes[0], errors["variant"].values, strict=True):
+        image = errors.sel(variant=name).transpose("emissivity", "noise")[::-1]
+        scale = (0.0, highest)
+        draw_image(figure, axis, image, str(name), "error [1]", cmap="magma_r", limits=scale)
+        for row, column in np.ndindex(*image.shape):
+            value = float(image[row, column])
+            if np.isfinite(value):
+                color = "white" if value > highest / 2 else "black"
+                place = {"ha": "center", "va": "center", "fontsize": 7}
+                axis.text(column, row, f"{value:.3f}", color=color, **place)
+        axis.set_xticks(range(image.sizes["noise"]), [f"{v:g}" for v in image["noise"].values])
+        rows = [f"{v:.2f}" for v in image["emissivity"].values]
+        axis.set_yticks(range(image.sizes["emissivity"]), rows)
+        axis.set(xlabel="noise of the quieter band [K]")
+    axes[0, 0].set_ylabel(f"emissivity, {band_label('8-14')} [1]")
+    figure.suptitle(title + provenance_note(errors))
+    return figure
+
+
+def reductions(reduction: xr.DataArray, published: Sequence[float]) -> Figure:
+    """
+    What each loss term is worth, beside the published figure.
+
+    Parameters
+    ----------
+    reduction : DataArray
+        Reduction of the error by adding the term to the others (term) [%].
+    published : sequence of float
+        The paper's [%], in the same order.
+
+    Returns
+    -------
+    Figure
+        Two bars a term, with their numbers.
+    """
+    figure, ((axis,),) = canvas(1, 1, (6.0, 3.4))
+    place = np.arange(reduction.sizes["term"])
+    for shift, values, label, color in (
+        (-0.2, reduction.values, "here", COLORS[0]),
+        (0.2, np.asarray(published), "the paper", "0.6"),
+    ):
+        bars = axis.bar(place + shift, values, 0.38, label=label, color=color)
+        axis.bar_label(bars, fmt="%.1f", fontsize=8, padding=2)
+    axis.axhline(0.0, color="black", linewidth=0.6)
+    axis.margins(y=0.12)
+    axis.set_xticks(place, [str(name) for name in reduction["term"].values])
+    axis.set_ylabel("reduction of the error by the term [%]")
+    axis.legend(frameon=False, fontsize=8)
+    axis.set_title("What each loss term is worth" + provenance_note(reduction))
+    return figure
+
+
+def sensitivity(errors: xr.DataArray, base: float) -> Figure:
+    """
+    Error with one setting changed at a time.
+
+    Parameters
+    ----------
+    errors : DataArray
+        Median error (variant) [K] with the change that the variant's name says.
+    base : float
+        The error with all settings at their defaults [K].
+
+    Returns
+    -------
+    Figure
+        Bars, and a line at the default's error.
+    """
+    figure, ((axis,),) = canvas(1, 1, (7.5, 0.24 * errors.sizes["variant"] + 1.4))
+    place = np.arange(errors.sizes["variant"])
+    axis.barh(place, errors.values, color=COLORS[0])
+    axis.axvline(base, color="black", linewidth=1, label="defaults")
+    axis.set_yticks(place, [str(name) for name in errors["variant"].values], fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel("median error of the object temperature [K]")
+    axis.legend(frameon=False, fontsize=8)
+    axis.set_title("Settings of the optimiser, one changed at a time" + provenance_note(errors))
+    return figure

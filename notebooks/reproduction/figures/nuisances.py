@@ -1,0 +1,132 @@
+"""Figures of a real rig's nuisances: what each costs, and what is left when it is undone."""
+
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+from dbthermal.figures._canvas import COLORS, canvas, provenance_note
+
+_MARKERS: Final = "osD^v"
+_RMSE: Final = "object_temperature_rmse"
+_RMSE_LABEL: Final = "RMSE of the object temperature [K]"
+
+
+def offsets(measured: xr.Dataset) -> Figure:
+    """
+    Bands that are not exposed together: the offset found, and the object before and after.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Over `delay`, the true offset [frame]: `found` [frame]; and over `treatment` too,
+        `object_temperature_rmse` [K] and `flagged` [1].
+
+    Returns
+    -------
+    Figure
+        Left, the error of the offset; middle, that of the object; right, the share flagged.
+    """
+    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.6))
+    left.axhline(0.0, color="black", linewidth=0.6)
+    left.plot(measured["delay"], measured["found"] - measured["delay"], "o", color=COLORS[0])
+    left.set(ylabel="error of the offset [frame]", ylim=(-0.1, 0.1))
+    _lines(middle, measured[_RMSE], "delay")
+    _lines(right, 100 * measured["flagged"], "delay")
+    _kelvin(middle)
+    right.set(ylabel="flagged [%]", ylim=(-3, 103))
+    for axis in (left, middle, right):
+        axis.set(xlabel="offset of the second band [frame]")
+        axis.grid(visible=True, color="0.9")
+    middle.legend(frameon=False, fontsize=8)
+    figure.suptitle("Bands exposed apart" + provenance_note(measured))
+    return figure
+
+
+def disturbances(measured: xr.Dataset) -> Figure:
+    """
+    Nuisances in time: the object as recorded, undone, and without.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Over `nuisance` and `treatment`: `object_temperature_rmse` [K] and `flagged` [1].
+
+    Returns
+    -------
+    Figure
+        Bars with their numbers, a group a nuisance; above each the share of pixels flagged.
+    """
+    figure, ((axis,),) = canvas(1, 1, (8.0, 3.8))
+    names, treatments = measured["nuisance"].values, measured["treatment"].values
+    width = 0.8 / treatments.size
+    for index, treatment in enumerate(treatments):
+        here = measured.sel(treatment=treatment)
+        place = np.arange(names.size) + width * (index - (treatments.size - 1) / 2)
+        axis.bar(place, here[_RMSE], width, color=COLORS[index % len(COLORS)], label=treatment)
+        for at, value, share in zip(place, here[_RMSE].values, here["flagged"].values, strict=True):
+            text = f"{value:.2f} K\n{100 * share:.0f} % flagged"
+            axis.text(at, value, text, ha="center", va="bottom", fontsize=7)
+    axis.set_xticks(np.arange(names.size), names)
+    _kelvin(axis)
+    axis.margins(y=0.2)
+    axis.legend(frameon=False, fontsize=8)
+    axis.set_title("Frames that are none" + provenance_note(measured))
+    return figure
+
+
+def parallax(measured: xr.Dataset) -> Figure:
+    """
+    Two views of one object whose reflections are apart: what it costs, and how much is flagged.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Over `parallax` [pixel] and `treatment`: `object_temperature_rmse` [K], `flagged` and
+        `covered` [1].
+
+    Returns
+    -------
+    Figure
+        Left, the error; middle, the share flagged; right, the share of the 95 % intervals that
+        hold the truth in the pixels without a flag.
+    """
+    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.6))
+    _lines(left, measured[_RMSE], "parallax")
+    _lines(middle, 100 * measured["flagged"], "parallax")
+    _lines(right, 100 * measured["covered"], "parallax")
+    _kelvin(left)
+    middle.set(ylabel="flagged [%]", ylim=(-3, 103))
+    right.axhspan(92, 98, color=COLORS[2], alpha=0.3, linewidth=0)
+    right.set(ylabel="95 % intervals that hold, no flag [%]", ylim=(-3, 103))
+    for axis in (left, middle, right):
+        axis.set(xlabel="parallax of the reflection [pixel]")
+        axis.grid(visible=True, color="0.9")
+    left.legend(frameon=False, fontsize=8)
+    figure.suptitle("Two cameras side by side" + provenance_note(measured))
+    return figure
+
+
+def _lines(axis: Axes, values: xr.DataArray, over: str) -> None:
+    """A line a treatment."""
+    for index, treatment in enumerate(values["treatment"].values):
+        axis.plot(
+            values[over],
+            values.sel(treatment=treatment),
+            color=COLORS[index % len(COLORS)],
+            marker=_MARKERS[index % len(_MARKERS)],
+            markersize=4,
+            linewidth=1,
+            label=treatment,
+        )
+
+
+def _kelvin(axis: Axes) -> None:
+    """A logarithmic axis of errors, with plain numbers."""
+    axis.set(yscale="log", ylabel=_RMSE_LABEL)
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.yaxis.set_minor_locator(NullLocator())

@@ -1,0 +1,239 @@
+"""The table: every number and figure of the paper beside ours."""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import Final
+
+from reproduction.paper.published import EMISSIVITIES, PEAKS, REDUCTIONS, SCENE_ERRORS
+from reproduction.paper.row import TWIN, Numbers, Row
+
+COLUMNS: Final = ("in the paper", "quantity", "paper", "here", "measured on", "verdict")
+"""Columns of the table."""
+
+_PERCENT: Final = "%"
+
+
+def compare(numbers: Numbers) -> Iterator[tuple[str, ...]]:
+    """
+    Set every published number beside ours.
+
+    Parameters
+    ----------
+    numbers : mapping
+        See `Numbers`.
+
+    Yields
+    ------
+    tuple of str
+        Cells of `COLUMNS`.
+    """
+    for row in rows():
+        found = row.ours(numbers)
+        texts = [
+            f"{label} {_text(value, row.unit)}" if row.labels else _text(value, row.unit)
+            for label, value in found.items()
+        ]
+        paper = "-" if row.published is None else f"{row.published:g}{_after(row.unit)}"
+        here = ", ".join(texts) or "-"
+        if row.reference is not None:
+            paper, here = (f"{text} (for {row.reference:g})" for text in (paper, here))
+        yield (row.place, row.quantity, paper, here, row.data, row.verdict(numbers))
+
+
+def markdown(numbers: Numbers) -> str:
+    """
+    Write the comparison as a table in Markdown.
+
+    Parameters
+    ----------
+    numbers : mapping
+        See `Numbers`.
+
+    Returns
+    -------
+    str
+        Head, rule, and a line for each row.
+    """
+    lines = [COLUMNS, ("---",) * len(COLUMNS), *compare(numbers)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def rows() -> tuple[Row, ...]:
+    """
+    List every number of the paper, and every figure.
+
+    Returns
+    -------
+    tuple of Row
+        In the paper's order.
+    """
+    return (*_FIRST, *_terms(), *_bench(), *_scenes(), *_LAST)
+
+
+def _terms() -> Iterator[Row]:
+    for term, value in REDUCTIONS.items():
+        names, what = (f"{term}: reduction [%]",), f"error saved by the {term} term"
+        yield Row(
+            "Table 1", what, "06_optimiser", names, "simulated", value, _PERCENT, "value", 10.0
+        )
+
+
+def _bench() -> Iterator[Row]:
+    for procedure, name in (("paper", "bench"), ("reflector", "reflector")):
+        for thing, value in EMISSIVITIES[procedure].items():
+            yield Row(
+                "Table 2",
+                f"emissivity of the {thing}, {name}",
+                "07_bench",
+                (f"{thing}: {name} [1]",),
+                TWIN,
+                value,
+                judged="distance" if name == "bench" else "value",
+                within=0.01 if name == "bench" else 0.03,
+                reference=EMISSIVITIES["reference"][thing],
+            )
+
+
+def _scenes() -> Iterator[Row]:
+    for scene, errors in SCENE_ERRORS.items():
+        shown = scene.replace("_", " ")
+        highest = (f"{scene}: highest reading [degC]",)
+        what = f"{shown}: highest reading of the thermocouple"
+        common = ("08_twins", highest, TWIN, PEAKS[scene], "\N{DEGREE SIGN}C")
+        yield Row("Fig. 6", what, *common, note="by construction")
+        for method, error in errors.items():
+            what = f"{shown}: error at the thermocouple, {_ROLES.get(method, method)}"
+            names = (f"{scene}: error of {method} [%]",)
+            judged = "error" if method in _ROLES else "no"
+            ours = ("08_twins", names, TWIN, error, _PERCENT)
+            yield Row("Fig. 6", what, *ours, judged, note="another scene, no target")
+
+
+_ROLES: Final = {"subspace": "emissivities unknown", "calibrated": "emissivities calibrated"}
+_METHODS: Final = ("subspace", "dbvt", "naive", "ratio, narrow", "bcp, patch 5", "apparent")
+_PAIRS: Final = ("8.5", "9.5", "10.6", "12.1")
+
+_FIRST: Final = (
+    Row(
+        "Fig. 1",
+        "image formation: object, background, path, optics, camera",
+        data="`mixing`, its tests",
+        note="implemented",
+    ),
+    Row(
+        "Figs. 2 left, 10",
+        "error of the object temperature at moderate noise, median over materials",
+        "05_methods",
+        tuple(f"{name}: error at moderate noise [K]" for name in _METHODS),
+        "simulated",
+        unit="K",
+        labels=_METHODS,
+    ),
+    Row(
+        "Fig. 2 right",
+        "error of the emissivity at low noise, median over emissivities",
+        "05_methods",
+        tuple(f"{name}: emissivity error at the lowest noise [1]" for name in _METHODS[:2]),
+        "simulated",
+        labels=_METHODS[:2],
+    ),
+    Row(
+        "Fig. 3",
+        "error of the bunny's temperature, mean over frames, median over its pixels",
+        "08_twins",
+        tuple(f"{name}: error on the bunny [K]" for name in ("subspace", "naive")),
+        "simulated",
+        unit="K",
+        labels=("subspace", "naive"),
+    ),
+)
+
+_LAST: Final = (
+    *(
+        Row(
+            "section 5.2",
+            f"emissivity, unknown less calibrated: {scene}, {band} \N{MICRO SIGN}m".replace(
+                "_", " "
+            ),
+            "08_twins",
+            (f"{scene}: emissivity unknown less calibrated, {band} [1]",),
+            TWIN,
+            value,
+            judged="error",
+        )
+        for (scene, band), value in zip(
+            product(("wineglass", "coffee_pot"), ("8-14", "9.5")),
+            (0.17, 0.15, 0.19, 0.15),
+            strict=True,
+        )
+    ),
+    Row(
+        "Fig. 4",
+        "emissivity of five objects in five bands, largest error in any series",
+        "07_bench",
+        ("largest error of the bench in any series [1]",),
+        TWIN,
+    ),
+    Row(
+        "Fig. 5",
+        "finger print: share of its warmth that is found as emission; "
+        "finger reflection: share of it that is found as reflection",
+        "08_twins",
+        tuple(f"{name}: share found [1]" for name in ("fingerprint", "fingers")),
+        TWIN,
+        labels=("print", "reflection"),
+    ),
+    Row(
+        "Fig. 6",
+        "coffee pot: map of the reflection, correlation with the authors'",
+        "04_separation",
+        ("coffeepot_map_correlation",),
+        "published video",
+    ),
+    Row(
+        "Fig. 6",
+        "glass plate: the same",
+        "04_separation",
+        ("glass-plate_map_correlation",),
+        "published video",
+    ),
+    Row(
+        "Fig. 7",
+        "residual of the Sakuma-Hattori curve, and of the line, 0 to 75 \N{DEGREE SIGN}C",
+        "01_calibration",
+        ("residual_8-14_K", "linear_residual_8-14_K"),
+        "simulated",
+        unit="K",
+        judged="alike",
+        within=2.0,
+        labels=("curve", "line"),
+    ),
+    Row(
+        "Fig. 8",
+        "ablation over noise: the noise terms' share at the highest level",
+        "06_optimiser",
+        ("noise: reduction at the highest noise [%]",),
+        "simulated",
+        unit=_PERCENT,
+    ),
+    Row(
+        "Fig. 9",
+        "median condition number of 8-14 \N{MICRO SIGN}m with each filter",
+        "02_emissivity",
+        tuple(f"condition_8-14_{name}" for name in _PAIRS),
+        "spectral libraries",
+        judged="lowest",
+        note="9.5",
+        labels=_PAIRS,
+    ),
+)
+
+
+def _text(value: float, unit: str) -> str:
+    """Three significant digits and the unit."""
+    shown = f"{value:#.3g}".rstrip(".") if abs(value) < 1000 else f"{value:.0f}"
+    return shown + _after(unit)
+
+
+def _after(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"

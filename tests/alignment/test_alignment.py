@@ -1,0 +1,319 @@
+"""Two cameras onto one clock: offsets found, undone, and nothing made up where frames are lost."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dbthermal import alignment, separation, simulation
+from dbthermal.alignment import _clocks as clocks
+from dbthermal.simulation import Background, Rig
+from dbthermal.simulation._clocks import drop_frames, expose, repeat_frames
+
+RIG = Rig()
+FRAMES, STEPS, START = 350, 20, 80
+PERIOD = 0.1
+FINE = np.arange(STEPS * (FRAMES + 10)) * PERIOD / STEPS
+
+
+def glass(
+    pixels: int = 400, stop: float = 333.15, seed: int = 3, **background: object
+) -> xr.Dataset:
+    """Glass that warms from 20 C, on a clock of 20 steps a frame."""
+    value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    rng, moves = np.random.default_rng(seed), Background(**background)  # type: ignore[arg-type]
+    return simulation.independent_pixels(FINE, value, moves, pixels, rng, start=293.15, stop=stop)
+
+
+def recorded(
+    scene: xr.Dataset, delay: float, *, stamped: bool = False, seed: int = 1
+) -> xr.Dataset:
+    """Capture in which the second band is so many frames late."""
+    capture = expose(
+        scene,
+        RIG.response(),
+        np.random.default_rng(seed),
+        every=STEPS,
+        offsets=(START, START + round(delay * STEPS)),
+        frames=FRAMES,
+    )
+    return capture if stamped else capture.drop_vars("exposure_time")
+
+
+def object_rmse(scene: xr.Dataset, capture: xr.Dataset) -> float:
+    """Root mean square over time of the object's error, median over the pixels [K]."""
+    result = separation.solve(capture, RIG.response())["object_temperature"]
+    error = result - scene["object_temperature"].interp(time=result["time"])
+    return float(((error**2).mean("time") ** 0.5).median())
+
+
+def ramp(bands: int = 2, frames: int = 40) -> xr.Dataset:
+    """Counts that rise by 10 a second, and noise that tells the frames apart, in 16 pixels."""
+    time = np.arange(frames) * PERIOD
+    counts = np.broadcast_to(10.0 * time[:, np.newaxis, np.newaxis], (bands, frames, 4, 4))
+    return xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts.astype(np.float32))},
+        coords={"band": [f"b{band}" for band in range(bands)], "time": time},
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> xr.Dataset:
+    """Glass to 60 C, someone walking by."""
+    return glass()
+
+
+@pytest.mark.parametrize("delay", [0, 0.3, 0.5, 1, 1.7, 2, 3, -0.75])
+def test_time_offset_is_found(scene: xr.Dataset, delay: float) -> None:
+    """The offset is found within a tenth of a frame, with its sign."""
+    error = alignment.time_offset(recorded(scene, delay)) / PERIOD - delay
+    print(f"second band {delay} frames late: error {error:.4f} frames")
+    assert abs(error) < 0.1
+    assert abs(error) < 0.04  # four times what 400 pixels scatter by
+
+
+@pytest.mark.parametrize("memory", [0.3, 3.0, 30.0])
+@pytest.mark.parametrize("delay", [0.3, 1.5])
+def test_time_offset_of_a_restless_background(memory: float, delay: float) -> None:
+    """A background that walks at random shows the offset as one that steps does."""
+    capture = recorded(glass(kind="random walk", memory=memory), delay)
+    error = alignment.time_offset(capture) / PERIOD - delay
+    print(f"memory {memory} s, {delay} frames late: error {error:.4f} frames")
+    assert abs(error) < 0.1
+
+
+def test_nothing_moves() -> None:
+    """An object that warms before a background at rest gives no offset."""
+    with pytest.raises(ValueError, match=r"no rapid change that both bands see|Must be known"):
+        alignment.time_offset(recorded(glass(kind="still"), 0))
+
+
+def test_end_of_the_search(scene: xr.Dataset) -> None:
+    """An offset as large as the search is not reported as if it were found."""
+    with pytest.raises(ValueError, match=r"2 frames apart, at the end of the search"):
+        alignment.time_offset(recorded(scene, 3), search=2)
+
+
+def test_shutter_steps_are_no_motion(scene: xr.Dataset) -> None:
+    """A step in both bands at once, after a shutter event, does not pull the offset to zero."""
+    capture = recorded(scene, 1.5)
+    segment = (np.arange(FRAMES) >= 150).astype(np.int64)
+    capture["counts"].values[...] += 60.0 * segment[:, np.newaxis, np.newaxis]
+    error = alignment.time_offset(capture.assign(segment=("time", segment))) / PERIOD - 1.5
+    print(f"a step of 60 counts: error {error:.4f} frames")
+    assert abs(error) < 0.06
+
+
+def test_a_still_background_gives_no_offset_by_chance() -> None:
+    """In 20 captures in which nothing moves, none gives an offset."""
+    found = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        noise = xr.Dataset(
+            {"counts": (("band", "time", "y", "x"), rng.normal(size=(2, 100, 8, 8)))},
+            coords={"band": ["a", "b"], "time": np.arange(100) / 10.0},
+        )
+        try:
+            found.append(alignment.time_offset(noise))
+        except ValueError:
+            continue
+    assert found == []
+
+
+@pytest.mark.parametrize("stop", [318.15, 333.15])
+@pytest.mark.parametrize("delay", [0.3, 0.5, 1, 1.7, 2, 3])
+def test_offset_is_undone(stop: float, delay: float) -> None:
+    """Aligned, the object is within 20 % of a synchronous capture of the same frames."""
+    warm = glass(stop=stop)
+    capture = recorded(warm, delay)
+    aligned = alignment.align(capture)
+    late = expose(
+        warm,
+        RIG.response(),
+        np.random.default_rng(1),
+        every=STEPS,
+        offsets=[START + round(delay * STEPS)] * 2,
+        frames=FRAMES,
+    )
+    values = [object_rmse(warm, one) for one in (late, aligned, capture)]
+    print(f"to {stop} K, {delay} frames: synchronous, aligned, as it was: {np.round(values, 3)} K")
+    assert aligned.attrs["clock"] == "9.5"
+    assert aligned.sizes["time"] == FRAMES
+    assert values[1] < 1.2 * values[0]
+
+
+@pytest.mark.parametrize("driver", ["stamps", "copies"])
+def test_dropped_frames(scene: xr.Dataset, driver: str) -> None:
+    """With 5 % of either band's frames lost the object is within 20 % of the whole capture."""
+    whole = recorded(scene, 0.3, stamped=True)
+    lost = np.random.default_rng(8).random((2, FRAMES)) < 0.05
+    lost[:, 0] = False
+    if driver == "stamps":
+        aligned = alignment.align(drop_frames(whole, lost), offset=0.0)
+    else:
+        aligned = alignment.align(repeat_frames(whole, lost))
+    reference, value = (object_rmse(scene, one) for one in (recorded(scene, 0), aligned))
+    print(f"lost, {driver}: {reference:.3f} -> {value:.3f} K, {aligned.attrs['frames_lost']}")
+    assert value < 1.2 * reference
+    assert min(aligned.attrs["frames_lost"]) >= lost.sum(axis=1).min() - 1
+
+
+def test_different_rates(scene: xr.Dataset) -> None:
+    """Cameras of 10 and 9.5 frames/s with stamps; a lag beyond the stamps is found as well."""
+    capture = expose(
+        scene,
+        RIG.response(),
+        np.random.default_rng(1),
+        every=(STEPS, STEPS + 1),
+        offsets=(START, START),
+        frames=330,
+    )
+    wrong = capture["exposure_time"].copy()
+    wrong[1] -= 0.7 * PERIOD
+    offset = alignment.time_offset(capture.assign(exposure_time=wrong))
+    aligned = alignment.align(capture, offset=0.0)
+    values = [object_rmse(scene, one) for one in (recorded(scene, 0), aligned)]
+    print(f"10 and 9.5 frames/s: offset {offset:.4f} s of 0.07 s; {np.round(values, 3)} K")
+    assert offset == pytest.approx(0.07, abs=0.01)
+    assert values[1] < 1.2 * values[0]
+
+
+@given(frames=st.integers(-7, 7))
+def test_whole_frames_are_a_pure_shift(frames: int) -> None:
+    """An offset of whole frames moves samples and changes none."""
+    capture = ramp()
+    capture["counts"].values[...] = np.random.default_rng(1).normal(size=capture["counts"].shape)
+    aligned = alignment.align(capture, offset=0.3 * frames / 3, clock="b1")
+    shifted = capture["counts"].isel(band=0).shift(time=-frames)
+    np.testing.assert_array_equal(aligned["counts"].isel(band=0).values, shifted.values)
+    np.testing.assert_array_equal(aligned["counts"][1], capture["counts"][1])
+
+
+@given(
+    offset=st.floats(-1.0, 1.0),
+    jitter=st.lists(st.floats(-0.02, 0.02), min_size=80, max_size=80),
+)
+@settings(max_examples=30)
+def test_a_line_is_kept(offset: float, jitter: list[float]) -> None:
+    """What rises evenly is interpolated exactly, at any stamps and offset; never extrapolated."""
+    capture = ramp()
+    stamps = capture["time"].values + np.reshape(jitter, (2, 40))
+    seen = stamps + np.array([[0.0], [offset]])
+    counts = np.broadcast_to(10.0 * seen[..., np.newaxis, np.newaxis], (2, 40, 4, 4))
+    capture["counts"].values[...] = counts
+    capture["exposure_time"] = (("band", "time"), stamps)
+    aligned = alignment.align(capture, offset=offset, clock="b1")
+    known = aligned["counts"].isel(band=0, y=0, x=0).dropna("time")
+    # A sample within a hundredth of a frame is taken as it is: 0.001 s of 10 count/s.
+    np.testing.assert_allclose(known, 10.0 * known["time"], rtol=0, atol=0.0145)
+    assert known["time"].size >= 40 - abs(offset) / PERIOD - 3
+    np.testing.assert_array_equal(aligned["time"], seen[1])
+
+
+def test_gaps_are_not_bridged() -> None:
+    """NaN frames, copies and holes in the stamps stay holes, and only the frames next to them."""
+    capture = ramp()
+    capture["counts"].values[0, 10] = np.nan
+    capture["counts"].values[0, 21] = capture["counts"].values[0, 20]
+    aligned = alignment.align(capture, offset=0.25 * PERIOD, clock="b1")["counts"]
+    holes = np.flatnonzero(np.isnan(aligned.values[0]).any(axis=(1, 2)))
+    assert holes.tolist() == [9, 10, 20, 21, 39]
+    assert not np.isnan(aligned.values[1]).any()
+    exact = alignment.align(capture, offset=0.0)["counts"]
+    assert np.flatnonzero(np.isnan(exact.values[0]).any(axis=(1, 2))).tolist() == [10, 21]
+
+
+def test_segments_are_not_mixed() -> None:
+    """No frame is made of samples from both sides of a shutter event, or moved across one."""
+    segment = ("time", (np.arange(40) >= 20).astype(np.int64))
+    capture = ramp().assign(segment=segment)
+    half = alignment.align(capture, offset=1.5 * PERIOD, clock="b1")
+    assert np.flatnonzero(half["counts"].isnull().any(("y", "x"))[0]).tolist() == [18, 19, 38, 39]
+    assert half["segment"].values.tolist() == segment[1].tolist()
+
+
+def test_three_bands() -> None:
+    """Each band has an offset of its own against the first."""
+    capture = ramp(3)
+    late = xr.DataArray([0.0, 0.02, -0.04], dims="band", coords={"band": ["b0", "b1", "b2"]})
+    counts = 10.0 * (capture["time"].values + late.values[:, np.newaxis])
+    capture["counts"].values[...] = counts[..., np.newaxis, np.newaxis]
+    aligned = alignment.align(capture, offset=late, clock="b1")
+    middle = aligned["counts"].isel(time=slice(2, 38), y=0, x=0)
+    expected = np.broadcast_to(10.0 * middle["time"].values, middle.shape)
+    np.testing.assert_allclose(middle, expected, rtol=0, atol=1e-5)
+    with pytest.raises(ValueError, match="Must be one for each"):
+        alignment.align(capture, offset=0.1)
+
+
+def test_what_was_done_is_written_down(scene: xr.Dataset) -> None:
+    """Attributes name the clock, the offsets and the frames lost; the capture is not changed."""
+    capture = recorded(scene, 0.5, stamped=True)
+    before = capture.copy(deep=True)
+    aligned = alignment.align(capture)
+    xr.testing.assert_identical(capture, before)
+    assert "exposure_time" not in aligned
+    assert aligned.attrs["clock"] == "9.5"
+    assert aligned.attrs["time_offset"] == pytest.approx([0.0, 0.0], abs=0.1 * PERIOD)
+    assert aligned.attrs["frames_lost"] == [1, 0]
+    assert aligned["counts"].dtype == np.float32
+
+
+def test_wrong_options() -> None:
+    """An offset that is no number, and a clock that is no band, are refused by name."""
+    with pytest.raises(ValueError, match=r"Invalid offset \[0\.0, nan\] s"):
+        alignment.align(ramp(), offset=np.nan)
+    with pytest.raises(ValueError, match=r"Unknown clock '7'\. Must be one of"):
+        alignment.align(ramp(), offset=0.1, clock="7")
+    with pytest.raises(ValueError, match=r"Invalid band 'b0'\. Must be another than the first"):
+        alignment.time_offset(ramp(), band="b0")
+    with pytest.raises(ValueError, match=r"Invalid search of 11 frames"):
+        alignment.time_offset(ramp(), search=11)
+
+
+def test_an_offset_beyond_the_capture_leaves_nothing() -> None:
+    """Frames that never saw the same time are all NaN, and counted."""
+    aligned = alignment.align(ramp(), offset=10.0, clock="b1")
+    assert aligned.attrs["frames_lost"] == [40, 0]
+
+
+def test_wrong_stamps() -> None:
+    """Stamps that go back are refused, and say where."""
+    capture = ramp()
+    stamps = np.tile(capture["time"].values, (2, 1))
+    stamps[1, 5] = 0.0
+    capture["exposure_time"] = (("band", "time"), stamps)
+    with pytest.raises(ValueError, match=r"Unordered exposure times of band 'b1': 0\.4 s"):
+        alignment.align(capture, offset=0.0)
+
+
+def test_filled_stamps_increase() -> None:
+    """A slot without a frame lies between its neighbours, or a period beyond the last."""
+    filled = clocks.filled(np.array([np.nan, 0.0, 0.1, np.nan, 0.3, 0.4, np.nan, np.nan]))
+    np.testing.assert_allclose(filled, np.arange(-1, 7) / 10.0, rtol=0, atol=1e-12)
+
+
+def test_lost_frames_of_the_simulation(scene: xr.Dataset) -> None:
+    """Stamped frames move up and leave NaN; repeated ones copy the frame before."""
+    capture = recorded(scene.isel(x=slice(16)), 0, stamped=True)
+    lost = np.zeros((2, FRAMES), dtype=bool)
+    lost[1, 7] = True
+    dropped, copied = drop_frames(capture, lost), repeat_frames(capture, lost)
+    np.testing.assert_array_equal(dropped["counts"][1, 7], capture["counts"][1, 8])
+    assert np.isnan(dropped["exposure_time"].values[1, -1])
+    np.testing.assert_array_equal(copied["counts"][1, 7], capture["counts"][1, 6])
+    np.testing.assert_array_equal(copied["counts"][0], capture["counts"][0])
+    with pytest.raises(ValueError, match="Must increase and lie in"):
+        recorded(scene, 20)
+
+
+def test_nothing_is_left_on_the_clocks_before(scene: xr.Dataset) -> None:
+    """What was told frame by frame is not handed on beside other times; an offset is in seconds."""
+    capture = simulation.observe(scene, Rig().response(), np.random.default_rng(0))
+    told = (("band", "time"), np.zeros(capture["counts"].shape[:2]), {"units": "count"})
+    aligned = alignment.align(capture.assign(drift=told), offset=0.02)
+    assert set(aligned.data_vars) == {"counts"}
+    offset = xr.DataArray([0.0, 20.0], dims="band", coords={"band": capture["band"]})
+    with pytest.raises(ValueError, match="Invalid unit 'ms' of the offset"):
+        alignment.align(capture, offset=offset.assign_attrs(units="ms"))

@@ -1,0 +1,199 @@
+"""Views of one object onto one grid; what a reflection costs that does not register with it."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import alignment, schema, separation, simulation
+from dbthermal.alignment import _resampling as resampling
+from dbthermal.simulation import Rig
+
+registration = pytest.importorskip("dbthermal.alignment._registration", exc_type=ImportError)
+
+RIG = Rig()
+SHAPE = (96, 128)
+
+
+def picture(x: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
+    """Ten warm or cold ellipses with soft edges, at any position [K]."""
+    rng, result = np.random.default_rng(seed), np.full(x.shape, 295.0)
+    for _ in range(10):
+        middle, axes = rng.uniform((0, 0), SHAPE[::-1]), rng.uniform(6, 23, 2)
+        angle, height = rng.uniform(0, 3), rng.uniform(-6, 12)
+        u, v = x - middle[0], y - middle[1]
+        along, across = u * np.cos(angle) + v * np.sin(angle), v * np.cos(angle) - u * np.sin(angle)
+        distance = np.hypot(along / axes[0], across / axes[1])
+        result += height / (1 + np.exp((distance - 1) * axes[0] / 0.7))
+    return result
+
+
+def homography(shift: tuple[float, float], degrees: float, scale: float) -> np.ndarray:
+    """Rotation and scaling about the image's middle, then a shift [pixel]."""
+    angle = np.deg2rad(degrees)
+    cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
+    turned = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    middle = np.array([[1.0, 0.0, 64.0], [0.0, 1.0, 48.0], [0.0, 0.0, 1.0]])
+    shifted = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]], [0.0, 0.0, 1.0]])
+    return np.asarray(shifted @ middle @ turned @ np.linalg.inv(middle))
+
+
+def views(matrix: np.ndarray, seed: int = 0, frames: int = 3) -> xr.Dataset:
+    """Two views of one plane, the second of other gain, offset and noise, with bad pixels."""
+    rng = np.random.default_rng(seed)
+    (y, x), (row, column) = np.indices(SHAPE), resampling.positions(np.linalg.inv(matrix), SHAPE)
+    first, second = 100.0 * picture(x, y, seed), 3000.0 + 8.0 * picture(column, row, seed)
+    counts = np.stack([np.stack([first] * frames), np.stack([second] * frames)])
+    counts += rng.normal(0, [[[[1.0]]], [[[0.3]]]], counts.shape)
+    counts[1, :, 20, 30], counts[1, :, 50, 77] = 0.0, 60000.0
+    status = np.zeros(SHAPE, dtype=np.uint16)
+    status[20, 30] = status[50, 77] = schema.FLAGS["dead_pixel"]
+    return xr.Dataset(
+        {
+            "counts": (("band", "time", "y", "x"), counts.astype(np.float32)),
+            "status": (("y", "x"), status, schema.status_attrs()),
+        },
+        coords={"band": ["8-14", "9.5"], "time": np.arange(frames) / 10.0},
+    )
+
+
+@pytest.mark.parametrize("model", ["affine", "homography"])
+@pytest.mark.parametrize(
+    "truth", [((2.3, -1.6), 0, 1), ((3.3, -4.6), 1, 1.01), ((9.7, 3.2), -1.5, 1.02)], ids=str
+)
+def test_object_registers(truth: tuple[tuple[float, float], float, float], model: str) -> None:
+    """Every pixel of the second view is found within a fifth of a pixel."""
+    matrix = homography(*truth)
+    for seed in range(3):
+        found = registration.register(views(matrix, seed), model=model)
+        apart = resampling.positions(found.values[1], SHAPE) - resampling.positions(matrix, SHAPE)
+        errors = np.hypot(*apart)
+        print(
+            f"{truth} {model}: {np.sqrt(np.mean(errors**2)):.3f}, at most {errors.max():.3f} pixel"
+        )
+        assert errors.max() < 0.2
+        np.testing.assert_array_equal(found.values[0], np.eye(3))
+
+
+def test_views_are_warped() -> None:
+    """After `align` the second view shows the object where the first does; outside it is NaN."""
+    capture = views(homography((3.3, -4.6), 1, 1.01))
+    aligned = alignment.align(capture, offset=0.0, transform=registration.register(capture))
+    good = (aligned["status"] == 0) & aligned["counts"].notnull().all(("band", "time"))
+    first, second = aligned["counts"].mean("time").where(good)
+    error = (second - 3000.0) / 8.0 - first / 100.0
+    print(
+        f"difference of the views: {float(error.std()):.3f} K of {float(first.std() / 100):.2f} K"
+    )
+    assert float(error.std()) < 0.15  # [K], of edges of up to 12 K over a few pixels
+    assert float(good.mean()) > 0.9
+    assert np.isnan(aligned["counts"].values[1, :, 0]).all()
+    assert len(aligned.attrs["transform"]) == 18
+
+
+def test_a_shift_by_whole_pixels_moves_samples() -> None:
+    """A transform by whole pixels changes no sample, and moves the bad pixels' flags along."""
+    capture = views(np.eye(3))
+    matrices = np.stack([np.eye(3), [[1, 0, 2], [0, 1, 1], [0, 0, 1]]])
+    transform = xr.DataArray(
+        matrices, dims=("band", "row", "column"), coords={"band": ["8-14", "9.5"]}
+    )
+    aligned = alignment.align(capture, offset=0.0, transform=transform)
+    moved = aligned["counts"].values[1, :, :-1, :-2]
+    np.testing.assert_array_equal(moved, capture["counts"].values[1, :, 1:, 2:])
+    assert np.isnan(aligned["counts"].values[1, :, -1]).all()
+    flagged = np.argwhere(aligned["status"].values)
+    assert flagged.tolist() == [[19, 28], [20, 30], [49, 75], [50, 77]]
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"model": "thin plate"}, "Unknown model 'thin plate'"),
+        ({"noise": True}, "band '9.5'"),
+        ({"blank": True}, "all pixels are alike"),
+    ],
+)
+def test_views_that_do_not_match(change: dict[str, object], what: str) -> None:
+    """Views of different things are refused, and so is an unknown model."""
+    capture = views(np.eye(3))
+    rng = np.random.default_rng(5)
+    if "noise" in change:
+        capture["counts"].values[1] = rng.normal(0, 1, SHAPE)
+    if "blank" in change:
+        capture["counts"].values[1] = 5.0
+    capture["counts"].values[1, 1:] += np.array([[[1.0]], [[2.0]]], dtype=np.float32)
+    with pytest.raises(ValueError, match=what):
+        registration.register(capture, **{k: v for k, v in change.items() if k == "model"})
+
+
+def parallax(pixels: float, rng: np.random.Generator) -> tuple[xr.Dataset, xr.Dataset]:
+    """Glass in which walkers are reflected so many pixels apart in the two bands, and a capture."""
+    value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    time, margin, width = np.arange(350) / 10.0, 6, 40
+    wide = simulation.walkers(time, (24, width + 2 * margin), value, np.random.default_rng(2))
+    seen = [
+        wide["background_temperature"].interp(x=np.arange(width) + margin + moved).values
+        for moved in (0.0, pixels)
+    ]
+    scene = wide.isel(x=slice(margin, margin + width)).drop_vars("background_temperature")
+    both = (("band", "time", "y", "x"), np.stack(seen), {"units": "K"})
+    apart = scene.assign(background_temperature=both)
+    return scene, simulation.observe(apart, RIG.response(), rng)
+
+
+def test_what_parallax_costs() -> None:
+    """A reflection half a pixel apart costs about as much noise again; a pixel or two, a kelvin."""
+    found = {}
+    for pixels in (0.0, 0.25, 0.5, 1.0, 2.0, 4.0):
+        scene, capture = parallax(pixels, np.random.default_rng(1))
+        result = separation.solve(capture, RIG.response())
+        error = result["object_temperature"] - scene["object_temperature"]
+        found[pixels] = float(((error**2).mean("time", skipna=False) ** 0.5).median())
+        flagged = float((result["status"].where(error.notnull().all("time")) > 0).mean())
+        print(f"reflection {pixels} pixels apart: {found[pixels]:.3f} K, flagged {flagged:.2f}")
+    assert np.all(np.diff(list(found.values())) > 0)
+    assert found[0.25] < 1.5 * found[0.0]
+    assert found[0.5] < 3 * found[0.0]
+    assert 0.2 < found[1.0] < 0.5  # [K]
+    assert found[2.0] > 0.5  # [K]
+
+
+def test_parallax_looks_like_a_time_offset() -> None:
+    """What walkers of both directions leave of it is less than half a frame, at 2 pixels."""
+    _, capture = parallax(2.0, np.random.default_rng(1))
+    offset = alignment.time_offset(capture)
+    print(f"reflection 2 pixels apart: {offset / 0.1:.2f} frames")
+    assert 0.1 < abs(offset) / 0.1 < 0.5
+
+
+def test_the_offset_is_that_of_registered_views() -> None:
+    """Of views 3 pixels and 4/3 frames apart, the offset is found after they are registered."""
+    value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    fine, rng, response = np.arange(1056) / 30.0, np.random.default_rng(3), RIG.response()
+    wide = simulation.walkers(fine, (56, 72), value, rng)
+    views = [wide.isel(y=slice(4, 52), x=slice(4, 68)), wide.isel(y=slice(2, 50), x=slice(7, 71))]
+    places = {"x": np.arange(64), "y": np.arange(48)}
+    parts = [
+        simulation.expose(
+            view.assign_coords(places),
+            response.isel(band=[band]),
+            rng,
+            every=3,
+            offsets=[4 * band],
+            frames=350,
+        ).drop_vars("exposure_time")
+        for band, view in enumerate(views)
+    ]
+    time = parts[0]["time"]
+    capture = xr.concat(
+        [part.assign_coords(time=time) for part in parts], "band", combine_attrs="override"
+    )
+    transform = registration.register(capture, model="translation")
+    aligned = alignment.align(capture, transform=transform)
+    errors = [
+        10.0 * found - 4.0 / 3.0
+        for found in (alignment.time_offset(capture), aligned.attrs["time_offset"][1])
+    ]
+    print(f"error of the offset: {errors[0]:.3f} frames as seen, {errors[1]:.3f} registered")
+    assert abs(errors[1]) < 0.05  # [frame]
+    assert abs(errors[0]) > 0.2  # [frame]: else the scene would not tell

@@ -1,0 +1,306 @@
+"""Emissivity by the reflector method and on the bench: exact without errors, true error bars."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import calibration, response, schema
+from dbthermal.calibration import Bias
+from dbthermal.simulation import Rig
+from dbthermal.simulation._bench import Bench, bench_series, contact_measurements, reflector_series
+from dbthermal.simulation._samples import OBJECTS, Sample, band_emissivity
+from reproduction.experiments.procedures import compare_procedures, reflector_sensitivity
+
+STDS = (0.2, 0.3)  # of a contact reading and of the foil [K]
+TRUE = np.array([0.3, 0.45])
+NO_ERRORS = Bench(
+    reading_std=1e-9,
+    probe_tolerance=0.0,
+    logger_tolerance=0.0,
+    contact=(0.0, 0.0),
+    blackbody_std=1e-9,
+    blackbody_tolerance=0.0,
+    foil_emissivity=0.0,
+    foil_std=1e-9,
+    direction=(0.0, 0.0),
+)
+
+
+@pytest.fixture(scope="module")
+def known() -> xr.Dataset:
+    """Response of the simulated rig."""
+    return Rig().response()
+
+
+def measured(of: xr.Dataset, warm: float, foil: float, number: int = 1) -> xr.Dataset:
+    """Measurements without errors of a material in front of one reflected temperature [K]."""
+    levels = xr.DataArray([warm, foil], dims="level")
+    own, reflected = response.counts(of, levels).values.T
+    one = np.ones((1, number))
+    return xr.Dataset(
+        {
+            "counts": (
+                ("band", "measurement"),
+                (TRUE * own + (1 - TRUE) * reflected)[:, np.newaxis] * one,
+            ),
+            "reflected_counts": (("band", "measurement"), reflected[:, np.newaxis] * one),
+            "object_temperature": ("measurement", np.full(number, warm)),
+        },
+        coords={"band": of["band"].values},
+    )
+
+
+def test_exact_without_errors(known: xr.Dataset) -> None:
+    """Exact signals give the exact emissivity, from one measurement too."""
+    found = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
+    np.testing.assert_allclose(found["emissivity"], TRUE, rtol=0, atol=1e-12)
+    assert np.all(np.isnan(found["reduced_chi2"]))
+
+
+def test_deviation_is_the_standards_formula(known: xr.Dataset) -> None:
+    """One measurement's deviation: sqrt(W^2 + e^2 Wo^2 + (1-e)^2 Wr^2) / |Wo - Wr|."""
+    found = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
+    curve = response.curve(known, "9.5")
+    noise, share = float(known["noise"].sel(band="9.5")), TRUE[1]
+    of_object = float(curve.count_slope(325.0)) * STDS[0]
+    of_foil = np.hypot(noise, float(curve.count_slope(295.0)) * STDS[1])
+    parts = [noise, share * of_object, (1 - share) * of_foil]
+    expected = np.linalg.norm(parts) / float(curve.counts(325.0) - curve.counts(295.0))
+    assert float(found["emissivity_std"].sel(band="9.5")) == pytest.approx(expected, rel=1e-6)
+
+
+def test_deviation_is_true(known: xr.Dataset) -> None:
+    """Over 4000 simulated measurements the scatter is the stated deviation within 5 %."""
+    rng, number = np.random.default_rng(4), 4000
+    exact = measured(known, 325.0, 295.0, number)
+    curves = [response.curve(known, str(name)) for name in known["band"].values]
+    noise = known["noise"].values[:, np.newaxis]
+    uneven = np.stack([curve.counts(295.0 + rng.normal(0, STDS[1], number)) for curve in curves])
+    own, foil = (noise * rng.standard_normal((2, number)) for _ in range(2))
+    read = exact["object_temperature"].values + rng.normal(0, STDS[0], number)
+    warm = np.stack([curve.counts(read) for curve in curves])
+    each = (exact["counts"].values + own - uneven - foil) / (warm - uneven - foil)
+    stated = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
+    np.testing.assert_allclose(each.std(axis=1) / stated["emissivity_std"], 1, rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda it: it.drop_vars("reflected_counts"), "Missing variable 'reflected_counts'"),
+        (lambda it: it.transpose(), "Invalid dims ('measurement', 'band')"),
+        (lambda it: it.assign(counts=it["counts"] * np.nan), "Invalid counts: NaN or infinite"),
+        (
+            lambda it: it.assign(object_temperature=it["object_temperature"] + 60),
+            "Invalid object temperature 385.0 K in band '8-14'",
+        ),
+        (
+            lambda it: it.assign(object_temperature=it["object_temperature"] - 29.5),
+            "between object and reflection in band '8-14'. Must exceed 1.08",
+        ),
+        (lambda it: it.assign_coords(band=["8-14", "10.6"]), "Missing band '10.6'"),
+    ],
+)
+def test_bad_measurements(
+    known: xr.Dataset, change: Callable[[xr.Dataset], xr.Dataset], message: str
+) -> None:
+    """Measurements that carry no emissivity are refused."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        calibration.reflector_emissivity(change(measured(known, 325.0, 295.0)), known, STDS)
+
+
+@pytest.mark.parametrize("sample", OBJECTS, ids=lambda sample: sample.name)
+def test_both_procedures_are_exact_without_errors(known: xr.Dataset, sample: Sample) -> None:
+    """With errors of zero, noise of a billionth and a perfect mirror both give the truth."""
+    quiet, rng = known.assign(noise=1e-9 * known["noise"]), np.random.default_rng(0)
+    mirror = replace(sample, stray=0.0)
+    true = band_emissivity(mirror, ["8-14", "9.5"])
+    series = bench_series(quiet, mirror, NO_ERRORS, rng)
+    foil = reflector_series(quiet, mirror, NO_ERRORS, rng)
+    for found in (
+        calibration.fit_emissivity(series, quiet, STDS),
+        calibration.reflector_emissivity(foil, quiet, STDS),
+    ):
+        np.testing.assert_allclose(found["emissivity"], true, rtol=0, atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def table(known: xr.Dataset) -> xr.Dataset:
+    """Forty series of each object by every procedure."""
+    return compare_procedures(known, np.random.default_rng(1), repeats=40)
+
+
+def test_bench_is_within_three_hundredths(table: xr.Dataset) -> None:
+    """Every series of every object on the bench, in both bands, is within 0.03 of its truth."""
+    print(table.sel(procedure="bench")[["mean", "spread", "largest"]].to_dataframe())
+    assert float(table["largest"].sel(procedure="bench").max()) < 0.03
+
+
+def test_bench_s_error_bars_are_true(table: xr.Dataset) -> None:
+    """Knowing the common errors 68 % are within one deviation; not knowing them, far fewer."""
+    coverage = table["coverage"].mean(("object", "band"))
+    print("coverage", dict(zip(coverage["procedure"].values, coverage.values, strict=True)))
+    assert float(coverage.sel(procedure="bench")) == pytest.approx(0.68, abs=0.06)
+    assert float(coverage.sel(procedure="bench, plain fit")) < 0.4
+
+
+def test_reflector_method_fails_at_low_emissivity(table: xr.Dataset) -> None:
+    """Mirrors seem to emit twice as much or more; paint and glass are right within 0.03."""
+    mean = table["mean"].sel(procedure="reflector", band="8-14")
+    print(mean.to_series())
+    assert np.all(mean.values[:2] > 1.8 * np.array([0.10, 0.05]))
+    np.testing.assert_allclose(mean.values[2:], [0.87, 0.95, 0.95], rtol=0, atol=0.03)
+
+
+def test_its_failure_is_the_mirrored_direction(known: xr.Dataset) -> None:
+    """In a room of one temperature it is right within 0.015; each kelvin mirrored adds to that."""
+    found = reflector_sensitivity(known, np.random.default_rng(1), (0.0, 5.0, 11.0), repeats=60)
+    print(found["mean"].sel(band="8-14").to_pandas())
+    assert found["mean"].dims == ("object", "excess", "band")
+    even = found["mean"].sel(excess=0.0)
+    np.testing.assert_allclose(even, found["true"], rtol=0, atol=0.015)
+    mirrors = found["mean"].isel(object=[0, 1])
+    assert float(mirrors.diff("excess").min()) > 0.03
+
+
+def test_other_bands_follow_the_kin() -> None:
+    """Metals by the ratio of emissivities, dielectrics by that of reflectances, all in (0, 1)."""
+    for sample in OBJECTS:
+        value = band_emissivity(sample, ["8-14", "9.5"])
+        assert float(value[0]) == pytest.approx(sample.emissivity, abs=1e-12)
+        assert 0 < float(value[1]) < 1
+    glass = band_emissivity(OBJECTS[-1], ["9.5"])
+    assert float(glass[0]) == pytest.approx(1 - 0.05 * (1 - 0.7180) / (1 - 0.8605), abs=1e-9)
+
+
+def test_contact_error_is_corrected_by_its_middle() -> None:
+    """A thermocouple that misses 2 to 4 % of 40 K reads 1.2 K low."""
+    bias = Bias(contact=(0.02, 0.04), air_temperature=295.0)
+    found = bias.corrected(np.array([335.0 - 0.03 * 40.0]))
+    np.testing.assert_allclose(found, 335.0, rtol=0, atol=1e-9)  # K
+
+
+def test_common_errors_do_not_average_out(known: xr.Dataset) -> None:
+    """Sixteen times the measurements: a deviation of noise falls by 4, one of a bias stays."""
+
+    def stated(number: int, bias: Bias) -> float:
+        warm, cold = np.full(number, 330.0), np.full(number, 295.0)
+        series = contact_measurements(
+            known,
+            xr.DataArray([0.9, 0.8], dims="band", coords={"band": ["8-14", "9.5"]}),
+            warm,
+            cold,
+            (0.1, 0.05),
+            np.random.default_rng(0),
+        )
+        found = calibration.fit_emissivity(series, known, (0.1, 0.05), bias)
+        return float(found["emissivity_std"][0])
+
+    alone, common = Bias(), Bias(object_tolerance=2.0)
+    assert stated(4, alone) / stated(64, alone) == pytest.approx(4.0, rel=0.01)
+    assert stated(4, common) / stated(64, common) == pytest.approx(1.0, rel=0.03)
+
+
+def test_scatter_does_not_pass_for_contrast(known: xr.Dataset) -> None:
+    """Readings that scatter by 0.5 K at a contrast of 2 K: no bias, and the spread is stated."""
+    rng, number = np.random.default_rng(3), 60
+    true = xr.DataArray([0.9, 0.8], dims="band", coords={"band": ["8-14", "9.5"]})
+    warm, stds = np.full(200, 300.0), (0.5, 0.05)
+    series = (contact_measurements(known, true, warm, warm - 2.0, stds, rng) for _ in range(number))
+    found = xr.concat([calibration.fit_emissivity(it, known, stds) for it in series], "repeat")
+    spread, stated = found["emissivity"].std("repeat"), found["emissivity_std"].mean("repeat")
+    np.testing.assert_allclose(found["emissivity"].mean("repeat"), true, rtol=0, atol=0.01)
+    np.testing.assert_allclose(spread / stated, 1.0, rtol=0, atol=0.25)
+
+
+def test_deviations_grow_with_the_correction(known: xr.Dataset) -> None:
+    """An offset counts 1 / (1 - m) times at the thermocouple, 1 - s times at the blackbody."""
+    bias = Bias(0.6, (0.1, 0.3), 295.0, 0.3, (0.05, 0.15))
+    curve, warm, step = response.curve(known, "9.5"), np.array([320.0]), 1e-3
+    reading = 295.0 + 0.8 * (warm - 295.0)
+    slopes = [
+        np.diff([curve.counts(bias.corrected(reading + it)) for it in (-step, step)], axis=0),
+        np.diff([bias.reflection(curve, warm + it) for it in (-step, step)], axis=0),
+    ]
+    effects = (bias.emitted(curve, warm, 0.2), bias.reflected(curve, warm, 0.2))
+    for tolerance, slope, (scatter, common) in zip((0.6, 0.3), slopes, effects, strict=True):
+        expected = slope[0] / (2 * step)  # count a kelvin of the reading
+        np.testing.assert_allclose(scatter, 0.2 * expected, rtol=1e-6)
+        np.testing.assert_allclose(common[0], tolerance / 3**0.5 * expected, rtol=1e-6)
+    wrong = [replace(bias, contact=(m, m)).corrected(reading) for m in (0.2 - step, 0.2 + step)]
+    contact = np.diff(wrong, axis=0)[0] / (2 * step) * 0.2 / 12**0.5 * curve.count_slope(warm)
+    np.testing.assert_allclose(effects[0][1][1], contact, rtol=1e-5)
+
+
+def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit that is stopped before it stands still names its band."""
+    monkeypatch.setattr("dbthermal.calibration._contact._ITERATIONS", 1)
+    rng = np.random.default_rng(0)
+    series = bench_series(known, OBJECTS[0], Bench(), rng)
+    with pytest.raises(ArithmeticError, match=r"No convergence in band '8-14': emissivity 0\."):
+        calibration.fit_emissivity(series, known, STDS)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"object_tolerance": -0.5}, "Invalid object_tolerance -0.5 K. Must be zero or positive."),
+        ({"contact": (0.05, 0.0)}, r"Invalid contact \(0.05, 0.0\). Must be a range"),
+        ({"stray": (0.0, 1.0)}, r"Invalid stray \(0.0, 1.0\). Must be a range"),
+        ({"air_temperature": -20.0}, r"Invalid air_temperature \[K\] -20.0"),
+    ],
+)
+def test_bad_bias(options: dict[str, object], message: str) -> None:
+    """Ranges that are none are refused."""
+    with pytest.raises(ValueError, match=message):
+        Bias(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"contact": (0.1, 0.0)}, r"Invalid contact \(0\.1, 0\.0\) of the bench"),
+        ({"contact": (0.0, 1.0)}, r"Invalid contact .* in \[0\.0, 1\.0\)"),
+        ({"direction": (0.0, np.nan)}, r"Invalid direction \(0\.0, nan\)"),
+        ({"direction": (-np.inf, 0.0)}, r"Invalid direction \(-inf, 0\.0\)"),
+        ({"probe_tolerance": np.nan}, r"Invalid probe_tolerance nan of the bench"),
+        ({"logger_tolerance": -0.5}, r"Invalid logger_tolerance -0\.5"),
+        ({"blackbody_tolerance": np.inf}, r"Invalid blackbody_tolerance inf"),
+        ({"foil_emissivity": 2.0}, r"Invalid foil_emissivity 2\.0 .* in \[0, 1\.0\)"),
+        ({"foil_warming": -0.1}, r"Invalid foil_warming -0\.1"),
+        ({"least_excess": np.nan}, r"Invalid least_excess nan"),
+        ({"reading_std": 0.0}, r"Invalid reading_std \[K\] of the bench 0\.0"),
+        ({"object_temperatures": ()}, r"Invalid object_temperatures \(\) of the bench"),
+        ({"blackbody_temperatures": (np.nan,)}, r"Invalid blackbody_temperatures \[K\]"),
+    ],
+)
+def test_numbers_that_are_no_bench(options: dict[str, object], message: str) -> None:
+    """Each is refused by its name, with the rule."""
+    with pytest.raises(ValueError, match=message):
+        Bench(**options)  # type: ignore[arg-type]
+
+
+def test_bad_bench(known: xr.Dataset) -> None:
+    """Objects, steps and repeats that are none are refused."""
+    with pytest.raises(ValueError, match=r"Invalid emissivity 1\.2 of 'tin'"):
+        Sample("tin", 1.2, "brass plate", 0.0)
+    with pytest.raises(ValueError, match=r"Invalid stray 2\.0 of 'tin'"):
+        Sample("tin", 0.2, "brass plate", 2.0)
+    cold = Bench(object_temperatures=(300.0,))
+    with pytest.raises(ValueError, match=r"One must be 10\.0 K above the air's 295\.15 K"):
+        reflector_series(known, OBJECTS[0], cold, np.random.default_rng(0))
+    with pytest.raises(ValueError, match="Invalid comparison of 5 samples, 1 times"):
+        compare_procedures(known, np.random.default_rng(0), repeats=1)
+
+
+def test_series_are_stages(known: xr.Dataset) -> None:
+    """A simulated series is what the calibration asks for."""
+    rng = np.random.default_rng(0)
+    contact = bench_series(known, OBJECTS[0], Bench(), rng)
+    foil = reflector_series(known, OBJECTS[0], Bench(), rng)
+    assert schema.check(contact, "contact").sizes["measurement"] == 12
+    assert schema.check(foil, "reflector").sizes["measurement"] == 3

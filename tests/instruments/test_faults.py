@@ -1,0 +1,321 @@
+"""Every fault of the rig: what its user sees, and that it costs a recording no frame and no truth.
+
+What is asked of an instrument goes through its driver to its emulator, on a clock of its own; the
+frames come from two emulated cameras in real time, and each picture tells when it was seen. Frames
+that a busy machine loses are losses like others, so all is held against what came (`rig_take`).
+"""
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig_devices import BosonBench, LoggerBench, WheelBench
+from rig_take import Read, Take, session
+
+from dbthermal import correction as frames
+from dbthermal import store
+from dbthermal.instruments import apt
+from dbthermal.instruments.boson import Boson, BosonReplyError, BosonStatusError, BosonTimeoutError
+from dbthermal.instruments.devices import Devices, Thermocouples
+from dbthermal.instruments.emulated.boson import EmulatedBoson
+from dbthermal.instruments.emulated.boson_faults import Fault
+from dbthermal.instruments.emulated.frames import Faults
+from dbthermal.instruments.emulated.port import EmulatedPort
+from dbthermal.instruments.filterwheel import (
+    FilterWheel,
+    NoReplyError,
+    NotHomedError,
+    StalledWheelError,
+    WheelError,
+)
+from dbthermal.instruments.recording.capture import open_capture
+from dbthermal.instruments.tc08 import TC08, TC08Error
+from dbthermal.instruments.transport import TransportError
+from dbthermal.instruments.video.source import FrameFlag
+
+# Cameras: what goes wrong with their frames.
+
+OFTEN = frozenset(range(6, 60, 5))
+AFTER = frozenset(number + 1 for number in OFTEN)
+LOST, ERROR = FrameFlag.FRAMES_LOST_BEFORE, FrameFlag.DRIVER_ERROR
+
+DAMAGES = {
+    "dropped": (Faults(dropped=OFTEN | {7, 8}), LOST, "frames_lost"),
+    "corrupt": (Faults(corrupt=OFTEN), ERROR, "damaged"),
+    "short": (Faults(short=OFTEN), FrameFlag.WRONG_SIZE, "damaged"),
+    "dropped and corrupt": (Faults(dropped=OFTEN, corrupt=AFTER), ERROR | LOST, "damaged"),
+    "shutter": (Faults(ffc=frozenset(range(6, 15))), FrameFlag.SHUTTER_CLOSED, "shutter_closed"),
+}
+"""What happens to which frames, the flag that tells it, and the note in the log."""
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_frames(name: str, tmp_path: Path) -> None:
+    """What happens to frames is in their flags and in the log, of their camera and no other."""
+    faults, flag, kind = DAMAGES[name]
+    take = Take(tmp_path / "a.zarr", {"9.5": faults}).record(0.5)
+    flags = [FrameFlag(int(value)) for value in take.stored("9.5")["frame_flags"]]
+    assert any(flag in found for found in flags)
+    assert kind in take.kinds("9.5")
+    assert {*take.kinds("8-14")} <= {"frames_lost"}
+    assert take.summary.ended == "duration"
+
+
+def test_a_repeated_image(tmp_path: Path) -> None:
+    """The recording keeps it as it came and says so, and afterwards it is found and taken out."""
+    take = Take(tmp_path / "a.zarr", {"9.5": Faults(repeated=OFTEN)}).record(0.4)
+    capture = open_capture(take.path).isel(time=slice(0, len(take.cameras["9.5"].given)))
+    found = frames.find_shutter(capture).query(event="band == '9.5'")
+    repeated = np.isin(capture["sequence"].sel(band="9.5"), [*OFTEN])
+    flagged = capture["frame_flags"].sel(band="9.5").values & int(FrameFlag.IMAGE_REPEATED)
+    np.testing.assert_array_equal(flagged > 0, repeated)
+    assert found["frames"].sum() == np.count_nonzero(repeated) > 0
+    assert not found["renewed"].any()
+
+
+def test_a_corrupt_frame_that_nobody_tells(tmp_path: Path) -> None:
+    """Where the driver says nothing of it, a corrupt frame passes for a good one."""
+    take = Take(tmp_path / "a.zarr", {"9.5": Faults(unseen=OFTEN)}).record(0.4)
+    kept = take.stored("9.5")
+    corrupt = np.isin(kept["sequence"], [*OFTEN])
+    assert corrupt.any()
+    assert {*kept["frame_flags"].values[corrupt]} <= {0, int(LOST)}
+
+
+def test_an_unplugged_camera(tmp_path: Path) -> None:
+    """The other camera is recorded to the end, and the store says whose frames end where."""
+    take = Take(tmp_path / "a.zarr", {"9.5": Faults(unplugged=12)}).record(0.6)
+    assert take.summary.ended == "source lost"
+    assert take.kinds("9.5")[-1] == "source_lost"
+    assert take.cameras["9.5"].given[-1].sequence < 12 < take.cameras["8-14"].given[-1].sequence
+    opened = open_capture(take.path)
+    after = opened.sel(band="9.5").isel(time=slice(len(take.cameras["9.5"].given), None))
+    assert opened.attrs["complete"] is False
+    assert np.isnan(after["exposure_time"]).all()
+
+
+def test_a_clock_that_drifts(tmp_path: Path) -> None:
+    """Stamps of a camera's own clock are kept, are no times, and are fitted on demand only."""
+    take = Take(tmp_path / "a.zarr", {"9.5": Faults(clock_rate=1.01)}).record(0.4)
+    with pytest.raises(ValueError, match=r"Invalid exposure times of band '9\.5': 0 stamps"):
+        open_capture(take.path)
+    fitted = open_capture(take.path, fitted=True)["exposure_time"].sel(band="9.5")
+    given = take.cameras["9.5"].given
+    device, host = ([getattr(f, name) for f in given] for name in ("device_time", "host_time"))
+    line = np.polynomial.Polynomial.fit(device, host, 1)
+    expected = line(np.array(device)) - store.open_dataset(take.path).attrs["clock_origin"]
+    np.testing.assert_allclose(fitted[: len(given)], expected, rtol=0, atol=1e-6)
+
+
+# Instruments: what goes wrong with what is asked beside the frames.
+
+FPA, SLOT, TIP, ROOM = 308.15, 3.0, 350.0, 296.15
+
+Instrument = Boson | FilterWheel | TC08
+Error = tuple[type[Exception], str]
+
+
+def camera(*faults: Fault | None, **knobs: object) -> Boson:
+    """A camera that has these faults again and again."""
+    bench = BosonBench()
+    bench.device.faults.once = deque([*faults] * 400)
+    for name, value in knobs.items():
+        setattr(bench.device.faults, name, value)
+    return bench.camera
+
+
+def correcting_camera() -> Boson:
+    """A camera that corrects its offsets, and does not answer before it is through."""
+    bench = BosonBench()
+    bench.device.faults.ffc_stalls = True
+    bench.camera.start_ffc()
+    return bench.camera
+
+
+def unplugged_camera() -> Boson:
+    """A camera that was pulled out."""
+    bench = BosonBench()
+    bench.state.plugged = False
+    return bench.camera
+
+
+def wheel(*, plugged: bool = True, **knobs: object) -> FilterWheel:
+    """A wheel that was sent to the third slot before it got these faults."""
+    bench = WheelBench()
+    bench.homed().move_to(3)
+    bench.device.plugged = plugged
+    for name, value in knobs.items():
+        setattr(bench.device.faults, name, value)
+    return bench.wheel
+
+
+def stalled_wheel() -> FilterWheel:
+    """A wheel that stood though it should move, which was an error at once."""
+    bench = WheelBench()
+    bench.homed()
+    bench.device.faults.stands_after = 20.0
+    with pytest.raises(StalledWheelError, match=r"stood at 20\.00 deg for 2\.0 s .* was stopped"):
+        bench.wheel.move_to(3)
+    return bench.wheel
+
+
+def stopped_wheel() -> FilterWheel:
+    """A wheel that was stopped on its way."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.receive(apt.move_absolute(1, 200_000, destination=apt.BAY_1))
+    bench.clock.sleep(0.5)
+    wheel.stop()
+    return wheel
+
+
+def logger(**knobs: object) -> TC08:
+    """A logger of two tips, with these faults."""
+    bench = LoggerBench()
+    bench.ready()
+    for name, value in knobs.items():
+        setattr(bench.unit.faults, name, value)
+    return bench.driver
+
+
+TROUBLES: dict[str, tuple[Callable[[], Instrument], float | Error]] = {
+    "Boson: replies lost": (lambda: camera(Fault.DROP, None), FPA),
+    "Boson: late replies": (lambda: camera(Fault.LATE, None), FPA),
+    "Boson: stale replies": (lambda: camera(Fault.LATE, Fault.LATE, None, late=1.2), FPA),
+    "Boson: two replies in one read": (lambda: camera(Fault.HOLD, None), FPA),
+    "Boson: one reply in many reads": (lambda: camera(single_bytes=True), FPA),
+    "Boson: wrong checksums": (lambda: camera(Fault.BAD_CHECKSUM, None), FPA),
+    "Boson: illegal escapes": (lambda: camera(Fault.ILLEGAL_ESCAPE, None), FPA),
+    "Boson: replies cut short": (lambda: camera(Fault.CUT, None), FPA),
+    "Boson: text on another channel": (lambda: camera(Fault.DEBUG_TEXT), FPA),
+    "Boson: stalled by a correction": (correcting_camera, FPA),
+    "Boson: mute": (lambda: camera(Fault.DROP), (BosonTimeoutError, "through with booting")),
+    "Boson: busy": (lambda: camera(Fault.BUSY), (BosonStatusError, "0x283, camera busy")),
+    "Boson: short data": (lambda: camera(Fault.SHORT), (BosonReplyError, "1 bytes. Must have 2")),
+    "Boson: another's reply": (
+        lambda: camera(Fault.WRONG_COMMAND),
+        (BosonReplyError, "of command 0x00050031. Must be of command 0x00050030"),
+    ),
+    "Boson: unplugged": (unplugged_camera, (TransportError, "Lost the emulated device")),
+    "wheel: answers lost": (lambda: wheel(drop=1), SLOT),
+    "wheel: late answers": (lambda: wheel(late=0.4), SLOT),
+    "wheel: stale answers": (lambda: wheel(late=1.2), SLOT),
+    "wheel: one answer in many reads": (lambda: wheel(single_bytes=True), SLOT),
+    "wheel: noise": (lambda: wheel(noise=b"\xff\x12\x04"), SLOT),
+    "wheel: reports that nobody asked for": (lambda: wheel(stray_completed=True), SLOT),
+    "wheel: an error that nobody asked for": (lambda: wheel(notice="motor hot"), SLOT),
+    "wheel: silent": (lambda: wheel(silent=True), (NoReplyError, "must be on and in no other")),
+    "wheel: stalled": (stalled_wheel, (NotHomedError, "has lost steps since. Must be homed")),
+    "wheel: between two slots": (stopped_wheel, (WheelError, "between two slots, at .* deg")),
+    "wheel: unplugged": (lambda: wheel(plugged=False), (TransportError, "Lost the emulated dev")),
+    "TC-08: open thermocouple": (lambda: logger(open={1}), math.nan),
+    "TC-08: open, and reads the room": (lambda: logger(open={1}, open_reads="ambient"), ROOM),
+    "TC-08: another one open": (lambda: logger(open={2}), TIP),
+    "TC-08: overflow": (lambda: logger(overflow={1}), math.nan),
+    "TC-08: unplugged": (
+        lambda: logger(unplugged=True),
+        (TC08Error, "error 16, the communication with the unit is lost"),
+    ),
+}
+"""What is done to which instrument, and what its user gets: a number, or an error."""
+
+
+def asked(device: Instrument) -> Read:
+    """How a user asks an instrument."""
+    if isinstance(device, TC08):
+        return lambda: float(device.single().temperature[1])
+    return device.fpa_temperature if isinstance(device, Boson) else device.position
+
+
+def read_beside_frames(device: Instrument) -> Read:
+    """How a recording asks it."""
+    if isinstance(device, FilterWheel):
+        return device.position
+    if isinstance(device, Boson):
+        return Devices(session(), {}, {"9.5": device}).readings()["fpa 9.5"].read
+    tips = Thermocouples(device, {1: "tip"}, clock=device._clock)
+    return Devices(session(), {}, thermocouples=tips).readings()["tip"].read
+
+
+@pytest.mark.parametrize("name", TROUBLES)
+def test_what_the_user_sees(name: str) -> None:
+    """A fault is overcome, time after time, or is an error that says what it is."""
+    make, sees = TROUBLES[name]
+    ask = asked(make())
+    for _ in range(3):
+        if isinstance(sees, float):
+            assert ask() == pytest.approx(sees, abs=0.05, nan_ok=True)
+        else:
+            with pytest.raises(sees[0], match=sees[1]):
+                ask()
+
+
+@pytest.fixture(scope="module")
+def troubled(tmp_path_factory: pytest.TempPathFactory) -> Take:
+    """One recording beside which every instrument is in trouble, and takes its time."""
+
+    def slowly(read: Read) -> Read:
+        def wait_and_read() -> float:
+            time.sleep(0.002)
+            return read()
+
+        return wait_and_read
+
+    readings = {name: slowly(read_beside_frames(make())) for name, (make, _) in TROUBLES.items()}
+    return Take(tmp_path_factory.mktemp("troubled") / "a.zarr").record(0.8, readings)
+
+
+@pytest.mark.parametrize("name", TROUBLES)
+def test_what_is_recorded(name: str, troubled: Take) -> None:
+    """A number that is one is in the log, all else is noted as failed; no frame was lost for it."""
+    sees, found = TROUBLES[name][1], troubled.noted(name)
+    if isinstance(sees, float) and not math.isnan(sees):
+        kind, value = "reading", sees
+    else:
+        kind, value = "reading_failed", math.nan
+    assert troubled.kinds(name) == [kind] * len(found) != []
+    np.testing.assert_allclose([read for _, read in found], value, rtol=0, atol=0.05)
+
+
+def test_a_camera_that_boots(tmp_path: Path) -> None:
+    """It is mute for longer than a question is asked; the next one after that is answered."""
+    bench = BosonBench()
+    bench.camera.reboot()
+    with pytest.raises(BosonTimeoutError, match="and the camera through with booting"):
+        bench.camera.fpa_temperature()
+    assert bench.camera.wait_until_booted() == 93588
+    bench.camera.reboot()
+    take = Take(tmp_path / "a.zarr").record(0.5, {"fpa": read_beside_frames(bench.camera)})
+    assert take.kinds("fpa")[0] == "reading_failed"
+    assert {*take.kinds("fpa")[1:]} == {"reading"}
+
+
+def test_a_correction_that_stalls_replies_and_freezes_frames(tmp_path: Path) -> None:
+    """The camera answers after its shutter opened; its frames say that it was closed."""
+    take = Take(tmp_path / "a.zarr", {"9.5": Faults(ffc=frozenset(range(8, 20)))})
+    device = EmulatedBoson(take.world, "9.5", free_running=False)
+    device.faults.ffc_stalls = True
+    with EmulatedPort(device) as port, Boson.from_url(f"pty://{port.path}", timeout=20) as boson:
+        take.record(1.0, {"fpa": read_beside_frames(boson)})
+        assert boson.statistics.timeouts == 0
+    assert "shutter_closed" in take.kinds("9.5")
+    assert {*take.kinds("fpa")} == {"reading"}
+
+
+def test_an_instrument_that_is_pulled_out(tmp_path: Path) -> None:
+    """Its readings are right until then and failed from then on, in the order of the log."""
+    bench = WheelBench()
+    bench.homed().move_to(3)
+    left = iter([True, True])
+
+    def read() -> float:
+        bench.device.plugged = next(left, False)
+        return bench.wheel.position()
+
+    take = Take(tmp_path / "a.zarr").record(0.5, {"slot": read})
+    assert take.noted("slot")[:2] == [("reading", SLOT)] * 2
+    assert {*take.kinds("slot")[2:]} == {"reading_failed"}

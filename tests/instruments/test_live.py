@@ -1,0 +1,346 @@
+"""The live view tells how a recording goes, in one figure, and costs it no frame."""
+
+import math
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.image import AxesImage
+
+from dbthermal.figures import LiveFigure, Panel
+from dbthermal.instruments import live
+from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.recording.fetching import Limits, Reading
+from dbthermal.instruments.recording.record import Preview, Summary, record
+from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.video import telemetry
+from dbthermal.instruments.video.source import GOOD, Counts, Frame, FrameFlag
+
+BANDS = ("8-14", "9.5")
+DEGREE = "\N{DEGREE SIGN}C"
+RAMP = (5000 + np.arange(384, dtype=np.uint16)).reshape(16, 24)
+
+
+def frame(counts: Counts = RAMP, flags: FrameFlag = GOOD, rows: Counts | None = None) -> Frame:
+    """A frame whose clocks do not matter."""
+    return Frame(counts, 0.0, 0.0, 0, flags, rows)
+
+
+def rows(fpa_temperature: float, last_ffc_frame: int = 0) -> Counts:
+    """Telemetry of a frame."""
+    fields = telemetry.Telemetry(fpa_temperature=fpa_temperature, last_ffc_frame=last_ffc_frame)
+    return telemetry.encode(fields, 640)
+
+
+def preview(at: float = 0.0, shown: Frame | None = None, **readings: float) -> Preview:
+    """What a recording of 60 frames/s in one band shows at a time [s]."""
+    last = replace(shown or frame(), host_time=1000 + round(60 * at) / 60)
+    totals = {"9.5": {"frames": round(60 * at) + 1, "lost": 2, "refused": 3, "damaged": 4}}
+    return Preview(at, {"9.5": last}, totals, readings)
+
+
+def ffc(at: float = 0.0, shown: Frame | None = None, *, ffc: float, fpa: float = 308.15) -> Preview:
+    """A preview with the camera's own readings."""
+    return replace(preview(at, shown), readings={"ffc 9.5": ffc, "fpa 9.5": fpa})
+
+
+def status(*previews: Preview, window: float = 3.0) -> live.Status:
+    """How the band is after the last of them."""
+    watch = live.Watch(window)
+    for one in previews:
+        watch.note(one)
+    return watch.status()["9.5"]
+
+
+def texts(view: live.View) -> list[str]:
+    """All that is written in the figure of a view, outside its axes' numbers."""
+    figure = view.figure
+    assert figure is not None
+    below = [axis.get_xlabel() for axis in figure.axes]
+    across = [text.get_text() for axis in figure.axes for text in axis.texts]
+    return [figure.get_suptitle(), *below, *across, figure.get_supxlabel()]
+
+
+class Recorder:
+    """A display that keeps what it is handed."""
+
+    def __init__(self) -> None:
+        self.displayed: list[Any] = []
+        self.updated: list[Any] = []
+        self.display, self.update = self.displayed.append, self.updated.append
+
+
+def recording(path: Path, view: live.View) -> Summary:
+    """Record two emulated cameras, whose shutters are closed, until a view has seen enough."""
+    world, sources, stop = World(), {}, threading.Event()
+    wide = np.tile(RAMP, (1, 3))  # two rows of it hold the telemetry
+    movie, faults = Movie(wide[None], 60.0, endless=True), Faults(ffc=frozenset(range(1, 6000)))
+    for number, band in enumerate(BANDS):
+        world.add_camera(band, number)
+        sources[band] = EmulatedCamera(
+            world, band, {band: movie}, band, wide.shape, 100.0, telemetry.ROWS, faults
+        )
+
+    def show(shown: Preview) -> None:
+        view(shown)
+        if "plate" in shown.readings and min(one.frames for one in view.status.values()) > 9:
+            stop.set()
+
+    camera = Camera(Device("sim://camera/any", "v4l2:///dev/video0"))
+    cameras = dict.fromkeys(BANDS, camera)
+    session = Session("test", True, "scene", 60.0, cameras, 100.0, wide.shape, telemetry.ROWS)
+    limits = Limits(reserve=0, preview_period=0.0, reading_period=0.05)
+    plate = {"plate": Reading(lambda: 303.15)}
+    return record(
+        session, dict(sources), path, readings=plate, limits=limits, preview=show, stop=stop
+    )
+
+
+def test_numbers_of_a_preview() -> None:
+    """Totals are handed on, and the ramp's percentiles and ends are found."""
+    found = status(preview())
+    assert (found.frames, found.lost, found.refused, found.damaged) == (1, 2, 3, 4)
+    assert (found.lowest, found.highest, found.dead, found.saturated) == (5000, 5383, 0, 0)
+    expected = np.percentile(RAMP[::4, ::4], live._watch.PERCENTILES)
+    np.testing.assert_allclose(found.limits, expected, rtol=0, atol=1e-9)
+    assert math.isnan(found.frame_rate)
+
+
+def test_frame_rate_is_that_of_the_last_seconds() -> None:
+    """It is that at which frames came, whenever they were written, and 0 after a window of none."""
+    running = [preview(at) for at in np.arange(0.0, 10.1, 0.5)]
+    late = [replace(one, time=one.time + 0.4 * math.sin(one.time)) for one in running]
+    stopped = [replace(running[-1], time=at) for at in (11.0, 12.0, 13.0)]
+    for seen in (running, late, running + stopped[:2]):
+        np.testing.assert_allclose(status(*seen).frame_rate, 60.0, rtol=0, atol=1e-9)
+    slower = replace(running[-1].frames["9.5"], host_time=1012.0)
+    half = replace(running[-1], time=12.0, frames={"9.5": slower})
+    np.testing.assert_allclose(status(*running, half).frame_rate, 20.0, rtol=0, atol=1e-9)
+    assert status(*running, *stopped).frame_rate == 0
+    assert status(*running, *stopped).warning == "no new frames come"
+
+
+def test_another_recording_begins_anew() -> None:
+    """A time that goes back, fewer frames or other bands are another recording."""
+    watch = live.Watch()
+    first, other = preview(5.0), {"11": dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)}
+    assert watch.status() == {}
+    assert [watch.note(one) for one in (first, preview(6.0), preview(0.1))] == [True, False, True]
+    assert math.isnan(watch.status()["9.5"].frame_rate)
+    assert watch.note(replace(preview(0.0), time=7.0))
+    assert watch.note(Preview(8.0, {}, other, {}))
+    assert watch.status()["11"].warning == "no frame has come"
+
+
+@pytest.mark.parametrize(
+    ("number", "name"),
+    [
+        (0.0, "none performed"),
+        (1.0, "imminent"),
+        (2.0, "in progress"),
+        (3.0, "complete"),
+        (math.nan, "no answer"),
+        (7.0, "state 7"),
+    ],
+)
+def test_state_of_the_correction_as_the_camera_answers(number: float, name: str) -> None:
+    """Each state has its name, one that is not known its number, a failed reading says so."""
+    assert status(ffc(ffc=number)).ffc == name
+
+
+def test_state_of_the_correction_by_the_frame() -> None:
+    """A closed shutter is a correction, though the camera's answer is older or late."""
+    closed = frame(flags=FrameFlag.SHUTTER_CLOSED)
+    assert status(preview(shown=closed)).ffc == "in progress"
+    assert status(ffc(shown=closed, ffc=3.0)).ffc == "in progress"
+    assert status(preview()).ffc == "unknown"
+    assert status(ffc(shown=closed, ffc=math.nan)).warning == "shutter closed: FFC in progress"
+
+
+def test_time_since_the_last_correction() -> None:
+    """It is counted from when it was last seen, in the readings or as a leap of the telemetry."""
+    asked = (ffc(1.0, ffc=3.0), ffc(2.0, ffc=2.0), ffc(5.5, ffc=3.0))
+    assert math.isnan(status(asked[0]).ffc_age)
+    assert status(*asked).ffc_age == 3.5
+    told = [
+        preview(at, frame(rows=rows(300.0, number)))
+        for at, number in ((1.0, 10), (2.0, 10), (3.0, 130), (7.0, 130))
+    ]
+    assert math.isnan(status(*told[:2]).ffc_age)
+    assert status(*told).ffc_age == 4.0
+
+
+def test_camera_temperature() -> None:
+    """The reading counts, without an answer the telemetry, but not that of a damaged frame."""
+    told = frame(rows=rows(311.2))
+    assert status(ffc(shown=told, ffc=3.0, fpa=308.15)).fpa_temperature == 308.15
+    silent = status(ffc(shown=told, ffc=3.0, fpa=math.nan))
+    np.testing.assert_allclose(silent.fpa_temperature, 311.2, rtol=0, atol=1e-9)
+    damaged = frame(flags=FrameFlag.WRONG_SIZE, rows=rows(0.0))
+    assert math.isnan(status(preview(shown=damaged)).fpa_temperature)
+
+
+def test_lines() -> None:
+    """Two lines say it, in degrees Celsius, and say what is not known."""
+    expected = f"FPA 35.0 {DEGREE}, FFC complete, last 4 s ago"
+    lines = status(ffc(0.0, ffc=2.0), ffc(4.0, ffc=3.0)).text.splitlines()
+    assert lines == ["60.0 frames/s, 2 lost, 3 refused, 4 damaged", expected]
+    assert status(ffc(ffc=2.0)).text.endswith(f"FPA 35.0 {DEGREE}, FFC in progress")
+    unknown = status(preview()).text.splitlines()
+    assert unknown == ["- frames/s, 2 lost, 3 refused, 4 damaged", "FPA unknown, FFC unknown"]
+
+
+@pytest.mark.parametrize(
+    ("value", "pixels", "warning"),
+    [
+        (0, 4, "1.0 % of the pixels at 0: dead"),
+        (65535, 96, "25.0 % of the pixels at 65535: saturated"),
+        (65535, 3, ""),
+        (65534, 96, ""),
+        (10_000, 384, "every pixel at 10000: nothing is seen"),
+    ],
+)
+def test_bad_pictures_are_told(value: int, pixels: int, warning: str) -> None:
+    """More than one pixel in a hundred at an end of the range is told, and so is a blank."""
+    counts = RAMP.copy()
+    counts.flat[:pixels] = value
+    assert status(preview(shown=frame(counts))).warning == warning
+
+
+@pytest.mark.parametrize("bad", [{"period": -1.0}, {"period": math.nan}, {"window": 0.0}])
+def test_bad_settings_are_refused(bad: dict[str, float]) -> None:
+    """Times that are none are a clear error."""
+    with pytest.raises(ValueError, match=r"Invalid (period|window) .* s\. Must be"):
+        live.View(is_simulated=True, **bad)  # type: ignore[arg-type]
+
+
+def test_title_says_that_it_is_emulated() -> None:
+    """An emulated rig is never shown as a real one, nor a real one as emulated."""
+    for is_simulated, title in ((True, "pot (emulated), 2.0 s"), (False, "pot, 2.0 s")):
+        view = live.View(title="pot", is_simulated=is_simulated)
+        view(preview(2.0))
+        assert texts(view)[0] == title
+
+
+def test_readings_are_written_below() -> None:
+    """Thermocouples in degrees Celsius, other units as told, no answer as such, cameras above."""
+    view = live.View(is_simulated=True)
+    named = {"plate": 303.15, "air": 40.0, "room": math.nan, "ffc 11": 3.0, "fpa 9.5": 308.15}
+    view(replace(preview(), readings=named, units={"air": "%"}))
+    assert texts(view)[-1] == f"plate 30.0 {DEGREE}, air 40 %, room no answer, ffc 11 complete"
+
+
+def test_one_figure_is_used_again() -> None:
+    """Figure and artists stay, with other data; other bands get another figure."""
+    display = Recorder()
+    view = live.View(display, is_simulated=True, period=0.0)
+    view(preview(1.0))
+    first = view.figure
+    assert first is not None
+    artists = [*first.findobj(Axes), *first.findobj(AxesImage), *first.texts]
+    view(preview(2.0, frame(RAMP + 100)))
+    assert view.figure is first
+    assert [*first.findobj(Axes), *first.findobj(AxesImage), *first.texts] == artists
+    image = first.axes[0].images[0]
+    np.testing.assert_array_equal(image.get_array(), RAMP + 100)
+    np.testing.assert_allclose(image.get_clim(), view.status["9.5"].limits, rtol=0, atol=1e-9)
+    view(Preview(3.0, {"11": frame()}, {"11": preview().totals["9.5"]}, {}))
+    assert view.figure is not first
+    assert (len(display.displayed), len(display.updated)) == (1, 2)
+
+
+def test_no_picture_of_a_recording_before() -> None:
+    """A band without a frame is blank and says so, though it had one in the recording before."""
+    view = live.View(is_simulated=True)
+    totals = {band: preview().totals["9.5"] for band in BANDS}
+    view(Preview(1.0, dict.fromkeys(BANDS, frame()), totals, {}))
+    totals = {**totals, "9.5": dict.fromkeys(totals["9.5"], 0)}
+    view(Preview(0.0, {"8-14": frame()}, totals, {}))
+    figure = view.figure
+    assert figure is not None
+    assert np.isnan(np.asarray(figure.axes[1].images[0].get_array(), dtype=float)).all()
+    assert texts(view)[-2] == "no frame has come"
+
+
+def test_updates_keep_the_period() -> None:
+    """It is drawn at most every period, and at once where another recording begins."""
+    display = Recorder()
+    view = live.View(display, is_simulated=True, period=1.0)
+    shown = []
+    for at in (0.0, 0.4, 0.9, 1.0, 1.9, 2.1, 0.3, 0.5):
+        before = len(display.displayed + display.updated)
+        view(preview(at))
+        shown += [at] * (len(display.displayed + display.updated) - before)
+    assert shown == [0.0, 1.0, 2.1, 0.3]
+    view(replace(preview(0.1), frames={}))
+    view(preview(0.2))
+    assert "2 lost" in repr(display.updated[-1])
+    assert len(display.updated) == 4
+
+
+def test_what_a_display_is_handed() -> None:
+    """A notebook gets a PNG of the figure, a terminal the same in words."""
+    display = Recorder()
+    live.View(display, title="pot", is_simulated=True)(preview(plate=303.15))
+    picture = display.displayed[0]
+    assert picture._repr_png_().startswith(b"\x89PNG\r\n")
+    assert repr(picture).startswith("pot (emulated), 0.0 s\n9.5: - frames/s, 2 lost")
+    assert repr(picture).endswith(f"plate 30.0 {DEGREE}")
+
+
+def test_labels_and_room() -> None:
+    """Colour bars have their unit, and no text lies on another or outside, however long it is."""
+    drawn, image = LiveFigure(BANDS, (512, 640)), np.zeros((512, 640), np.uint16)
+    empty, full = Panel(None, (0.0, 1.0), "one"), Panel(image, (20_000.0, 60_000.0), "one\ntwo")
+    for panel, foot in ((empty, ""), (full, "plate 30.0"), (full, "plate 30.0, " * 40)):
+        drawn.update(dict.fromkeys(BANDS, panel), title="pot", foot=foot)
+        drawn.pixels()
+        figure, axes = drawn.figure, drawn.figure.axes
+        title, foot_box = (text.get_window_extent() for text in figure.texts)
+        assert title.y0 > max(axis.title.get_window_extent().y1 for axis in axes[:2])
+        assert foot_box.y1 < min(axis.xaxis.label.get_window_extent().y0 for axis in axes[:2])
+        outer = figure.get_tightbbox()
+        assert min(outer.x0, outer.y0) >= 0
+        assert outer.x1 <= figure.get_figwidth()
+    assert [axis.get_ylabel() for axis in axes[2:]] == ["raw signal [count]"] * 2
+
+
+def test_recording_without_a_notebook(tmp_path: Path) -> None:
+    """Two emulated cameras are watched from within a recording, each by its own frames."""
+    view = live.View(title="test", is_simulated=True, period=0.0)
+    assert recording(tmp_path / "a.zarr", view).ended == "stopped"
+    for one in view.status.values():
+        assert (one.lowest, one.highest, one.ffc, one.ffc_age) == (5000, 5383, "in progress", 0)
+        np.testing.assert_allclose(one.fpa_temperature, 308.2, rtol=0, atol=0.06)
+    assert texts(view)[-1] == f"plate 30.0 {DEGREE}"
+    assert texts(view).count("shutter closed: FFC in progress") == 2
+
+
+def test_import_is_light() -> None:
+    """Neither the package nor the watch loads matplotlib or IPython: the first picture does."""
+    code = "import sys, dbthermal.live; print({'matplotlib', 'IPython', 'torch'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.bench
+def test_cost_of_an_update() -> None:
+    """What an update of two full pictures takes; the queue bridges 2 s."""
+    noise = np.random.default_rng(0).normal(20_000, 15, (8, 512, 640)).astype(np.uint16)
+    view, spent = live.View(Recorder(), is_simulated=True, period=0.0), []
+    for number, counts in enumerate(noise):
+        frames = dict.fromkeys(BANDS, frame(counts))
+        totals = dict.fromkeys(BANDS, preview(number).totals["9.5"])
+        start = time.process_time()
+        view(Preview(float(number), frames, totals, {"plate": 300.0 + number}))
+        spent.append(time.process_time() - start)
+    print(f"first picture {1e3 * spent[0]:.0f} ms, then {1e3 * np.median(spent[1:]):.0f} ms each")
+    assert np.median(spent[1:]) < 1.0

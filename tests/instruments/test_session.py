@@ -1,0 +1,135 @@
+"""A session says what it is, and its steps wait for what they need."""
+
+from pathlib import Path
+
+import pytest
+from rig_session import TEXT, replaced
+
+from dbthermal.instruments.session import Session
+from reproduction import paths
+
+SWEEP, FILTERS = "sweep: [9.5, 11]\n", 'filters: {1: 9.5, 3: "11"}\n'
+
+
+def test_session_is_read(tmp_path: Path) -> None:
+    """All that the file says is there, and one switch chooses all addresses."""
+    (tmp_path / "a.yaml").write_text(TEXT, encoding="utf-8")
+    session = Session.load(tmp_path / "a.yaml")
+    wheel, video = session.devices["filter_wheel"], session.cameras["9.5"].video
+    assert session.bands == ("8-14", "9.5")
+    assert (session.url(wheel), session.url(video)) == ("sim://apt/wheel", "sim://camera/narrow")
+    assert session.filters == {1: "9.5", 3: "11"}
+    real = Session.from_yaml(replaced(("simulated: true", "simulated: false")))
+    assert real.url(wheel) == "serial:///dev/ttyUSB0"
+    assert real.content()["blackbody"]["temperatures"] == (300.0, 290.0, 310.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("protocol: response", "protocol: sweep", "Unknown protocol 'sweep'. Must be one of"),
+        ("protocol: response", "protocol: scene", "of protocol 'scene'. Must have no blackbody"),
+        ("duration: 0.15\n", "", "Missing 'duration' in the session. Must be given"),
+        ("duration: 0.15", "duration: -1", "Invalid duration -1. Must be positive"),
+        ("duration: 0.15", "time: 1", "Unknown 'time' in the session"),
+        ("simulated: true", "simulated: maybe", "Invalid simulated 'maybe'. Must be true or false"),
+        ("duration: 0.15", "duration: long", "Invalid duration 'long'. Must be a number"),
+        ("[300.0, 290.0, 310.0]", "[290.0, -3]", "Must be positive"),
+        ("[300.0, 290.0, 310.0]", "[]", "Invalid blackbody temperatures"),
+        (SWEEP, "sweep: [", "Invalid session. Must be YAML"),
+        (
+            SWEEP,
+            'sweep: ["12"]\n',
+            "Invalid filter of the sweep '12'. Must be one of ['9.5', '11']",
+        ),
+        (SWEEP, "sweep: [11, 11]\n", "Repeated filter of the sweep '11'. Must be there once"),
+        (FILTERS, 'filters: {7: "9.5"}\n', "Invalid slot of a filter 7. Must be one of [1, 2, 3,"),
+        (FILTERS, 'filters: {1: "9.5", 2: "9.5"}\n', "Repeated filter '9.5'. Must be there once"),
+        (
+            FILTERS,
+            "filters: {1: a, 2: b}\n",
+            "Invalid cameras [] behind the wheel. Must be exactly",
+        ),
+        (FILTERS, 'filters: {1: "9.5", 2: "8-14"}\n', "Invalid cameras ['8-14', '9.5'] behind"),
+        (FILTERS, "filters: {1: 9.5, 2: a/b}\n", "Invalid name 'a/b'. Must be fit for a file"),
+        ("name: plate", "name: ../plate", "Invalid name '../plate'. Must be fit for a file"),
+        (
+            "{1: blackbody, 4",
+            "{9: blackbody, 4",
+            "Invalid channel of a thermocouple 9. Must be one",
+        ),
+        ("4: plate}", "4: 8-14}", "Repeated thermocouple '8-14'. Must be there once"),
+        ("4: plate}", "4: ffc 11}", "Repeated thermocouple 'ffc 11'. Must be there once"),
+        (
+            "telemetry_rows: 2",
+            "telemetry_rows: 3",
+            "Invalid telemetry_rows 3. Must be one of [0, 2]",
+        ),
+        (
+            "  thermocouples: {sim",
+            "  thermometer: {sim",
+            "Invalid device 'thermometer'. Must be one",
+        ),
+        ("  filter_wheel: {", "  # {", "Missing device 'filter_wheel' of {1: '9.5', 3: '11'}"),
+        ("sim://tc08", "tc08:", "Invalid simulated address 'tc08:'. Must begin with sim: or pty:"),
+        (
+            "v4l2:///dev/video0",
+            "pty://a",
+            "Invalid hardware address 'pty://a'. Must not begin with",
+        ),
+        (
+            '{simulated: "sim://apt/wheel", ',
+            "{",
+            "Missing 'simulated' in the device 'filter_wheel'",
+        ),
+    ],
+)
+def test_invalid_sessions_are_refused(old: str, new: str, message: str) -> None:
+    """The error names the key, the value and the rule."""
+    with pytest.raises((ValueError, TypeError)) as raised:
+        Session.from_yaml(replaced((old, new)))
+    assert message in str(raised.value)
+
+
+def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
+    """What several sessions share is read from the file that they name; no key is in both."""
+    own, shared = ["name: plate", "rig: rig.yaml"], list[str]()
+    for line in TEXT.splitlines():
+        of_session = line.startswith(("simulated", "protocol", "duration", "blackbody", "sweep"))
+        (own if of_session else shared).append(line)
+    shared.remove("name: plate")
+    (tmp_path / "a.yaml").write_text("\n".join(own), encoding="utf-8")
+    (tmp_path / "rig.yaml").write_text("\n".join(shared), encoding="utf-8")
+    assert Session.load(tmp_path / "a.yaml") == Session.from_yaml(TEXT)
+    (tmp_path / "rig.yaml").write_text("\n".join([*shared, "duration: 3"]), encoding="utf-8")
+    with pytest.raises(ValueError, match="Repeated key of session and rig 'duration'"):
+        Session.load(tmp_path / "a.yaml")
+
+
+def test_camera_behind_the_wheel() -> None:
+    """It is the one whose band is a filter; the wheel goes through the sweep, or stays there."""
+    session = Session.from_yaml(TEXT)
+    assert (session.filtered, session.swept) == ("9.5", ("9.5", "11"))
+    alone = Session.from_yaml(replaced((SWEEP, "")))
+    assert (alone.filtered, alone.swept) == ("9.5", ("9.5",))
+    none = Session.from_yaml(replaced((SWEEP, ""), (FILTERS, "")))
+    assert (none.filtered, none.swept) == (None, ())
+
+
+def test_one_temperature_is_no_calibration_twice() -> None:
+    """A bench may repeat a temperature of the blackbody, a calibration may not."""
+    twice = ("[300.0, 290.0, 310.0]", "[300.0, 290.0, 300.0]")
+    bench = replaced(twice, ("protocol: response", "protocol: emissivity_bench"))
+    assert Session.from_yaml(bench).blackbody is not None
+    with pytest.raises(ValueError, match=r"Repeated temperature \[K\] '300\.0'"):
+        Session.from_yaml(replaced(twice))
+
+
+@pytest.mark.parametrize("name", ["response", "emissivity_bench", "scene"])
+def test_rig_of_the_project_has_one_switch(name: str) -> None:
+    """All its sessions are emulated as they come, until the one file that they share says not."""
+    path = paths.session(name)
+    assert "simulated" not in path.read_text(encoding="utf-8")
+    assert Session.load(path).simulated
+    hardware = Session.load(path, {"simulated": False})
+    assert hardware.url(hardware.cameras["8-14"].video) == "v4l2:///dev/video0"

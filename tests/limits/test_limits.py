@@ -1,0 +1,287 @@
+"""Statistical limits: against closed forms, the whole Fisher matrix, and one another."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dbthermal import _smooth as smooth
+from dbthermal import limits, mixing, simulation
+from dbthermal import response as responses
+from dbthermal.simulation import Background, Rig
+
+RIG = Rig()
+THREE = Rig(bands=("8-14", "9.5", "10.6"), noise=(0.03, 0.35, 0.15))
+TIME = np.arange(350) / 10.0
+NOTHING: dict[str, Any] = {"resting": False, "response_kind": "linear"}
+
+
+def scene_of(
+    *values: float,
+    rig: Rig = RIG,
+    stop: float = 333.15,
+    pixels: int = 6,
+    **background: Any,
+) -> xr.Dataset:
+    """Pixels of one material, heated from 20 C."""
+    return simulation.independent_pixels(
+        TIME,
+        xr.DataArray(list(values), dims="band", coords={"band": list(rig.bands)}),
+        Background(**background),
+        pixels,
+        np.random.default_rng(4),
+        start=293.15,
+        stop=stop,
+    )
+
+
+def linear_noise(rig: Rig) -> tuple[float, float]:
+    """Noise [K] of the linear signals."""
+    response = rig.response()
+    first, second = (response["noise"] / response["linear_slope"]).values
+    return float(first), float(second)
+
+
+@pytest.mark.parametrize("background", [{}, {"kind": "random walk"}, {"drift": 5.0}], ids=str)
+def test_ratio_without_rest_is_the_closed_form(background: dict[str, Any]) -> None:
+    """Linear, with no frame at rest, the reflection ratio's bound is that of `ratio_variance`."""
+    scene = scene_of(0.86, 0.72, **background)
+    found = limits.bounds(scene, RIG.response(), order=6, **NOTHING)["reflection_ratio_std"]
+    cold = scene["background_temperature"].values[:, 0]
+    variance = limits.ratio_variance((0.86, 0.72), linear_noise(RIG), cold, smooth.basis(TIME, 6))
+    np.testing.assert_allclose(found[1, 0], np.sqrt(variance), rtol=1e-7)
+    assert np.all(found[0] == 0)  # the quieter band over itself
+
+
+def test_known_emissivities_give_the_closed_form() -> None:
+    """One temperature a frame and known emissivities: the bound is `calibrated_variance`."""
+    scene = scene_of(0.86, 0.72).isel(time=slice(0, 12))
+    found = limits.bounds(scene, RIG.response(), order=12, resting=False, emissivity_std=0.0)
+    curves = [responses.curve(RIG.response(), name) for name in RIG.bands]
+    temperatures = np.stack(
+        [scene[f"{name}_temperature"].values for name in ("object", "background")]
+    )
+    mixed = np.stack(
+        [
+            np.array([e, 1 - e])[:, None, None, None] * curve.slope(temperatures)
+            for e, curve in zip((0.86, 0.72), curves, strict=True)
+        ]
+    )
+    noise = responses.noise(RIG.response(), list(RIG.bands))
+    std = noise / [curve.reference_slope for curve in curves]
+    variance = limits.calibrated_variance(mixed, (std[0], std[1]), temperatures, np.zeros(2))
+    for name, expected in zip(("object", "background"), np.sqrt(variance), strict=True):
+        np.testing.assert_allclose(found[f"{name}_temperature_std"], expected, rtol=1e-9)
+    assert not found["emissivity_std"].any()
+
+
+def whole_fisher(scene: xr.Dataset, rig: Rig, functions: np.ndarray) -> dict[str, np.ndarray]:
+    """Deviations from the inverse of the whole Fisher matrix, by differences of the model."""
+    curves = [responses.curve(rig.response(), name) for name in rig.bands]
+    slopes = [curve.reference_slope for curve in curves]
+    noise = responses.noise(rig.response(), list(rig.bands)) / slopes
+    warm, cold = (scene[f"{name}_temperature"].values[:, 0, 0] for name in ("object", "background"))
+    e = scene["emissivity"].values[:, 0, 0]
+    rest = cold == cold.min()
+    bands, order = len(e), functions.shape[1]
+
+    def signal(unknown: np.ndarray) -> np.ndarray:
+        own, level, free = unknown[:bands], unknown[bands + order], unknown[bands + order + 1 :]
+        x, y = functions @ unknown[bands : bands + order], np.full(len(cold), level)
+        y[~rest] = free
+        parts = zip(own, curves, noise, strict=True)
+        return np.concatenate(
+            [mixing.leaving(a, u.signal(x), u.signal(y)) / s for a, u, s in parts]
+        )
+
+    truth = np.concatenate([e, functions.T @ warm, [cold.min()], cold[~rest]])
+    steps = np.where(np.arange(truth.size) < bands, 1e-4, 0.02)
+    jacobian = np.stack(
+        [
+            (signal(truth + step) - signal(truth - step)) / (2 * size)
+            for size, step in zip(steps, np.diag(steps), strict=True)
+        ],
+        axis=1,
+    )
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    of_object = functions @ covariance[bands : bands + order, bands : bands + order] @ functions.T
+    ratio = (1 - e[1]) / (1 - e[0])
+    gradient = np.array([ratio, -1.0]) / (1 - e[0])
+    std = np.sqrt(np.diag(covariance))
+    of_background = np.full(len(cold), std[bands + order])
+    of_background[~rest] = std[bands + order + 1 :]
+    return {
+        "emissivity": std[:bands],
+        "object_temperature": np.sqrt(np.diag(of_object)),
+        "background_temperature": of_background,
+        "reflection_ratio": np.sqrt([gradient @ covariance[:2, :2] @ gradient]),
+    }
+
+
+@pytest.mark.parametrize(("rig", "values"), [(RIG, (0.86, 0.72)), (THREE, (0.86, 0.72, 0.82))])
+def test_elimination_gives_the_whole_inverse(rig: Rig, values: tuple[float, ...]) -> None:
+    """The background eliminated frame by frame, two bands or three, exact response, with rests."""
+    scene = scene_of(*values, rig=rig, pixels=1).isel(time=slice(0, 350, 7))
+    functions = smooth.basis(scene["time"].values, 5)
+    projected = functions @ (functions.T @ scene["object_temperature"].values[:, 0, 0])
+    scene["object_temperature"] = scene["object_temperature"].copy(data=projected[:, None, None])
+    found = limits.bounds(scene, rig.response(), order=5)
+    assert 5 < int(found["resting"].sum()) < 45
+    for name, expected in whole_fisher(scene, rig, functions).items():
+        values_found = found[f"{name}_std"].values[:, 0, 0]
+        if name == "reflection_ratio":
+            values_found = values_found[1:2]
+        np.testing.assert_allclose(values_found, expected, rtol=1e-5, err_msg=name)
+
+
+QUANTITIES = ("object_temperature", "background_temperature", "emissivity", "reflection_ratio")
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "told"),
+    [
+        ({}, {}, (True, True, True, True)),
+        ({}, NOTHING, (True, False, False, True)),
+        ({}, {"resting": False}, (True, False, False, True)),
+        ({"kind": "random walk"}, {"response_kind": "linear"}, (True, False, False, True)),
+        ({"stop": 293.15}, {"response_kind": "linear"}, (True, False, False, True)),
+        ({"kind": "still"}, {"response_kind": "linear"}, (False, True, False, False)),
+        ({"kind": "still"}, NOTHING, (False, False, False, False)),
+        ({"values": (0.8, 0.8)}, NOTHING, (False, False, False, True)),
+        ({"values": (0.8, 0.8)}, {}, (False, False, False, True)),
+    ],
+    ids=str,
+)
+def test_what_is_identifiable(
+    changes: dict[str, Any], options: dict[str, Any], told: tuple[bool, ...]
+) -> None:
+    """Constant object, still background, gray body, no rest: each hides what theory says."""
+    values = changes.get("values", (0.86, 0.72))
+    scene = scene_of(*values, **{k: v for k, v in changes.items() if k != "values"})
+    found = limits.bounds(scene, RIG.response(), **options)
+    shares = found["identifiable"].sel(quantity=list(QUANTITIES)).mean(("y", "x"))
+    assert tuple(shares.values > 0.5) == told
+    if options.get("response_kind") == "linear":
+        for name, known in zip(QUANTITIES, told, strict=True):
+            assert bool(np.isfinite(found[f"{name}_std"].values).all()) == known
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    first=st.floats(0.1, 0.9),
+    second=st.floats(0.1, 0.9),
+    third=st.floats(0.1, 0.9),
+    louder=st.floats(0.3, 3.0),
+)
+def test_noise_scales_and_bands_help(
+    first: float, second: float, third: float, louder: float
+) -> None:
+    """The bound is proportional to the noise, and one band more never raises it."""
+    scene = scene_of(first, second, third, rig=THREE, pixels=2)
+    response = THREE.response()
+    found = limits.bounds(scene, response, order=5)
+    noisy = response.assign(noise=louder * response["noise"].assign_attrs(units="count"))
+    scaled = limits.bounds(scene, noisy, order=5)
+    two = limits.bounds(scene.isel(band=[0, 1]), response, order=5)
+    for name in ("object_temperature_std", "background_temperature_std"):
+        np.testing.assert_allclose(scaled[name], louder * found[name], rtol=1e-6)
+        assert np.all(found[name].values <= two[name].values * (1 + 1e-6))
+    of_two = found["emissivity_std"].isel(band=[0, 1])
+    assert np.all(of_two.values <= two["emissivity_std"].values * (1 + 1e-6))
+
+
+def test_order_leaves_little() -> None:
+    """The order chosen leaves no more than the tenth of a variance, one fewer leaves more."""
+    scene = scene_of(0.86, 0.72)
+    found = limits.bounds(scene, RIG.response(), **NOTHING)
+    first, second = linear_noise(RIG)
+    for pixel, order in enumerate(found["order"].values[0]):
+        left = []
+        for size in (order, order - 1):
+            functions = smooth.basis(TIME, int(size))
+            warm = scene["object_temperature"].values[:, 0, pixel]
+            left.append(np.sum((warm - functions @ (functions.T @ warm)) ** 2))
+        # z2 - k2 z1 holds (1 - k2) x, and k2 = 2.
+        energy = np.array(left) / (second**2 + (2.0 * first) ** 2)
+        assert energy[0] <= 0.1 < energy[1]
+
+
+def test_more_is_known_the_less_is_assumed() -> None:
+    """Rests, known emissivities and a smaller subspace each lower the bound."""
+    scene, response = scene_of(0.86, 0.72), RIG.response()
+    plain = limits.bounds(scene, response, order=6)
+    cases: tuple[tuple[dict[str, Any], bool], ...] = (
+        ({"resting": False}, False),
+        ({"order": 7}, False),
+        ({"order": 5}, True),
+        ({"emissivity_std": 0.01}, True),
+        ({"emissivity_std": 0.0}, True),
+    )
+    for options, lower in cases:
+        other = limits.bounds(scene, response, **{"order": 6, **options})
+        ratio = other["object_temperature_std"].mean() / plain["object_temperature_std"].mean()
+        print(f"{options}: object's bound times {float(ratio):.3f}")
+        assert (float(ratio) < 1) == lower
+
+
+def test_pixels_are_independent() -> None:
+    """A pixel's bound is the same alone and among others of other orders."""
+    scene = scene_of(0.86, 0.72)
+    whole = limits.bounds(scene, RIG.response())
+    alone = limits.bounds(scene.isel(x=[4]), RIG.response())
+    assert len(np.unique(whole["order"])) > 1
+    for name in ("object_temperature_std", "emissivity_std", "order"):
+        np.testing.assert_allclose(alone[name], whole[name].isel(x=[4]), rtol=1e-9)
+
+
+def test_glass_is_as_designed() -> None:
+    """Glass to 60 C at noise (0.03, 0.35) K: the design's order of size, and units."""
+    found = limits.bounds(scene_of(0.86, 0.72, pixels=100), RIG.response())
+    rms = float((found["object_temperature_std"] ** 2).mean() ** 0.5)
+    ratio = float(found["reflection_ratio_std"].sel(band="9.5").median())
+    of_emissivity = found["emissivity_std"].median(("y", "x")).values
+    print(f"object {rms:.3f} K, k2 {ratio:.4f}, emissivity {of_emissivity.round(4)}")
+    assert rms == pytest.approx(0.27, abs=0.05)  # [K]
+    assert ratio == pytest.approx(0.073, abs=0.01)
+    units = {"object_temperature_std": "K", "emissivity_std": "1", "condition_number": "1"}
+    assert {name: found[name].attrs["units"] for name in units} == units
+    assert found.attrs["reference_band"] == "8-14"
+    assert float(found["condition_number"][0, 0]) == pytest.approx(
+        float(mixing.condition_number([0.86, 0.72]))
+    )
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "message"),
+    [
+        (lambda s: s.drop_vars("emissivity"), {}, "Missing variable 'emissivity'"),
+        (lambda s: s.isel(band=[0]), {}, "one band"),
+        (lambda s: s.assign(emissivity=s["emissivity"] * 2), {}, r"emissivity 1.72 in band '8-14'"),
+        (
+            lambda s: s.assign(object_temperature=s["object_temperature"] + 100),
+            {},
+            "object_temperature",
+        ),
+        (
+            lambda s: s.assign(object_temperature=s["background_temperature"]),
+            {},
+            "30 smooth functions",
+        ),
+        (lambda s: s, {"resting": True}, "Must be one level"),
+        (lambda s: s, {"resting": np.zeros(3, bool)}, r"resting \(3,\)"),
+        (lambda s: s, {"resting": [0.0] * 350}, "Must be bool"),
+        (lambda s: s, {"emissivity_std": -0.1}, "emissivity_std -0.1"),
+        (lambda s: s, {"order": 0}, "order 0"),
+    ],
+)
+def test_bad_scene_is_a_clear_error(
+    spoil: Callable[[xr.Dataset], xr.Dataset], options: dict[str, Any], message: str
+) -> None:
+    """What has no bound is named, with its value and the rule."""
+    scene = spoil(scene_of(0.86, 0.72))
+    with pytest.raises(ValueError, match=message):
+        limits.bounds(scene, RIG.response(), **options)

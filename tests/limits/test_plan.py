@@ -1,0 +1,162 @@
+"""The planner: the bounds of a film not yet made, the best filter, and the figures of both."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import emissivity, limits, simulation
+from dbthermal.figures import _limits as drawn
+from dbthermal.simulation import Rig
+
+
+@pytest.fixture(scope="module")
+def materials() -> tuple[xr.Dataset, xr.DataArray]:
+    """Table of materials, and the noise of a camera behind each filter."""
+    table = emissivity.embedded_table()
+    return table, emissivity.filter_noise(0.03, table["band"].values.tolist())
+
+
+Materials = tuple[xr.Dataset, xr.DataArray]
+
+
+def test_plan_is_the_bound(materials: Materials) -> None:
+    """The plan of glass is `bounds` of the same film with the rig's own response."""
+    table, noise = materials
+    row = table.sel(material=["plate window glass"])
+    truth = limits.Recording().truth(row["emissivity"].values.T)
+    rig = Rig(bands=("8-14", "9.5"), noise=(1.0, 1.0))
+    response = rig.response()
+    of_glass = row["emissivity"].isel(material=0).sel(band=list(rig.bands))
+    scene = simulation.scene(
+        truth.time, truth.warm[..., None], truth.cold[..., None], of_glass.drop_vars("material")
+    )
+    response["noise"] = noise.sel(band=list(rig.bands)) * response["noise"].assign_attrs(
+        units="count"
+    )
+    response["noise"].attrs["units"] = "count"
+    found = limits.bounds(scene, response)
+    reference = float(response["reference_temperature"])
+    expected = limits.plan(row, noise, temperature=reference).sel(filter="9.5")
+    rms = float((found["object_temperature_std"] ** 2).mean() ** 0.5)
+    assert float(expected["object_temperature_std"][0]) == pytest.approx(rms, rel=0.01)
+    ratio = float(found["reflection_ratio_std"].sel(band="9.5").item())
+    planned = expected["reflection_ratio_std"].sel(band="9.5")
+    assert float(planned[0]) == pytest.approx(ratio, rel=0.01)
+
+
+def test_plan_finds_the_filter(materials: Materials) -> None:
+    """Silicates by their reststrahlen bands, and none for metals that are nearly gray."""
+    expected = limits.plan(*materials)
+    best = dict(zip(expected["material"].values, expected["best"].values, strict=True))
+    print(expected["object_temperature_std"].to_pandas().round(2).assign(best=expected["best"]))
+    assert best["plate window glass"] == "9.5"
+    assert best["quartz sandstone"] == "8.5"
+    assert best["brass plate"] == limits.NO_FILTER
+    assert expected["best_of_all"] == "9.5"
+    assert expected["emissivity_std"].isnull().sel(filter="9.5", band="8.5").all()
+
+
+def test_more_bands_and_more_seconds_help(materials: Materials) -> None:
+    """A second filter at once never hurts; twice the film cuts the error by the root of two."""
+    table, noise = materials
+    table = table.isel(material=slice(0, 3))
+    one, two = (limits.plan(table, noise, together=count) for count in (1, 2))
+    std = one["object_temperature_std"]
+    for label in two["filter"].values:
+        both = two["object_temperature_std"].sel(filter=label)
+        assert np.all(both <= std.sel(filter=label.split(" + ")).min("filter") * 1.02)
+    durations = limits.plan_durations(table, noise, [40.0, 80.0, 160.0])
+    gain = durations["object_temperature_std"].sel(filter="9.5", material="plate window glass")
+    print(f"object [K] after 40, 80, 160 s: {gain.values.round(3)}")
+    np.testing.assert_allclose(gain.values[:-1] / gain.values[1:], np.sqrt(2), rtol=0.05)
+
+
+def test_gray_table_has_no_filter(materials: Materials) -> None:
+    """Where all emissivities are equal nothing is finite and no filter is the best."""
+    table, noise = materials
+    gray = table.isel(material=[0]).copy(deep=True)
+    gray["emissivity"][:] = 0.8
+    expected = limits.plan(gray, noise)
+    assert expected["best"].values.tolist() == [limits.NO_FILTER]
+    assert expected["best_of_all"] == limits.NO_FILTER
+    assert np.isinf(expected["condition_number"]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"beside": "7.0"}, "Missing band '7.0'"),
+        ({"together": 5}, "together 5"),
+        ({"filters": {}}, "Unknown band '8-14'"),
+        ({"emissivity": 1.2}, "emissivity 1.2 of 'plate window glass'"),
+        ({"noise": -1.0}, "noise"),
+        ({"seconds": [2.0, 1.0]}, "Must increase strictly"),
+    ],
+)
+def test_bad_plan_is_a_clear_error(
+    materials: Materials, options: dict[str, Any], message: str
+) -> None:
+    """What cannot be planned is named, with its value and the rule."""
+    table, noise = materials[0].copy(deep=True), materials[1].copy(deep=True)
+    table["emissivity"][0, 0] = options.pop("emissivity", 0.8)
+    noise[0] = options.pop("noise", 0.03)
+    seconds = options.pop("seconds", [1.0])
+    with pytest.raises((ValueError, KeyError), match=message):
+        limits.plan_durations(table, noise, seconds, **options)
+
+
+@pytest.mark.parametrize(
+    "change", [{"seconds": 0.0}, {"rate": -1.0}, {"duration": 6.0}, {"seconds": 0.1}]
+)
+def test_bad_recording_is_a_clear_error(change: dict[str, float]) -> None:
+    """Numbers that are no film are refused."""
+    with pytest.raises(ValueError, match="Must"):
+        replace(limits.Recording(), **change)
+
+
+def texts(figure: Any) -> set[str]:
+    """Labels of all axes."""
+    return {text for axis in figure.axes for text in (axis.get_xlabel(), axis.get_ylabel()) if text}
+
+
+def test_figure_of_the_plan(materials: Materials) -> None:
+    """A map with the best filter of each material framed, and the lines of those that have one."""
+    table, noise = materials
+    table = table.sel(material=["plate window glass", "brass plate", "water"])
+    expected = limits.plan(table, noise)
+    durations = limits.plan_durations(table, noise, [20.0, 40.0])
+    figure = drawn.plan(expected, durations, ["plate window glass", "brass plate"])
+    figure.draw_without_rendering()
+    framed = [text.get_text() for text in figure.axes[0].texts if text.get_bbox_patch()]
+    assert framed == [f"{v:.2g}" for v in expected["object_temperature_std"].min("filter")[::2]]
+    assert len(figure.axes[1].lines) == 1
+    assert texts(figure) == {
+        "filter beside 8-14 [\N{MICRO SIGN}m]",
+        "length of the film [s]",
+        "expected std [K]",
+    }
+    assert "(simulated)" in figure.get_suptitle()
+
+
+def test_figure_of_the_limits() -> None:
+    """Errors are drawn as they are, and below in units of their bound."""
+    level = {"noise": [0.01, 0.03, 0.1]}
+    parts = {
+        f"{name}_{kind}": ("noise", scale * np.array([1.0, 2.0, 4.0]))
+        for name in ("reflection_ratio", "object_temperature")
+        for kind, scale in (("bound", 0.1), ("error", 0.12))
+    }
+    figure = drawn.error_over_bound(xr.Dataset(parts, level, {"origin": "simulated"}))
+    figure.draw_without_rendering()
+    ratio = np.asarray(figure.axes[2].lines[0].get_ydata())
+    np.testing.assert_allclose(ratio, 1.2, rtol=1e-12)
+    assert texts(figure) == {
+        "error of the reflection ratio [1]",
+        "error of the object temperature [K]",
+        "error / bound [1]",
+        "noise of the quieter band [K]",
+    }
+    assert "(simulated)" in figure.get_suptitle()

@@ -1,0 +1,247 @@
+"""Outside files are listed with checksums, fetched from their origin, refused if altered."""
+
+import hashlib
+import re
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from reproduction import manifest
+
+CONTENT = {"one.txt": b"first", "two.txt": b"second"}
+
+LISTED = """collections:
+  notes:
+    title: two notes
+    origin: {origin}
+    citation: ["Nobody (2000). Notes."]
+    terms: free
+    used_by: [tests]
+    note: ""
+    files:
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Project that lists two files, whose origin cannot be reached."""
+    root = tmp_path / "project"
+    root.mkdir()
+    list_files(root, "http://127.0.0.1:9/")
+    monkeypatch.chdir(root)
+    monkeypatch.delenv(manifest.MIRROR, raising=False)
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setattr(manifest, "_RETRIES", 0)
+    return root
+
+
+@pytest.fixture
+def copies(tmp_path: Path, project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of the two files within a mirror that DBTHERMAL_DATA names."""
+    assert project.is_dir()
+    folder = tmp_path / "mirror" / "notes"
+    folder.mkdir(parents=True)
+    for name, content in CONTENT.items():
+        (folder / name).write_bytes(content)
+    monkeypatch.setenv(manifest.MIRROR, str(folder.parent))
+    return folder
+
+
+@pytest.fixture
+def served(tmp_path: Path, project: Path) -> Iterator[Path]:
+    """Folder, with a space in its name, from which the project's origin serves the two files."""
+    folder = tmp_path / "all notes"
+    folder.mkdir()
+    for name, content in CONTENT.items():
+        (folder / name).write_bytes(content)
+    handler = partial(Quiet, directory=str(tmp_path))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        list_files(project, f"http://127.0.0.1:{server.server_port}/all notes/")
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield folder
+        server.shutdown()
+        thread.join()
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """Serve files without a line for each."""
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+def list_files(root: Path, origin: str) -> None:
+    """Write the project's list."""
+    lines = [
+        f"      - {{name: {name}, sha256: {hashlib.sha256(content).hexdigest()}, "
+        f"bytes: {len(content)}}}\n"
+        for name, content in CONTENT.items()
+    ]
+    (root / "data_manifest.yaml").write_text(LISTED.format(origin=origin) + "".join(lines))
+
+
+def edit(root: Path, old: str, new: str) -> None:
+    """Change the project's list."""
+    path = root / "data_manifest.yaml"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def test_the_list_is_complete() -> None:
+    """Every collection has an origin, a citation, terms; all but the mesh are used; 933 files."""
+    collections = manifest.load().collections
+    assert set(collections) == {"ecostress", "slum", "ucsb", "scenes", "meshes"}
+    for collection in collections.values():
+        assert collection.origin.startswith("https://")
+        assert collection.origin.endswith("/")
+        assert all((collection.citation, collection.terms))
+        assert collection.used_by
+    assert sum(len(collection.files) for collection in collections.values()) == 933
+
+
+def test_the_list_notes_short_and_repeated_spectra() -> None:
+    """22 spectra end short of 14 um, and 8 repeat another that is listed too."""
+    files = manifest.load()["ecostress"].files
+    assert sum(not file.covers_8_14um for file in files.values()) == 22
+    repeated = [file.thermal_duplicate_of for file in files.values() if file.thermal_duplicate_of]
+    assert len(repeated) == 8
+    assert set(repeated) <= files.keys()
+
+
+def test_a_space_in_an_address_is_quoted() -> None:
+    """The folder 'other files' is asked for as 'other%20files'."""
+    url = manifest.load()["slum"].url("LUMA_SLUM_IR.csv")
+    assert re.fullmatch(r"https://[\w./-]+/other%20files/LUMA_SLUM_IR\.csv", url)
+
+
+def test_mirror(copies: Path) -> None:
+    """Files of a mirror are verified where they lie, by every way to ask for them."""
+    expected = {name: copies / name for name in CONTENT}
+    assert manifest.available("notes")
+    assert manifest.local("notes") == expected
+    assert manifest.fetch_collection("notes") == expected
+    assert manifest.fetch("two.txt", "notes") == copies / "two.txt"
+
+
+def test_provenance_is_the_checksums(copies: Path) -> None:
+    """The record of a result gets what the files have been held against."""
+    found = {
+        name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for name, path in manifest.local("notes").items()
+    }
+    assert manifest.provenance("notes") == found
+    assert copies.is_dir()
+
+
+def test_mirror_with_an_altered_file(copies: Path) -> None:
+    """A wrong checksum is refused, naming the file, what it has and what it must have."""
+    (copies / "two.txt").write_bytes(b"seconds")
+    got, expected = (hashlib.sha256(text).hexdigest() for text in (b"seconds", b"second"))
+    for read in (manifest.local, manifest.fetch_collection):
+        with pytest.raises(ValueError, match=rf"two\.txt': {got}. Must be {expected}"):
+            read("notes")
+
+
+def test_mirror_without_a_file(copies: Path, project: Path) -> None:
+    """What a mirror lacks is named, and not downloaded."""
+    (copies / "two.txt").unlink()
+    assert not manifest.available("notes")
+    with pytest.raises(FileNotFoundError, match=r"Missing 1 of 2 files of 'notes'.*'two\.txt'"):
+        manifest.local("notes")
+    with pytest.raises(FileNotFoundError, match=r"Missing file '.*two\.txt'"):
+        manifest.fetch("two.txt", "notes")
+    assert not (project / "data").exists()
+
+
+def test_mirror_that_is_no_folder(copies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mirror's name that leads nowhere is refused, not passed over."""
+    monkeypatch.setenv(manifest.MIRROR, str(copies / "absent"))
+    with pytest.raises(ValueError, match=r"Invalid DBTHERMAL_DATA '.*absent'\. Must name a folder"):
+        manifest.available("notes")
+
+
+def test_download(served: Path, project: Path) -> None:
+    """Without a mirror, files come from their origin once, and are then at hand in data/."""
+    assert not manifest.available("notes")
+    found = manifest.fetch_collection("notes")
+    assert {name: path.read_bytes() for name, path in found.items()} == CONTENT
+    (served / "one.txt").unlink()
+    assert manifest.local("notes") == manifest.fetch_collection("notes") == found
+    assert found["one.txt"] == project / "data" / "notes" / "one.txt"
+
+
+def test_download_of_an_altered_file(served: Path, project: Path) -> None:
+    """A download with a wrong checksum is refused and thrown away."""
+    (served / "two.txt").write_bytes(b"seconds")
+    expected = hashlib.sha256(b"second").hexdigest()
+    with pytest.raises(ValueError, match=rf"two\.txt.*{expected}"):
+        manifest.fetch("two.txt", "notes")
+    assert not (project / "data" / "notes" / "two.txt").exists()
+
+
+def test_only_fetch_downloads(served: Path, project: Path) -> None:
+    """Asking what is at hand changes nothing."""
+    assert served.is_dir()
+    assert not manifest.available("notes")
+    with pytest.raises(FileNotFoundError, match="Missing 2 of 2 files"):
+        manifest.local("notes")
+    assert not (project / "data").exists()
+
+
+@pytest.mark.usefixtures("copies")
+def test_main(capsys: pytest.CaptureFixture[str]) -> None:
+    """The command says in one line that a collection is whole."""
+    assert manifest.main() == 0
+    assert re.fullmatch(r"notes: 2 files, 0\.0 MB, in .*notes\n", capsys.readouterr().out)
+
+
+@pytest.mark.usefixtures("project")
+def test_main_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    """The command fails where a collection is not whole, and says which."""
+    assert manifest.main() == 1
+    assert capsys.readouterr().err.startswith("notes: ")
+
+
+def test_unknown_names(copies: Path) -> None:
+    """A file or a collection that is not listed is refused."""
+    assert copies.is_dir()
+    with pytest.raises(ValueError, match=r"Unknown collection 'notices'. Must be one of .'notes'."):
+        manifest.local("notices")
+    with pytest.raises(ValueError, match=r"Unknown file 'ten\.txt'"):
+        manifest.fetch("ten.txt", "notes")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("bytes: 5", "bytes: 0", r"Invalid size 0 of 'one\.txt'"),
+        ("sha256: ", "sha256: A", r"Invalid sha256 'A.*' of 'one\.txt'"),
+        ("name: one.txt", "name: ../one.txt", r"Invalid file name '\.\./one\.txt'"),
+        ("name: one.txt", "name: two.txt", "Repeated file name under 'two notes'"),
+        ("bytes: 5", "bytes: 5, colour: red", "colour"),
+        ("    terms: free\n", "", "terms"),
+        ("    citation:", "    quotation:", "citation"),
+        ("collections:", "collection:", "collections"),
+    ],
+)
+def test_a_malformed_list_is_refused(project: Path, old: str, new: str, message: str) -> None:
+    """A list that could not be checked against is refused by name."""
+    edit(project, old, new)
+    with pytest.raises(ValueError, match=rf"Invalid 'data_manifest\.yaml'.*{message}"):
+        manifest.load()
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("collection", ["ecostress", "slum", "ucsb", "scenes", "meshes"])
+@pytest.mark.usefixtures("mirror")
+def test_every_file_of_the_mirror(collection: str) -> None:
+    """Each file has the listed checksum and size."""
+    files = manifest.load()[collection].files
+    sizes = {name: path.stat().st_size for name, path in manifest.local(collection).items()}
+    assert sizes == {name: file.bytes for name, file in files.items()}

@@ -1,0 +1,82 @@
+"""The rules of the notebooks that running them does not show."""
+
+import ast
+from pathlib import Path
+
+import nbformat
+import pytest
+import yaml
+from nbformat import NotebookNode
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+LONGEST_CELL = 12  # lines
+
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def read(path: Path) -> NotebookNode:
+    """Notebook as stored, if it is a valid one."""
+    notebook: NotebookNode = nbformat.read(path, nbformat.NO_CONVERT)  # type: ignore[no-untyped-call]
+    nbformat.validate(notebook)
+    return notebook
+
+
+def cells(path: Path, kind: str) -> list[NotebookNode]:
+    """Cells of one kind."""
+    return [cell for cell in read(path).cells if cell.cell_type == kind]
+
+
+def test_stems_are_equal() -> None:
+    """Every notebook has its parameters, and there are no others."""
+    names = {path.stem for path in (ROOT / "params").glob("*.yaml")}
+    assert names == {path.stem for path in NOTEBOOKS}
+
+
+@each_notebook
+def test_parameters_are_the_ones_in_yaml(path: Path) -> None:
+    """The one cell tagged `parameters` sets plain values for the names that the YAML file has."""
+    tagged = [cell for cell in cells(path, "code") if "parameters" in cell.metadata.get("tags", ())]
+    assert len(tagged) == 1
+    small: dict[str, object] = {}
+    exec(tagged[0].source, {"__builtins__": {}}, small)
+    full = yaml.safe_load((ROOT / "params" / f"{path.stem}.yaml").read_text(encoding="utf-8"))
+    assert small.keys() == full.keys()
+
+
+@each_notebook
+def test_notebook_asks_a_question(path: Path) -> None:
+    """The title comes first and is a question."""
+    title = cells(path, "markdown")[0].source.splitlines()[0]
+    assert title.startswith("# ")
+    assert title.endswith("?")
+
+
+@each_notebook
+def test_notebook_is_stored_without_outputs(path: Path) -> None:
+    """No outputs and no execution counts are committed."""
+    code = cells(path, "code")
+    assert not [cell.source for cell in code if cell.outputs or cell.execution_count]
+
+
+@each_notebook
+def test_cells_compose(path: Path) -> None:
+    """A cell is short and defines nothing: what is worth a name belongs in the package."""
+    for cell in cells(path, "code"):
+        definitions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
+        tree = ast.parse(cell.source)
+        assert not [node for node in ast.walk(tree) if isinstance(node, definitions)], cell.source
+        assert len(cell.source.splitlines()) <= LONGEST_CELL, cell.source
+
+
+@each_notebook
+def test_notebook_checks_what_it_shows(path: Path) -> None:
+    """One of the last two cells asserts the answer."""
+    assert any("assert" in cell.source for cell in cells(path, "code")[-2:])
+
+
+@each_notebook
+def test_kernel_is_set(path: Path) -> None:
+    """Papermill takes the kernel and the language from the notebook."""
+    kernel = read(path).metadata.kernelspec
+    assert (kernel.name, kernel.language) == ("python3", "python")

@@ -1,0 +1,91 @@
+"""What moves around the twins: writing, cups, hands, routes, and what is refused of them."""
+
+import numpy as np
+import pytest
+
+from dbthermal.simulation._surroundings import Actor, Pose, gliding
+from reproduction.twins import AMBIENT, clock, surfaces
+from reproduction.twins.panes import pointing
+from reproduction.twins.people import FINGERS, Route, imprint, pacing
+from reproduction.twins.props import Writing, board, cup
+
+PLATE = surfaces.plate(0.1, 0.1, 0.1)
+
+
+def test_writing_appears_and_fades() -> None:
+    """A stroke is as cold as it was written, after it was written, and rewarms by 1/e."""
+    writing = Writing("V", start=2.0, pace=0.1, drop=4.0, drying=10.0)
+    times, path = writing.path()
+    flat = surfaces.plate(0.2, 0.2, 0.002)
+    places = flat.vertices[:, [0, 2]] - (0.0, 0.1)
+    actor = board(flat, places, writing, AMBIENT, lambda _: Pose())
+    vertex = int(np.argmin(np.linalg.norm(places - path[-1], axis=1)))
+    last = float(times[-1])
+    warmth = [actor.warmth(now)[vertex] for now in (last - 1.0, last, last + 10.0)]
+    np.testing.assert_allclose(warmth, [AMBIENT, AMBIENT - 4, AMBIENT - 4 / np.e], rtol=0, atol=0.1)
+
+
+def test_the_index_writes_the_strokes() -> None:
+    """Its tip is a radius in front of each stroke, at its place, and no other finger is nearer."""
+    writing, ends = Writing(start=3.0), np.array([(f.tip[0], 0.0, f.tip[1]) for f in FINGERS])
+    for time, place in zip(*writing.path(), strict=True):
+        tips = pointing(writing, float(time)).outwards(ends)
+        expected = (-place[0], -FINGERS[1].radius, place[1])
+        np.testing.assert_allclose(tips[1], expected, rtol=0, atol=1e-12)  # m
+        others = [-tip[1] - part.radius for tip, part in zip(tips, FINGERS, strict=True)]
+        assert min(others[:1] + others[2:]) > 0.002  # m
+
+
+def test_a_cup_is_uncovered() -> None:
+    """The top jumps from the lid's temperature to the drink's; the wall stays."""
+    mug = cup(uncovered=5.0, wall=318.0, lid=299.0, drink=335.0)
+    before, after = mug.warmth(4.9), mug.warmth(5.0)
+    assert set(before) == {318.0, 299.0}
+    assert set(after) == {318.0, 335.0}
+
+
+def test_pacing_keeps_its_pace() -> None:
+    """Between the corners of the way the pace lies in its range, and pauses are pauses."""
+    route = pacing(
+        ((-2.0, 0.0), (0.0, 0.0), (2.0, 1.0)), clock(), np.random.default_rng(1), pace=(0.5, 1.0)
+    )
+    lengths = np.linalg.norm(np.diff(route.places, axis=0), axis=1)
+    speeds = lengths / np.diff(route.times)
+    np.testing.assert_array_equal(speeds[::2], 0.0)
+    assert np.all((speeds[1::2] > 0.5) & (speeds[1::2] < 1.0))
+    assert route.times[-1] >= 34.9
+
+
+def test_who_stands_faces_where_he_came_to() -> None:
+    """A walk along y heads for y, a pause after it too."""
+    route = Route(np.array([0.0, 1.0, 2.0, 3.0]), np.array([[0, 0], [0, 1], [0, 1], [1.0, 1]]))
+    headings = [route.heading(time) for time in (-1.0, 0.5, 1.5, 2.5, 9.0)]
+    np.testing.assert_allclose(headings, [np.pi / 2] * 3 + [0.0] * 2, rtol=0, atol=1e-12)
+
+
+def test_a_hand_touches_under_palm_and_fingers() -> None:
+    """The print is 1 at the palm and on a finger, 0 between spread fingers and beyond."""
+    share = imprint([(0.0, 0.0), (-0.010, 0.10), (-0.06, 0.06), (0.0, 0.2)])
+    np.testing.assert_allclose(share, [1, 1, 0, 0], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: Writing("X"), "Unknown letter 'X'"),
+        (lambda: Route(np.array([0.0, 0.0]), np.zeros((2, 2))), "increase strictly"),
+        (lambda: Route(np.array([0.0, np.nan]), np.zeros((2, 2))), "Invalid time nan s of a route"),
+        (lambda: Route(np.zeros(1), np.zeros((1, 2))), "of a route. Must be two or more"),
+        (lambda: Route(np.arange(2.0), np.zeros((3, 2))), "Invalid places of shape .3, 2. of a"),
+        (lambda: gliding([0.0], [(0, 0, 0)]), "of a motion. Must be two or more"),
+        (lambda: gliding([0.0, np.nan], np.zeros((2, 3))), "Invalid time nan s of a motion"),
+        (lambda: gliding([0.0, 1.0], np.full((2, 3), np.nan)), "of a motion. Must be finite, .2,"),
+        (lambda: Actor(PLATE, np.zeros(2)), "Invalid temperature of shape .2,. of an actor"),
+        (lambda: Actor(PLATE, np.full(4, np.nan)), "Must be finite, .4,."),
+        (lambda: Actor(PLATE, lambda time: np.full(3, time)).warmth(1.0), "Must be finite, .4,."),
+    ],
+)
+def test_refusals(wrong: object, message: str) -> None:
+    """What is wrong is refused, with the rule."""
+    with pytest.raises(ValueError, match=message):
+        wrong()  # type: ignore[operator]

@@ -1,0 +1,315 @@
+"""The twins: scenes that satisfy the schema, are what they say, and can be separated."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from dbthermal import metrics, schema, separation, simulation
+from dbthermal.simulation import Rig
+from dbthermal.simulation._rays import Camera
+from dbthermal.simulation._surroundings import Actor, Pose, Room
+from reproduction import twins
+from reproduction.twins import AMBIENT, TWINS, Capture, Stage, Vessel, clock, meshes, surfaces
+from reproduction.twins.panes import WITHDRAWAL
+from reproduction.twins.props import Writing
+
+GLASS = xr.DataArray(
+    [0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]}, attrs={"units": "1"}
+)
+SHORT = Capture(GLASS, shape=(24, 32), time=clock(12, rate=2.0))
+SLOW = Capture(GLASS, shape=(36, 48), time=clock(36, rate=1.0))
+COARSE = twins.Pane(spacing=0.006)
+PEAKS = {"wineglass": 63.6, "coffee_pot": 63.1}  # degrees Celsius
+FILLED = {"glass_plate", "fingers", "fingerprint"}  # whose plate is larger than the image
+
+
+def rng(seed: int = 1) -> np.random.Generator:
+    """Seeded random numbers."""
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture
+def scan(mirror: Path) -> surfaces.Surface:
+    """The Stanford bunny."""
+    mesh = meshes.mesh(mirror / "meshes" / "stanford-bunny.obj")
+    return surfaces.Surface(mesh["vertices"].values, mesh["faces"].values)
+
+
+@pytest.fixture(scope="module", params=TWINS)
+def scene(request: pytest.FixtureRequest) -> xr.Dataset:
+    """Each of the twins, small and short."""
+    return twins.twin(request.param, SHORT, rng())
+
+
+@pytest.fixture(scope="module")
+def rig() -> xr.Dataset:
+    """Response of the default rig."""
+    return Rig().response()
+
+
+def test_scene_is_complete(scene: xr.Dataset) -> None:
+    """Dims, units and labels are those of a scene, and it says which twin it is."""
+    for name in ("object_temperature", "background_temperature", "emissivity"):
+        schema.check_variable(scene[name], schema.STAGES["separated"][name], name)
+    assert scene.attrs["origin"] == "simulated"
+    assert scene.attrs["twin"] in TWINS
+    assert 0.1 < float(scene["on_object"].mean()) <= 1.0
+
+
+def test_temperatures_are_those_of_a_room(scene: xr.Dataset) -> None:
+    """Nothing is colder than a wet finger's stroke, nor warmer than a drink."""
+    for name in ("object_temperature", "background_temperature"):
+        assert float(scene[name].min()) > AMBIENT - Writing().drop - 0.1
+        assert float(scene[name].max()) < 345.0
+
+
+def test_beside_the_object_the_background_is_seen(scene: xr.Dataset) -> None:
+    """Where the object is not, both temperatures are one; a plate leaves no such place."""
+    beyond = ~scene["on_object"].values
+    assert (scene.attrs["twin"] in FILLED) == (not beyond.any())
+    np.testing.assert_array_equal(
+        scene["object_temperature"].values[:, beyond],
+        scene["background_temperature"].values[:, beyond],
+    )
+
+
+def test_observed_with_noise_only(scene: xr.Dataset, rig: xr.Dataset) -> None:
+    """A rig can observe it: the stage `corrected`."""
+    schema.check(simulation.observe(scene, rig, rng()), "corrected")
+
+
+def test_the_seed_makes_the_scene(scene: xr.Dataset) -> None:
+    """The same seed gives the same scene; another seed gives other ways, where anything moves."""
+    name = scene.attrs["twin"]
+    again, other = (twins.twin(name, SHORT, rng(seed)) for seed in (1, 2))
+    xr.testing.assert_identical(again, scene)
+    still = bool(np.ptp(scene["background_temperature"].values) < 1e-9)
+    assert still == (name == "fingerprint")
+    assert still == scene["background_temperature"].equals(other["background_temperature"])
+
+
+LONG = replace(SHORT, time=clock(70, rate=2.0))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("name", TWINS)
+def test_nothing_comes_before_the_object(name: str, seed: int) -> None:
+    """No actor hides the object from the camera in 35 s, which a scene could not say."""
+    assert not twins.obstructed(TWINS[name](LONG, rng(seed)), LONG.time).any()
+
+
+@pytest.mark.data
+def test_nothing_comes_before_the_scan(scan: surfaces.Surface) -> None:
+    """Nor is the scanned bunny hidden, whose ears reach higher."""
+    assert not twins.obstructed(twins.bunny(LONG, rng(), scan=scan), LONG.time).any()
+
+
+def inside(stage: Stage) -> bool:
+    """Whether every vertex of the object lies within the image."""
+    places = stage.camera.project(stage.surface.vertices)
+    return bool(np.all((places > -0.5) & (places < np.array(stage.camera.shape) - 0.5)))
+
+
+def test_the_whole_rabbit_is_seen() -> None:
+    """No vertex of the built-in rabbit lies beyond the image, ears and feet included."""
+    assert inside(twins.bunny(SHORT, rng()))
+
+
+@pytest.mark.data
+def test_the_whole_scan_is_seen(scan: surfaces.Surface) -> None:
+    """No vertex of the scanned bunny does, and its head is in the left half."""
+    stage = twins.bunny(SHORT, rng(), scan=scan)
+    assert inside(stage)
+    head = stage.surface.vertices[:, 2] > 0.11
+    assert stage.surface.vertices[head, 0].mean() < -0.01  # m
+
+
+@pytest.mark.parametrize(("name", "celsius"), PEAKS.items())
+def test_vessels_peak_where_the_paper_s_did(name: str, celsius: float) -> None:
+    """The outer wall at the thermocouple peaks at 63.6 and 63.1 degrees Celsius."""
+    readings = twins.thermocouple_readings(
+        twins.twin(name, SLOW, rng()), rng(), std=0.0, offset_std=0.0, bead=1
+    )
+    np.testing.assert_allclose(float(readings.max()) - 273.15, celsius, rtol=0, atol=0.15)  # K
+
+
+@pytest.mark.parametrize("name", PEAKS)
+def test_vessels_can_be_separated(name: str, rig: xr.Dataset) -> None:
+    """With unknown emissivities the thermocouple's pixels are right to 1.7 % of Celsius."""
+    scene = twins.twin(name, Capture(GLASS, shape=(36, 48)), rng())
+    y, x = int(scene["thermocouple_y"][0]), int(scene["thermocouple_x"][0])
+    bead = {"y": slice(y - 1, y + 2), "x": slice(x - 1, x + 2)}
+    separated = separation.solve(simulation.observe(scene.isel(bead), rig, rng()), rig)
+    error = metrics.relative_error_celsius(
+        separated["object_temperature"].mean(("y", "x")),
+        scene["object_temperature"].isel(bead).mean(("y", "x")),
+    )
+    assert float(error.mean()) < 1.7
+
+
+def test_the_level_rises() -> None:
+    """At the end of the pouring the wall is wet below the level, dry above, and was dry before."""
+    vessel = twins.WINEGLASS
+    height = np.array([0.10, 0.14, 0.21])
+    before, after = (vessel.wetted(height, vessel.start + t) for t in (0.0, vessel.duration))
+    assert before.max() < 0.01
+    np.testing.assert_allclose(after, [1.0, 1.0, 0.0], rtol=0, atol=0.01)
+
+
+def test_prints_fade() -> None:
+    """A print is warmest when the capture starts, by at least 1 K, and only fades from then on."""
+    scene = twins.twin("fingerprint", SLOW, rng(), pane=COARSE)
+    peak = scene["object_temperature"].max(("y", "x")).values - AMBIENT
+    assert peak[0] > 1.0
+    assert np.all(np.diff(peak) < 0)
+    assert peak[-1] > 0.2
+    np.testing.assert_allclose(scene["background_temperature"], AMBIENT, rtol=0, atol=1e-9)  # K
+
+
+def test_a_visitor_moves_behind_a_print() -> None:
+    """With somebody far away the plate's background moves, and the print is the same."""
+    alone, visited = (
+        twins.twin("fingerprint", SLOW, rng(), pane=COARSE, visitor=visitor)
+        for visitor in (False, True)
+    )
+    xr.testing.assert_equal(alone["object_temperature"], visited["object_temperature"])
+    assert float(visited["background_temperature"].max()) > AMBIENT + 5
+
+
+def test_fingers_are_reflection_only() -> None:
+    """The plate stays at room temperature while warm skin is reflected, now and then."""
+    scene = twins.twin("fingers", SLOW, rng())
+    np.testing.assert_allclose(scene["object_temperature"], AMBIENT, rtol=0, atol=1e-9)  # K
+    warm = scene["background_temperature"] > AMBIENT + 5
+    assert warm.any("time").mean() > 0.2
+    assert not warm.all("time").any()
+
+
+def test_letters_are_reflected_in_the_plate() -> None:
+    """While CV is written the plate reflects strokes colder than the room, more and more."""
+    scene = twins.twin("glass_plate", SLOW, rng())
+    cold = (scene["background_temperature"] < AMBIENT - 1).sum(("y", "x")).values
+    assert cold[0] == 0
+    assert cold[8] > 0
+    assert cold[15] > 1.5 * cold[8]
+
+
+def test_letters_stay_when_the_hand_has_left() -> None:
+    """A second after the last stroke no skin is seen; 15 s later CV is still 2 K cold and more."""
+    writing = Writing(start=1.0)
+    gone = float(writing.path()[0][-1]) + WITHDRAWAL
+    capture = replace(SLOW, time=np.array([0.0, gone, gone + 15.0]))
+    scene = twins.twin("glass_plate", capture, rng(), writing=writing)
+    change = scene["background_temperature"].isel(time=[1, 2]) - AMBIENT
+    assert float(change.max()) < 1e-9
+    assert np.all((change < -2).mean(("y", "x")) > 0.03)
+
+
+def test_parallax_is_that_of_a_mirror_image() -> None:
+    """The second camera sees a ball's mirror image through another point of a plate."""
+    plate = surfaces.moved(surfaces.plate(2.0, 2.0, 2.0), translation=(0, 0, -1))
+    place, radius = np.array([0.1, -1.5, 0.05]), 0.05
+    surface = surfaces.sphere(radius, radius / 10)
+    ball = Actor(surface, np.full(len(surface.vertices), 310.0), lambda _: Pose(translation=place))
+    camera = Camera((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (90, 120))
+    stage = Stage("ball", plate, np.full((2, len(plate.vertices)), AMBIENT), camera, [ball], Room())
+    capture = Capture(GLASS, shape=(90, 120), time=clock(2), baseline=0.04)
+    seen = twins.take(stage, capture)["background_temperature"].isel(time=0).values
+    image = place * (1, -1, 1)
+    for warmth, x in zip(seen, (0.0, 0.04), strict=True):
+        eye = np.array([x, -1.0, 0.0])
+        crossing = eye + (image - eye) / (image[1] + 1.0)
+        found = np.argwhere(warmth > AMBIENT + 1).mean(axis=0)
+        np.testing.assert_allclose(found, camera.project(crossing), rtol=0, atol=0.3)  # pixel
+
+
+def test_a_baseline_gives_a_background_for_each_band(rig: xr.Dataset) -> None:
+    """The first band is as without a baseline; the second is another, and it is observed."""
+    one = twins.twin("coffee_pot", SHORT, rng())
+    two = twins.twin("coffee_pot", replace(SHORT, baseline=0.04), rng())
+    background = two["background_temperature"]
+    assert background.dims == ("band", "time", "y", "x")
+    np.testing.assert_array_equal(background[0], one["background_temperature"])
+    assert not background[1].equals(background[0])
+    assert not (two["hidden_from_second"] & ~two["on_object"]).any()
+    single = two.assign(background_temperature=background.sel(band="9.5", drop=True))
+    both, second = (simulation.observe(part, rig, rng())["counts"] for part in (two, single))
+    np.testing.assert_array_equal(both.sel(band="9.5"), second.sel(band="9.5"))
+    with pytest.raises(ValueError, match=r"Missing band '9.5' in background_temperature"):
+        simulation.observe(
+            two.drop_sel(band="9.5").assign(emissivity=one["emissivity"]), rig, rng()
+        )
+
+
+def test_a_scan_is_stood_on_the_table() -> None:
+    """A rabbit scanned with y up, in millimetres, is 0.15 m high; its z faces the camera."""
+    upright = twins.rabbit()
+    lying = surfaces.moved(upright, Rotation.from_euler("x", -90.0, degrees=True), scale=1e3)
+    stood = twins.bunny(SHORT, rng(), scan=lying).surface
+    np.testing.assert_allclose(stood.vertices[:, 2].min(), 0.0, rtol=0, atol=1e-12)  # m
+    np.testing.assert_allclose(np.ptp(stood.vertices[:, 2]), 0.15, rtol=0, atol=1e-12)  # m
+    np.testing.assert_allclose(stood.face_normals, upright.face_normals, rtol=0, atol=1e-9)
+
+
+def test_thermocouples_read_the_mean_under_the_bead() -> None:
+    """Without errors a reading is the mean of 3 x 3 pixels; a probe's offset is constant."""
+    scene = twins.twin("glass_plate", SHORT, rng())
+    y, x = int(scene["thermocouple_y"][0]), int(scene["thermocouple_x"][0])
+    near = scene["object_temperature"][:, y - 1 : y + 2, x - 1 : x + 2].mean(("y", "x"))
+    exact = twins.thermocouple_readings(scene, rng(), std=0.0, offset_std=0.0)[0]
+    np.testing.assert_allclose(exact, near, rtol=0, atol=1e-9)  # K
+    shifted = twins.thermocouple_readings(scene, rng(), std=0.0, offset_std=0.5)[0] - exact
+    assert abs(float(shifted[0])) > 0.01
+    np.testing.assert_allclose(shifted, shifted[0], rtol=0, atol=1e-9)  # K
+
+
+def test_a_probe_is_on_its_ring() -> None:
+    """A probe has the height and the radius of a ring of vertices, the nearest one."""
+    ball = surfaces.sphere(0.05, 0.02)
+    place = np.array(twins.on_wall(ball, 0.013, 30.0))
+    np.testing.assert_allclose(np.linalg.norm(place), 0.05, rtol=0, atol=1e-12)  # m
+    assert place[2] in ball.vertices[:, 2]
+    assert place[2] != 0.013
+
+
+def vessel(**changes: object) -> Vessel:
+    """A wineglass with changes."""
+    return replace(twins.WINEGLASS, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: twins.twin("teapot", SHORT, rng()), "Unknown twin 'teapot'"),
+        (lambda: vessel(level=0.05), "Invalid level 0.05 m. Must be above"),
+        (lambda: vessel(duration=0.0), "Invalid duration 0.0 s of pouring"),
+        (lambda: Capture(GLASS, time=clock(1)), "of a capture. Must be two or more"),
+        (lambda: Capture(GLASS, time=clock(3)[::-1]), "Invalid time 0.1 s of a capture"),
+        (lambda: Capture(GLASS[:1], baseline=0.04), "Must be two"),
+        (lambda: Capture(GLASS.rename(band="filter")), "Must be .band,."),
+        (
+            lambda: twins.thermocouple_readings(twins.twin("fingers", SHORT, rng()), rng(), bead=2),
+            "Invalid bead 2 pixels. Must be odd",
+        ),
+        (
+            lambda: twins.thermocouple_readings(twins.twin("bulb", SHORT, rng()), rng(), bead=31),
+            "its bead reaches beyond the object",
+        ),
+        (
+            lambda: twins.twin("wineglass", SHORT, rng(), vessel=vessel(probe=(0.01, 0.0))),
+            "Must be on the object",
+        ),
+        (
+            lambda: twins.twin("wineglass", SHORT, rng(), vessel=vessel(probe=(0.152, 180.0))),
+            "behind another part of the object. Must be seen by the camera",
+        ),
+    ],
+)
+def test_refusals(wrong: object, message: str) -> None:
+    """What is wrong is refused, with the rule."""
+    with pytest.raises(ValueError, match=message):
+        wrong()  # type: ignore[operator]

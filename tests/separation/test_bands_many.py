@@ -1,0 +1,138 @@
+"""Any number of bands: the error falls as the bound says, whatever their order."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dbthermal import limits, schema, separation, simulation
+from dbthermal.simulation import Background, Rig
+from reproduction import experiments
+
+TIME = np.arange(350) / 10.0
+BANDS = ("8-14", "9.5", "10.6", "12.1")
+NOISE = (0.03, 0.35, 0.15, 0.4)  # [K]
+VALUES = (0.86, 0.72, 0.88, 0.95)
+OTHERS = [name for name in separation.METHODS if name != "subspace"]
+Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+
+
+def case(number: int, pixels: int, seed: int) -> Case:
+    """Scene, capture and response of the first so many bands."""
+    rig = Rig(bands=BANDS[:number], noise=NOISE[:number])
+    glass: dict[str, Any] = {"emissivity": list(VALUES[:number]), "start": 20, "stop": 60}
+    return experiments.simulate(glass, rig, TIME, pixels, seed)
+
+
+def pooled(error: xr.DataArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt((error**2).mean()))
+
+
+def test_error_falls_as_the_bound_says() -> None:
+    """With 3 and 4 bands the object's error falls, at a constant ratio to the bound."""
+    errors, ratios = [], []
+    for number in (2, 3, 4):
+        scene, capture, response = case(number, 400, seed=1)
+        result = separation.solve(capture, response)
+        bound = limits.bounds(scene, response)["object_temperature_std"]
+        errors.append(pooled(result["object_temperature"] - scene["object_temperature"]))
+        ratios.append(errors[-1] / pooled(bound))
+    print(f"2, 3, 4 bands: {np.round(errors, 3)} K, over the bound {np.round(ratios, 3)}")
+    assert errors[0] > errors[1] > errors[2]
+    assert np.ptp(ratios) < 0.1 * np.mean(ratios)
+
+
+@pytest.mark.parametrize("number", [3, 4])
+def test_error_bars_are_true(number: int) -> None:
+    """Object and ratios scatter as they say, in every band; clean pixels have no flag."""
+    scene, capture, response = case(number, 600, seed=2)
+    result = separation.solve(capture, response)
+    truth = (1 - scene["emissivity"]) / (1 - scene["emissivity"].sel(band="8-14"))
+    others = {"band": slice(1, None)}
+    scores = {
+        "object": (result["object_temperature"] - scene["object_temperature"])
+        / result["object_temperature_std"],
+        "ratios": ((result["reflection_ratio"] - truth) / result["reflection_ratio_std"]).isel(
+            others
+        ),
+    }
+    for name, values in scores.items():
+        spread = float(np.diff(np.nanquantile(values, [0.1587, 0.8413]))[0] / 2)
+        print(f"{number} bands, {name}: spread of errors over their deviation {spread:.2f}")
+        assert spread == pytest.approx(1.0, abs=0.15)
+    within = abs(result["emissivity"] - scene["emissivity"]) < 1.96 * result["emissivity_std"]
+    assert float(within.mean()) > 0.92
+    assert float((result["status"] != 0).mean()) < 0.03
+    assert float(abs(result["emissivity"] - scene["emissivity"]).median()) < 0.02
+
+
+@settings(max_examples=10, deadline=None)
+@given(order=st.permutations(range(4)))
+def test_order_of_bands_does_not_matter(order: list[int]) -> None:
+    """The quietest band leads, wherever it stands."""
+    _, capture, response = case(4, 5, seed=3)
+    names = list(BANDS)
+    plain = separation.solve(capture, response)
+    mixed = separation.solve(capture.isel(band=order), response).sel(band=names)
+    assert mixed.attrs["reference_band"] == "8-14"
+    for name in schema.STAGES["separated"]:
+        np.testing.assert_allclose(
+            mixed[name].values.astype(float), plain[name].values, rtol=1e-5, atol=1e-6
+        )
+
+
+def test_the_quietest_band_is_the_reference() -> None:
+    """There the ratio is 1 and its deviation 0, exactly."""
+    _, capture, response = case(3, 20, seed=4)
+    result = separation.solve(capture.isel(band=[2, 0, 1]), response)
+    assert np.all(result["reflection_ratio"].sel(band="8-14") == 1)
+    assert np.all(result["reflection_ratio_std"].sel(band="8-14") == 0)
+    assert np.all(result["reflection_ratio_std"].sel(band=["9.5", "10.6"]) > 0)
+
+
+def test_three_bands_can_be_pooled() -> None:
+    """A material's ratios are right within one per cent in every band."""
+    _, capture, response = case(3, 400, seed=5)
+    pool = xr.zeros_like(capture["counts"][0, 0], dtype=int)
+    ratio = separation.solve(capture, response, pool=pool)["reflection_ratio"][:, 0, 0]
+    expected = (1 - np.array(VALUES[:3])) / (1 - VALUES[0])
+    print(f"ratios {ratio.values.round(4)}, true {expected.round(4)}")
+    np.testing.assert_allclose(ratio, expected, rtol=0.02)
+
+
+def test_noise_of_many_bands_is_found() -> None:
+    """Without a calibrated noise that of each band is estimated within 5 %."""
+    _, capture, response = case(4, 200, seed=6)
+    found = separation.solve(capture, response.drop_vars(["noise", "netd"]))["noise"]
+    print(f"noise over the true one: {(found / response['noise']).values.round(3)}")
+    np.testing.assert_allclose(found, response["noise"], rtol=0.05)
+
+
+def test_a_gray_third_band_harms_nothing() -> None:
+    """A band in which the body is as in the first adds no information and costs none."""
+    rig = Rig(bands=BANDS[:3], noise=(0.03, 0.35, 0.15))
+    errors = []
+    for bands in (2, 3):
+        value = xr.DataArray([0.86, 0.72, 0.86], dims="band", coords={"band": list(BANDS[:3])})
+        rng = np.random.default_rng(7)
+        scene = simulation.independent_pixels(
+            TIME, value, Background(), 200, rng, start=293.15, stop=333.15
+        )
+        capture = simulation.observe(scene, rig.response(), rng).isel(band=slice(0, bands))
+        result = separation.solve(capture, rig.response())
+        errors.append(pooled(result["object_temperature"] - scene["object_temperature"]))
+    print(f"two bands {errors[0]:.3f} K, with a gray third {errors[1]:.3f} K")
+    assert errors[1] < 1.05 * errors[0]
+
+
+@pytest.mark.parametrize("method", OTHERS)
+def test_other_methods_take_two_bands(method: str) -> None:
+    """Two equations, two bands: a third one is refused before anything else."""
+    _, capture, response = case(3, 2, seed=8)
+    message = rf"Invalid bands \['8-14', '9.5', '10.6'\] for method '{method}'. Must be exactly two"
+    with pytest.raises(ValueError, match=message):
+        separation.solve(capture, response, method)

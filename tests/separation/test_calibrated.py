@@ -1,0 +1,134 @@
+"""Known emissivities: two equations a frame, the noise is the price."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dbthermal import _smooth as smooth
+from dbthermal import limits, mixing, schema, separation
+from dbthermal import response as responses
+from dbthermal.simulation import Rig
+
+RIG = Rig()
+TIME = np.arange(350) / 10.0
+
+
+def emissivity_of(*values: float) -> xr.DataArray:
+    """Emissivity (band) of the rig's two bands."""
+    return xr.DataArray(list(values), dims="band", coords={"band": list(RIG.bands)})
+
+
+Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    first=st.floats(0.05, 0.95),
+    second=st.floats(0.05, 0.95),
+    warm=st.floats(275.0, 345.0),
+    cold=st.floats(275.0, 345.0),
+)
+def test_calibrated_inverts_the_image_formation(
+    first: float, second: float, warm: float, cold: float
+) -> None:
+    """Without noise the calibrated method returns the temperatures that went in."""
+    if abs(first - second) < 0.05:
+        return
+    response = RIG.response()
+    curves = [responses.curve(response, name) for name in RIG.bands]
+    counts = [
+        mixing.leaving(e, curve.counts(warm), curve.counts(cold))
+        for e, curve in zip((first, second), curves, strict=True)
+    ]
+    # Two frames, one an hair warmer: a signal that never changes is flagged, not solved.
+    movie = np.array(counts)[:, None, None, None] * np.array([1.0, 1.0 + 1e-9])[None, :, None, None]
+    capture = xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), movie)},
+        coords={"band": list(RIG.bands), "time": [0.0, 0.1]},
+    )
+    result = separation.solve(
+        capture, response, "calibrated", emissivity=emissivity_of(first, second)
+    )
+    for name, value in (("object_temperature", warm), ("background_temperature", cold)):
+        np.testing.assert_allclose(result[name].values[0], value, rtol=0, atol=2e-3)  # [K]
+
+
+def test_calibrated_noise_is_the_bound(glass: Glass) -> None:
+    """Known emissivities: errors are those of the closed form, 0.35 K and 2.1 K for glass."""
+    scene, capture, response = glass
+    known = emissivity_of(0.86, 0.72)
+    result = separation.solve(capture, response, "calibrated", emissivity=known)
+    for name in ("object_temperature", "background_temperature"):
+        scores = (result[name] - scene[name]) / result[f"{name}_std"]
+        assert float(scores.std()) == pytest.approx(1.0, abs=0.05)
+    assert not result["status"].any()
+
+
+def test_unlabelled_emissivity_goes_by_position(glass: Glass) -> None:
+    """An emissivity without band names is taken in the capture's order, as xarray aligns it."""
+    _, capture, response = glass
+    named = emissivity_of(0.86, 0.72)
+    results = [
+        separation.solve(capture.isel(time=[7]), response, "calibrated", emissivity=emissivity)
+        for emissivity in (named, named.drop_vars("band"))
+    ]
+    xr.testing.assert_identical(*results)
+
+
+def test_one_frame_can_be_calibrated(glass: Glass) -> None:
+    """A single frame is enough with known emissivities, and is no constant signal."""
+    scene, capture, response = glass
+    known = emissivity_of(0.86, 0.72)
+    result = separation.solve(capture.isel(time=[7]), response, "calibrated", emissivity=known)
+    assert not np.any(result["status"])
+    error = result["object_temperature"] - scene["object_temperature"].isel(time=[7])
+    assert float(abs(error).max()) < 5 * 0.4  # five standard deviations [K]
+
+
+def test_nonsense_in_one_pixel_stays_there(glass: Glass) -> None:
+    """Counts that no two temperatures give are flagged, not cast into infinity."""
+    _, capture, response = glass
+    wild = capture.copy(deep=True)
+    wild["counts"].values[1, :, 0, 0] = wild["counts"].values[0, :, 0, 0]
+    known = emissivity_of(0.86, 0.72)
+    result = separation.solve(wild, response, "calibrated", emissivity=known)
+    assert result["status"].values[0, 0] & schema.FLAGS["outside_response"]
+    assert not np.any(result["status"].values[1:])
+
+
+def test_linear_variances_are_the_closed_form() -> None:
+    """The design's figures for glass with noise (0.04, 0.4) K: 0.40 K and 2.4 K a frame."""
+    mixed = mixing.matrix([0.86, 0.72])
+    none = np.zeros(2)
+    variance = limits.calibrated_variance(mixed, (0.04, 0.4), np.array([300.0, 300.0]), none)
+    np.testing.assert_allclose(np.sqrt(variance), [0.40, 2.4], rtol=0, atol=0.07)  # [K]
+
+
+@given(first=st.floats(0.02, 0.98), second=st.floats(0.02, 0.98))
+def test_ratios_and_emissivities_are_inverse(first: float, second: float) -> None:
+    """Emissivities follow from the two ratios, unless the body is gray."""
+    if abs(first - second) < 1e-3:
+        return
+    pair = (first, second)
+    found = limits.emissivities(limits.emission_ratio(pair), limits.reflection_ratio(pair))
+    np.testing.assert_allclose(found, pair, rtol=0, atol=1e-9)
+
+
+def test_bound_of_the_ratio_is_that_of_a_linear_model() -> None:
+    """The bound equals the inverse Fisher information of the model with all its unknowns."""
+    rng = np.random.default_rng(0)
+    time, noise, pair = np.arange(40.0), (0.05, 0.3), (0.86, 0.72)
+    background, functions = rng.normal(0, 3, 40), smooth.basis(time, 4)
+    ratio = float(limits.reflection_ratio(pair))
+    # Unknowns: the ratio, four coefficients of each band's smooth part, one reflection a frame.
+    reflection = (1 - pair[0]) * background
+    identity, zero = np.eye(40), np.zeros((40, 4))
+    first = np.hstack([np.zeros((40, 1)), functions, zero, identity]) / noise[0]
+    second = np.hstack([reflection[:, None], zero, functions, ratio * identity]) / noise[1]
+    jacobian = np.vstack([first, second])
+    # One combination of smooth part and reflection is shared: the pseudoinverse leaves it out.
+    expected = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10)[0, 0]
+    found = limits.ratio_variance(pair, noise, background, functions)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)

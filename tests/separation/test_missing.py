@@ -1,0 +1,278 @@
+"""Samples that are not there: NaN, masks, shutter events; the rest is as without them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dbthermal import schema, separation
+from dbthermal.simulation import Rig
+from reproduction import experiments
+
+RIG = Rig()
+TIME = np.arange(350) / 10.0
+GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
+PIXELS = 20
+FRAMES = ("object_temperature", "background_temperature")
+INVALID = schema.FLAGS["invalid_samples"]
+Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    """Scene, capture and response of 20 pixels of glass."""
+    return experiments.simulate(GLASS, RIG, TIME, PIXELS, seed=1)
+
+
+def without(capture: xr.Dataset, there: np.ndarray) -> xr.Dataset:
+    """The capture with NaN where samples (..., time, y, x) are not there, in all bands."""
+    return capture.assign(
+        counts=capture["counts"].where(xr.DataArray(there, dims=("time", "y", "x")))
+    )
+
+
+def assert_agree(found: xr.Dataset, expected: xr.Dataset, frames: np.ndarray) -> None:
+    """The frames that are there have the values of the shorter capture, the others none."""
+    for name in schema.STAGES["separated"]:
+        values = found[name].values
+        if name.startswith(FRAMES):
+            assert np.all(np.isnan(values[~frames]))
+            values = values[frames]
+        np.testing.assert_allclose(values, expected[name].values, rtol=1e-5, atol=1e-6)
+
+
+def lost(fraction: float, seed: int = 0) -> np.ndarray:
+    """Frames (time) that are there, some lost at random and one long gap."""
+    there = np.random.default_rng(seed).random(350) >= fraction
+    there[120:150] = False
+    return np.asarray(there)
+
+
+@pytest.mark.parametrize("band", [[0], [1], [0, 1]])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_missing_frames_are_as_if_never_taken(case: Case, band: list[int], value: float) -> None:
+    """Frames that are not numbers, in one band or both, change nothing else."""
+    _, capture, response = case
+    frames = lost(0.1)
+    spoilt = capture.copy(deep=True)
+    for one in band:
+        spoilt["counts"].values[one, ~frames] = value
+    expected = separation.solve(capture.isel(time=frames), response)
+    assert_agree(separation.solve(spoilt, response), expected, frames)
+
+
+@pytest.mark.parametrize("noise_known", [True, False])
+def test_masks_of_frames(case: Case, noise_known: bool) -> None:
+    """A mask over time is the capture without these frames, noise known or not."""
+    _, capture, response = case
+    response = response if noise_known else response.drop_vars(["noise", "netd"])
+    frames = lost(0.2, seed=3)
+    found = separation.solve(capture, response, mask=xr.DataArray(frames, dims="time"))
+    assert_agree(found, separation.solve(capture.isel(time=frames), response), frames)
+
+
+def test_masks_of_pixels(case: Case) -> None:
+    """Pixels that are masked are flagged and NaN, the others as they were."""
+    _, capture, response = case
+    used = np.arange(PIXELS)[np.newaxis] % 3 > 0
+    found = separation.solve(capture, response, mask=xr.DataArray(used, dims=("y", "x")))
+    whole = separation.solve(capture, response)
+    assert np.all(found["status"].values[~used] == INVALID)
+    for name in schema.STAGES["separated"]:
+        if name != "status":
+            assert np.all(np.isnan(found[name].values[..., ~used]))
+        np.testing.assert_allclose(
+            found[name].values[..., used], whole[name].values[..., used], rtol=1e-6
+        )
+
+
+def test_masks_of_samples_are_nan(case: Case) -> None:
+    """A mask of single samples is the same as NaN there, each pixel with its own frames."""
+    _, capture, response = case
+    there = np.random.default_rng(4).random((350, 1, PIXELS)) > 0.25  # too many to be bridged
+    masked = separation.solve(capture, response, mask=xr.DataArray(there, dims=("time", "y", "x")))
+    spoilt = separation.solve(without(capture, there), response)
+    xr.testing.assert_identical(masked, spoilt)
+    assert np.all(np.isnan(masked["object_temperature"].values[~there]))
+    assert np.all(np.isfinite(masked["object_temperature"].values[there]))
+    pixel = capture.isel(x=[7]).isel(time=there[:, 0, 7])
+    alone = separation.solve(pixel, response)
+    assert_agree(masked.isel(x=[7]), alone, there[:, 0, 7])
+
+
+@pytest.mark.parametrize(("missing", "good"), [(170, True), (180, False)])
+def test_half_of_the_frames_must_be_there(case: Case, missing: int, good: bool) -> None:
+    """A pixel with less than half of its frames is flagged and NaN."""
+    _, capture, response = case
+    there = np.ones((350, 1, PIXELS), dtype=bool)
+    there[np.random.default_rng(5).permutation(350)[:missing], 0, 3] = False
+    result = separation.solve(without(capture, there), response)
+    assert bool(result["status"].values[0, 3] != INVALID) == good
+    assert bool(np.any(np.isfinite(result["object_temperature"].values[:, 0, 3]))) == good
+    assert not np.any(np.delete(result["status"].values[0], 3))
+
+
+def test_lost_frames_cost_little() -> None:
+    """With one frame in ten lost the object is within 20 % of the whole capture."""
+    scene, capture, response = experiments.simulate(GLASS, RIG, TIME, 400, seed=2)
+    there = np.broadcast_to(lost(0.1)[:, np.newaxis, np.newaxis], (350, 1, 400))
+    rmse = [
+        float(np.sqrt(((r["object_temperature"] - scene["object_temperature"]) ** 2).mean()))
+        for r in (separation.solve(c, response) for c in (capture, without(capture, there)))
+    ]
+    print(f"whole {rmse[0]:.3f} K, with gaps {rmse[1]:.3f} K")
+    assert rmse[1] < 1.2 * rmse[0]
+
+
+@pytest.mark.parametrize("events", [(200,), (90, 210, 300)])
+def test_shutter_steps_are_undone(events: tuple[int, ...]) -> None:
+    """Steps of 40 counts, another for each pixel and band, cost 20 % with `segment`; without it
+    the result is useless or flagged.
+    """
+    scene, capture, response = experiments.simulate(GLASS, RIG, TIME, 300, seed=6)
+    segment = np.searchsorted(events, np.arange(350), side="right")
+    rng = np.random.default_rng(7)
+    offsets = np.concatenate(
+        [np.zeros((2, 1, 1, 300)), rng.normal(0, 40, (2, len(events), 1, 300))], 1
+    )
+    stepped = capture.assign(counts=capture["counts"] + offsets[:, segment].astype(np.float32))
+    stepped["counts"].attrs.update(capture["counts"].attrs)
+    results = [
+        separation.solve(c, response)
+        for c in (capture, stepped.assign(segment=("time", segment)), stepped)
+    ]
+    rmse, good = [], []
+    for result in results:
+        error = result["object_temperature"] - scene["object_temperature"]
+        of_pixel = (error**2).mean("time") ** 0.5
+        rmse.append(float(of_pixel.median()))
+        right = (result["status"] == 0) & (of_pixel < 3 * rmse[0])
+        good.append(float(right.mean()))
+    within = abs(results[1]["object_temperature"] - scene["object_temperature"]) < (
+        1.96 * results[1]["object_temperature_std"]
+    )
+    print(
+        f"{events}: whole {rmse[0]:.3f} K, undone {rmse[1]:.3f} K, not undone {rmse[2]:.3f} K; "
+        f"right and unflagged {np.round(good, 3)}; intervals {float(within.mean()):.3f}"
+    )
+    assert rmse[1] < 1.2 * rmse[0] if len(events) == 1 else rmse[1] < 1.6 * rmse[0]
+    assert 0.92 <= float(within.mean()) <= 0.98
+    assert good[2] < 0.3
+
+
+def test_a_segment_without_a_step_costs_little(case: Case) -> None:
+    """An event that changed nothing leaves a true error bar and no flag."""
+    _, capture, response = case
+    plain = separation.solve(capture, response)
+    freed = separation.solve(capture.assign(segment=("time", np.repeat([3, 4], 175))), response)
+    assert not np.any(freed["status"])
+    apart = freed["object_temperature"] - plain["object_temperature"]
+    assert float(np.sqrt((apart**2).mean())) < 0.15  # [K]
+    constant = separation.solve(capture.assign(segment=("time", np.full(350, 9))), response)
+    xr.testing.assert_identical(constant["object_temperature"], plain["object_temperature"])
+
+
+BAD: dict[str, tuple[dict[str, Any], Any, type[Exception], str]] = {
+    "mask of numbers": (
+        {},
+        xr.DataArray(np.ones(350), dims="time"),
+        TypeError,
+        "Invalid dtype float64 of the mask",
+    ),
+    "mask of a list": ({}, [True] * 350, TypeError, "Invalid mask of type list"),
+    "mask too short": ({}, xr.DataArray(np.ones(9, bool), dims="time"), ValueError, "Invalid mask"),
+    "mask of bands": ({}, xr.DataArray([True, True], dims="band"), ValueError, "Invalid mask"),
+    "half segments": ({"segment": ("time", np.ones(350))}, None, ValueError, "of float64"),
+    "falling": ({"segment": ("time", np.arange(350)[::-1])}, None, ValueError, "do not fall"),
+    "of pixels": ({"segment": ("x", np.arange(PIXELS))}, None, ValueError, "Must be .'time',"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_masks_and_segments(case: Case, what: str) -> None:
+    """Masks are booleans of the capture's sizes, segments whole numbers that do not fall."""
+    new, mask, error, message = BAD[what]
+    _, capture, response = case
+    with pytest.raises(error, match=message):
+        separation.solve(capture.assign(new), response, mask=mask)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    frames=st.integers(32, 120),
+    share=st.floats(0.0, 0.7),
+    common=st.booleans(),
+    events=st.integers(0, 3),
+    materials=st.integers(0, 4),
+)
+def test_nothing_missing_raises(
+    seed: int, frames: int, share: float, common: bool, events: int, materials: int
+) -> None:
+    """Random gaps, events and labels: what is good is finite wherever the capture has samples."""
+    rng = np.random.default_rng(seed)
+    _, capture, response = experiments.simulate(GLASS, RIG, TIME[:frames], 12, seed)
+    there = rng.random((frames, 1, 1 if common else 12)) >= share
+    there = np.broadcast_to(there, (frames, 1, 12))
+    segment = np.searchsorted(np.sort(rng.integers(1, frames, events)), np.arange(frames), "right")
+    labels = xr.DataArray(rng.integers(-1, max(materials, 1), (1, 12)), dims=("y", "x"))
+    result = separation.solve(
+        without(capture, there).assign(segment=("time", segment)),
+        response,
+        pool=labels if materials else None,
+    )
+    good = result["status"].values == 0
+    for name in schema.STAGES["separated"]:
+        known = good & there if name.startswith(FRAMES) else good
+        values = result[name].values
+        assert np.all(np.isfinite(values[np.broadcast_to(known, values.shape)]))
+    assert np.all(np.isnan(result["object_temperature"].values[~there]))
+
+
+def test_unequal_gaps_need_a_known_noise(case: Case) -> None:
+    """Where every pixel lacks other frames the noise cannot be estimated, and the error says so."""
+    _, capture, response = case
+    there = np.random.default_rng(8).random((350, 1, PIXELS)) > 0.02
+    with pytest.raises(ValueError, match=r"0 usable pixels .* or give the noise"):
+        separation.solve(without(capture, there), response.drop_vars(["noise", "netd"]))
+
+
+@pytest.mark.parametrize("method", ["subspace", "naive", "ratio", "apparent"])
+def test_one_lost_sample_costs_its_frame_alone(case: Case, method: str) -> None:
+    """A frame that one pixel lacks is NaN there; the pixel's other frames have their values."""
+    _, capture, response = case
+    spoilt = capture.isel(x=slice(0, 6), time=slice(0, 200)).copy(deep=True)
+    spoilt["counts"].values[0, 30, 0, 2] = np.nan
+    temperature = separation.solve(spoilt, response, method)["object_temperature"].values[:, 0]
+    assert np.isnan(temperature[30, 2])
+    assert np.all(np.isfinite(temperature[31:, 2]))
+
+
+@pytest.mark.parametrize("method", ["dbvt", "bcp"])
+def test_pixel_that_lacks_a_frame_is_left_out_where_all_must_have_the_same(method: str) -> None:
+    """A method that needs the same frames of all pixels flags the one that lacks a sample."""
+    _, capture, response = experiments.simulate(GLASS, RIG, TIME[:40], 4, seed=3)
+    spoilt = capture.copy(deep=True)
+    spoilt["counts"].values[1, 7:10, 0, 2] = np.nan  # longer than what is bridged
+    result = separation.solve(spoilt, response, method)
+    lacking = result["status"].values[0] & schema.FLAGS["invalid_samples"] != 0
+    np.testing.assert_array_equal(lacking, [False, False, True, False])
+    given = np.isfinite(result["object_temperature"].values[:, 0]).any(axis=0)
+    np.testing.assert_array_equal(given, ~lacking)
+
+
+def test_short_gaps_are_bridged() -> None:
+    """With single samples lost, others in each pixel, the object is as good, and NaN where lost."""
+    scene, capture, response = experiments.simulate(GLASS, RIG, TIME, 300, seed=5)
+    there = np.random.default_rng(6).random((350, 1, 300)) > 0.05
+    errors = []
+    for one in (capture, without(capture, there)):
+        error = separation.solve(one, response)["object_temperature"] - scene["object_temperature"]
+        errors.append(float(np.sqrt((error**2).mean())))
+    print(f"whole {errors[0]:.3f} K, one sample in twenty lost {errors[1]:.3f} K")
+    assert errors[1] < 1.1 * errors[0]
+    assert np.all(np.isnan(error.values[~there]))
+    assert np.isfinite(error.values[there]).mean() > 0.99

@@ -1,0 +1,214 @@
+"""Pixels of one material share what they tell: smaller errors, and no bleeding."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import schema, separation
+from dbthermal.simulation import Rig
+from reproduction import experiments
+
+RIG = Rig()
+TIME = np.arange(350) / 10.0
+GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
+TEMPERATURES = ("object_temperature", "background_temperature")
+Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+
+
+def labels(*values: int | np.ndarray) -> xr.DataArray:
+    """Labels (y, x) of an image one row high."""
+    return xr.DataArray(np.hstack([np.atleast_1d(v) for v in values])[np.newaxis], dims=("y", "x"))
+
+
+def one(pixels: int, label: int = 0) -> np.ndarray:
+    """One label for some pixels."""
+    return np.full(pixels, label)
+
+
+def beside(*cases: Case) -> Case:
+    """Images one row high, side by side; the response of the first."""
+    columns = np.arange(sum(part[0].sizes["x"] for part in cases))
+    scene, capture = (
+        xr.concat([part[i] for part in cases], "x").assign_coords(x=columns) for i in (0, 1)
+    )
+    return scene, capture.transpose("band", "time", "y", "x"), cases[0][2]
+
+
+def case(pixels: int, seed: int, **changes: Any) -> Case:
+    """Scene, capture and response."""
+    return experiments.simulate({**GLASS, **changes}, RIG, TIME, pixels, seed)
+
+
+def error_of_ratio(result: xr.Dataset, truth: float = 2.0) -> float:
+    """Root mean square error of the second band's reflection ratio."""
+    return float(np.sqrt(((result["reflection_ratio"].sel(band="9.5") - truth) ** 2).mean()))
+
+
+def test_four_hundred_pixels_cut_the_error_tenfold() -> None:
+    """The error of k2 falls by more than 10 over a few films, and that of the object falls."""
+    alone, shared, objects = [], [], []
+    for seed in range(3):
+        scene, capture, response = case(400, seed)
+        results = [
+            separation.solve(capture, response, pool=pool) for pool in (None, labels(one(400)))
+        ]
+        alone.append(error_of_ratio(results[0]))
+        shared.append(error_of_ratio(results[1]))
+        error = [r["object_temperature"] - scene["object_temperature"] for r in results]
+        objects.append([float(np.sqrt((e**2).mean())) for e in error])
+    before, after = (np.sqrt(np.mean(np.square(part))) for part in (alone, shared))
+    of_object = np.sqrt(np.mean(np.square(objects), axis=0))
+    print(
+        f"k2 {before:.4f} alone, {after:.4f} pooled: 1/{before / after:.1f}; object {of_object} K"
+    )
+    assert before / after >= 10
+    assert of_object[1] < of_object[0]
+
+
+def test_shared_error_bars_are_true() -> None:
+    """Errors of materials of ten pixels are as large as their standard deviations say."""
+    scene, capture, response = case(1000, 3)
+    pool = labels(np.repeat(np.arange(100), 10))
+    result = separation.solve(capture, response, pool=pool)
+    scores = ((result["reflection_ratio"] - 2.0) / result["reflection_ratio_std"]).sel(band="9.5")
+    spread = float(scores.std())
+    within = abs(result["object_temperature"] - scene["object_temperature"]) < (
+        1.96 * result["object_temperature_std"]
+    )
+    known = result["object_temperature"].notnull()
+    of_object = float(within.where(known).mean())
+    covered = abs(result["emissivity"] - scene["emissivity"]) < 1.96 * result["emissivity_std"]
+    of_emissivity = float(covered.mean())
+    print(f"ratio {spread:.2f}; intervals: object {of_object:.3f}, emissivity {of_emissivity:.3f}")
+    assert spread == pytest.approx(1.0, abs=0.2)
+    assert 0.92 <= of_object <= 0.98
+    assert of_emissivity >= 0.92
+
+
+def test_a_material_of_one_pixel_is_that_pixel() -> None:
+    """Labels that none share change nothing, error bars included."""
+    _, capture, response = case(30, 4)
+    alone = separation.solve(capture, response)
+    shared = separation.solve(capture, response, pool=labels(np.arange(30)))
+    for name in ("object_temperature", "emissivity", "reflection_ratio"):
+        apart = abs(shared[name] - alone[name])
+        assert bool((apart <= 0.15 * alone[f"{name}_std"]).all())
+        np.testing.assert_allclose(shared[f"{name}_std"], alone[f"{name}_std"], rtol=0.1, atol=0)
+
+
+def test_still_pixels_of_a_material_get_a_temperature() -> None:
+    """Without motion a pixel alone tells nothing; what its material tells is enough."""
+    together = beside(case(60, 5), case(20, 6, background={"kind": "still"}))
+    scene, capture, response = together
+    still = {"x": slice(60, None)}
+    alone = separation.solve(capture, response).isel(still)
+    shared = separation.solve(capture, response, pool=labels(one(80))).isel(still)
+    assert float(alone["object_temperature"].notnull().mean()) < 0.1
+    error = shared["object_temperature"] - scene["object_temperature"].isel(still)
+    rmse = float(np.sqrt((error**2).mean()))
+    print(f"still pixels with their material: {rmse:.3f} K")
+    assert bool(error.notnull().all())
+    assert rmse < 0.3
+    assert not np.any(shared["status"].values & schema.FLAGS["no_background_motion"])
+
+
+@pytest.mark.parametrize("kind", [{"background": {"kind": "still"}}, {"emissivity": [0.8, 0.8]}])
+def test_a_material_that_tells_nothing_says_so(kind: dict[str, Any]) -> None:
+    """Where no pixel tells anything nothing is claimed, and every pixel has a flag."""
+    _, capture, response = case(20, 7, **kind)
+    shared = separation.solve(capture, response, pool=labels(one(20)))
+    assert np.all(shared["status"] != 0)
+    assert bool(shared["object_temperature"].isnull().all())
+
+
+def test_wrong_labels_do_not_pull() -> None:
+    """A clear pixel of another material keeps its own ratio, and its material keeps its own."""
+    loud = {"background": {"amplitude": 9.0}}
+    scene, capture, response = beside(
+        case(60, 8, **loud), case(3, 9, emissivity=[0.6, 0.45], **loud)
+    )
+    alone = separation.solve(capture, response)["reflection_ratio"].sel(band="9.5")
+    shared = separation.solve(capture, response, pool=labels(one(63)))
+    ratio = shared["reflection_ratio"].sel(band="9.5")
+    np.testing.assert_allclose(ratio[0, 60:], alone[0, 60:], rtol=1e-5)
+    assert abs(float(ratio[0, :60].mean()) - 2.0) < 0.02
+    error = (shared["object_temperature"] - scene["object_temperature"]).isel(x=slice(60, None))
+    assert float(np.sqrt((error**2).mean())) < 1.0  # [K]; 3 K with the ratio of glass
+
+
+def test_two_materials_stay_apart() -> None:
+    """Each label has its own ratio, whatever its number; pixels without one are alone."""
+    parts = [
+        case(50, 10 + n, emissivity=list(pair))
+        for n, pair in enumerate([(0.86, 0.72), (0.6, 0.45), (0.86, 0.72)])
+    ]
+    _, capture, response = beside(*parts)
+    pool = labels(one(50, 700), one(50, 3), one(50, -2))
+    ratio = separation.solve(capture, response, pool=pool)["reflection_ratio"].sel(band="9.5")
+    first, second, none = (ratio.values[0, i : i + 50] for i in (0, 50, 100))
+    print(f"ratios {first[0]:.3f} (2), {second[0]:.3f} (1.375)")
+    for values, truth in ((first, 2.0), (second, 1.375)):
+        assert np.ptp(values) == 0
+        assert abs(values[0] - truth) < 0.05
+    alone = separation.solve(capture, response)["reflection_ratio"].sel(band="9.5")
+    np.testing.assert_allclose(none, alone.values[0, 100:], rtol=1e-6)
+
+
+def test_labels_of_nothing_share_nothing() -> None:
+    """Negative labels alone are no pool."""
+    _, capture, response = case(20, 13)
+    shared = separation.solve(capture, response, pool=labels(one(20, -1)))
+    alone = separation.solve(capture, response)
+    for name in schema.STAGES["separated"]:
+        np.testing.assert_array_equal(shared[name].values, alone[name].values)
+
+
+def test_result_does_not_depend_on_workers_or_tiles() -> None:
+    """Rows or columns, one thread or two: the same pixels, the same values."""
+    _, capture, response = case(400, 14)
+    wide = separation.solve(capture, response, pool=labels(np.arange(400) % 2), workers=1)
+    counts = capture["counts"].values.reshape(2, 350, 400, 1)
+    tall = xr.Dataset(
+        {"counts": (capture["counts"].dims, counts, capture["counts"].attrs)},
+        coords={"band": capture["band"], "time": capture["time"]},
+    )
+    pool = xr.DataArray((np.arange(400) % 2)[:, np.newaxis], dims=("y", "x"))
+    down = [separation.solve(tall, response, pool=pool, workers=n) for n in (1, 2)]
+    xr.testing.assert_identical(*down)
+    for name in ("object_temperature", "emissivity", "reflection_ratio"):
+        np.testing.assert_allclose(
+            down[0][name].values.reshape(wide[name].shape), wide[name].values, rtol=1e-4
+        )
+
+
+def test_a_capture_of_nothing_can_be_pooled() -> None:
+    """Without one usable sample every pixel is flagged, and nothing raises."""
+    _, capture, response = case(4, 15)
+    empty = capture.assign(counts=capture["counts"] * np.nan)
+    result = separation.solve(empty, response, pool=labels(one(4)))
+    assert np.all(result["status"] == schema.FLAGS["invalid_samples"])
+
+
+@pytest.mark.parametrize(
+    ("pool", "error", "message"),
+    [
+        (np.zeros((1, 20), int), TypeError, "Invalid pool of type ndarray"),
+        (labels(np.zeros(20)), TypeError, "Invalid dtype float64 of the pool"),
+        (labels(one(19)), ValueError, r"Invalid pool {'y': 1, 'x': 19}"),
+        (labels(one(20)).transpose("x", "y"), ValueError, "Invalid pool"),
+    ],
+)
+def test_bad_labels_are_a_clear_error(pool: Any, error: type[Exception], message: str) -> None:
+    """Labels are whole numbers, one for each pixel."""
+    _, capture, response = case(20, 16)
+    with pytest.raises(error, match=message):
+        separation.solve(capture, response, pool=pool)
+
+
+def test_other_methods_do_not_pool() -> None:
+    """It is refused by a method that would not use it."""
+    _, capture, response = case(20, 17)
+    with pytest.raises(ValueError, match="Invalid pool for method 'ratio'"):
+        separation.solve(capture, response, "ratio", pool=labels(one(20)))

@@ -1,0 +1,138 @@
+"""The one entrance to all methods: options, randomness, truth, pixels that cannot be used."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import response as responses
+from dbthermal import schema, separation, simulation
+from dbthermal.separation import _methods as methods
+from dbthermal.separation import _tiles as tiles
+from dbthermal.simulation import Rig
+
+TIME = np.arange(60) / 10.0  # s
+
+
+@pytest.fixture(scope="module")
+def scene() -> xr.Dataset:
+    """Four rows of six pixels of plate glass."""
+    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
+    return simulation.walkers(TIME, (4, 6), emissivity, np.random.default_rng(1), crossings=2)
+
+
+@pytest.fixture(scope="module")
+def capture(scene: xr.Dataset) -> xr.Dataset:
+    """What the rig sees of it."""
+    return simulation.observe(scene, Rig().response(), np.random.default_rng(2))
+
+
+@pytest.mark.parametrize("name", separation.METHODS)
+def test_every_method_has_a_record(name: str) -> None:
+    """A record, whose options can be built with their defaults."""
+    assert callable(methods.get(name).separate)
+    kind = methods.get(name).settings
+    assert methods.settings(name, {}) == (None if kind is None else kind())
+
+
+def test_tiles_draw_for_themselves() -> None:
+    """No tile shares its numbers with another, nor the first with the seed's own generator."""
+    places = [(slice(row, row + 1), slice(0, 4)) for row in (0, 1)]
+    first, second = (tiles.generator(7, place).random(4) for place in places)
+    assert not np.any(np.isin(first, second))
+    assert not np.any(np.isin(first, np.random.default_rng(7).random(8)))
+
+
+@pytest.mark.parametrize("method", ["naive", "dbvt"])
+def test_random_starts_hang_on_the_seed_alone(capture: xr.Dataset, method: str) -> None:
+    """The same seed gives the same result on one thread and on two, another seed another."""
+    response = Rig().response()
+    few: dict[str, Any] = {"steps": 3, "stages": 1} if method == "dbvt" else {}
+    one, two, other = (
+        separation.solve(capture, response, method, seed=seed, workers=workers, **few)
+        for seed, workers in ((1, 1), (1, 2), (2, 1))
+    )
+    xr.testing.assert_identical(one["emissivity"], two["emissivity"])
+    assert float(abs(one["emissivity"] - other["emissivity"]).max()) > 1e-6
+
+
+BAD: dict[str, tuple[str, dict[str, Any], type[Exception], str]] = {
+    "unknown option": ("naive", {"begins": 3}, TypeError, "Unknown option 'begins' of method"),
+    "option of none": ("apparent", {"starts": 3}, TypeError, r"'starts' .* Has \[\]"),
+    "half a start": ("naive", {"starts": 2.5}, TypeError, r"Invalid starts 2\.5 of method 'naive'"),
+    "half a batch": ("dbvt", {"batch": 2.5}, TypeError, "Must be a whole number"),
+    "half an odd patch": ("bcp", {"patch": 5.0}, TypeError, r"Invalid patch 5\.0"),
+    "negative seed": ("naive", {"seed": -1}, ValueError, "Invalid seed -1. Must be zero or"),
+    "oracle alone": ("naive", {"oracle": True}, ValueError, "Invalid truth for method 'naive'"),
+    "no such device": ("dbvt", {"device": "cuda:9"}, ValueError, "Invalid device 'cuda:9'"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_options_are_named(capture: xr.Dataset, what: str) -> None:
+    """An error names the option, the value and the rule."""
+    method, options, error, message = BAD[what]
+    with pytest.raises(error, match=message):
+        separation.solve(capture, Rig().response(), method, **options)
+
+
+def test_truth_is_for_the_oracle(scene: xr.Dataset, capture: xr.Dataset) -> None:
+    """It is refused by a method that would not use it, and where it has gaps."""
+    truth, response = scene["object_temperature"], Rig().response()
+    with pytest.raises(ValueError, match="Invalid truth for method 'subspace'"):
+        separation.solve(capture, response, truth=truth)
+    with pytest.raises(ValueError, match="Invalid truth with NaN"):
+        separation.solve(
+            capture, response, "naive", oracle=True, truth=truth.where(truth["time"] > 1)
+        )
+    separation.solve(capture, response, "naive", oracle=True, truth=truth)
+
+
+def test_the_optimiser_wants_an_even_clock(capture: xr.Dataset) -> None:
+    """Its smoothness loss counts frames: a gap is refused, with its place."""
+    gap = capture.isel(time=[*range(20), *range(40, 60)])
+    with pytest.raises(ValueError, match=r"Invalid interval 2\.1 s after 1\.9 s"):
+        separation.solve(gap, Rig().response(), "dbvt")
+
+
+def test_a_dead_pixel_harms_no_neighbour() -> None:
+    """The channel prior looks around itself: a pixel marked as dead, however hot, is not seen."""
+    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
+    rng, response = np.random.default_rng(3), Rig().response()
+    scene = simulation.walkers(TIME[:8], (20, 24), emissivity, rng, crossings=2)
+    clean = simulation.observe(scene, response, rng)
+    dead = clean.copy(deep=True)
+    dead["counts"][:, :, 10, 12] = 60000.0
+    status = xr.zeros_like(clean["counts"][0, 0], dtype=np.uint16).drop_vars(["band", "time"])
+    status[10, 12] = schema.FLAGS["dead_pixel"]
+    options: dict[str, Any] = {"method": "bcp", "patch": 5, "window": 9}
+    found = separation.solve(dead.assign(status=status), response, **options)
+    expected = separation.solve(clean, response, **options)
+    name = "object_temperature"
+    assert np.all(np.isnan(found[name][:, 10, 12]))
+    assert float(abs(found[name] - expected[name]).max()) < 2.0  # [K]; 50 K with the pixel in
+
+
+def test_progress_is_shown(capture: xr.Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    """A bar counts the pixels, on request."""
+    separation.solve(capture, Rig().response(), progress=True)
+    assert "subspace: 100%" in capsys.readouterr().err
+    separation.solve(capture, Rig().response())
+    assert capsys.readouterr().err == ""
+
+
+def test_options_are_recorded(capture: xr.Dataset) -> None:
+    """The result says which options made it, and what is never estimated."""
+    result = separation.solve(capture, Rig().response(), "ratio", kind="narrow")
+    assert "kind='narrow'" in result.attrs["settings"]
+    for name in result.attrs["not_estimated"].split():
+        assert bool(result[name].isnull().all())
+
+
+def test_apparent_is_the_reading_of_the_quieter_band(capture: xr.Dataset) -> None:
+    """Nothing is separated: a blackbody at that temperature has the first band's counts."""
+    response = Rig().response()
+    found = separation.solve(capture, response, "apparent")["object_temperature"]
+    counts = responses.curve(response, "8-14").counts(found.values.astype(np.float64))
+    np.testing.assert_allclose(counts, capture["counts"][0], rtol=0, atol=0.05)  # [count]

@@ -1,0 +1,233 @@
+"""Ray casting and moving surroundings: against closed forms of geometry."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dbthermal.simulation._mesh import Surface
+from dbthermal.simulation._rays import Camera, Caster, mirror, unit
+from dbthermal.simulation._surroundings import Actor, Motion, Pose, Room, distance, incident
+from reproduction.twins import surfaces
+
+CAMERA = Camera(position=(0.1, -0.6, 0.3), target=(0.0, 0.0, 0.05), shape=(45, 60))
+FRONT = Camera(position=(0.0, -1.0, 0.0), target=(0.0, 0.0, 0.0), shape=(90, 120))
+RADIUS = 0.1  # m
+ROOM = 295.15  # K
+SKIN = 307.15  # K
+
+
+def sphere(radius: float = RADIUS, subdivisions: int = 4) -> Caster:
+    """Sphere about the origin."""
+    return Caster(surfaces.sphere(radius, radius * 1.107 / 2**subdivisions))
+
+
+def wall(turn: float = 0.0) -> Surface:
+    """A plate 2 m wide and high, in the plane y = 0 unless turned about z [degrees]."""
+    flat = surfaces.plate(2.0, 2.0, 2.0)
+    rotation = Rotation.from_euler("z", turn, degrees=True)
+    return surfaces.moved(surfaces.moved(flat, translation=(0, 0, -1)), rotation)
+
+
+def ball(radius: float, temperature: float = SKIN, motion: Motion | None = None) -> Actor:
+    """A ball of one temperature."""
+    surface = surfaces.sphere(radius, radius / 15)
+    return Actor(surface, np.full(len(surface.vertices), temperature), motion)
+
+
+def rays_of(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of a camera's rays."""
+    directions = camera.directions()
+    return np.broadcast_to(camera.position, directions.shape), directions
+
+
+def test_projection_undoes_directions() -> None:
+    """A point along the ray of a pixel appears in that pixel, at any distance."""
+    way = np.linspace(0.2, 3.0, 45 * 60)[:, np.newaxis]
+    places = CAMERA.project(np.array(CAMERA.position) + way * CAMERA.directions())
+    expected = np.indices(CAMERA.shape).reshape(2, -1).T
+    np.testing.assert_allclose(places, expected, rtol=0, atol=1e-10)  # pixel
+
+
+def test_field_of_view_is_horizontal() -> None:
+    """From edge to edge the image spans 24 degrees across; the image's right is the world's."""
+    edges = FRONT.directions(offset=(0.0, 0.5)).reshape(90, 120, 3)[:, -1, 0]
+    middle = np.tan(np.radians(12.0)) / np.sqrt(1 + np.tan(np.radians(12.0)) ** 2)
+    np.testing.assert_allclose(edges.max(), middle, rtol=0, atol=1e-4)
+    right, down, forward = FRONT.axes
+    expected = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+    np.testing.assert_allclose([right, down, forward], expected, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"field_of_view": 180.0}, r"field_of_view 180.0 degrees. Must lie in \(0, 180\)"),
+        ({"shape": (0, 4)}, "shape .* Must be positive"),
+        ({"up": (-0.1, 0.6, -0.25)}, "up .* Must not be parallel"),
+    ],
+)
+def test_no_camera(change: dict[str, object], message: str) -> None:
+    """What is no camera is refused, with the rule."""
+    arguments = {"position": CAMERA.position, "target": CAMERA.target, "shape": (3, 4)} | change
+    with pytest.raises(ValueError, match=message):
+        Camera(**arguments)  # type: ignore[arg-type]
+
+
+def test_behind_the_camera() -> None:
+    """A point behind the camera has no place in its image."""
+    with pytest.raises(ValueError, match="Must be positive"):
+        FRONT.project([0.0, -2.0, 0.0])
+
+
+def test_plane_mirrors_as_the_law_says() -> None:
+    """On a plane y turns round and the rest stays, and the point is where the ray meets it."""
+    origins, directions = rays_of(FRONT)
+    caster = Caster(wall())
+    hits = caster.cast(origins, directions)
+    starts, mirrored = caster.mirrored(hits, directions)
+    np.testing.assert_allclose(mirrored, directions * [1, -1, 1], rtol=0, atol=1e-12)
+    met = origins + directions / directions[:, [1]]
+    np.testing.assert_allclose(caster.points(hits), met, rtol=0, atol=1e-12)  # m
+    np.testing.assert_allclose(starts - met, [[0, -2.83e-4, 0]] * len(met), rtol=0, atol=1e-6)
+
+
+def test_sphere_mirrors_as_the_law_says() -> None:
+    """Smooth shading on a faceted sphere gives the mirror directions of the true sphere."""
+    origins, directions = rays_of(FRONT)
+    caster = sphere(subdivisions=5)
+    hits = caster.cast(origins, directions)
+    met = hits.met
+    origins, directions = origins[met], directions[met]
+    along = np.sum(origins * directions, axis=1)
+    root = np.sqrt(along**2 - np.sum(origins**2, axis=1) + RADIUS**2)
+    normals = unit(origins + (-along - root)[:, np.newaxis] * directions)
+    inner = np.sum(normals * directions, axis=1) < -0.5  # not at the rim, where facets show
+    _, mirrored = caster.mirrored(hits.of(met), directions)
+    cosines = np.sum(mirrored * mirror(directions, normals), axis=1)[inner]
+    assert np.degrees(np.arccos(cosines.min())) < 0.2
+
+
+def test_mirror_law() -> None:
+    """The angle to the normal is kept, and mirroring twice is doing nothing."""
+    rng = np.random.default_rng(2)
+    directions, normals = unit(rng.normal(size=(2, 50, 3)))
+    mirrored = mirror(directions, normals)
+    sums = np.sum((directions + mirrored) * normals, axis=1)
+    np.testing.assert_allclose(sums, 0.0, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(mirror(mirrored, normals), directions, rtol=0, atol=1e-14)
+
+
+def test_sphere_covers_its_solid_angle() -> None:
+    """The pixels on a sphere, weighted by their solid angle, add up to that of its cone."""
+    hits = sphere().cast(*rays_of(FRONT))
+    forward = FRONT.directions() @ FRONT.axes[2]
+    pixel = (2 * np.tan(np.radians(12.0)) / 120) ** 2
+    solid = np.sum(pixel * forward[hits.met] ** 3)
+    expected = 2 * np.pi * (1 - np.sqrt(1 - RADIUS**2))
+    np.testing.assert_allclose(solid, expected, rtol=0.01)
+
+
+def test_values_are_interpolated_linearly() -> None:
+    """A linear function on the vertices is itself at the points that rays meet, at all times."""
+    caster = Caster(wall())
+    hits = caster.cast(*rays_of(FRONT))
+    slopes = np.array([[3.0, 5.0, 7.0], [1.0, -1.0, 2.0]])
+    values = caster.interpolate(hits, slopes @ wall().vertices.T)
+    np.testing.assert_allclose(values, slopes @ caster.points(hits).T, rtol=0, atol=1e-12)
+
+
+def test_hidden_points() -> None:
+    """Of a sphere's points those within the horizon's cone are seen, and no other."""
+    points = RADIUS * unit(np.random.default_rng(4).normal(size=(500, 3)))
+    fine = sphere(subdivisions=5)
+    height = points @ np.array([0.0, -1.0, 0.0])
+    clear = np.abs(height - RADIUS**2) > 0.006
+    seen = fine.visible(points * (1 - 1e-4), FRONT.position)
+    np.testing.assert_array_equal(seen[clear], (height > RADIUS**2)[clear])
+
+
+def test_concave_surface_sees_itself() -> None:
+    """A ray into a corner of two mirrors comes back along its way, and meets the other mirror."""
+    caster = Caster(surfaces.merge([wall(45.0), wall(-45.0)]))
+    origins, directions = rays_of(FRONT)
+    hits = caster.cast(origins, directions)
+    again = caster.cast(*caster.mirrored(hits, directions))
+    assert again.met.all()
+    assert np.all(again.face // 2 != hits.face // 2)
+
+
+def test_convex_surface_does_not() -> None:
+    """No mirrored ray of a sphere meets the sphere, at a silhouette either."""
+    coarse = sphere(subdivisions=2)
+    origins, directions = rays_of(FRONT)
+    hits = coarse.cast(origins, directions)
+    again = coarse.cast(*coarse.mirrored(hits.of(hits.met), directions[hits.met]))
+    assert not again.met.any()
+
+
+def test_pose_moves_rays_as_it_moves_the_body() -> None:
+    """A body moved and rays at rest meet as rays moved back and a body at rest."""
+    pose = Pose(Rotation.from_euler("zx", [0.3, 0.5]), (0.2, 0.1, -0.1))
+    inner = Pose(Rotation.from_euler("y", 0.7), (0.0, 0.0, 0.2))
+    point = np.array([[0.1, 0.2, 0.3]])
+    world = (pose @ inner).outwards(point)
+    np.testing.assert_allclose(world, pose.outwards(inner.outwards(point)), rtol=0, atol=1e-15)
+    inside, turned = (pose @ inner).inwards(world, point)
+    np.testing.assert_allclose(inside, point, rtol=0, atol=1e-15)  # m
+    back = (pose.rotation * inner.rotation).apply(turned)
+    np.testing.assert_allclose(back, point, rtol=0, atol=1e-15)
+
+
+def test_reflection_is_where_geometry_puts_it() -> None:
+    """In a plane mirror a ball's image is centred where its mirror image would be seen."""
+    caster, place = Caster(wall()), np.array([0.15, -1.5, 0.1])
+    actor = ball(0.06, motion=lambda _: Pose(translation=place))
+    origins, directions = rays_of(FRONT)
+    hits = caster.cast(origins, directions)
+    rays = caster.mirrored(hits, directions)
+    seen = incident(*rays, np.zeros(1), Room(ROOM), [actor])[0]
+    pixels = np.argwhere((seen > ROOM + 1).reshape(FRONT.shape))
+    expected = FRONT.project(place * [1, -1, 1])
+    np.testing.assert_allclose(pixels.mean(axis=0), expected, rtol=0, atol=0.3)  # pixel
+    assert set(np.round(seen, 6)) == {ROOM, SKIN}
+
+
+def test_person_crosses_when_predicted() -> None:
+    """A ball at 1 m/s is seen along a ray while it is within its radius of it."""
+    time = np.arange(0.0, 4.0, 0.01)
+    actor = ball(0.2, motion=lambda now: Pose(translation=(now - 2.0, -3.0, 0.0)))
+    ray = np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, -1.0, 0.0]])
+    seen = incident(*ray, time, Room(ROOM), [actor])[:, 0]
+    warm = time[seen > ROOM + 1]
+    np.testing.assert_allclose(warm[[0, -1]], [1.8, 2.2], rtol=0, atol=0.011)  # s
+    np.testing.assert_allclose(distance(*ray, time, [actor]), 2.8, rtol=0, atol=1e-3)  # m
+
+
+def test_the_nearest_actor_hides_the_others() -> None:
+    """Of two bodies along a ray the nearer one is seen, in whichever order they are given."""
+    near = ball(0.2, 300.0, motion=lambda _: Pose(translation=(0.0, -2.0, 0.0)))
+    far = ball(0.4, 310.0, motion=lambda _: Pose(translation=(0.0, -3.0, 0.0)))
+    ray = np.zeros((1, 3)), np.array([[0.0, -1.0, 0.0]])
+    for actors in ([near, far], [far, near]):
+        seen = incident(*ray, np.zeros(1), Room(ROOM), actors)
+        np.testing.assert_allclose(seen, 300.0, rtol=0, atol=1e-9)  # K
+
+
+def test_temperature_of_an_actor_may_change() -> None:
+    """A body that stands still is seen at its temperature of the moment."""
+    still = ball(0.2).surface
+    warming = Actor(still, lambda now: np.full(len(still.vertices), 300 + now))
+    ray = np.array([[0.0, -1.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+    seen = incident(*ray, np.arange(3.0), Room(ROOM), [warming])[:, 0]
+    np.testing.assert_allclose(seen, [300.0, 301.0, 302.0], rtol=0, atol=1e-9)  # K
+
+
+def test_room_with_a_gradient() -> None:
+    """Upwards the room is warmer by the gradient, downwards colder."""
+    room = Room(ROOM, gradient=(0.0, 0.0, 1.5))
+    np.testing.assert_allclose(
+        room.seen(np.array([[0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0]])),
+        [ROOM + 1.5, ROOM - 1.5, ROOM],
+        rtol=0,
+        atol=1e-12,
+    )

@@ -1,0 +1,328 @@
+"""Simulation: scenes whose truth has a closed form, and a rig that adds no more than it says."""
+
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dbthermal import bands, response, schema, simulation
+from dbthermal import correction as frames
+from dbthermal.simulation import Background, Rig
+from dbthermal.simulation._scenes import heating
+
+TIME = np.arange(120) / 10.0  # s
+GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
+SHAPE = (12, 16)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Seeded random numbers."""
+    return np.random.default_rng(11)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """The default rig with 2 % of dead pixels."""
+    return Rig(bad_fraction=0.02)
+
+
+@pytest.fixture(scope="module")
+def known(rig: Rig) -> xr.Dataset:
+    """Response of the rig."""
+    return rig.response()
+
+
+@pytest.fixture
+def detector(rig: Rig, rng: np.random.Generator) -> xr.Dataset:
+    """Fixed pattern of the rig."""
+    return simulation.pattern(rig, SHAPE, rng)
+
+
+@pytest.fixture
+def twin(rng: np.random.Generator) -> xr.Dataset:
+    """A plate in which people are reflected."""
+    return simulation.walkers(TIME, SHAPE, GLASS, rng)
+
+
+@given(
+    start=st.floats(280.0, 300.0),
+    stop=st.floats(280.0, 340.0),
+    constant=st.floats(1.0, 100.0),
+)
+def test_heating_is_newton_s(start: float, stop: float, constant: float) -> None:
+    """It starts and stops where asked; between, the distance to its limit decays as exp(-t/tau)."""
+    curve = heating(TIME, start, stop, constant)
+    limit = start + (stop - start) / -np.expm1(-TIME[-1] / constant)
+    decay = (limit - start) * np.exp(-TIME / constant)
+    np.testing.assert_allclose(limit - curve, decay, rtol=0, atol=1e-9)  # K
+    np.testing.assert_allclose(curve[[0, -1]], [start, stop], rtol=0, atol=1e-11)
+
+
+def test_heating_obeys_its_equation() -> None:
+    """The rate is (limit - T) / tau, for a time constant a column, whenever the clock starts."""
+    constants, step = np.array([3.0, 12.0]), 1e-3
+    time = np.linspace(0.0, 2.0, 2001)
+    curve = heating(time + 500.0, 300.0, 320.0, constants)
+    limit = 300.0 + 20.0 / -np.expm1(-time[-1] / constants)
+    rate = np.gradient(curve, step, axis=0)[1:-1]
+    np.testing.assert_allclose(rate, ((limit - curve) / constants)[1:-1], rtol=0, atol=1e-5)  # K/s
+
+
+def test_still_background_drifts(rng: np.random.Generator) -> None:
+    """A still background is its level, and a drift a straight line over the capture."""
+    still = Background("still", level=290.0).draw(TIME, 3, rng)
+    np.testing.assert_array_equal(still, np.full((120, 3), 290.0))
+    drift = Background("still", level=290.0, drift=5.0).draw(TIME, 3, rng)
+    expected = 290.0 + 5.0 * TIME / TIME[-1]
+    np.testing.assert_allclose(drift.T, [expected] * 3, rtol=0, atol=1e-12)
+
+
+def test_one_pulse(rng: np.random.Generator) -> None:
+    """A pulse of 3 K rises once, lasts one to two seconds, or until the capture ends."""
+    change = Background(count=(1, 1), duration=(1.0, 2.0)).draw(TIME, 500, rng) - 295.15
+    np.testing.assert_allclose(change, 3.0 * (change > 1), rtol=0, atol=1e-12)
+    on = change > 1
+    np.testing.assert_array_equal((np.diff(on, axis=0, prepend=False) & on).sum(axis=0), 1)
+    length = on.sum(axis=0)[~on[-1]]
+    assert 10 <= length.min() <= 11  # frames
+    assert 19 <= length.max() <= 20
+
+
+def test_number_of_pulses(rng: np.random.Generator) -> None:
+    """Six to nine pulses, each number as often: told by pulses that outlast the capture."""
+    drawn = Background(duration=(100.0, 101.0)).draw(TIME, 2000, rng)
+    number, times = np.unique(np.rint((drawn[-1] - 295.15) / 3.0), return_counts=True)
+    assert number.tolist() == [6, 7, 8, 9]
+    np.testing.assert_allclose(times, 500, rtol=0, atol=80)  # 4 standard deviations
+
+
+def test_random_walk(rng: np.random.Generator) -> None:
+    """The walk's deviation is its amplitude at any time, its correlation exp(-lag / memory)."""
+    walk = Background("random walk", amplitude=2.0, memory=3.0).draw(TIME, 4000, rng) - 295.15
+    np.testing.assert_allclose(walk.std(axis=1), 2.0, rtol=0, atol=0.1)  # K
+    for lag in (1, 30):
+        found = np.mean(walk[lag:] * walk[:-lag]) / np.mean(walk**2)
+        assert found == pytest.approx(np.exp(-lag / 30.0), abs=0.02)
+
+
+@pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [0.0, np.nan, 2.0], [[0.0, 1.0]]])
+def test_times_that_are_no_capture(times: list[float], rng: np.random.Generator) -> None:
+    """A single time, one that stands still and a NaN are refused by backgrounds and heatings."""
+    rule = r"Must be (two or more|finite, and increase)"
+    with pytest.raises(ValueError, match=rule):
+        Background("still").draw(np.array(times), 3, rng)
+    with pytest.raises(ValueError, match=rule):
+        heating(np.array(times), 300.0, 320.0, 5.0)
+
+
+@pytest.mark.parametrize("constant", [0.0, -1.0, np.nan])
+def test_time_constants_are_positive(constant: float) -> None:
+    """Nothing heats with a time constant that is none."""
+    with pytest.raises(ValueError, match=r"Invalid time_constant \[s\]"):
+        heating(TIME, 300.0, 320.0, constant)
+
+
+def test_unknown_background() -> None:
+    """A kind that does not exist is refused, with those that do."""
+    with pytest.raises(ValueError, match=r"Unknown background 'waves'. Must be one of .*'pulses'"):
+        Background("waves")
+
+
+def test_walkers(twin: xr.Dataset) -> None:
+    """The room is reflected but where someone walks by; the plate's middle heats up."""
+    background = twin["background_temperature"]
+    assert set(np.unique(background)) == {295.15, 305.15}
+    assert (background.isel(y=0) == 295.15).all()  # above all heads
+    assert 0.1 < float((background == 305.15).mean()) < 0.5
+    plate = twin["object_temperature"]
+    np.testing.assert_allclose(plate.isel(time=0), 295.15, rtol=0, atol=1e-12)
+    assert 332.0 < float(plate.isel(time=-1).max()) < 333.15
+    assert twin.attrs["origin"] == "simulated"
+
+
+def test_independent_pixels(rng: np.random.Generator) -> None:
+    """Each pixel has its own curve and background, all from start to stop, with the same glass."""
+    made = simulation.independent_pixels(
+        TIME, GLASS, Background(), 50, rng, start=293.15, stop=333.15
+    )
+    assert dict(made["object_temperature"].sizes) == {"time": 120, "y": 1, "x": 50}
+    ends = made["object_temperature"].isel(time=[0, -1], y=0)
+    np.testing.assert_allclose(ends.T, [[293.15, 333.15]] * 50, rtol=0, atol=1e-10)
+    assert np.unique(made["object_temperature"].isel(time=60)).size == 50
+    np.testing.assert_array_equal(made["emissivity"].isel(y=0, x=7), GLASS)
+
+
+def test_side_by_side() -> None:
+    """Panels stand from left to right, as equal as the width allows."""
+    table = xr.DataArray(
+        [[0.9, 0.8], [0.7, 0.6], [0.5, 0.4]],
+        dims=("material", "band"),
+        coords={"band": ["8-14", "9.5"]},
+    )
+    image = simulation.side_by_side(table, (2, 6))
+    np.testing.assert_array_equal(image.sel(band="9.5"), [[0.8, 0.8, 0.6, 0.6, 0.4, 0.4]] * 2)
+
+
+def test_response_is_planck_s(rig: Rig, known: xr.Dataset) -> None:
+    """The rig's counts are the band's radiance, within 0.05 mK from -10 to 80 C."""
+    temperature = np.linspace(263.15, 353.15, 451)
+    unit = 115.0 / float(bands.FILTERS["8-14"].slope(300.0))
+    for name, netd in zip(rig.bands, rig.noise, strict=True):
+        counts = 15500.0 + unit * bands.FILTERS[name].radiance(temperature)
+        found = response.curve(known, name).inverse(counts)
+        np.testing.assert_allclose(found, temperature, rtol=0, atol=5e-5)  # K
+        assert float(known["netd"].sel(band=name)) == pytest.approx(netd, rel=1e-9)
+    assert known.attrs["origin"] == "simulated"
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"bands": ("8-14", "9.6")}, KeyError, "Unknown band '9.6'"),
+        ({"noise": (0.03,)}, ValueError, "Invalid noise (0.03,) K. Must be one for each"),
+        ({"noise": (0.03, 0.0)}, ValueError, "Invalid noise [K] 0.0. Must be finite and positive"),
+        ({"bad_fraction": 1.0}, ValueError, "Invalid bad_fraction 1.0. Must lie in [0, 1)"),
+        ({"bad_fraction": -0.1}, ValueError, "Invalid bad_fraction -0.1"),
+    ],
+)
+def test_bad_rig(change: dict[str, object], error: type[Exception], message: str) -> None:
+    """Bands that do not exist and numbers that are no rig are refused."""
+    with pytest.raises(error, match=re.escape(message)):
+        Rig(**change)  # type: ignore[arg-type]
+
+
+def test_observed_counts(twin: xr.Dataset, known: xr.Dataset, rng: np.random.Generator) -> None:
+    """Without noise the counts are e U(x) + (1 - e) U(y), whatever the order of the bands."""
+    quiet = known.assign(noise=1e-9 * known["noise"])
+    seen = simulation.observe(twin.isel(band=[1, 0]), quiet, rng, dtype="float64")
+    emitted, reflected = (
+        response.counts(known, twin[name])
+        for name in ("object_temperature", "background_temperature")
+    )
+    expected = GLASS * emitted + (1 - GLASS) * reflected
+    np.testing.assert_allclose(seen["counts"], expected, rtol=0, atol=1e-6)  # count
+    assert schema.check(seen, "corrected").attrs["origin"] == "simulated"
+
+
+def test_counts_say_of_what_they_are_a_twin(
+    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
+) -> None:
+    """Observed and raw counts keep the name of the twin; those of another scene have none."""
+    seen = simulation.observe(twin.assign_attrs(twin="bulb"), known, rng)
+    assert seen.attrs["twin"] == simulation.capture(seen, detector).attrs["twin"] == "bulb"
+    assert "twin" not in simulation.observe(twin, known, rng).attrs
+
+
+def test_noise_of_observed_counts(
+    twin: xr.Dataset, known: xr.Dataset, rng: np.random.Generator
+) -> None:
+    """The noise has the response's deviation within 2 %, no mean, and no memory."""
+    quiet = known.assign(noise=1e-9 * known["noise"])
+    noise = (simulation.observe(twin, known, rng) - simulation.observe(twin, quiet, rng))["counts"]
+    pixels = ("time", "y", "x")
+    np.testing.assert_allclose(noise.std(pixels) / known["noise"], 1.0, rtol=0, atol=0.02)
+    np.testing.assert_allclose(noise.mean(pixels), 0.0, rtol=0, atol=0.1)  # count
+    memory = (noise.values[:, 1:] * noise.values[:, :-1]).mean(axis=(1, 2, 3)) / known["noise"] ** 2
+    np.testing.assert_allclose(memory, 0.0, rtol=0, atol=0.03)
+    assert abs(float(xr.corr(*noise))) < 0.03
+
+
+def test_observe_refuses(twin: xr.Dataset, known: xr.Dataset, rng: np.random.Generator) -> None:
+    """A temperature that the rig cannot see, and a band without emissivity, are named."""
+    with pytest.raises(ValueError, match=r"Invalid object_temperature .*the response's range"):
+        simulation.observe(
+            twin.assign(object_temperature=twin["object_temperature"] + 30), known, rng
+        )
+    with pytest.raises(ValueError, match=r"Missing band '9.5' in the scene. Has .'8-14'."):
+        simulation.observe(twin.isel(band=[0]), known, rng)
+
+
+def test_pattern(rig: Rig) -> None:
+    """Over live pixels the gain has mean 1 and the offset 0; the deviations are the rig's."""
+    made = simulation.pattern(rig, (80, 90), np.random.default_rng(5))
+    live = made.where(~made["dead"])
+    np.testing.assert_allclose(live["gain"].mean(("y", "x")), 1.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(live["offset"].mean(("y", "x")), 0.0, rtol=0, atol=1e-10)  # count
+    assert float(made["dead"].mean()) == pytest.approx(0.02, abs=0.005)
+    rough = made[["gain", "offset"]].diff("x").std() / 2**0.5  # the vignette is smooth
+    assert float(rough["gain"]) == pytest.approx(rig.gain_std, rel=0.05)
+    assert float(rough["offset"]) == pytest.approx(rig.offset_std, rel=0.05)
+
+
+def test_capture(
+    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
+) -> None:
+    """Raw counts are gain times signal and offset, rounded, and 0 where a pixel is dead."""
+    seen = simulation.observe(twin, known, rng)
+    raw = simulation.capture(seen, detector.isel(band=[1, 0]))  # by name, not by place
+    assert raw["counts"].dtype == np.uint16
+    assert (raw["counts"].where(detector["dead"], 0) == 0).all()
+    exact = detector["gain"] * seen["counts"] + detector["offset"]
+    rest = (raw["counts"] - exact).where(~detector["dead"])
+    assert 0.49 < float(abs(rest).max()) <= 0.5 + 1e-9  # count
+    assert schema.check(raw, "capture").attrs["origin"] == "simulated"
+
+
+def test_capture_that_does_not_fit(
+    twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
+) -> None:
+    """Counts over 16 bits, below 0 or NaN, and a missing band, are refused, not wrapped."""
+    seen = simulation.observe(twin, known, rng)
+    for wrong in (seen + 50000.0, seen - 40000.0, seen.where(seen["time"] > 1)):
+        with pytest.raises(ValueError, match=r"band '8-14'. Must lie in \[0, 65535\]"):
+            simulation.capture(wrong, detector)
+    with pytest.raises(ValueError, match=r"Missing band '9.5' in the detector"):
+        simulation.capture(seen, detector.isel(band=[0]))
+    with pytest.raises(ValueError, match=r"band '8-14'. Must lie in \[0, 65535\]"):
+        simulation.blackbody_movies(Rig(offset=60000.0), np.array([290.0, 330.0]), 2, detector, rng)
+
+
+def test_calibration_undoes_the_detector(
+    rig: Rig, twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
+) -> None:
+    """Movies, correction, corrected capture: what is left is rounding and the movies' noise."""
+    temperatures = np.linspace(283.15, 343.15, 5)
+    movies = simulation.blackbody_movies(rig, temperatures, 40, detector, rng)
+    statistics = frames.blackbody_statistics(movies)
+    correction = frames.fit_correction(statistics)
+    seen = simulation.observe(twin, known, rng)
+    corrected = frames.correct(simulation.capture(seen, detector), correction)
+    np.testing.assert_array_equal(correction["bad"], detector["dead"])
+    np.testing.assert_allclose(statistics["noise"] / known["noise"], 1.0, rtol=0, atol=0.02)
+    error = (corrected["counts"] - seen["counts"]).where(~detector["dead"])
+    spread = (error**2).mean(("time", "y", "x")) ** 0.5
+    assert float(spread.min()) > 0.28  # count; rounding alone is 12**-0.5
+    assert float(spread.max()) < 0.5
+    np.testing.assert_allclose(error.mean(("time", "y", "x")), 0.0, rtol=0, atol=0.05)
+
+
+def test_contact_measurements(known: xr.Dataset, rng: np.random.Generator) -> None:
+    """The counts are of the true temperatures, the readings off by their deviations."""
+    warm, cold = np.full(4000, 320.0), np.full(4000, 295.0)
+    made = simulation.contact_measurements(known, GLASS, warm, cold, (0.1, 0.05), rng)
+    for name, level, std in (("object", 320.0, 0.1), ("background", 295.0, 0.05)):
+        read = made[f"{name}_temperature"]
+        assert float(read.mean()) == pytest.approx(level, abs=4 * std / 4000**0.5)
+        assert float(read.std()) == pytest.approx(std, rel=0.05)
+    levels = xr.DataArray([320.0, 295.0], dims="part")
+    expected = (response.counts(known, levels) * [1, -1]).sum("part") * GLASS
+    expected = expected + response.counts(known, levels).isel(part=1)
+    np.testing.assert_allclose(made["counts"].mean("measurement"), expected, rtol=0, atol=0.25)
+    np.testing.assert_allclose(made["counts"].std("measurement"), known["noise"], rtol=0.05)
+
+
+def test_same_seed_same_data(rig: Rig, known: xr.Dataset) -> None:
+    """A seed decides everything, another seed changes it."""
+
+    def record(seed: int) -> xr.Dataset:
+        rng = np.random.default_rng(seed)
+        detector = simulation.pattern(rig, SHAPE, rng)
+        scene = simulation.walkers(TIME, SHAPE, GLASS, rng)
+        return simulation.capture(simulation.observe(scene, known, rng), detector)
+
+    xr.testing.assert_identical(record(1), record(1))
+    assert float((record(1)["counts"] != record(2)["counts"]).mean()) > 0.9

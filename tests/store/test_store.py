@@ -1,0 +1,275 @@
+"""What is stored comes back unchanged, whole, and with the record of what made it."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+from matplotlib.figure import Figure
+from PIL import Image
+
+from dbthermal import store
+from dbthermal.store import _provenance as provenance
+
+RECORD: dict[str, Any] = {"parameters": {"frames": 3}, "commit": "unknown", "inputs": {}}
+DTYPES = st.sampled_from(["uint16", "float32", "float64", "int64", "bool"])
+
+
+@pytest.fixture
+def capture() -> xr.Dataset:
+    """Two bands of three frames, with a gap in one and all that may accompany them."""
+    temperature = np.arange(24, dtype="float32").reshape(3, 2, 4)
+    temperature[1, 1, 1] = np.nan
+    return xr.Dataset(
+        {
+            "counts": (
+                ("band", "time", "y", "x"),
+                np.arange(48, dtype="uint16").reshape(2, 3, 2, 4),
+            ),
+            "object_temperature": (("time", "y", "x"), temperature, {"units": "K"}),
+            "status": (("y", "x"), np.eye(2, 4, dtype="uint16"), {"flag_masks": [1, 2]}),
+            "valid": (("y", "x"), np.eye(2, 4) > 0),
+        },
+        coords={
+            "band": ["8-14", "9.5"],
+            "time": ("time", [0.0, 0.1, 0.2], {"units": "s"}),
+            "clock": ("time", np.arange(3).astype("timedelta64[ns]")),
+            "scene": "coffee pot",
+        },
+        attrs={"radiometric": 0},
+    )
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    """Relative name and bytes of every file below a folder."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder): path.read_bytes() for path in files}
+
+
+def test_dataset_comes_back_identical(capture: xr.Dataset, tmp_path: Path) -> None:
+    """Values, dtypes, dims, coordinates and attributes survive, gaps and zeros included."""
+    store.save(capture, tmp_path / "a.zarr", RECORD)
+    opened = store.open_dataset(tmp_path / "a.zarr")
+    assert opened.attrs.pop("provenance") == RECORD
+    xr.testing.assert_identical(opened, capture)
+    assert {n: v.dtype for n, v in opened.variables.items()} == {
+        n: v.dtype for n, v in capture.variables.items()
+    }
+
+
+@given(values=DTYPES.flatmap(lambda dtype: arrays(dtype, array_shapes(min_dims=2, max_dims=4))))
+def test_any_array_comes_back(
+    values: np.ndarray[Any, np.dtype[Any]], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Any numbers of any shape come back bit by bit, infinities and gaps too."""
+    path = tmp_path_factory.mktemp("any") / "a.zarr"
+    dims = ("band", "time", "y", "x")[-values.ndim :]
+    store.save(xr.Dataset({"value": (dims, values)}), path, RECORD)
+    np.testing.assert_array_equal(store.open_dataset(path)["value"], values, strict=True)
+
+
+def test_saving_changes_nothing(capture: xr.Dataset, tmp_path: Path) -> None:
+    """The dataset handed over stays as it was."""
+    before = capture.copy(deep=True)
+    store.save(capture, tmp_path / "a.zarr", RECORD)
+    xr.testing.assert_identical(capture, before)
+
+
+def test_opened_dataset_can_be_saved_again(capture: xr.Dataset, tmp_path: Path) -> None:
+    """Reading and writing a second time gives the same bytes, also onto the folder that is open."""
+    store.save(capture, tmp_path / "a.zarr", RECORD)
+    first = contents(tmp_path / "a.zarr")
+    store.save(store.open_dataset(tmp_path / "a.zarr"), tmp_path / "a.zarr", RECORD)
+    assert contents(tmp_path / "a.zarr") == first
+
+
+def test_failed_save_leaves_the_earlier_result(capture: xr.Dataset, tmp_path: Path) -> None:
+    """A write that fails on the way leaves what was there, and nothing beside it."""
+    store.save(capture, tmp_path / "a.zarr", RECORD)
+    first = contents(tmp_path)
+    broken = capture.assign(material=("band", np.array([object(), object()])))
+    with pytest.raises((TypeError, ValueError)):
+        store.save(broken, tmp_path / "a.zarr", RECORD)
+    assert contents(tmp_path) == first
+
+
+def test_saving_replaces_all_of_the_earlier_result(capture: xr.Dataset, tmp_path: Path) -> None:
+    """No variable of an earlier result is left in a later one."""
+    store.save(capture, tmp_path / "a.zarr", RECORD)
+    store.save(capture[["valid"]], tmp_path / "a.zarr", RECORD)
+    assert list(store.open_dataset(tmp_path / "a.zarr").data_vars) == ["valid"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
+
+
+def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
+    """Values are read when they are used: a later save shows in a dataset opened before it."""
+    store.save(capture, tmp_path / "a.zarr", RECORD)
+    opened = store.open_dataset(tmp_path / "a.zarr")
+    store.save(capture.assign(counts=capture["counts"] + 1), tmp_path / "a.zarr", RECORD)
+    assert int(opened["counts"][0, 0, 0, 0]) == 1
+
+
+def test_missing_dataset_is_named(tmp_path: Path) -> None:
+    """Opening what is not there names the path."""
+    with pytest.raises(FileNotFoundError, match=r"No dataset '.*a\.zarr'"):
+        store.open_dataset(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "expected"),
+    [
+        ((2, 350, 512, 640), "uint16", (2, 350, 28, 27)),
+        ((350, 512, 640), "float32", (350, 28, 27)),
+        ((512, 640), "uint16", (512, 640)),
+        ((350, 8, 640), "float32", (350, 8, 94)),
+        ((350, 640, 8), "float32", (350, 94, 8)),
+        ((350, 8, 10), "float64", (350, 8, 10)),
+        ((0, 8, 10), "float64", (1, 8, 10)),
+    ],
+)
+def test_chunks(shape: tuple[int, ...], dtype: str, expected: tuple[int, ...]) -> None:
+    """Tiles hold all frames and just over 1 MiB, or the whole frame where that is smaller."""
+    variable = xr.Variable(("band", "time", "y", "x")[-len(shape) :], np.empty(shape, dtype))
+    assert store.chunks(variable) == expected
+
+
+def test_chunks_without_pixels() -> None:
+    """A table is one chunk."""
+    assert store.chunks(xr.Variable(("material", "wavelength"), np.empty((7, 900)))) == (7, 900)
+
+
+def test_numbers_come_back_sorted(tmp_path: Path) -> None:
+    """Numbers keep value and kind; NumPy's become Python's."""
+    numbers: dict[str, store.Number | np.generic]
+    numbers = {"rmse_K": np.float64(0.1), "frames": 350, "exact": np.True_, "method": "subspace"}
+    store.save_numbers(numbers, tmp_path / "run" / "a.json", RECORD)
+    opened = store.read_numbers(tmp_path / "run" / "a.json")
+    assert list(opened) == sorted(numbers)
+    assert opened == {"rmse_K": 0.1, "frames": 350, "exact": True, "method": "subspace"}
+    assert type(opened["exact"]) is bool
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, np.float32("nan")])
+def test_numbers_are_finite(value: float, tmp_path: Path) -> None:
+    """A number that is none is refused by name, and no file is written."""
+    with pytest.raises(ValueError, match=r"Invalid 'rmse_K' = .*\. Must be finite"):
+        store.save_numbers({"rmse_K": value}, tmp_path / "a.json", RECORD)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_are_scalars(tmp_path: Path) -> None:
+    """A list among the numbers is refused by name."""
+    with pytest.raises(TypeError, match=r"Invalid 'rmse_K' = \[1\]. Must be a number"):
+        store.save_numbers({"rmse_K": [1]}, tmp_path / "a.json", RECORD)  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize("text", ['{"numbers": {"rmse_K": NaN}}', "{}", "[1]", "{"])
+def test_damaged_numbers_are_refused(text: str, tmp_path: Path) -> None:
+    """A file that is cut, loose or of another kind is not read."""
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(ValueError, match=r"NaN|No 'numbers'|Expecting"):
+        store.read_numbers(tmp_path / "a.json")
+
+
+def test_figure_is_the_same_twice(tmp_path: Path) -> None:
+    """The same figure gives the same bytes, and tells what made it."""
+    for name in ("a.png", "b.png"):
+        figure = Figure(figsize=(2, 1))
+        figure.subplots().plot([293.15, 294.15])
+        store.save_figure(figure, tmp_path / name, RECORD, dpi=50)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size == (100, 50)
+        assert json.loads(image.info["Comment"]) == RECORD
+
+
+@pytest.mark.parametrize("save", [store.save, store.save_numbers, store.save_figure])
+def test_suffix_tells_the_kind(save: Callable[..., None], tmp_path: Path) -> None:
+    """A result's name ends in its format."""
+    content = {store.save: xr.Dataset(), store.save_numbers: {}, store.save_figure: Figure()}[save]
+    with pytest.raises(ValueError, match=r"Invalid path '.*a\.txt'. Must end in"):
+        save(content, tmp_path / "a.txt", RECORD)
+
+
+def test_record_holds_what_made_a_result(tmp_path: Path) -> None:
+    """Parameters, versions, commit and input checksums are kept, the same each time."""
+    (tmp_path / "in.txt").write_text("abc")
+    record = provenance.record({"levels": (1, 2)}, {"input": tmp_path / "in.txt"})
+    assert record == provenance.record({"levels": (1, 2)}, {"input": tmp_path / "in.txt"})
+    assert record["parameters"] == {"levels": [1, 2]}
+    assert record["versions"]["numpy"] == np.__version__
+    assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?|unknown", record["commit"])
+    # FIPS 180-2, appendix B.1
+    assert record["inputs"]["input"].startswith("ba7816bf8f01cfea414140de5dae2223")
+
+
+def test_parameter_must_be_plain(tmp_path: Path) -> None:
+    """A parameter that JSON cannot hold is refused by name."""
+    with pytest.raises(ValueError, match="Invalid parameter 'noise' = nan"):
+        provenance.record({"noise": math.nan})
+    with pytest.raises(TypeError, match="Invalid parameter 'folder' = "):
+        provenance.record({"folder": tmp_path})
+
+
+def test_checksum_of_a_folder(tmp_path: Path) -> None:
+    """A folder's checksum hangs on names and contents alone."""
+    for name in ("a", "b"):
+        (tmp_path / name / "sub").mkdir(parents=True)
+        (tmp_path / name / "sub" / "file").write_text("abc")
+    before = provenance.checksum(tmp_path / "a")
+    assert before == provenance.checksum(tmp_path / "b")
+    (tmp_path / "b" / "sub" / "file").rename(tmp_path / "b" / "file")
+    assert before != provenance.checksum(tmp_path / "b")
+
+
+def test_commit_is_unknown_without_git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package outside a work tree has no commit."""
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "provenance.py"))
+    assert provenance.commit() == "unknown"
+
+
+def film(*shapes: tuple[int, int]) -> list[np.ndarray]:
+    """Frames of one gray level each."""
+    return [np.full((*shape, 3), 40 * index, np.uint8) for index, shape in enumerate(shapes, 1)]
+
+
+def test_video_comes_back(tmp_path: Path) -> None:
+    """As many frames, at their rate, of nearly their colours, with the record as a comment."""
+    store.save_video(film((32, 48), (32, 48), (32, 48)), tmp_path / "a.mp4", RECORD, rate=10.0)
+    with av.open(tmp_path / "a.mp4") as video:
+        assert video.streams.video[0].average_rate == 10
+        assert json.loads(video.metadata["comment"]) == RECORD
+        levels = [frame.to_ndarray(format="rgb24").mean() for frame in video.decode(video=0)]
+    np.testing.assert_allclose(levels, [40, 80, 120], rtol=0, atol=3)  # of 255
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (film((32, 47)), "Invalid frame of 32 x 47 pixels. Must be of even size"),
+        (film((32, 48), (32, 46)), "as all others: 32 x 48"),
+        ([], "Invalid film without frames"),
+    ],
+)
+def test_no_video_of_nonsense(tmp_path: Path, frames: list[np.ndarray], message: str) -> None:
+    """What cannot be a video is refused, and leaves nothing behind."""
+    with pytest.raises(ValueError, match=message):
+        store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0)
+    assert not any(tmp_path.iterdir())
+
+
+def test_text_keeps_its_record(tmp_path: Path) -> None:
+    """The text comes first, the record in a comment."""
+    store.save_text("| a |\n", tmp_path / "a.md", RECORD)
+    text, _, comment = (tmp_path / "a.md").read_text().partition("\n<!-- ")
+    assert text == "| a |\n"
+    assert json.loads(comment.removesuffix(" -->\n")) == RECORD
