@@ -106,7 +106,7 @@ def test_several_processes_find_the_same(tmp_path: Path) -> None:
 def test_grid_of_results() -> None:
     """The last coordinate varies fastest; a missing result is refused."""
     results = [xr.Dataset({"value": ((), float(number))}) for number in range(6)]
-    coords = {"noise": [0.1, 0.2], "seed": [1, 2, 3]}
+    coords: dict[str, list[float]] = {"noise": [0.1, 0.2], "seed": [1, 2, 3]}
     together = cache.gridded(results, coords)
     assert float(together["value"].sel(noise=0.2, seed=1)) == 3.0
     with pytest.raises(ValueError, match=r"Invalid number of results 5\. Must be 6\."):
