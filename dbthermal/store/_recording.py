@@ -225,7 +225,8 @@ class Recording:
         Bring all bands to one number of frames and say that the recording is complete.
 
         A band with fewer frames than another gets copies of its last one, without stamps: as a
-        driver that lost frames, see `dbthermal.correction.mark_shutter`. A second call does nothing.
+        driver that lost frames, see `dbthermal.correction.mark_shutter`. A second call does
+        nothing.
 
         Parameters
         ----------

@@ -2,8 +2,8 @@
 
 Each function writes beside its goal and renames, so that what bears a result's name is whole,
 whatever happens on the way. Each result carries the record of what made it (see
-`dbthermal.store._provenance`) and nothing that differs between two runs of the same code on the same
-input. No other package opens or writes zarr.
+`dbthermal.store._provenance`) and nothing that differs between two runs of the same code on the
+same input. No other package opens or writes zarr.
 """
 
 import json
