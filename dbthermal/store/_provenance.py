@@ -58,21 +58,6 @@ def record(
     }
 
 
-def source() -> str:
-    """SHA-256 of this package's source code: names and contents of its modules and tables.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-    """
-    folder, total = Path(__file__).parent, hashlib.sha256()
-    files = [path for path in folder.rglob("*") if path.suffix in (".py", ".csv")]
-    for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
-        total.update(f"{path.relative_to(folder).as_posix()} {checksum(path)}\n".encode())
-    return total.hexdigest()
-
-
 def checksum(path: str | Path) -> str:
     """SHA-256 of a file, or of a folder's file names and contents.
 
