@@ -21,7 +21,7 @@ from scipy.constants import zero_Celsius
 __all__ = ["EMF", "TEMPERATURE", "emf", "temperature"]
 
 Array = npt.NDArray[np.float64]
-Coefficients = Array | tuple[float, ...]
+Coefficients = npt.NDArray[np.floating] | tuple[float, ...]
 
 TEMPERATURE: Final = (3.15, 673.15)
 """Range of `emf` [K]: -270 to 400 °C."""
