@@ -5,8 +5,7 @@
 chunks and survives a kill or a power loss. No other package opens or writes zarr.
 """
 
-from dbthermal.store._provenance import checksum
-from dbthermal.store._provenance import record as provenance
+from dbthermal.store._provenance import checksum, provenance
 from dbthermal.store._recording import Recording, recover
 from dbthermal.store._results import (
     Number,

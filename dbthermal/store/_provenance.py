@@ -19,7 +19,7 @@ from dbthermal import __version__
 _PACKAGES = ("numpy", "scipy", "xarray", "zarr")
 
 
-def record(
+def provenance(
     parameters: Mapping[str, object], inputs: Mapping[str, str | Path] | None = None
 ) -> dict[str, Any]:
     """
@@ -64,15 +64,6 @@ def record(
         "commit": commit(),
         "inputs": {name: checksum(path) for name, path in (inputs or {}).items()},
     }
-
-
-def source() -> str:
-    """SHA-256 of this package's source code: names and contents of its modules and tables."""
-    folder, total = Path(__file__).parents[1], hashlib.sha256()
-    files = [path for path in folder.rglob("*") if path.suffix in (".py", ".csv")]
-    for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
-        total.update(f"{path.relative_to(folder).as_posix()} {checksum(path)}\n".encode())
-    return total.hexdigest()
 
 
 def checksum(path: str | Path) -> str:
