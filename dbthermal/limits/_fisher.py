@@ -253,9 +253,7 @@ class FisherInverse:
         return np.where(dependent, np.inf, along @ inverse[..., np.newaxis])[..., 0]
 
 
-def fisher_inverse(
-    sensitivity: Sensitivity, functions: Array, prior: float = 0.0
-) -> FisherInverse:
+def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.0) -> FisherInverse:
     """
     Inverse information about emissivities (band), object (order) [K] and resting level [K].
 
