@@ -7,13 +7,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema, store
-<<<<<<< HEAD
 from dbthermal.alignment import exposure_times, fill_times
-from dbthermal.instruments.video.source import UNTIMED, FrameFlag
-=======
-from dbthermal.alignment import _clocks as clocks
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
->>>>>>> main
 
 Array = npt.NDArray[np.float64]
 

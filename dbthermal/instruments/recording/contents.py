@@ -9,16 +9,9 @@ from enum import IntEnum, IntFlag
 from types import MappingProxyType
 from typing import Any, Final
 
-<<<<<<< HEAD
-from dbthermal.instruments.video import telemetry
-from dbthermal.instruments.video.source import MEANINGS
-from dbthermal.schema import EXPOSURE_TIME, STAGES, Variable
-=======
-from dbthermal.alignment import _clocks as clocks
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import MEANINGS
-from dbthermal.schema import STAGES, Variable
->>>>>>> main
+from dbthermal.schema import EXPOSURE_TIME, STAGES, Variable
 
 
 class Note(IntEnum):
