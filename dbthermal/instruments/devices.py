@@ -18,7 +18,7 @@ from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Picture
 from dbthermal.instruments.emulated.world import ROOM, World
-from dbthermal.instruments.entries import check_one_of
+from dbthermal.instruments.session import check_one_of
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.rig import Devices, ReadingError, Thermocouples
 from dbthermal.instruments.session import Session
