@@ -9,7 +9,7 @@ from rig_session import LEVELS, TEXT, bench, pictures, replaced, scene_text
 
 from dbthermal import acquire
 from dbthermal.instruments import inventory, protocols
-from dbthermal.instruments.boson.commands import FfcStatus
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import World

@@ -8,7 +8,7 @@ import xarray as xr
 
 from dbthermal import schema, store
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.instruments.video.source import UNTIMED, FrameFlag
+from dbthermal.instruments.camera import UNTIMED, FrameFlag
 
 Array = npt.NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.instruments.video import telemetry
-from dbthermal.instruments.video.source import MEANINGS
+from dbthermal.instruments import telemetry
+from dbthermal.instruments.camera import MEANINGS
 from dbthermal.schema import STAGES, Variable
 
 
