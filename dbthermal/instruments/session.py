@@ -310,7 +310,7 @@ def _read_yaml(text: str, file: str) -> dict[Any, Any]:
     except yaml.YAMLError as error:
         raise ValueError(f"{file}: Must be YAML: {error}.") from error
     if not isinstance(content, dict):
-        raise ValueError(f"{file}: Invalid content {content!r}. Must be a mapping.")  # noqa: TRY004
+        raise ValueError(f"{file}: Invalid content {content!r}. Must be a mapping.")
     return content
 
 

@@ -28,7 +28,11 @@ def test_session_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("protocol: response", "protocol: sweep", "Invalid protocol 'sweep'. Must be 'gain_offset'"),
+        (
+            "protocol: response",
+            "protocol: sweep",
+            "Invalid protocol 'sweep'. Must be 'gain_offset'",
+        ),
         ("protocol: response", "protocol: scene", "of protocol 'scene'. Must have no blackbody"),
         ("duration: 0.15\n", "", "session: Missing 'duration'. Must be given"),
         ("duration: 0.15", "duration: -1", "Invalid duration -1. Must be greater than 0"),
