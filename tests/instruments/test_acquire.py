@@ -78,7 +78,7 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("text", "status", "message"),
     [
-        ("name: plate", 2, "Missing 'simulated' in the session"),
+        ("name: plate", 2, "Missing 'simulated'. Must be given"),
         (TEXT.replace("sim://tc08", "sim://tc09"), 1, "Failed: Invalid URL 'sim://tc09'"),
     ],
 )
@@ -94,7 +94,7 @@ def test_failures_have_a_status(
 def test_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A file that is not there is named."""
     assert acquire.main([str(tmp_path / "a.yaml"), str(tmp_path)]) == 2
-    assert "No session in" in capsys.readouterr().err
+    assert "Invalid session: " in capsys.readouterr().err
 
 
 def test_interrupted(
