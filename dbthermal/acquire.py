@@ -140,8 +140,8 @@ def main(
     options = _parser().parse_args(arguments)
     try:
         session = Session.load(options.session)
-    except (OSError, TypeError, ValueError) as error:
-        print(f"No session in '{options.session}': {error}", file=sys.stderr)
+    except (OSError, ValueError) as error:
+        print(f"Invalid session: {error}", file=sys.stderr)
         return 2
     session = replace(session, simulated=True) if options.simulate else session
     try:

@@ -16,11 +16,17 @@ from rig_openings import CAMERAS, LOGGERS, VIDEOS, WHEELS, Opened, Opening
 
 from dbthermal.instruments import inventory
 from dbthermal.instruments.boson import Boson, commands
-from dbthermal.instruments.boson.commands import FfcMode, FfcStatus
+from dbthermal.instruments.camera import (
+    FfcMode,
+    FfcStatus,
+    FrameSource,
+    NoFrameError,
+    SourceLostError,
+    frames,
+)
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.tc08 import TC08, Flag
 from dbthermal.instruments.transport import TransportError
-from dbthermal.instruments.video.source import FrameSource, NoFrameError, SourceLostError, frames
 
 CLOSED = (TransportError, RuntimeError, SourceLostError)
 NAMES = {"model", "part_number", "serial_number"}
