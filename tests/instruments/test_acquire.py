@@ -1,6 +1,7 @@
 """One command records a session, from its file to movies that open, and says how it went."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -154,8 +155,10 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
         raise inventory.LibusbMissingError("no libusb")
 
     monkeypatch.setattr(inventory, "find", missing)
-    session = Session.from_yaml(TEXT)
-    assert acquire.plugged_in(session) == "The bus was not looked at: no libusb"
+    emulated = Session.from_yaml(TEXT)
+    real = replace(emulated, simulated=False)
+    assert acquire.plugged_in(real) == "The USB bus was not looked at: no libusb"
+    assert "is emulated: the USB bus was not" in acquire.plugged_in(emulated)
 
 
 def test_progress_is_a_line() -> None:
