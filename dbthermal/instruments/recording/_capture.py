@@ -10,6 +10,7 @@ from dbthermal import schema, store
 from dbthermal.alignment import exposure_times, fill_times
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
 
+
 def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     r"""
     Open a recording as stage `capture`, also one that was cut short or is being written.

@@ -284,7 +284,8 @@ class _Run:
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = False, ""
-        # For the preview: last frame of each band, last value of each reading.
+        # For the preview, after each frame is written: totals, last frames, last readings.
+        self.totals: dict[str, dict[str, int]] = {}
         self.last_frames: dict[str, Frame] = {}
         self.last_readings: dict[str, float] = {}
         # (band, frame, number refused before it); at most `limits.queue` frames of each band.
@@ -355,7 +356,7 @@ class _Run:
         while not self.done.wait(period):
             if preview and self.last_frames and self.is_going():
                 period = max(_SHOW_POLL, self.limits.preview_period)
-                time, totals = self.clock() - self.start, self.file.totals
+                time, totals = self.clock() - self.start, self.totals
                 frames, readings = dict(self.last_frames), dict(self.last_readings)
                 preview(Preview(time, frames, totals, readings, units))
 
@@ -417,6 +418,7 @@ class _Run:
             return
         flags = self.file.frame(band, frame, refused)
         self.last_frames[band] = replace(frame, flags=flags)
+        self.totals = self.file.totals
 
     def _take_notes(self) -> None:
         while not self._notes.empty():

@@ -23,7 +23,7 @@ Region = tuple[slice, slice]
 
 
 def step_path(folder: str | Path, name: str, number: int, band: str | None) -> Path:
-    """Path of one recording of a sweep: ``<name>_<number>_<band>.zarr``, no band without a wheel."""
+    """Path of a recording: ``<name>_<number>_<band>.zarr``, or without a wheel no band."""
     behind = "" if band is None else f"_{band}"
     return Path(folder) / f"{name}_{number:02d}{behind}.zarr"
 
