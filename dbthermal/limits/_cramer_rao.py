@@ -11,8 +11,8 @@ import xarray as xr
 
 from dbthermal import mixing, schema
 from dbthermal import response as responses
-from dbthermal.curves import Curve, require_range
 from dbthermal.limits._deviations import QUANTITIES, Truth, deviations, orders
+from dbthermal.response import Curve, require_range
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -11,8 +11,9 @@ from typing import Final
 import numpy as np
 
 from dbthermal import limits
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Separated, flag
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._tiles import Array, Estimate, Method, Tile
 
 _STEPS: Final = 5
 # Largest last step of a sample that is solved [K].
@@ -22,35 +23,35 @@ _GRAY_SIGMAS: Final = 4.0
 _LEAST_DIFFERENCE: Final = 1e-6
 
 
-def separate(problem: Problem) -> Separated:
+def separate(tile: Tile) -> Estimate:
     """
     Separate one tile, given its emissivities.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         Signals, and `emissivity` (2, pixel) in (0, 1), different in the two bands.
 
     Returns
     -------
-    Separated
+    Estimate
         Temperatures with their standard deviations; the emissivities as given.
 
     Raises
     ------
     ValueError
-        If the problem has no emissivity.
+        If the tile has no emissivity.
     """
-    if problem.emissivity is None:
+    if tile.emissivity is None:
         raise ValueError("Missing emissivity. Method 'calibrated' must be given one.")
-    emissivity = problem.emissivity
+    emissivity = tile.emissivity
     emissivity_std = (
-        np.zeros_like(emissivity) if problem.emissivity_std is None else problem.emissivity_std
+        np.zeros_like(emissivity) if tile.emissivity_std is None else tile.emissivity_std
     )
-    noise = (problem.noise[0], problem.noise[1])
+    noise = (tile.noise[0], tile.noise[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        temperatures, last_step = _newton(problem, emissivity)
-        mixing = _mixing(problem, emissivity, temperatures)
+        temperatures, last_step = _newton(tile, emissivity)
+        mixing = _mixing(tile, emissivity, temperatures)
         variances = limits.calibrated_variance(mixing, noise, temperatures, emissivity_std)
         stds = np.sqrt(variances)
     apart = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * np.hypot(*emissivity_std))
@@ -60,38 +61,38 @@ def separate(problem: Problem) -> Separated:
     undefined = gray | ~solved
     none = np.zeros_like(gray)
     return (
-        Separated(
+        Estimate(
             object_temperature=temperatures[0],
             object_temperature_std=stds[0],
             background_temperature=temperatures[1],
             background_temperature_std=stds[1],
             emissivity=emissivity,
             emissivity_std=emissivity_std,
-            status=flag({"gray": gray, "outside_response": ~solved & ~gray}),
+            status=status_bits({Status.GRAY: gray, Status.OUTSIDE_RESPONSE: ~solved & ~gray}),
         )
-        .without(undefined, none, undefined)
-        .ranged(problem.curves[0])
+        .undefine(undefined, none, undefined)
+        .check_range(tile.curves[0])
     )
 
 
-def _newton(problem: Problem, emissivity: Array) -> tuple[Array, Array]:
+def _newton(tile: Tile, emissivity: Array) -> tuple[Array, Array]:
     """Object and background temperature, (2, time, pixel), and the last change of both."""
     weights = np.stack([emissivity, 1.0 - emissivity], axis=1)[:, :, np.newaxis]
-    temperatures = _invert(weights, problem.signals) + problem.reference
+    temperatures = _invert(weights, tile.signals) + tile.reference
     step = np.zeros_like(temperatures)
     for _ in range(_STEPS):
-        residual = problem.signals - np.stack(
-            [(weights[m] * problem.blackbody(m, temperatures)).sum(axis=0) for m in (0, 1)]
+        residual = tile.signals - np.stack(
+            [(weights[m] * tile.blackbody(m, temperatures)).sum(axis=0) for m in (0, 1)]
         )
-        step = _invert(_mixing(problem, emissivity, temperatures), residual)
+        step = _invert(_mixing(tile, emissivity, temperatures), residual)
         temperatures = temperatures + step
     return np.asarray(temperatures), step
 
 
-def _mixing(problem: Problem, emissivity: Array, temperatures: Array) -> Array:
+def _mixing(tile: Tile, emissivity: Array, temperatures: Array) -> Array:
     """Derivative of the signals with the two temperatures, (band, 2, time, pixel)."""
     weights = np.stack([emissivity, 1.0 - emissivity], axis=1)[:, :, np.newaxis]
-    slopes = np.stack([curve.slope(temperatures) for curve in problem.curves])
+    slopes = np.stack([curve.slope(temperatures) for curve in tile.curves])
     return np.asarray(weights * slopes)
 
 

@@ -22,14 +22,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dbthermal.schema import Status
 from dbthermal.separation._baselines import calibrated
 from dbthermal.separation._dbvt import objective
 from dbthermal.separation._dbvt.homotopy import Minimum, minimise
 from dbthermal.separation._dbvt.newton import Limits
 from dbthermal.separation._dbvt.objective import Images, Unknowns, Weights
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Mask, Separated, flag
+from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import method as subspace
+from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Tile
 
 STARTS: Final = ("random", "subspace")
 """Where the search may start."""
@@ -105,20 +106,20 @@ class DbvtSettings(Weights, Limits):
             )
 
 
-def separate(problem: Problem, settings: DbvtSettings) -> Separated:
+def separate(tile: Tile, settings: DbvtSettings) -> Estimate:
     """
     Separate one tile.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         Signals of two bands.
     settings : DbvtSettings
         The objective and how it is minimised.
 
     Returns
     -------
-    Separated
+    Estimate
         Temperatures and emissivities, without deviations; `not_converged` where the kept start was
         still improving at the last step, or has no finite objective, which leaves NaN.
 
@@ -129,9 +130,9 @@ def separate(problem: Problem, settings: DbvtSettings) -> Separated:
     """
     quiet = np.errstate(invalid="ignore", divide="ignore", over="ignore")
     with quiet, torch.inference_mode(), _one_thread():
-        minimum = _search(problem, settings)
-        kept = _choice(minimum.loss, problem.signals.shape[-1])
-        return _report(problem, minimum, kept, settings)
+        minimum = _search(tile, settings)
+        kept = _choice(minimum.loss, tile.signals.shape[-1])
+        return _report(tile, minimum, kept, settings)
 
 
 @contextmanager
@@ -162,13 +163,13 @@ def _even(time: Array) -> float:
     return interval
 
 
-def images(problem: Problem, columns: int, settings: DbvtSettings) -> Images:
+def images(tile: Tile, columns: int, settings: DbvtSettings) -> Images:
     """
     Bring a tile to the device.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         The tile.
     columns : int
         Pixels times starts.
@@ -181,21 +182,21 @@ def images(problem: Problem, columns: int, settings: DbvtSettings) -> Images:
         The tile for every start, with all of the reconstruction's weight.
     """
     like = _tensor(np.ones(columns), settings)
-    signals = _tensor(problem.signals, settings).repeat(1, 1, columns // problem.signals.shape[-1])
-    sigma = torch.stack([noise * like for noise in problem.noise])
-    interval = like * _even(problem.time)
+    signals = _tensor(tile.signals, settings).repeat(1, 1, columns // tile.signals.shape[-1])
+    sigma = torch.stack([noise * like for noise in tile.noise])
+    interval = like * _even(tile.time)
     none = torch.zeros_like(signals)
     deviation = objective.deviation(signals, none, sigma, settings.deviation_floor)
     return Images(signals, deviation, sigma, interval, like)
 
 
-def start(problem: Problem, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
+def start(tile: Tile, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
     """
     Draw the starts.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         The tile, with its source of randomness.
     settings : DbvtSettings
         How many, and where.
@@ -207,14 +208,14 @@ def start(problem: Problem, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
     ndarray of bool, shape (column,)
         Which of them start at what the subspace separator found.
     """
-    frames, pixels = problem.signals.shape[1:]
+    frames, pixels = tile.signals.shape[1:]
     columns = pixels * settings.starts
-    drawn = problem.rng.uniform(settings.margin, 1.0 - settings.margin, (2, columns))
-    smooth = np.tile(problem.signals[0] * (not settings.smooth_from_zero), settings.starts)
+    drawn = tile.rng.uniform(settings.margin, 1.0 - settings.margin, (2, columns))
+    smooth = np.tile(tile.signals[0] * (not settings.smooth_from_zero), settings.starts)
     informed = np.zeros(columns, dtype=bool)
     if settings.start == "subspace":
-        informed[:pixels] = _inform(problem, drawn[:, :pixels], smooth[:, :pixels])
-    second = np.tile(problem.signals[1], settings.starts)
+        informed[:pixels] = _inform(tile, drawn[:, :pixels], smooth[:, :pixels])
+    second = np.tile(tile.signals[1], settings.starts)
     rise = drawn[1] / drawn[0] * (smooth - smooth[0])
     offset = np.mean(second - rise, axis=0) * (not settings.smooth_from_zero)
     nothing = np.zeros((2, frames, columns))
@@ -223,13 +224,13 @@ def start(problem: Problem, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
     ), informed
 
 
-def _inform(problem: Problem, emissivity: Array, smooth: Array) -> Mask:
+def _inform(tile: Tile, emissivity: Array, smooth: Array) -> Mask:
     """Overwrite a start with what the subspace separator finds, where it finds all of it."""
-    found = subspace.separate(problem, subspace.SubspaceSettings())
-    emitted = problem.blackbody(0, found.object_temperature) * found.emissivity[0]
+    found = subspace.separate(tile, subspace.SubspaceSettings())
+    emitted = tile.blackbody(0, found.object_temperature) * found.emissivity[0]
     known = np.all(np.isfinite(emitted), axis=0)
     known &= np.all((found.emissivity > 0) & (found.emissivity < 1), axis=0)
-    rest = np.median(problem.signals[0] - emitted, axis=0)
+    rest = np.median(tile.signals[0] - emitted, axis=0)
     emissivity[:, known] = found.emissivity[:, known]
     smooth[:, known] = (emitted + rest)[:, known]
     return np.asarray(known)
@@ -240,10 +241,10 @@ def _tensor(values: Array, settings: DbvtSettings) -> Tensor:
     return torch.as_tensor(values, dtype=dtype, device=settings.device)
 
 
-def _search(problem: Problem, settings: DbvtSettings) -> Minimum:
+def _search(tile: Tile, settings: DbvtSettings) -> Minimum:
     """All starts to their end."""
-    unknowns, informed = start(problem, settings)
-    given = images(problem, informed.size, settings)
+    unknowns, informed = start(tile, settings)
+    given = images(tile, informed.size, settings)
     for mask, stages in ((~informed, settings.stages), (informed, 1)):
         columns = torch.as_tensor(np.flatnonzero(mask), device=given.share.device)
         if columns.numel():
@@ -254,7 +255,7 @@ def _search(problem: Problem, settings: DbvtSettings) -> Minimum:
     minimum = minimise(unknowns, given, settings, settings, 1)
     bend = np.zeros(unknowns.smooth.shape)
     for _ in range(settings.bend_updates):
-        straight = _straightened(problem, minimum, given, bend)
+        straight = _straightened(tile, minimum, given, bend)
         if np.array_equal(straight, bend):
             break
         bend = straight
@@ -263,7 +264,7 @@ def _search(problem: Problem, settings: DbvtSettings) -> Minimum:
     return minimum
 
 
-def _straightened(problem: Problem, minimum: Minimum, given: Images, bend: Array) -> Array:
+def _straightened(tile: Tile, minimum: Minimum, given: Images, bend: Array) -> Array:
     r"""
     What bends the two bands apart, :math:`e_2 [u_2(x) - u_1(x)] + (1 - e_2) [u_2(y) - u_1(y)]`.
 
@@ -277,12 +278,10 @@ def _straightened(problem: Problem, minimum: Minimum, given: Images, bend: Array
     total, outside = np.zeros_like(bend), np.zeros(bend.shape[1], dtype=bool)
     for ratio, share in zip((reflection, emission), shares, strict=True):
         signal = (second - ratio * first) / (1 - ratio)
-        temperature = problem.temperature(0, signal)
-        inside = (temperature >= problem.curves[0].lowest) & (
-            temperature <= problem.curves[0].highest
-        )
+        temperature = tile.temperature(0, signal)
+        inside = (temperature >= tile.curves[0].lowest) & (temperature <= tile.curves[0].highest)
         outside |= ~np.all(inside, axis=0)
-        total += share * (problem.blackbody(1, temperature) - signal)
+        total += share * (tile.blackbody(1, temperature) - signal)
     return np.where(outside, 0.0, total)
 
 
@@ -293,23 +292,23 @@ def _choice(loss: Tensor, pixels: int) -> Tensor:
     return finite.argmin(dim=0) * pixels + place
 
 
-def _report(problem: Problem, minimum: Minimum, kept: Tensor, settings: DbvtSettings) -> Separated:
+def _report(tile: Tile, minimum: Minimum, kept: Tensor, settings: DbvtSettings) -> Estimate:
     """Temperatures from the emissivities, by the closed form and Newton's steps."""
     unknowns = minimum.unknowns.taken(kept)
     emissivity = _array(unknowns.emissivity)
     lost = ~np.isfinite(_array(minimum.loss[kept]))
-    signals = problem.signals
+    signals = tile.signals
     if settings.temperatures_from == "corrected":
         signals = signals - _array(unknowns.noise)
     found = calibrated.separate(
-        replace(problem, signals=signals, emissivity=emissivity, emissivity_std=None)
+        replace(tile, signals=signals, emissivity=emissivity, emissivity_std=None)
     )
     unfinished: Mask = lost | ~minimum.converged[kept].cpu().numpy()
     return replace(
         found,
         **{name: np.full_like(getattr(found, name), np.nan) for name in METHOD.not_estimated},
-        status=found.status | flag({"not_converged": unfinished}),
-    ).without(lost, lost, lost)
+        status=found.status | status_bits({Status.NOT_CONVERGED: unfinished}),
+    ).undefine(lost, lost, lost)
 
 
 def _array(values: Tensor) -> Array:
