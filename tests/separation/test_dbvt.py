@@ -1,6 +1,7 @@
 """The paper's optimiser: its losses one by one, its descent, and what it finds from any start."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -155,7 +156,9 @@ def directional(
 def test_slopes_match_finite_differences(name: str, along: str) -> None:
     """The slope of each loss along each unknown is that of its finite differences."""
     unknowns, images = anywhere()
-    nothing = dict.fromkeys(("smoothness", "huber", "reconstruction", "noise_mean"), 0.0)
+    nothing: dict[str, Any] = dict.fromkeys(
+        ("smoothness", "huber", "reconstruction", "noise_mean"), 0.0
+    )
     weights = DbvtSettings(**(nothing | {"noise": 1.0, "curvature": 50.0, name: 1.3}))
     zero = Unknowns(*(torch.zeros_like(value) for value in vars(unknowns).values()))
     direction = torch.as_tensor(
