@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
     from dbthermal.separation._baselines.ratio import RatioSettings
-    from dbthermal.separation._dbvt.method import DbvtSettings
+    from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
     Settings = SubspaceSettings | DbvtSettings | NaiveSettings | RatioSettings | BcpSettings

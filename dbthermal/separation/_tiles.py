@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import mixing, schema
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation._quality import status_bits
@@ -109,6 +109,16 @@ class Tile:
     def temperature(self, band: int, signal: Array) -> Array:
         """Temperature [K] of the blackbody with a signal [K]; NaN where there is none."""
         return self.curves[band].temperature(signal + self.reference)
+
+    def mixed(self, emissivity: Array, temperatures: Array) -> Array:
+        """Signals (band, time, pixel) [K] of object and background (2, time, pixel) [K]."""
+        x, y = temperatures
+        return np.stack(
+            [
+                mixing.mixed(share, self.blackbody(band, x), self.blackbody(band, y))
+                for band, share in enumerate(emissivity)
+            ]
+        )
 
     def select_frames(self, selected: Mask) -> "Tile":
         """Return the tile with the selected frames (time) alone."""

@@ -10,7 +10,8 @@ import pytest
 from rig_session import SHAPE, TEXT, bench, pictures, replaced, rig
 
 from dbthermal.instruments.boson import Boson, BosonTimeoutError, commands
-from dbthermal.instruments.boson.commands import FfcMode, FfcStatus, Ir16Mode, Switch, SyncMode
+from dbthermal.instruments.boson.commands import Ir16Mode, Switch, SyncMode
+from dbthermal.instruments.camera import FfcMode, FfcStatus, NoFrameError
 from dbthermal.instruments.devices import (
     Devices,
     ReadingError,
@@ -24,7 +25,6 @@ from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.filterwheel import NotHomedError
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan
-from dbthermal.instruments.video.source import NoFrameError
 
 
 @pytest.fixture
@@ -156,7 +156,7 @@ class Logger:
         self.scans += 1
         values = np.full(9, 300.0 + self.scans)
         flags = np.where(np.arange(9) == 2, Flag.MISSING, Flag.GOOD).astype(np.uint8)
-        return Scan(0.0, 0.0, values, np.full(9, np.nan), flags)
+        return Scan(0.0, values, flags)
 
 
 def test_one_scan_gives_all_channels_once() -> None:

@@ -20,6 +20,7 @@ from dbthermal import correction as frames
 from dbthermal import store
 from dbthermal.instruments import apt
 from dbthermal.instruments.boson import Boson, BosonReplyError, BosonStatusError, BosonTimeoutError
+from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.devices import Devices, Thermocouples
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.boson_faults import Fault
@@ -35,7 +36,6 @@ from dbthermal.instruments.filterwheel import (
 from dbthermal.instruments.recording.capture import open_capture
 from dbthermal.instruments.tc08 import TC08, TC08Error
 from dbthermal.instruments.transport import TransportError
-from dbthermal.instruments.video.source import FrameFlag
 
 # Cameras: what goes wrong with their frames.
 
@@ -213,7 +213,7 @@ TROUBLES: dict[str, tuple[Callable[[], Instrument], float | Error]] = {
     "wheel: between two slots": (stopped_wheel, (WheelError, "between two slots, at .* deg")),
     "wheel: unplugged": (lambda: wheel(plugged=False), (TransportError, "Lost the emulated dev")),
     "TC-08: open thermocouple": (lambda: logger(open={1}), math.nan),
-    "TC-08: open, and reads the room": (lambda: logger(open={1}, open_reads="ambient"), ROOM),
+    "TC-08: open, and reads the room": (lambda: logger(open={1}, reads_ambient=True), ROOM),
     "TC-08: another one open": (lambda: logger(open={2}), TIP),
     "TC-08: overflow": (lambda: logger(overflow={1}), math.nan),
     "TC-08: unplugged": (
