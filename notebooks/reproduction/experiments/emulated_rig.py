@@ -18,8 +18,8 @@ import xarray as xr
 
 from dbthermal import mixing, store
 from dbthermal import response as responses
-from dbthermal.curves import Curve
 from dbthermal.instruments.emulated.world import World
+from dbthermal.response import Curve
 from dbthermal.simulation._rig import Rig, digitise
 
 Array = npt.NDArray[np.float64]
