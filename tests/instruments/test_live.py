@@ -324,7 +324,8 @@ def test_recording_without_a_notebook(tmp_path: Path) -> None:
 
 def test_import_is_light() -> None:
     """Neither the package nor the watch loads matplotlib or IPython: the first picture does."""
-    code = "import sys, dbthermal.instruments.live; print({'matplotlib', 'IPython', 'torch'} & {*sys.modules})"
+    heavy = "{'matplotlib', 'IPython', 'torch'}"
+    code = f"import sys, dbthermal.instruments.live; print({heavy} & {{*sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 
