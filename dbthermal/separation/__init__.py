@@ -7,10 +7,9 @@ options takes them as its frozen record, such as `SubspaceSettings`.
 import importlib
 from typing import TYPE_CHECKING, Any, Final
 
-from dbthermal.separation._methods import METHODS, get_method
 from dbthermal.separation._pooling.materials import materials
 from dbthermal.separation._reflected import reflected_change
-from dbthermal.separation._solve import solve
+from dbthermal.separation._solve import METHODS, get_method, solve
 from dbthermal.separation._uncalibrated import reflections
 
 if TYPE_CHECKING:
