@@ -58,18 +58,24 @@ def record(
     }
 
 
-def source() -> str:
-    """SHA-256 of this package's source code: names and contents of its modules and tables.
+def source(*packages: Path) -> str:
+    """SHA-256 of the source code that runs: names and contents of modules and tables.
+
+    Parameters
+    ----------
+    *packages : Path
+        Folders of further packages than dbthermal.
 
     Returns
     -------
     str
         64 hexadecimal digits.
     """
-    folder, total = Path(__file__).parent, hashlib.sha256()
-    files = [path for path in folder.rglob("*") if path.suffix in (".py", ".csv")]
-    for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
-        total.update(f"{path.relative_to(folder).as_posix()} {checksum(path)}\n".encode())
+    total = hashlib.sha256()
+    for folder in (Path(__file__).parents[1], *packages):
+        files = [path for path in folder.rglob("*") if path.suffix in (".py", ".csv")]
+        for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
+            total.update(f"{path.relative_to(folder).as_posix()} {checksum(path)}\n".encode())
     return total.hexdigest()
 
 

@@ -69,7 +69,7 @@ def test_changed_code_starts_anew(
     """A cell of other source code is not used."""
     cells = [{"folder": str(marks), "value": 1.0, "seed": 1}]
     experiments.remembered(counted, cells, tmp_path / "cells")
-    monkeypatch.setattr("dbthermal.store._provenance.source", lambda: "other")
+    monkeypatch.setattr("dbthermal.store._provenance.source", lambda *_: "other")
     with pytest.raises(RuntimeError, match=r"Changed source code\. Must be as it was imported"):
         experiments.remembered(counted, cells, tmp_path / "cells")
     monkeypatch.setattr("reproduction.experiments.memory._SOURCE", "other")

@@ -22,8 +22,9 @@ from dbthermal import store
 from dbthermal.store import _provenance as provenance
 
 _OPTIONAL: Final = ("torch", "trimesh", "embreex", "robust-laplacian")
+_PACKAGE: Final = Path(__file__).parents[1]
 # Of the code as it was imported, which is the code that runs.
-_SOURCE: Final = provenance.source()
+_SOURCE: Final = provenance.source(_PACKAGE)
 
 Cell = Mapping[str, Any]
 """Parameters of a cell: plain numbers, texts, lists and mappings."""
@@ -68,7 +69,7 @@ def remembered(
         If the package's source changed since it was imported, so that nobody could say which code
         a result is of.
     """
-    if provenance.source() != _SOURCE:
+    if provenance.source(_PACKAGE) != _SOURCE:
         raise RuntimeError("Changed source code. Must be as it was imported: restart the kernel.")
     cells = list(cells)
     paths = [folder / f"{_name(function, cell)}.zarr" for cell in cells]
@@ -125,7 +126,7 @@ def _keep(function: Callable[..., xr.Dataset], path: Path, cell: Cell) -> None:
     if path.exists():
         return
     result = function(**cell)
-    if provenance.source() != _SOURCE:
+    if provenance.source(_PACKAGE) != _SOURCE:
         raise RuntimeError("Changed source code during a run. Must stay until it ends.")
     try:
         store.save(result, path, provenance.record(cell))
