@@ -18,22 +18,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from scipy.constants import zero_Celsius
 
-from dbthermal import simulation
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.devices import Devices, emulated_world, open_devices
-from dbthermal.instruments.emulated import usb
+from dbthermal.instruments.emulated import blackbody, usb
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import ROOM, World
 from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording.record import Preview, Summary
 from dbthermal.instruments.session import Session
-from reproduction.experiments.emulated_rig import Views
-
-NOISE: Final = 0.1
-"""Noise of the emulated cameras of `blackbody_pictures`, as NETD near 25 degrees Celsius [K]."""
 
 FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)
 """What devices and recordings raise: the drivers' own errors are of these kinds."""
@@ -70,33 +64,6 @@ class Progress:
             for band, status in self._watch.status().items()
         )
         self.write(f"\r{preview.time:6.1f} s  {bands}")
-
-
-def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
-    """
-    What emulated cameras see of a blackbody that fills the view, by the simulated rig.
-
-    Parameters
-    ----------
-    session : Session
-        Its bands and filters must be of `dbthermal.bands`.
-    world : World
-        Its blackbody is seen, within the range of `dbthermal.simulation.Rig`.
-
-    Returns
-    -------
-    dict
-        Band to picture.
-
-    Raises
-    ------
-    ValueError
-        If a band is not known.
-    """
-    bands = tuple(dict.fromkeys((*session.bands, *session.filters.values())))
-    rig = simulation.Rig(bands=bands, noise=(NOISE,) * len(bands))
-    detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
-    return dict(Views(rig, detector, seed=0).blackbody(world))
 
 
 def ask_for_blackbody(name: str, temperature: float) -> None:
@@ -151,7 +118,7 @@ def plugged_in(session: Session) -> str:
 def main(
     arguments: Sequence[str] | None = None,
     world: World | None = None,
-    pictures: Pictures = blackbody_pictures,
+    pictures: Pictures = blackbody.pictures,
 ) -> int:
     """
     Record a session.

@@ -1,32 +1,61 @@
-"""The glossary: every variable's dims, unit and meaning at each stage of the data stream.
+"""Glossary: dimensions, type, unit and meaning of every variable at each stage of the data stream.
 
 A name is agreed here first, then used. `check` holds a dataset against its stage and raises with
-the value that offends. The stages follow the stream: capture, corrected, separated; a response
-and an emissivity table stand beside it.
+the value that offends. The stages follow the stream: capture, corrected, separated; calibration
+data, a response and an emissivity table stand beside it. ``python -m dbthermal.schema`` prints the
+glossary as text, which is docs/nomenclature.md.
 """
 
+import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntFlag
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import xarray as xr
 
+__all__ = [
+    "COORDINATES",
+    "EMISSIVITY_LIMITS",
+    "EXPOSURE_TIME",
+    "FLAGS",
+    "FRAME_FLAGS",
+    "NOISE",
+    "OPTIONAL",
+    "SEGMENT",
+    "SHUTTER_CLOSED",
+    "STAGES",
+    "Flags",
+    "Status",
+    "Variable",
+    "band_positions",
+    "check",
+    "check_variable",
+    "has_flag",
+    "nomenclature",
+    "status_attrs",
+]
+
 Dims = tuple[str, ...]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 @dataclass(frozen=True)
 class Variable:
     """
-    What a variable of a stage must be.
+    Definition of a variable of a stage.
 
     Attributes
     ----------
     dims : tuple of str
         Dimensions in their order.
     dtype : str
-        Dtype as written by this project; read, any real dtype of the same kind passes.
+        Type as written by this project; read, any real type of the same kind passes.
     units : str
         Unit as in the attribute `units`.
     long_name : str
@@ -46,7 +75,19 @@ class Variable:
 
 _MOVIE: Final = ("band", "time", "y", "x")
 _FRAMES: Final = ("time", "y", "x")
+_MAPS: Final = ("band", "y", "x")
 _IMAGE: Final = ("y", "x")
+_BAND: Final = ("band",)
+_MEASUREMENTS: Final = ("band", "measurement")
+_TABLE: Final = ("material", "band")
+
+
+def _counts(dims: Dims, dtype: str, long_name: str) -> Variable:
+    return Variable(dims, dtype, "count", long_name)
+
+
+def _temperature(dims: Dims, long_name: str) -> Variable:
+    return Variable(dims, "float64", "K", long_name)
 
 
 def _with_std(name: str, dims: Dims, units: str, long_name: str) -> dict[str, Variable]:
@@ -59,89 +100,114 @@ def _with_std(name: str, dims: Dims, units: str, long_name: str) -> dict[str, Va
 COORDINATES: Final = MappingProxyType(
     {
         "time": Variable(("time",), "float64", "s", "time since the first frame"),
-        "temperature": Variable(("temperature",), "float64", "K", "blackbody temperature"),
+        "temperature": _temperature(("temperature",), "blackbody temperature"),
         "wavelength": Variable(("wavelength",), "float64", "m", "wavelength"),
     }
 )
-"""Coordinates with a unit; they must increase strictly."""
+"""Coordinates with a unit; they must increase strictly. Coordinate `band` names each band."""
 
-STAGES: Final = MappingProxyType(
+NOISE: Final = _counts(_BAND, "float64", "noise of one pixel and frame")
+"""Variable `noise`: standard deviation of one pixel's counts from frame to frame."""
+
+EXPOSURE_TIME: Final = Variable(("band", "time"), "float64", "s", "when the frame was exposed")
+"""Variable `exposure_time`: each camera's own stamps, NaN for a frame that is no measurement."""
+
+FRAME_FLAGS: Final = Variable(("band", "time"), "uint16", "1", "flags of the frame, 0 is good")
+"""Variable `frame_flags` of a recording, bits named by its own CF attributes; see `has_flag`."""
+
+SHUTTER_CLOSED: Final = "shutter_closed"
+"""Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
+
+SEGMENT: Final = Variable(("time",), "int32", "1", "shutter events before the frame")
+"""Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
+
+_STATUS: Final = Variable(_IMAGE, "uint32", "1", "validity flags, 0 is good")
+
+STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
     {
-        "capture": {"counts": Variable(_MOVIE, "uint16", "count", "raw signal")},
-        "corrected": {"counts": Variable(_MOVIE, "float32", "count", "corrected signal")},
+        "capture": {"counts": _counts(_MOVIE, "uint16", "raw signal")},
+        "corrected": {"counts": _counts(_MOVIE, "float32", "corrected signal")},
+        "separated": {
+            **_with_std("object_temperature", _FRAMES, "K", "object temperature"),
+            **_with_std("background_temperature", _FRAMES, "K", "background temperature"),
+            **_with_std("emissivity", _MAPS, "1", "band emissivity"),
+            **_with_std("reflection_ratio", _MAPS, "1", "reflection ratio"),
+            "status": _STATUS,
+        },
         "blackbody": {
-            "counts": Variable(("band", "temperature"), "float64", "count", "mean blackbody signal")
+            "counts": _counts(("band", "temperature"), "float64", "mean blackbody signal")
         },
         "blackbody_movies": {
-            "counts": Variable(
-                ("band", "temperature", "frame", "y", "x"), "uint16", "count", "raw signal"
-            )
+            "counts": _counts(("band", "temperature", "frame", "y", "x"), "uint16", "raw signal")
         },
         "blackbody_frames": {
-            "counts": Variable(
-                ("band", "temperature", "y", "x"), "float64", "count", "mean over the frames"
-            )
+            "counts": _counts(("band", "temperature", "y", "x"), "float64", "mean over the frames")
         },
         "correction": {
-            "gain": Variable(("band", "y", "x"), "float64", "1", "gain of the pixel"),
-            "offset": Variable(("band", "y", "x"), "float64", "count", "offset of the pixel"),
-        },
-        "contact": {
-            "counts": Variable(("band", "measurement"), "float64", "count", "signal"),
-            "object_temperature": Variable(("measurement",), "float64", "K", "object temperature"),
-            "background_temperature": Variable(
-                ("measurement",), "float64", "K", "background temperature"
-            ),
-        },
-        "reflector": {
-            "counts": Variable(("band", "measurement"), "float64", "count", "signal"),
-            "reflected_counts": Variable(
-                ("band", "measurement"), "float64", "count", "signal of the reflector"
-            ),
-            "object_temperature": Variable(("measurement",), "float64", "K", "object temperature"),
+            "gain": Variable(_MAPS, "float64", "1", "gain of the pixel"),
+            "offset": _counts(_MAPS, "float64", "offset of the pixel"),
         },
         "response": {
-            "amplitude": Variable(("band",), "float64", "count", "Sakuma-Hattori amplitude"),
+            "amplitude": _counts(_BAND, "float64", "Sakuma-Hattori amplitude"),
             "effective_wavelength": Variable(
-                ("band",), "float64", "m", "Sakuma-Hattori effective wavelength"
+                _BAND, "float64", "m", "Sakuma-Hattori effective wavelength"
             ),
             "wavelength_shift": Variable(
-                ("band",), "float64", "m K", "Sakuma-Hattori wavelength shift"
+                _BAND, "float64", "m K", "Sakuma-Hattori wavelength shift"
             ),
-            "offset": Variable(("band",), "float64", "count", "Sakuma-Hattori offset"),
-            "linear_slope": Variable(
-                ("band",), "float64", "count K-1", "slope of the linear response"
-            ),
-            "linear_intercept": Variable(
-                ("band",), "float64", "count", "intercept of the linear response"
-            ),
-            "reference_temperature": Variable((), "float64", "K", "reference temperature"),
-            "temperature_min": Variable((), "float64", "K", "lowest calibrated temperature"),
-            "temperature_max": Variable((), "float64", "K", "highest calibrated temperature"),
+            "offset": _counts(_BAND, "float64", "Sakuma-Hattori offset"),
+            "linear_slope": Variable(_BAND, "float64", "count K-1", "slope of the linear response"),
+            "linear_intercept": _counts(_BAND, "float64", "intercept of the linear response"),
+            "reference_temperature": _temperature((), "reference temperature"),
+            "temperature_min": _temperature((), "lowest calibrated temperature"),
+            "temperature_max": _temperature((), "highest calibrated temperature"),
+        },
+        "contact": {
+            "counts": _counts(_MEASUREMENTS, "float64", "signal"),
+            "object_temperature": _temperature(("measurement",), "object temperature"),
+            "background_temperature": _temperature(("measurement",), "background temperature"),
+        },
+        "reflector": {
+            "counts": _counts(_MEASUREMENTS, "float64", "signal"),
+            "reflected_counts": _counts(_MEASUREMENTS, "float64", "signal of the reflector"),
+            "object_temperature": _temperature(("measurement",), "object temperature"),
         },
         "spectrum": {
             "emissivity": Variable(("wavelength",), "float64", "1", "spectral emissivity")
         },
         "emissivity_table": {
-            "emissivity": Variable(("material", "band"), "float64", "1", "band emissivity"),
+            "emissivity": Variable(_TABLE, "float64", "1", "band emissivity"),
             "coverage": Variable(
-                ("material", "band"), "float64", "1", "share of the band that the spectrum covers"
+                _TABLE, "float64", "1", "share of the band that the spectrum covers"
             ),
-        },
-        "separated": {
-            **_with_std("object_temperature", _FRAMES, "K", "object temperature"),
-            **_with_std("background_temperature", _FRAMES, "K", "background temperature"),
-            **_with_std("emissivity", ("band", "y", "x"), "1", "band emissivity"),
-            **_with_std("reflection_ratio", ("band", "y", "x"), "1", "reflection ratio"),
-            "status": Variable(_IMAGE, "uint32", "1", "validity flags, 0 is good"),
         },
     }
 )
-"""Stage -> variable -> what it must be. A response and blackbody frames may also hold `noise`
-(band) [count]; a correction holds `bad` (band, y, x), bool, too."""
+"""Stage -> variable -> its definition."""
 
-NOISE: Final = Variable(("band",), "float64", "count", "noise of one pixel and frame")
-"""Optional variable `noise` of a response: standard deviation of one pixel's counts."""
+OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
+    {
+        "capture": {"exposure_time": EXPOSURE_TIME, "frame_flags": FRAME_FLAGS},
+        "corrected": {
+            "exposure_time": EXPOSURE_TIME,
+            "frame_flags": FRAME_FLAGS,
+            "segment": SEGMENT,
+            "drift": _counts(("band", "time"), "float64", "drift taken out"),
+            "status": _STATUS,
+        },
+        "blackbody_frames": {"noise": NOISE},
+        "correction": {
+            "bad": Variable(_MAPS, "bool", "1", "bad pixel"),
+            "residual": _counts(_BAND, "float64", "RMS residual over the good pixels"),
+            "level": _counts(("band", "temperature"), "float64", "mean over the good pixels"),
+        },
+        "response": {
+            "noise": NOISE,
+            "netd": Variable(_BAND, "float64", "K", "noise-equivalent temperature difference"),
+        },
+    }
+)
+"""Stage -> variable that it may hold -> its definition."""
 
 EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
 """A spectral emissivity outside is no measurement, but a wrong unit or a damaged file [1].
@@ -150,82 +216,106 @@ The extremes of the libraries are -0.16 (trona) and 1.014 (maple bark), from ref
 and -1.4 % relative to the reference."""
 
 
-class Status(IntFlag):
-    """Bits of `status`, the validity of a pixel; 0 is good. `FLAG_MEANINGS` explains each."""
+class Flags(IntFlag):
+    """Bits with a name and a sentence each, written as CF `flag_masks` and `flag_meanings`."""
 
-    NO_BACKGROUND_MOTION = 1 << 0
-    CONSTANT_OBJECT = 1 << 1
-    GRAY = 1 << 2
-    BACKGROUND_NEVER_RESTS = 1 << 3
-    NONPHYSICAL_EMISSIVITY = 1 << 4
-    INVALID_SAMPLES = 1 << 5
-    CONSTANT_SIGNAL = 1 << 6
-    SATURATED = 1 << 7
-    OBJECT_NOT_SMOOTH = 1 << 8
-    OUTSIDE_RESPONSE = 1 << 9
-    DEAD_PIXEL = 1 << 10
-    FROZEN_FRAMES = 1 << 11
-    NOT_CONVERGED = 1 << 12
-    OBJECT_JUMP = 1 << 13
-    BANDS_APART = 1 << 14
-    ROLES_MAY_BE_SWAPPED = 1 << 15
+    meaning: str
+
+    def __new__(cls, value: int, meaning: str = "") -> Self:
+        """Make a bit from its value and its sentence."""
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.meaning = meaning
+        return member
+
+    @classmethod
+    def names(cls) -> dict[str, Self]:
+        """Bits by their name in lower case, as in `flag_meanings`."""
+        return {str(bit.name).lower(): bit for bit in cls}
+
+    @classmethod
+    def attrs(cls, variable: Variable) -> dict[str, object]:
+        """CF attributes of a variable of these flags: masks, names, a sentence each, unit."""
+        return {
+            **variable.attrs,
+            "flag_masks": np.array([bit.value for bit in cls], dtype=variable.dtype),
+            "flag_meanings": " ".join(cls.names()),
+            "comment": "; ".join(f"{name}: {bit.meaning}" for name, bit in cls.names().items()),
+        }
 
 
-FLAGS: Final = MappingProxyType({str(bit.name).lower(): int(bit) for bit in Status})
+class Status(Flags):
+    """Validity of a pixel, bits of `status`; 0 is good."""
+
+    NO_BACKGROUND_MOTION = 1 << 0, "no rapid change: no reflection ratio, so nothing is estimated"
+    CONSTANT_OBJECT = 1 << 1, "a constant object: its temperature holds, nothing else is estimated"
+    GRAY = 1 << 2, "the bands' emissivities do not differ: the system is singular"
+    BACKGROUND_NEVER_RESTS = 1 << 3, "background at rest in few frames: emissivity may be biased"
+    NONPHYSICAL_EMISSIVITY = 1 << 4, "estimate outside (0, 1): no background temperature"
+    INVALID_SAMPLES = 1 << 5, "too many samples NaN, infinite or masked: nothing is estimated"
+    CONSTANT_SIGNAL = 1 << 6, "the signal of a band never changes: nothing is estimated"
+    SATURATED = 1 << 7, "samples at the detector's limit"
+    OBJECT_NOT_SMOOTH = 1 << 8, "object changes too fast for a smooth curve, or noise is higher"
+    OUTSIDE_RESPONSE = 1 << 9, "a temperature outside the calibrated range of the response"
+    DEAD_PIXEL = 1 << 10, "bad pixel, marked by the correction"
+    FROZEN_FRAMES = 1 << 11, "the same counts in both bands for several frames, read as signal"
+    NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
+    OBJECT_JUMP = 1 << 13, "one step of the object, taken into its curve; the values hold"
+    BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
+    ROLES_MAY_BE_SWAPPED = 1 << 15, "mean emissivity below 1/2: object and background exchanged"
+
+
+FLAGS: Final = MappingProxyType({name: int(bit) for name, bit in Status.names().items()})
 """Bits of `status`, by name."""
-
-FLAG_MEANINGS: Final = MappingProxyType(
-    {
-        "no_background_motion": "no rapid change: the direction of the reflection is undefined; "
-        "no temperature and no emissivity",
-        "constant_object": "object constant: emissivity and background are undefined, the object "
-        "temperature holds, if it is the object that is constant",
-        "gray": "the bands' emissivities do not differ: the system is singular",
-        "background_never_rests": "the background rests in few frames: emissivity may be biased "
-        "beyond its standard deviation; a drift parallel to the object's curve cannot be seen",
-        "nonphysical_emissivity": "estimated emissivity outside (0, 1): no background temperature",
-        "invalid_samples": "more than half of the samples, or more than the method can spare, are "
-        "NaN, infinite or masked: nothing is estimated",
-        "constant_signal": "a band's signal never changes: nothing is estimated",
-        "saturated": "samples at the detector's limit: whole-number counts at an end of their "
-        "type, or as marked by the frame correction",
-        "object_not_smooth": "the combination of bands that holds no background is more than white "
-        "noise about a smooth curve: the object changes too fast, or the noise is another",
-        "outside_response": "a temperature lies outside the calibrated range of the response",
-        "dead_pixel": "marked as bad by the frame correction",
-        "frozen_frames": "the same counts in both bands for several frames, as while a shutter is "
-        "closed: what stands still in them is read as signal",
-        "object_jump": "the object jumped once: the jump was taken into its curve, the frames "
-        "around it are left out, and the values that are given hold",
-        "bands_apart": "the rapid changes of the bands are not simultaneous: a time offset "
-        "between the cameras, or a reflection seen from two places",
-        "roles_may_be_swapped": "mean emissivity below a half: a bright reflector, or what moves "
-        "smoothly is the background, and object and background are exchanged",
-        "not_converged": "the optimiser stopped at its limit of steps, or at no finite value",
-    }
-)
-"""A sentence for each bit of `status`."""
 
 
 def status_attrs() -> dict[str, object]:
+    """CF attributes of a `status` variable: `flag_masks` (uint32), `flag_meanings`, units."""
+    return Status.attrs(_STATUS)
+
+
+def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """
-    CF attributes of a `status` variable.
+    Where any of some flags is set, by the CF attributes of the variable that holds them.
+
+    Parameters
+    ----------
+    flags : DataArray
+        `status` or `frame_flags`, of whole numbers of any size, with the attributes
+        ``flag_masks`` and ``flag_meanings``.
+    names : str
+        Names of flags, in lower case.
 
     Returns
     -------
-    dict
-        `flag_masks` (uint32), `flag_meanings` (names, blank-separated), units and long_name.
+    DataArray of bool
+        Of the shape of the flags.
+
+    Raises
+    ------
+    ValueError
+        If the attributes are missing, or a name is not among them.
+
+    Examples
+    --------
+    >>> import numpy as np, xarray as xr
+    >>> bits = np.array([0, 1024, 128], dtype=np.uint32)
+    >>> status = xr.DataArray(bits, dims="x", attrs=status_attrs())
+    >>> has_flag(status, "dead_pixel", "gray").values
+    array([False,  True, False])
     """
-    return {
-        **STAGES["separated"]["status"].attrs,
-        "flag_masks": np.array(list(FLAGS.values()), dtype=np.uint32),
-        "flag_meanings": " ".join(FLAGS),
-    }
+    meanings = str(flags.attrs.get("flag_meanings", "")).split()
+    masks = dict(zip(meanings, np.atleast_1d(flags.attrs.get("flag_masks", [])), strict=True))
+    unknown = [name for name in names if name not in masks]
+    if unknown:
+        raise ValueError(f"Unknown flag '{unknown[0]}'. Must be one of {meanings}.")
+    mask = sum({int(masks[name]) for name in names})
+    return flags.copy(data=(flags.values & flags.dtype.type(mask)) != 0).drop_attrs()
 
 
 def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     """
-    Hold a dataset against its stage.
+    Check a dataset against its stage.
 
     A missing `units` attribute is taken as the agreed unit; a different one is an error.
     Values are not read, except those of coordinates and of variables without pixels.
@@ -233,7 +323,7 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     Parameters
     ----------
     dataset : Dataset
-        What a stage hands on.
+        Data of a stage.
     stage : str
         One of `STAGES`.
 
@@ -265,16 +355,16 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
 
 def check_variable(array: xr.DataArray, variable: Variable, what: str) -> None:
     """
-    Hold one array against its definition; see `check`.
+    Check one array against its definition; see `check`.
 
     Parameters
     ----------
     array : DataArray
         The array.
     variable : Variable
-        What it must be.
+        Its definition.
     what : str
-        Its name, for the error.
+        Name of the array, for the error.
 
     Raises
     ------
@@ -299,7 +389,7 @@ def check_variable(array: xr.DataArray, variable: Variable, what: str) -> None:
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], what: str) -> list[int]:
     """
-    Where each of some bands is, by its name as text.
+    Positions of bands on the dimension `band`, by name.
 
     Parameters
     ----------
@@ -308,7 +398,7 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], what: st
     wanted : list of str
         Names.
     what : str
-        What it is, for the error.
+        Name of the array, for the error.
 
     Returns
     -------
@@ -358,3 +448,42 @@ def _check_coordinate(array: xr.DataArray, dim: str, what: str) -> None:
             f"Unordered '{dim}' of {what}: {values[place]} {units} is followed by "
             f"{values[place + 1]} {units}. Must increase strictly."
         )
+
+
+def nomenclature() -> str:
+    """
+    Glossary as Markdown: coordinates, a table for each stage, and the bits of `status`.
+
+    Returns
+    -------
+    str
+        Text of docs/nomenclature.md.
+    """
+    parts = [_PREFACE, "## Coordinates", _table(COORDINATES)]
+    for stage, variables in STAGES.items():
+        parts += [f"## Stage `{stage}`", _table({**variables, **OPTIONAL.get(stage, {})}, stage)]
+    bits = [f"| {int(bit)} | `{name}` | {bit.meaning} |" for name, bit in Status.names().items()]
+    head = ["| value | name | meaning |", "| --: | --- | --- |"]
+    return "\n\n".join([*parts, "## Bits of `status`", "\n".join([*head, *bits])]) + "\n"
+
+
+_PREFACE: Final = """# Nomenclature
+
+Variables at each stage of the data stream, made from `dbthermal/schema.py` by
+`python -m dbthermal.schema > docs/nomenclature.md`. Temperatures are in kelvin, other units are SI;
+`count` is the unit of the detector's signal. A variable in italics is optional."""
+
+
+def _table(variables: Mapping[str, Variable], stage: str = "") -> str:
+    """Markdown table of variables; the optional ones of a stage in italics."""
+    rows = ["| variable | dimensions | type | unit | meaning |", "| --- | --- | --- | --- | --- |"]
+    optional = OPTIONAL.get(stage, {})
+    for name, one in variables.items():
+        label = f"*{name}*" if name in optional else f"`{name}`"
+        dims = ", ".join(one.dims) or "-"
+        rows.append(f"| {label} | {dims} | {one.dtype} | {one.units} | {one.long_name} |")
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    sys.stdout.write(nomenclature())

@@ -2,12 +2,14 @@
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import schema, store
+from dbthermal.schema import Status
 
 SIZES = {"band": 2, "time": 3, "temperature": 4, "wavelength": 5}
 
@@ -146,13 +148,14 @@ def test_units_are_si() -> None:
     assert {one.units for one in [*variables, *schema.COORDINATES.values()]} <= allowed
 
 
-def test_flags_are_bits() -> None:
-    """Each flag is a bit of its own in 16, with a sentence of its own."""
-    values = list(schema.FLAGS.values())
+def test_status_bits_are_documented() -> None:
+    """Each bit of `status` is one of 32, named and explained once."""
+    values = [bit.value for bit in Status]
     assert all(value.bit_count() == 1 for value in values)
-    assert len(set(values)) == len(values)
-    assert sum(values) <= np.iinfo(np.uint16).max
-    assert schema.FLAGS.keys() == schema.FLAG_MEANINGS.keys()
+    assert len({bit.meaning for bit in Status}) == len(set(values)) == len(values)
+    assert all(bit.meaning for bit in Status)
+    assert sum(values) <= np.iinfo(np.uint32).max
+    assert Status(1024 | 4) == Status.DEAD_PIXEL | Status.GRAY
 
 
 def test_status_attributes_follow_cf() -> None:
@@ -161,4 +164,37 @@ def test_status_attributes_follow_cf() -> None:
     masks, meanings = attrs["flag_masks"], str(attrs["flag_meanings"]).split()
     assert isinstance(masks, np.ndarray)
     assert masks.dtype == np.dtype(schema.STAGES["separated"]["status"].dtype)
-    assert dict(zip(meanings, masks.tolist(), strict=True)) == dict(schema.FLAGS)
+    assert dict(zip(meanings, masks.tolist(), strict=True)) == Status.names()
+
+
+def test_status_of_16_bits_still_opens(tmp_path: Path) -> None:
+    """A result stored with a 16-bit status passes its stage, and its bits mean the same."""
+    older = example("separated")
+    bits = np.array([[0, 1024], [1 << 15, 128 | 4]], dtype=np.uint16)
+    meanings = " ".join(Status.names())
+    masks = np.array([bit.value for bit in Status], dtype=np.uint16)
+    attrs = {"units": "1", "flag_masks": masks, "flag_meanings": meanings}
+    store.save(older.assign(status=(("y", "x"), bits, attrs)), tmp_path / "older.zarr", {})
+    opened = schema.check(store.open_dataset(tmp_path / "older.zarr"), "separated")["status"]
+    assert opened.dtype == np.uint16
+    for name, bit in Status.names().items():
+        np.testing.assert_array_equal(schema.has_flag(opened, name), bits & bit.value != 0)
+    assert Status(int(opened[1, 1])) == Status.SATURATED | Status.GRAY
+
+
+def test_flags_are_read_by_name() -> None:
+    """Any of several flags counts; a name that the attributes do not hold is refused."""
+    status = xr.DataArray(np.array([0, 1, 1024]), dims="x", attrs=schema.status_attrs())
+    found = schema.has_flag(status, "dead_pixel", "no_background_motion")
+    np.testing.assert_array_equal(found, [False, True, True])
+    assert found.dtype == bool
+    with pytest.raises(ValueError, match="Unknown flag 'closed'"):
+        schema.has_flag(status, "closed")
+    with pytest.raises(ValueError, match="Unknown flag 'gray'"):
+        schema.has_flag(status.drop_attrs(), "gray")
+
+
+def test_committed_nomenclature_is_the_glossary_s() -> None:
+    """docs/nomenclature.md is what ``python -m dbthermal.schema`` prints."""
+    page = Path(__file__).parents[1] / "docs" / "nomenclature.md"
+    assert page.read_text(encoding="utf-8") == schema.nomenclature()

@@ -15,8 +15,9 @@ from urllib.parse import urlsplit
 
 from dbthermal.instruments import filterwheel
 from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Picture
-from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.emulated.world import ROOM, World
 from dbthermal.instruments.entries import check_one_of
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.rig import Devices, ReadingError, Thermocouples
@@ -52,9 +53,10 @@ def open_devices(
     session : Session
         What is opened.
     world : World, optional
-        The emulated bench; by default `emulated_world`.
+        The emulated bench; by default `emulated_world` at room temperature.
     pictures : mapping, optional
-        Band to what the emulated cameras see in it.
+        Band to what the emulated cameras see in it; by default, with the default world, its
+        blackbody, see `dbthermal.instruments.emulated.blackbody`.
     faults : mapping, optional
         Band to what goes wrong with its emulated camera.
 
@@ -73,7 +75,10 @@ def open_devices(
         If a device cannot be opened, or is another one.
     """
     if session.simulated:
-        world = emulated_world(session) if world is None else world
+        if world is None:
+            room = dict.fromkeys(session.thermocouples.values(), ROOM)
+            world = emulated_world(session, scene=lambda _: room, waits=True)
+            pictures = blackbody.pictures(session, world) if pictures is None else pictures
     elif world is not None or pictures or faults:
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:

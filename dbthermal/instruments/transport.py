@@ -2,9 +2,8 @@
 
 ``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``pty:///dev/pts/3`` a
 pseudo-terminal on which somebody emulates a device, and ``sim://boson?sn=7`` an emulator that is
-started for the caller and ends with the transport. Nothing is sent when one is opened. What goes
-over a line can be noted and played back, see `dbthermal.instruments.dialogue`. Tested on
-pseudo-terminals, not on hardware.
+started for the caller and ends with the transport. Nothing is sent when one is opened. Tested
+on pseudo-terminals, not on hardware.
 """
 
 import errno

@@ -1,9 +1,54 @@
-"""Separation of emission and reflection: one function, several methods of one signature."""
+"""Separation of emission and reflection: one function, several methods of one signature.
 
-from dbthermal.separation._methods import METHODS
+Begin with `solve(corrected, response)`; `METHODS` names the methods, and each method that has
+options takes them as its frozen record, such as `SubspaceSettings`.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any, Final
+
+from dbthermal.separation._methods import METHODS, get_method
 from dbthermal.separation._pooling.materials import materials
 from dbthermal.separation._reflected import reflected_change
 from dbthermal.separation._solve import solve
 from dbthermal.separation._uncalibrated import reflections
 
-__all__ = ["METHODS", "materials", "reflected_change", "reflections", "solve"]
+if TYPE_CHECKING:
+    from dbthermal.separation._baselines.bcp import BcpSettings
+    from dbthermal.separation._baselines.naive import NaiveSettings
+    from dbthermal.separation._baselines.ratio import RatioSettings
+    from dbthermal.separation._dbvt.method import DbvtSettings
+    from dbthermal.separation._subspace.method import SubspaceSettings
+
+__all__ = [
+    "METHODS",
+    "BcpSettings",
+    "DbvtSettings",
+    "NaiveSettings",
+    "RatioSettings",
+    "SubspaceSettings",
+    "get_method",
+    "materials",
+    "reflected_change",
+    "reflections",
+    "solve",
+]
+
+# The settings are imported with their method when they are first asked for: one needs torch.
+_SETTINGS: Final = {
+    "BcpSettings": "_baselines.bcp",
+    "DbvtSettings": "_dbvt.method",
+    "NaiveSettings": "_baselines.naive",
+    "RatioSettings": "_baselines.ratio",
+    "SubspaceSettings": "_subspace.method",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _SETTINGS:
+        return getattr(importlib.import_module(f"{__name__}.{_SETTINGS[name]}"), name)
+    raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,4 +1,4 @@
-"""What a user knows of the scene: emissivities, or for an oracle the truth, checked and cut."""
+"""Checks of what a user gives beside the capture: emissivities, mask, materials."""
 
 from dataclasses import dataclass, replace
 
@@ -14,42 +14,13 @@ from dbthermal.separation._tiles import Tile
 
 @dataclass(frozen=True)
 class Given:
-    """
-    What is known of the scene, over the whole image.
-
-    Attributes
-    ----------
-    emissivity, emissivity_std : ndarray, shape (band, y, x), optional
-        Emissivities and their standard deviations [1], in the capture's order of bands.
-    truth : ndarray, shape (time, y, x), optional
-        True object temperature [K].
-    """
+    """Known emissivities and their standard deviations (band, y, x) [1] of the whole image."""
 
     emissivity: Array | None = None
     emissivity_std: Array | None = None
-    truth: Array | None = None
 
     def put_into(self, problem: Problem, tile: Tile, bands: list[int]) -> Problem:
-        """
-        Add what is known of a tile to its problem.
-
-        Parameters
-        ----------
-        problem : Problem
-            The tile's signals.
-        tile : tuple of slice
-            Rows and columns in the image.
-        bands : list of int
-            Order of the problem's bands in the capture.
-
-        Returns
-        -------
-        Problem
-            The same problem, with what is given.
-        """
-        if self.truth is not None:
-            truth = self.truth[(slice(None), *tile)]
-            problem = replace(problem, truth=truth.reshape(len(truth), -1))
+        """Add the emissivities of a tile, at rows and columns of the image, to its problem."""
         if self.emissivity is None or self.emissivity_std is None:
             return problem
         value, std = (
@@ -57,38 +28,6 @@ class Given:
             for array in (self.emissivity, self.emissivity_std)
         )
         return replace(problem, emissivity=value, emissivity_std=std)
-
-
-def check(
-    corrected: xr.Dataset,
-    emissivity: xr.DataArray | None,
-    emissivity_std: xr.DataArray | None,
-    truth: xr.DataArray | None,
-) -> Given:
-    """
-    Hold what is known against the capture.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture.
-    emissivity, emissivity_std : DataArray, optional
-        See `known_emissivity`.
-    truth : DataArray, optional
-        See `true_temperature`.
-
-    Returns
-    -------
-    Given
-        All of it, over the whole image.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `known_emissivity` and `true_temperature`.
-    """
-    value, std = known_emissivity(corrected, emissivity, emissivity_std) or (None, None)
-    return Given(value, std, true_temperature(corrected, truth))
 
 
 def known_emissivity(
@@ -160,44 +99,6 @@ def _spread(corrected: xr.Dataset, array: xr.DataArray, what: str) -> Array:
     if values.ndim == 3 and values.shape != shape:
         raise ValueError(f"Invalid shape {values.shape} of {what}. Must be {shape}.")
     return np.broadcast_to(values.reshape(2, *values.shape[1:] or (1, 1)), shape)
-
-
-def true_temperature(corrected: xr.Dataset, truth: xr.DataArray | None) -> Array | None:
-    """
-    Check a true object temperature.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture.
-    truth : DataArray, optional
-        True object temperature (time, y, x) [K].
-
-    Returns
-    -------
-    ndarray or None
-        Its values, shape (time, y, x).
-
-    Raises
-    ------
-    TypeError
-        If it is not a DataArray.
-    ValueError
-        If its dims, unit or sizes are not the capture's, or a value is not finite.
-    """
-    if truth is None:
-        return None
-    if not isinstance(truth, xr.DataArray):
-        raise TypeError(f"Invalid truth of type {type(truth).__name__}. Must be a DataArray.")
-    schema.check_variable(truth, schema.STAGES["separated"]["object_temperature"], "the truth")
-    if truth.shape != corrected["counts"].shape[1:]:
-        raise ValueError(
-            f"Invalid shape {truth.shape} of the truth. Must be {corrected['counts'].shape[1:]}."
-        )
-    values = np.asarray(truth.values, dtype=np.float64)
-    if not np.all(np.isfinite(values)):
-        raise ValueError("Invalid truth with NaN or infinite values. Must be finite.")
-    return values
 
 
 def labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> npt.NDArray[np.intp] | None:

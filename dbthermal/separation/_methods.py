@@ -19,7 +19,7 @@ METHODS: Final = tuple(_MODULES)
 """Names of the methods."""
 
 
-def get(name: str) -> Method:
+def get_method(name: str) -> Method:
     """
     Return a method's record.
 
@@ -44,38 +44,27 @@ def get(name: str) -> Method:
     return found
 
 
-def settings(name: str, options: dict[str, Any]) -> Any:
+def checked(name: str, settings: Any) -> Any:
     """
-    Return a method's settings.
-
-    Parameters
-    ----------
-    name : str
-        One of `METHODS`.
-    options : dict
-        Fields of its settings, by name; the others have their defaults.
-
-    Returns
-    -------
-    object
-        Its frozen record, None for a method without any.
+    Return the settings of a method, its defaults for None, and None for a method without any.
 
     Raises
     ------
     TypeError
-        If it has no such option, or one that is a number of things is not whole.
-    ValueError
-        If a value is not allowed, see the method's `Settings`.
+        If they are another method's, or a field that is a number of things is not whole.
     """
-    kind = get(name).settings
-    names = [] if kind is None else [field.name for field in fields(kind)]
-    unknown = sorted(options.keys() - set(names))
-    if unknown:
-        raise TypeError(f"Unknown option '{unknown[0]}' of method '{name}'. Has {names}.")
-    for field in () if kind is None else fields(kind):
-        value = options.get(field.name, field.default)
+    kind = get_method(name).settings
+    if settings is None:
+        return None if kind is None else kind()
+    if kind is None or type(settings) is not kind:
+        rule = "be omitted: it has no settings" if kind is None else f"be {kind.__name__}"
+        raise TypeError(
+            f"Invalid settings of type {type(settings).__name__} for method '{name}'. Must {rule}."
+        )
+    for field in fields(kind):
+        value = getattr(settings, field.name)
         if type(field.default) is int and type(value) is not int:
             raise TypeError(
                 f"Invalid {field.name} {value!r} of method '{name}'. Must be a whole number."
             )
-    return None if kind is None else kind(**options)
+    return settings

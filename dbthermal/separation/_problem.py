@@ -60,8 +60,6 @@ class Problem:
         What the pixels of one material share.
     emissivity, emissivity_std : ndarray, shape (band, pixel), optional
         Known emissivities and their standard deviations [1], for methods that need them.
-    truth : ndarray, shape (time, pixel), optional
-        True object temperature [K], for an oracle's choice.
     """
 
     signals: Array
@@ -74,7 +72,6 @@ class Problem:
     shared: Shared | None = None
     emissivity: Array | None = None
     emissivity_std: Array | None = None
-    truth: Array | None = None
 
     @property
     def reference(self) -> float:
@@ -136,7 +133,6 @@ class Problem:
             signals=self.signals[:, frames],
             time=self.time[frames],
             segment=None if self.segment is None else self.segment[frames],
-            truth=None if self.truth is None else self.truth[frames],
         )
 
     def of(self, pixels: Mask) -> "Problem":
@@ -159,7 +155,7 @@ class Problem:
             shared = Shared(*values)
         given: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[..., pixels]
-            for name in ("emissivity", "emissivity_std", "truth")
+            for name in ("emissivity", "emissivity_std")
         }
         signals = self.signals[..., pixels]
         return replace(self, signals=signals, shape=(1, signals.shape[2]), shared=shared, **given)

@@ -43,16 +43,15 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     response: xr.Dataset,
     method: str = "subspace",
     *,
+    settings: Any = None,
     emissivity: xr.DataArray | None = None,
     emissivity_std: xr.DataArray | None = None,
-    truth: xr.DataArray | None = None,
     mask: xr.DataArray | None = None,
     pool: xr.DataArray | None = None,
     response_kind: str = "exact",
     workers: int = 2,
     seed: int = 0,
     progress: bool = False,
-    **options: Any,
 ) -> xr.Dataset:
     r"""
     Separate emission and reflection in a capture of two bands or more.
@@ -73,12 +72,12 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         This project's separator; known emissivities; the paper's optimiser; and to compare with,
         least squares, dual-wavelength pyrometry, the blackbody channel prior, and the camera's
         own reading.
+    settings : SubspaceSettings, DbvtSettings, NaiveSettings, RatioSettings or BcpSettings, optional
+        Options of the method; its defaults if not given.
     emissivity : DataArray, optional
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional
         Its standard deviation, same dims.
-    truth : DataArray, optional
-        True object temperature (time, y, x) [K], for an oracle's choice (option of "naive").
     mask : DataArray, optional
         Which samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
@@ -93,8 +92,6 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         Of the random starts; the result depends on it and not on `workers`.
     progress : bool
         Show a bar.
-    **options
-        Options of the method, the fields of its module's `Settings`.
 
     Returns
     -------
@@ -110,9 +107,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     Raises
     ------
     TypeError
-        If an argument is of the wrong type.
+        If an argument is of the wrong type, or the settings are those of another method.
     ValueError
-        If a dim, unit, band, coordinate, method, option or emissivity is not as described, or
+        If a dim, unit, band, coordinate, method or emissivity is not as described, or
         the capture is too short for the method. What is wrong with single pixels is not an
         error but a bit of `status`.
 
@@ -121,7 +118,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     What no flag of `subspace` tells, because nothing in the bands tells it: that object and
     background have exchanged their roles, but for emissivities below a half, which are flagged as
     a suspicion; and a background that drifts along with the object's curve: the temperature holds,
-    and the emissivity's deviation carries a drift that the option `background_drift` states.
+    and the emissivity's deviation carries a drift that `SubspaceSettings.background_drift` states.
 
     A `segment` is used by "subspace" alone, and for the object alone: the step that a shutter
     event leaves stays in the background, and makes the emissivity less certain, as its deviation
@@ -132,13 +129,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        doi:10.48550/arXiv.2509.11334
     """
-    module, settings = methods.get(method), methods.settings(method, options)
+    module = methods.get_method(method)
+    settings = methods.checked(method, settings)
     _check(corrected, method, module, (workers, seed), has_emissivity=emissivity is not None)
-    if (truth is not None) != bool(getattr(settings, "oracle", False)):
-        raise ValueError(
-            f"Invalid truth for method '{method}'. Must be given with the option oracle=True of a "
-            "method that has it, and only then."
-        )
     names = [str(name) for name in corrected["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
     if pool is not None and module.survey is None:
@@ -151,7 +144,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         noise=deviations,
         # The quieter band comes first: the regression for the emissivity needs a quiet ordinate.
         bands=[int(band) for band in np.argsort(deviations, kind="stable")],
-        known=given.check(corrected, emissivity, emissivity_std, truth),
+        known=given.Given(*given.known_emissivity(corrected, emissivity, emissivity_std) or ()),
         method=module,
         settings=settings,
         seed=seed,

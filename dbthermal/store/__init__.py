@@ -1,10 +1,14 @@
-"""What is kept on disk: results, and recordings while they grow. Nothing else touches zarr."""
+"""Files on disk: results with their provenance, and recordings while they grow.
 
+`save` and `open_dataset` keep datasets as zarr; `save_numbers`, `save_figure`, `save_text` and
+`save_video` keep the rest of a result, each with the record from `provenance`. `Recording` grows in
+chunks and survives a kill or a power loss. No other package opens or writes zarr.
+"""
+
+from dbthermal.store._provenance import checksum, provenance
 from dbthermal.store._recording import Recording, recover
 from dbthermal.store._results import (
-    CHUNK_BYTES,
     Number,
-    chunks,
     open_dataset,
     read_numbers,
     save,
@@ -15,11 +19,11 @@ from dbthermal.store._results import (
 )
 
 __all__ = [
-    "CHUNK_BYTES",
     "Number",
     "Recording",
-    "chunks",
+    "checksum",
     "open_dataset",
+    "provenance",
     "read_numbers",
     "recover",
     "save",
@@ -28,3 +32,7 @@ __all__ = [
     "save_text",
     "save_video",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

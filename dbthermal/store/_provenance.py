@@ -1,7 +1,7 @@
-"""What made a result: parameters, versions, commit, and the checksums of the input.
+"""Provenance of a result: parameters, versions, commit, and checksums of the input.
 
-The record goes into every saved result (see `dbthermal.store`). It holds no date, no host and no
-folder, so that the same input, parameters and code give the same record, and the same bytes.
+It goes into every saved result (see `dbthermal.store`). It holds no date, no host and no folder, so
+that the same input, parameters and code give the same record, and the same bytes.
 """
 
 import hashlib
@@ -19,10 +19,11 @@ from dbthermal import __version__
 _PACKAGES = ("numpy", "scipy", "xarray", "zarr")
 
 
-def record(
+def provenance(
     parameters: Mapping[str, object], inputs: Mapping[str, str | Path] | None = None
 ) -> dict[str, Any]:
-    """Provenance of a result, to be handed to `dbthermal.store`.
+    """
+    Provenance of a result, for the functions that save it.
 
     Parameters
     ----------
@@ -36,8 +37,9 @@ def record(
     Returns
     -------
     dict
-        ``parameters``, ``versions`` (Python, dbthermal and its core dependencies), ``commit`` (see
-        `commit`) and ``inputs`` (name to sha256).
+        ``parameters``; ``versions`` of Python, dbthermal and its core dependencies; ``commit``, 40
+        hexadecimal digits, with ``-dirty`` if tracked files differ from it, or ``"unknown"``
+        outside a git work tree; and ``inputs``, name to sha256.
 
     Raises
     ------
@@ -45,6 +47,12 @@ def record(
         If a parameter is of another type, or not finite; the message names it.
     FileNotFoundError
         If an input does not exist.
+
+    Examples
+    --------
+    >>> from dbthermal import store
+    >>> store.provenance({"frames": 350})["parameters"]
+    {'frames': 350}
     """
     return {
         "parameters": {name: _plain(name, value) for name, value in parameters.items()},
@@ -58,40 +66,19 @@ def record(
     }
 
 
-def source(*packages: Path) -> str:
-    """SHA-256 of the source code that runs: names and contents of modules and tables.
-
-    Parameters
-    ----------
-    *packages : Path
-        Folders of further packages than dbthermal.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits.
-    """
-    total = hashlib.sha256()
-    for folder in (Path(__file__).parents[1], *packages):
-        files = [path for path in folder.rglob("*") if path.suffix in (".py", ".csv")]
-        for path in sorted(files, key=lambda path: path.relative_to(folder).as_posix()):
-            total.update(f"{path.relative_to(folder).as_posix()} {checksum(path)}\n".encode())
-    return total.hexdigest()
-
-
 def checksum(path: str | Path) -> str:
-    """SHA-256 of a file, or of a folder's file names and contents.
+    """
+    SHA-256 of a file, or of a folder's file names and contents.
 
     Parameters
     ----------
     path : str or Path
-        A file; or a folder, whose files are taken in the order of their names, whatever the file
-        system's order.
+        A file; or a folder, whose files are taken in the order of their names.
 
     Returns
     -------
     str
-        64 hexadecimal digits. For a file, what ``sha256sum`` prints.
+        64 hexadecimal digits. For a file, the output of ``sha256sum``.
 
     Raises
     ------
@@ -108,15 +95,7 @@ def checksum(path: str | Path) -> str:
 
 
 def commit() -> str:
-    """Commit of the code that runs.
-
-    Returns
-    -------
-    str
-        40 hexadecimal digits, followed by ``-dirty`` where tracked files differ from the commit;
-        ``"unknown"`` where this package is not a tracked part of a git work tree (an installed
-        copy, an archive) or git is not there.
-    """
+    """Commit of the code that runs, or ``"unknown"``; see `provenance`."""
     folder = Path(__file__).parent
     tracked = _git(folder, "ls-files", "--error-unmatch", Path(__file__).name)
     described = _git(folder, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")

@@ -1,47 +1,39 @@
-"""A recording while it grows: appended to in chunks along time, readable at any moment.
+"""A recording that grows in chunks along time and is readable at any moment.
 
-The folder is a zarr store (format 3) from the first moment on. Chunks are written first, to
-the disk and not only to its cache; then ``zarr.json``, which says how much is valid, is replaced in
-one step. What was declared valid is never written over, but replaced in one step, too. What a kill
-or a power loss leaves is thus a store without the chunk that was being written, and it says so:
-``complete`` is False and ``frames_written`` is where each band ends.
+The folder is a zarr store (format 3) from the first moment on. Chunks are written and synced to the
+disk first; then ``zarr.json``, which says how many frames are valid, is replaced in one step. Valid
+chunks are never written over in place. A kill or a power loss thus leaves a store without the chunk
+that was being written: ``complete`` is False and ``frames_written`` is where each band ends.
 `dbthermal.store.open_dataset` opens that much of it.
 """
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 import zarr
+from zarr.codecs import BloscCodec
 
 from dbthermal.schema import COORDINATES, Variable
-from dbthermal.store import _growing as growing
-from dbthermal.store._durable import DurableStore, made_beside, tree_to_disk
-from dbthermal.store._progress import attributes, write_attributes
+from dbthermal.store._durable import DurableStore, made_beside, replace, tree_to_disk
 
 Values = npt.NDArray[Any]
+
+_GROUP: Final = "zarr.json"  # file of a zarr group's attributes
+_LOG_CHUNK: Final = 4096  # rows of a chunk of the log
+_COMPRESSOR: Final = BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle")
 
 
 class Recording:
     """
-    A store that is being written; make one with `Recording.create`.
+    A store that is being written, from `Recording.create`.
 
-    It is a context manager: left by an exception it stays incomplete, with all that was appended.
-
-    Parameters
-    ----------
-    path : Path
-        Its folder.
-    group : Group
-        Of zarr.
-    chunk : int
-        Frames of a chunk.
-    attrs : dict
-        Attributes of the group, as they are on the disk.
+    `frames` is the number of frames of each band and `rows` that of the log, as far as they are
+    written; `commit` declares them valid.
     """
 
     def __init__(self, path: Path, group: zarr.Group, chunk: int, attrs: dict[str, Any]) -> None:
@@ -67,14 +59,14 @@ class Recording:
         fills: Mapping[str, float] | None = None,
     ) -> Self:
         """
-        Make the folder, with nothing in it but what is to come.
+        Make an empty recording in a new folder ``*.zarr``.
 
         Parameters
         ----------
         path : str or Path
-            Folder to make, ``*.zarr``.
+            Folder to make. FileExistsError if it exists: a recording is never overwritten.
         variables : mapping
-            What is recorded: of dims (band, time, ...), frame by frame, or (log,), row by row.
+            Name to `Variable` of dims (band, time, ...), frame by frame, or (log,), row by row.
         sizes : mapping
             Size of every other dim, such as ``y`` and ``x``.
         bands : sequence of str
@@ -84,19 +76,7 @@ class Recording:
         attrs : mapping
             JSON: identities, provenance.
         fills : mapping, optional
-            What a variable holds where a band has no frame any more; else it is NaN, or 0.
-
-        Returns
-        -------
-        Recording
-            Open.
-
-        Raises
-        ------
-        FileExistsError
-            If there is something at `path`: a recording is never overwritten.
-        ValueError
-            If `path` does not end in ``.zarr``, or a variable has other dims.
+            Value of a variable behind a band's last frame, instead of NaN or 0.
         """
         path = Path(path)
         if path.suffix != ".zarr":
@@ -114,40 +94,21 @@ class Recording:
         with made_beside(path, path.absolute().parent) as part:
             group = zarr.open_group(part, mode="w-", zarr_format=3, attributes=values)
             for name, variable in variables.items():
-                growing.create(group, name, variable, whole, fill=(fills or {}).get(name))
-            growing.create_text(group, "band", bands)
+                _create(group, name, variable, whole, (fills or {}).get(name))
+            text = np.array(bands, dtype=np.dtypes.StringDType())
+            names = group.create_array(
+                "band", shape=(len(bands),), dtype=str, dimension_names=("band",)
+            )
+            names[:] = text
         return cls(path, _open(path), chunk, values)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if kind is None:
-            self.close()
 
     def append(self, band: str, block: Mapping[str, Values]) -> None:
         """
-        Write frames of one band behind those that it has; valid with the next `commit`.
+        Write a chunk of frames of one band behind its others; valid with the next `commit`.
 
-        Parameters
-        ----------
-        band : str
-            Its name.
-        block : mapping
-            Every variable of frames, by its name, (frame, ...). A whole chunk, or, last, less.
-
-        Raises
-        ------
-        ValueError
-            If the variables are not all there, differ in their frames, are more than a chunk, or
-            follow on a chunk that is not whole.
+        `block` holds every variable of frames, (frame, ...): a whole chunk, or at last less.
         """
-        wanted = {name for name, array in self._arrays.items() if growing.is_movie(array)}
+        wanted = {name for name, array in self._arrays.items() if _is_movie(array)}
         if block.keys() != wanted:
             raise ValueError(f"Invalid variables {sorted(block)}. Must be {sorted(wanted)}.")
         lengths = {values.shape[0] for values in block.values()}
@@ -159,82 +120,40 @@ class Recording:
             )
         place = list(self.frames).index(band)
         for name, values in block.items():
-            growing.grow(self._arrays[name], 1, start + length)
+            _grow(self._arrays[name], 1, start + length)
             self._arrays[name][place, start : start + length] = values
         self._to_disk(block, [Path("c", str(place), str(start // self.chunk))])
         self.frames[band] += length
 
     def append_log(self, columns: Mapping[str, Values]) -> None:
-        """
-        Write rows of the log behind those that it has; valid with the next `commit`.
-
-        Parameters
-        ----------
-        columns : mapping
-            Every variable of dims (log,), by its name, (row,).
-
-        Raises
-        ------
-        ValueError
-            If the columns are not all there.
-        """
-        wanted = {name for name, array in self._arrays.items() if growing.dims(array) == ("log",)}
+        """Write rows of the log, every variable (row,); valid with the next `commit`."""
+        wanted = {name for name, array in self._arrays.items() if _dims(array) == ("log",)}
         if columns.keys() != wanted:
             raise ValueError(f"Invalid columns {sorted(columns)}. Must be {sorted(wanted)}.")
         start, end = self.rows, self.rows + len(next(iter(columns.values())))
         for name, values in columns.items():
-            growing.grow(self._arrays[name], 0, end)
+            _grow(self._arrays[name], 0, end)
             self._arrays[name][start:end] = values
-        chunks = range(start // growing.LOG_CHUNK, (end - 1) // growing.LOG_CHUNK + 1)
+        chunks = range(start // _LOG_CHUNK, (end - 1) // _LOG_CHUNK + 1)
         self._to_disk(columns, [Path("c", str(number)) for number in chunks])
         self.rows = end
 
     def read(self, name: str, band: str) -> Values:
-        """
-        Read back what was appended of one band.
-
-        Parameters
-        ----------
-        name : str
-            Of a variable of frames.
-        band : str
-            Name of the band.
-
-        Returns
-        -------
-        ndarray, shape (frame, ...)
-            Its values, as many as the longest band has frames.
-        """
+        """Values (frame, ...) of a band, as many as the longest band has frames."""
         place, frames = list(self.frames).index(band), max(self.frames.values())
         return np.asarray(self._arrays[name][place, :frames])
 
     def commit(self, **attrs: Any) -> None:
-        """
-        Declare valid what was appended, in one step.
-
-        Parameters
-        ----------
-        **attrs
-            Attributes to set besides, JSON.
-        """
+        """Declare valid, in one step, all that was appended, and set attributes (JSON)."""
         self._attrs.update(attrs, frames_written=dict(self.frames), log_written=self.rows)
-        write_attributes(self.path, self._attrs)
+        _write_attributes(self.path, self._attrs)
 
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
         """
-        Bring all bands to one number of frames and say that the recording is complete.
+        Bring all bands to one number of frames, with `time` [s] as coordinate; set attributes.
 
-        A band with fewer frames than another gets copies of its last one, without stamps: as a
-        driver that lost frames, see `dbthermal.correction.mark_shutter`. A second call does nothing.
-
-        Parameters
-        ----------
-        complete : bool
-            What to say.
-        time : ndarray, optional
-            Coordinate `time` [s], one for each frame of the longest band.
-        **attrs
-            Attributes to set besides, JSON.
+        A band with fewer frames than another gets copies of its last one, without stamps, as from
+        a driver that lost frames. A second call does nothing.
         """
         if self._closed:
             return
@@ -245,7 +164,7 @@ class Recording:
                 self._repeat_last(place, own, frames)
         for array in self._arrays.values():
             shape = {"time": frames, "log": self.rows}
-            sizes = zip(growing.dims(array), array.shape, strict=True)
+            sizes = zip(_dims(array), array.shape, strict=True)
             array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
         if time is not None:
             self._create_time(time)
@@ -254,7 +173,7 @@ class Recording:
 
     def _repeat_last(self, place: int, own: int, frames: int) -> None:
         counts = self._arrays["counts"]
-        growing.grow(counts, 1, frames)
+        _grow(counts, 1, frames)
         last = np.asarray(counts[place, own - 1])
         while own < frames:
             number = own // self.chunk
@@ -279,32 +198,88 @@ class Recording:
 
 def recover(path: str | Path) -> None:
     """
-    Close a recording that was cut short: all its frames are kept, and it stays incomplete.
+    Close a recording that was cut short, with all its frames; it stays incomplete.
 
-    Attribute ``ended`` is then ``"cut short"``.
-
-    Not needed for reading: without it, `dbthermal.store.open_dataset` opens as many frames as all
-    bands have.
+    Not needed for reading: `dbthermal.store.open_dataset` opens as many frames as all bands have.
 
     Parameters
     ----------
     path : str or Path
-        Folder ``*.zarr`` that nobody writes to.
+        Folder ``*.zarr`` that no program is writing. Attribute ``ended`` becomes ``"cut short"``.
 
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If the folder does not exist.
     ValueError
-        If it is no recording that was cut short.
+        If it is not a recording that was cut short.
     """
     attrs = attributes(path)
     if attrs.get("complete", True) or attrs.get("closed", False):
         raise ValueError(f"Invalid recording '{path}'. Must be one that was cut short.")
     group = _open(path)
-    arrays = [array for array in dict(group.arrays()).values() if growing.is_movie(array)]
+    arrays = [array for array in dict(group.arrays()).values() if _is_movie(array)]
     recording = Recording(Path(path), group, arrays[0].chunks[1], attrs)
     recording.close(complete=False, ended="cut short")
+
+
+def attributes(path: str | Path) -> dict[str, Any]:
+    """Attributes of a store as they are on the disk, without a look at its arrays."""
+    content = json.loads((Path(path) / _GROUP).read_text(encoding="utf-8"))
+    return dict(content.get("attributes", {}))
+
+
+def valid_part(attrs: Mapping[str, Any]) -> dict[str, slice]:
+    """Valid part of a recording that is not closed: frames that all bands have, rows of the log."""
+    frames = min(attrs["frames_written"].values())
+    return {"time": slice(0, frames), "log": slice(0, attrs["log_written"])}
+
+
+def _write_attributes(path: Path, attrs: Mapping[str, Any]) -> None:
+    """Replace the attributes of a store in one step; if that fails, the old ones stay."""
+    content = {"zarr_format": 3, "node_type": "group", "attributes": dict(attrs)}
+    text = json.dumps(content, allow_nan=False)
+    # Written beside the store: what a kill leaves of it is no part of the store.
+    replace(path / _GROUP, text.encode(), path.parent / f".{path.name}.part")
+
+
+def _create(
+    group: zarr.Group, name: str, variable: Variable, sizes: dict[str, int], fill: float | None
+) -> None:
+    """Make an empty array with room for one chunk of frames, or for no row of the log."""
+    if variable.dims[:2] != ("band", "time") and variable.dims != ("log",):
+        raise ValueError(
+            f"Invalid dims {variable.dims} of '{name}'. Must be ('band', 'time', ...) or ('log',)."
+        )
+    whole, chunks = {**sizes, "log": 0}, {**sizes, "band": 1, "log": _LOG_CHUNK}
+    nothing = math.nan if np.dtype(variable.dtype).kind == "f" else 0
+    group.create_array(
+        name,
+        shape=tuple(whole[dim] for dim in variable.dims),
+        chunks=tuple(chunks[dim] for dim in variable.dims),
+        dtype=variable.dtype,
+        compressors=_COMPRESSOR,
+        fill_value=nothing if fill is None else fill,
+        dimension_names=variable.dims,
+        attributes=dict(variable.attrs),
+    )
+
+
+def _dims(array: Any) -> tuple[str, ...]:
+    return tuple(array.metadata.dimension_names)
+
+
+def _is_movie(array: Any) -> bool:
+    """Whether an array grows by frames: dims (band, time, ...)."""
+    return _dims(array)[:2] == ("band", "time")
+
+
+def _grow(array: Any, axis: int, size: int) -> None:
+    """Make room, twice as much each time, so that the array's metadata are written seldom."""
+    if array.shape[axis] < size:
+        chunk = array.chunks[axis]
+        room = max(2 * array.shape[axis], math.ceil(size / chunk) * chunk)
+        array.resize((*array.shape[:axis], room, *array.shape[axis + 1 :]))
 
 
 def _open(path: str | Path) -> zarr.Group:

@@ -1,8 +1,8 @@
 """Results on disk: datasets as zarr, headline numbers as JSON, figures as PNG, films as MP4.
 
-Each function writes beside its goal and renames, so that what bears a result's name is whole,
-whatever happens on the way. Each result carries the record of what made it (see
-`dbthermal.store._provenance`) and nothing that differs between two runs of the same code on the same
+Each function writes to a temporary place beside its path and renames at the end, so that a file
+under a result's name is always whole. Each result carries its provenance (see
+`dbthermal.store.provenance`) and nothing that differs between two runs of the same code on the same
 input. No other package opens or writes zarr.
 """
 
@@ -19,38 +19,29 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal.store import _progress as progress
+from dbthermal.store import _recording as recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Number = float | int | str | bool
 
-CHUNK_BYTES = 2**20
+_CHUNK_BYTES = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
 
 
-def chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
-    """Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
+def _chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
+    """
+    Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
 
     Every stage works pixel by pixel on all frames and bands, so a chunk holds the full story of a
-    nearly square tile of pixels, the smallest that has `CHUNK_BYTES` before compression.
-
-    Parameters
-    ----------
-    variable : Variable or DataArray
-        Of any dims; without both ``y`` and ``x`` it is one chunk.
-
-    Returns
-    -------
-    tuple of int
-        One size [element] per dimension, at least 1.
+    nearly square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression.
     """
     sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
     if not {"y", "x"} <= sizes.keys():
         return tuple(sizes.values())
     pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
-    pixels = math.ceil(CHUNK_BYTES / pixel_bytes)
+    pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
     height = min(sizes["y"], math.ceil(math.sqrt(pixels)))
     width = min(sizes["x"], math.ceil(pixels / height))
     sizes |= {"y": min(sizes["y"], math.ceil(pixels / width)), "x": width}
@@ -67,7 +58,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     path : str or Path
         Folder to write, ``*.zarr``. Its parents are made.
     provenance : mapping
-        From `dbthermal.store._provenance.record`; becomes ``attrs["provenance"]``.
+        From `dbthermal.store.provenance`; becomes ``attrs["provenance"]``.
 
     Raises
     ------
@@ -76,7 +67,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     """
     plain = _with_variable_length_strings(dataset.drop_encoding())
     plain.attrs = {**dataset.attrs, "provenance": json.loads(_json(provenance))}
-    encoding = {name: {"chunks": chunks(variable)} for name, variable in plain.variables.items()}
+    encoding = {name: {"chunks": _chunks(variable)} for name, variable in plain.variables.items()}
     with _whole(path, ".zarr") as part:
         plain.to_zarr(part, mode="w-", encoding=encoding, zarr_format=3, consolidated=False)
 
@@ -107,7 +98,7 @@ def open_dataset(path: str | Path) -> xr.Dataset:
         raise FileNotFoundError(
             f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
         )
-    attrs = progress.attributes(path)
+    attrs = recording.attributes(path)
     cut_short = not attrs.get("closed", True)
     dataset = _open_valid_part(Path(path), attrs) if cut_short else _open(path)
     return _with_fixed_length_strings(dataset)
@@ -122,7 +113,7 @@ def _open(path: str | Path, leave: Iterable[str] = ()) -> xr.Dataset:
 
 def _open_valid_part(path: Path, attrs: Mapping[str, Any]) -> xr.Dataset:
     """Open the variables of a recording one by one, for their room differs while it grows."""
-    ends = progress.valid_part(attrs)
+    ends = recording.valid_part(attrs)
     names = {array.parent.name for array in path.glob("*/zarr.json")}
     parts = []
     for name in sorted(names):
@@ -145,7 +136,7 @@ def save_numbers(
     path : str or Path
         File to write, ``*.json``. Its parents are made.
     provenance : mapping
-        From `dbthermal.store._provenance.record`.
+        From `dbthermal.store.provenance`.
 
     Raises
     ------
@@ -200,7 +191,7 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
     path : str or Path
         File to write, ``*.md``. Its parents are made.
     provenance : mapping
-        From `dbthermal.store._provenance.record`.
+        From `dbthermal.store.provenance`.
 
     Raises
     ------
@@ -224,7 +215,7 @@ def save_figure(
     path : str or Path
         File to write, ``*.png``. Its parents are made.
     provenance : mapping
-        From `dbthermal.store._provenance.record`; becomes the text chunk ``Comment``, as JSON.
+        From `dbthermal.store.provenance`; becomes the text chunk ``Comment``, as JSON.
     dpi : int
         Resolution [pixel/inch], for that of the figure depends on where it is shown.
 
@@ -254,7 +245,7 @@ def save_video(
     path : str or Path
         File to write, ``*.mp4``. Its parents are made.
     provenance : mapping
-        From `dbthermal.store._provenance.record`; becomes the file's comment, as JSON.
+        From `dbthermal.store.provenance`; becomes the file's comment, as JSON.
     rate : float
         Frame rate [Hz].
 

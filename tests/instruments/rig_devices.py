@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+from faulty_tc08 import FaultyTC08
 
 from dbthermal.instruments import apt, fslp
 from dbthermal.instruments.boson import Boson
@@ -11,7 +12,6 @@ from dbthermal.instruments.emulated.apt import EmulatedApt
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.boson_faults import Fault
 from dbthermal.instruments.emulated.port import Loop
-from dbthermal.instruments.emulated.tc08 import EmulatedTC08
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
@@ -94,18 +94,17 @@ class WheelBench:
 class LoggerBench:
     """A driver on an emulated unit, a clock, and tips whose temperatures a test sets."""
 
-    def __init__(self, **settings: float) -> None:
+    def __init__(self) -> None:
         self.clock = Clock(1000.0)
         self.tips = {1: 350.0, 2: 300.0}
-        self.unit = EmulatedTC08(
-            lambda channel, _: self.tips.get(channel, np.nan),
+        self.unit = FaultyTC08(
+            lambda channel: self.tips.get(channel, np.nan),
             clock=self.clock,
             sleep=self.clock.sleep,
-            **settings,  # type: ignore[arg-type]
         )
         self.driver = TC08(self.unit, clock=self.clock, sleep=self.clock.sleep)
 
-    def ready(self, conversion: str = "library") -> TC08:
+    def ready(self) -> TC08:
         """Open the unit with two thermocouples of type T."""
-        self.driver.open().set_channels({1: "T", 2: "T"}, conversion=conversion)  # type: ignore[arg-type]
+        self.driver.open().set_channels({1: "T", 2: "T"})
         return self.driver

@@ -17,7 +17,7 @@ Numbers = MutableSequence[Any]
 SERIAL, FFC_MODE, RUN_FFC, FRAME_COUNT, LAST_FFC = 0x50002, 0x50013, 0x50007, 0x20002, 0x5005D
 HELLO, HELLO_BACK, MOVE, MOVE_HOME, HOMED = 0x005, 0x006, 0x453, 0x443, 0x444
 STATUS, ENABLED, SETTERS = 0x480, 0x211, (0x413, 0x440)
-HANDLE, JUNCTION, TIP, DIFFERENCE = 7, 293.15, 298.15, 0.991977 - 0.789612  # [K], [K], [mV]
+HANDLE, JUNCTION, TIP = 7, 293.15, 298.15  # the last two in kelvin
 
 
 class _Stub(Closing):
@@ -159,13 +159,9 @@ class StubLibrary:
         self._kinds[channel] = chr(kind)
         return int(handle == HANDLE)
 
-    def usb_tc08_get_minimum_interval_ms(self, handle: int) -> int:
-        """Two conversions."""
-        return 200 * (handle == HANDLE)
-
     def usb_tc08_get_single(self, handle: int, values: Numbers, overflow: Numbers, _: int) -> int:
-        """Give 25 degrees Celsius beside terminals of 20, of the published table."""
-        known = {"T": TIP, "X": DIFFERENCE, "C": JUNCTION}
+        """Give 25 degrees Celsius beside terminals of 20."""
+        known = {"T": TIP, "C": JUNCTION}
         values[:] = [known.get(self._kinds.get(channel, " "), np.nan) for channel in range(9)]
         overflow[0] = 0
         return int(handle == HANDLE)

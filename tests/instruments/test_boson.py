@@ -3,6 +3,7 @@
 from contextlib import suppress
 
 import pytest
+from dialogue import Dialogue
 from hypothesis import given
 from hypothesis import strategies as st
 from rig_devices import Clock
@@ -19,7 +20,6 @@ from dbthermal.instruments.boson import (
 )
 from dbthermal.instruments.boson.commands import GainMode, Setting
 from dbthermal.instruments.boson.link import MAXIMUM_RECEIVED
-from dbthermal.instruments.dialogue import Dialogue
 from dbthermal.instruments.emulated.boson_faults import DEBUG_CHANNEL
 
 SERIAL, FPA, GAIN, SET_GAIN = 0x00050002, 0x00050030, 0x00050015, 0x00050014

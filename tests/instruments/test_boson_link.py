@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 import pytest
+from dialogue import Dialogue, Pair
 from rig_devices import BosonBench, Clock
 from test_boson import reply
 
@@ -14,7 +15,6 @@ from dbthermal.instruments.boson import Boson, BosonError, BosonStatusError, com
 from dbthermal.instruments.boson.commands import FfcStatus, SyncMode
 from dbthermal.instruments.boson.link import REPLY_TIMEOUT, Link
 from dbthermal.instruments.closing import Closing
-from dbthermal.instruments.dialogue import Dialogue, Pair
 from dbthermal.instruments.emulated.boson_faults import Fault
 from dbthermal.instruments.transport import TransportError
 

@@ -190,14 +190,10 @@ def test_a_logger_reads_a_room(opened: Opened) -> None:
 
 
 @opens(*LOGGERS)
-def test_a_loggers_conversions_agree(opened: Opened) -> None:
-    """The library's conversion and this package's give one temperature; channel 9 is refused."""
-    logger: TC08 = opened.device
-    logger.set_channels({1: "T"})
-    assert abs(logger.cross_check(1)) < 0.5
-    assert logger.minimum_interval() >= 0.1
+def test_a_logger_has_eight_sockets(opened: Opened) -> None:
+    """Channel 9 is refused."""
     with pytest.raises(ValueError, match=r"Invalid channel 9\. Must lie in 1 to 8"):
-        logger.set_channels({9: "T"})
+        opened.device.set_channels({9: "T"})
 
 
 @opens(*VIDEOS)

@@ -156,7 +156,7 @@ class Logger:
         self.scans += 1
         values = np.full(9, 300.0 + self.scans)
         flags = np.where(np.arange(9) == 2, Flag.MISSING, Flag.GOOD).astype(np.uint8)
-        return Scan(0.0, 0.0, values, np.full(9, np.nan), flags)
+        return Scan(0.0, values, flags)
 
 
 def test_one_scan_gives_all_channels_once() -> None:

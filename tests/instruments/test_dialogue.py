@@ -1,26 +1,7 @@
-"""Dialogues that allow no rest, and recordings that play back as one."""
-
-import io
-import json
+"""Dialogues that allow no rest."""
 
 import pytest
-
-from dbthermal.instruments.dialogue import Dialogue, Pair, Recording
-
-
-def test_a_recording_plays_back() -> None:
-    """What was noted, with times and directions, is a dialogue."""
-    stream, times = io.StringIO(), iter([0.5, 0.75, 1.0])
-    with Dialogue([(b"\x01", [b"\x02", b"", b"\x03"])]) as device:
-        line = Recording(device, stream, clock=lambda: next(times))
-        line.write(b"\x01")
-        assert [line.read(9, 1.0) for _ in range(3)] == [b"\x02", b"", b"\x03"]
-        assert line.is_simulated
-    lines = stream.getvalue().splitlines()
-    assert json.loads(lines[1]) == {"time": 0.75, "direction": "read", "hex": "02"}
-    with Dialogue.from_lines(lines) as again:
-        again.write(b"\x01")
-        assert again.read(9, 1.0) + again.read(9, 1.0) == b"\x02\x03"
+from dialogue import Dialogue, Pair
 
 
 @pytest.mark.parametrize(

@@ -213,7 +213,7 @@ TROUBLES: dict[str, tuple[Callable[[], Instrument], float | Error]] = {
     "wheel: between two slots": (stopped_wheel, (WheelError, "between two slots, at .* deg")),
     "wheel: unplugged": (lambda: wheel(plugged=False), (TransportError, "Lost the emulated dev")),
     "TC-08: open thermocouple": (lambda: logger(open={1}), math.nan),
-    "TC-08: open, and reads the room": (lambda: logger(open={1}, open_reads="ambient"), ROOM),
+    "TC-08: open, and reads the room": (lambda: logger(open={1}, reads_ambient=True), ROOM),
     "TC-08: another one open": (lambda: logger(open={2}), TIP),
     "TC-08: overflow": (lambda: logger(overflow={1}), math.nan),
     "TC-08: unplugged": (

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 import pytest
+from dialogue import Dialogue
 from rig_devices import FILTERS, WheelBench
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.dialogue import Dialogue
 from dbthermal.instruments.emulated.apt import EmulatedApt, start
 from dbthermal.instruments.emulated.port import EmulatedPort, Loop
 from dbthermal.instruments.emulated.world import World

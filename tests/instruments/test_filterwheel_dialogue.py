@@ -1,12 +1,12 @@
 """The filter wheel's driver byte for byte, and among answers that are none."""
 
 import pytest
+from dialogue import Dialogue, Pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rig_devices import FILTERS, Clock
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.dialogue import Dialogue, Pair
 from dbthermal.instruments.filterwheel import FilterWheel, Settings, WheelError
 
 SETTINGS = Settings(filters=FILTERS)

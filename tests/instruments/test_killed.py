@@ -23,8 +23,7 @@ from dbthermal.store import _durable as durable
 
 SHAPE, RATE, CHUNK = (32, 40), 200.0, 6
 BANDS = ("8-14", "9.5")
-KILLS = 20
-LOSSES = 11
+DENSE = ((True, 11), (False, 11))
 
 
 def picture(time: float) -> Counts:
@@ -86,9 +85,10 @@ def check(opened: xr.Dataset, frames: list[int]) -> None:
         assert np.isfinite(opened["exposure_time"][place, :number]).all()
 
 
-def test_kill_costs_the_last_chunk(tmp_path: Path) -> None:
-    """Killed at twenty moments, a recording opens and lacks less than a chunk of each band."""
-    moments = np.random.default_rng(7).uniform(0.0, 0.5, KILLS)
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_kill_costs_the_last_chunk(tmp_path: Path, kills: int) -> None:
+    """Killed at any moment, a recording opens and lacks less than a chunk of each band."""
+    moments = np.random.default_rng(7).uniform(0.0, 0.5, kills)
     for number, moment in enumerate(moments):
         path = tmp_path / f"{number}.zarr"
         taken = killed(path, float(moment))
@@ -118,9 +118,10 @@ def test_recovered(tmp_path: Path) -> None:
         store.recover(path)
 
 
-def test_kill_while_it_is_closed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kills", [1, pytest.param(8, marks=pytest.mark.slow)])
+def test_kill_while_it_is_closed(tmp_path: Path, kills: int) -> None:
     """Killed about its end, a recording opens, too, and is complete only if it says so."""
-    for number, moment in enumerate(np.linspace(0.15, 0.3, 8)):
+    for number, moment in enumerate(np.linspace(0.3, 0.15, kills)):
         path = tmp_path / f"{number}.zarr"
         killed(path, float(moment), duration=0.2)
         opened = store.open_dataset(path)
@@ -203,9 +204,12 @@ def check_left(left: Path, committed: list[int]) -> None:
     np.testing.assert_array_equal(opened["log_value"], np.arange(opened.sizes["log"]))
 
 
-@pytest.mark.parametrize("early", [True, False])
+@pytest.mark.parametrize(
+    ("early", "every"),
+    [(True, 60), (False, 60), *(pytest.param(*case, marks=pytest.mark.slow) for case in DENSE)],
+)
 def test_power_loss_costs_the_last_chunk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, early: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, early: bool, every: int
 ) -> None:
     """Whatever the disk had not been asked to keep is lost: what was declared valid is there."""
     (tmp_path / "disk").mkdir()
@@ -219,7 +223,7 @@ def test_power_loss_costs_the_last_chunk(
     def sync(path: Path) -> None:
         nonlocal syncs
         syncs += 1
-        if recorded and syncs % LOSSES == 0:
+        if recorded and syncs % every == 0:
             lose()
         disk.sync(path)
 

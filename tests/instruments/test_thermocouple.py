@@ -48,8 +48,8 @@ def test_inverse_of_the_table() -> None:
     """From -200 °C, the table's voltages give its temperatures, to half a digit's worth of them."""
     known = CELSIUS >= -200.0
     found = thermocouple.temperature(EMFS[known], ICE)
-    digit = 0.000501 / thermocouple.sensitivity(CELSIUS[known] + ICE)
-    assert np.all(np.abs(found - ICE - CELSIUS[known]) <= digit)
+    digit = 0.000501 / np.gradient(EMFS, CELSIUS)[known]
+    assert np.all(np.abs(found - ICE - CELSIUS[known]) <= 1.05 * digit)
 
 
 @pytest.mark.parametrize(("celsius", "emf"), POINTS.items())
@@ -60,11 +60,11 @@ def test_points(celsius: float, emf: float) -> None:
 
 def test_approximate_inverse_is_the_one_that_was_published() -> None:
     """NIST's inverse alone is off as was measured elsewhere: by 0.038 K below 0 °C, 0.026 above."""
-    for piece, celsius, off in (
-        (thermocouple.BELOW, np.linspace(-200.0, 0.0, 2001), 0.038),
-        (thermocouple.ABOVE, np.linspace(0.0, 399.9, 2001), 0.026),
+    for inverse, celsius, off in (
+        (thermocouple._INVERSE_BELOW, np.linspace(-200.0, 0.0, 2001), 0.038),
+        (thermocouple._INVERSE_ABOVE, np.linspace(0.0, 399.9, 2001), 0.026),
     ):
-        alone = np.polynomial.polynomial.polyval(thermocouple.emf(celsius + ICE), piece.inverse)
+        alone = np.polynomial.polynomial.polyval(thermocouple.emf(celsius + ICE), inverse)
         assert_allclose(np.abs(alone - celsius).max(), off, rtol=0, atol=0.001)
 
 
@@ -74,17 +74,6 @@ def test_round_trip(temperature: float, junction: float) -> None:
     voltage = thermocouple.emf(temperature) - thermocouple.emf(junction)
     found = float(thermocouple.temperature(voltage, junction))
     assert found == pytest.approx(temperature, abs=1e-6)
-
-
-@given(TEMPERATURES)
-def test_sensitivity_is_the_derivative(temperature: float) -> None:
-    """The sensitivity is the central difference of the voltage."""
-    step = 1e-3
-    inside = min(max(temperature, 73.16), 673.14)
-    above, below = thermocouple.emf([inside + step, inside - step])
-    assert float(thermocouple.sensitivity(inside)) == pytest.approx(
-        float(above - below) / (2 * step), abs=1e-6
-    )
 
 
 def test_cold_junction() -> None:

@@ -12,7 +12,6 @@ import xarray as xr
 
 from dbthermal import separation, simulation, store
 from dbthermal.simulation import Rig
-from dbthermal.store import _provenance as provenance
 from reproduction import experiments
 
 ROWS, COLUMNS, FRAMES = 512, 640, 350
@@ -78,7 +77,7 @@ print(seconds, re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_tex
 def test_full_frame_from_disk(capture: xr.Dataset, tmp_path: Path) -> None:
     """Read from disk block by block, the whole process takes less than three captures."""
     path = tmp_path / "capture.zarr"
-    store.save(capture, path, provenance.record({}))
+    store.save(capture, path, store.provenance({}))
     command = [sys.executable, "-c", FROM_DISK, str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     seconds, peak = (float(number) for number in done.stdout.split())

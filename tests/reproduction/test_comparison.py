@@ -1,15 +1,12 @@
-"""Comparisons: every method on the same pixels, in cells that are done once."""
+"""Comparisons: every method on the same pixels."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import store
 from reproduction import experiments
-from reproduction.experiments import memory
 
 PLATE: dict[str, Any] = {"frames": 120, "shape": [10, 24], "crossings": 6}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -25,65 +22,6 @@ CELL: dict[str, Any] = {
     "pixels": 20,
     "seed": 2,
 }
-
-
-def counted(folder: str, value: float, seed: int) -> xr.Dataset:
-    """Leave a mark for each call, and return something random."""
-    (Path(folder) / f"call-{value}-{len(list(Path(folder).iterdir()))}").touch()
-    if value < 0:
-        raise ValueError("interrupted")
-    return xr.Dataset({"drawn": ("n", value + np.random.default_rng(seed).random(3))})
-
-
-@pytest.fixture
-def marks(tmp_path: Path) -> Path:
-    """Folder for the marks of `counted`."""
-    (tmp_path / "marks").mkdir()
-    return tmp_path / "marks"
-
-
-def test_a_cell_is_done_once(tmp_path: Path, marks: Path) -> None:
-    """A second run returns the same and computes nothing; a new cell is computed."""
-    cells = [{"folder": str(marks), "value": value, "seed": 1} for value in (1.0, 2.0)]
-    first = experiments.remembered(counted, cells, tmp_path / "cells")
-    again = experiments.remembered(counted, cells, tmp_path / "cells")
-    xr.testing.assert_identical(xr.concat(first, "cell"), xr.concat(again, "cell"))
-    assert len(list(marks.iterdir())) == 2
-    experiments.remembered(counted, [*cells, {**cells[0], "seed": 2}], tmp_path / "cells")
-    assert len(list(marks.iterdir())) == 3
-
-
-def test_an_interruption_loses_nothing(tmp_path: Path, marks: Path) -> None:
-    """What was done before it is kept; what was not leaves nothing."""
-    cells = [{"folder": str(marks), "value": value, "seed": 1} for value in (1.0, -1.0, 3.0)]
-    with pytest.raises(ValueError, match="interrupted"):
-        experiments.remembered(counted, cells, tmp_path / "cells")
-    assert len(list((tmp_path / "cells").iterdir())) == 1
-    experiments.remembered(counted, [cells[0], cells[2]], tmp_path / "cells")
-    assert len(list(marks.iterdir())) == 3
-
-
-def test_changed_code_starts_anew(
-    tmp_path: Path, marks: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A cell of other source code is not used."""
-    cells = [{"folder": str(marks), "value": 1.0, "seed": 1}]
-    experiments.remembered(counted, cells, tmp_path / "cells")
-    monkeypatch.setattr("dbthermal.store._provenance.source", lambda *_: "other")
-    with pytest.raises(RuntimeError, match=r"Changed source code\. Must be as it was imported"):
-        experiments.remembered(counted, cells, tmp_path / "cells")
-    monkeypatch.setattr("reproduction.experiments.memory._SOURCE", "other")
-    experiments.remembered(counted, cells, tmp_path / "cells")
-    assert len(list(marks.iterdir())) == 2
-
-
-def test_several_processes_find_the_same(tmp_path: Path) -> None:
-    """The number of processes changes nothing."""
-    cells = [{**CELL, "pixels": 4, "seed": seed} for seed in (1, 2)]
-    alone = experiments.remembered(experiments.compare, cells, tmp_path / "a")
-    shared = experiments.remembered(experiments.compare, cells, tmp_path / "b", workers=2)
-    for first, second in zip(alone, shared, strict=True):
-        xr.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
 
 
 def test_all_methods_see_the_same_pixels() -> None:
@@ -123,29 +61,3 @@ def test_medians_count_what_the_default_solves() -> None:
     np.testing.assert_array_equal(found["wrong"], [0.0, 0.0])
     lost = experiments.medians(comparison.isel(pixel=[1, 2]))
     assert np.isnan(lost["object_temperature_rmse"].sel(variant="other"))
-
-
-def test_a_failure_begins_no_further_cell(tmp_path: Path, marks: Path) -> None:
-    """With several processes too, what waits is not begun."""
-    cells = [{"folder": str(marks), "value": value, "seed": 1} for value in (-1.0, *range(1, 40))]
-    with pytest.raises(ValueError, match="interrupted"):
-        experiments.remembered(counted, cells, tmp_path / "cells", workers=2)
-    assert len(list(marks.iterdir())) < 30
-
-
-def test_another_process_was_first(tmp_path: Path, marks: Path) -> None:
-    """A cell that another process has made meanwhile is not made again."""
-    cell = {"folder": str(marks), "value": 1.0, "seed": 1}
-    (first,) = experiments.remembered(counted, [cell], tmp_path / "cells")
-    (path,) = (tmp_path / "cells").iterdir()
-    memory._keep(counted, path, cell)
-    assert len(list(marks.iterdir())) == 1
-    xr.testing.assert_identical(store.open_dataset(path).load(), first)
-
-
-def test_a_cell_on_disk_says_what_made_it(tmp_path: Path, marks: Path) -> None:
-    """Its parameters are in its record."""
-    cells = [{"folder": str(marks), "value": 1.0, "seed": 7}]
-    experiments.remembered(counted, cells, tmp_path / "cells")
-    (path,) = (tmp_path / "cells").iterdir()
-    assert store.open_dataset(path).attrs["provenance"]["parameters"]["seed"] == 7

@@ -89,7 +89,7 @@ def anywhere(frames: int = 12, columns: int = 3) -> tuple[Unknowns, Images]:
 def test_reconstruction_is_exact_at_the_truth() -> None:
     """Without noise the true smooth signals and k2 give back the second band to rounding."""
     problem, truth = linear((1e-9, 1e-9), 6)
-    _, _, rest = objective.departures(truth, dbvt.images(problem, 6, dbvt.Settings()))
+    _, _, rest = objective.departures(truth, dbvt.images(problem, 6, dbvt.DbvtSettings()))
     assert_allclose(rest, 0.0, rtol=0, atol=1e-7)  # K; a noise of 1e-9 K was needed
 
 
@@ -106,7 +106,7 @@ def test_second_smooth_signal_follows_the_recursion() -> None:
 def test_reconstruction_starts_from_the_second_band() -> None:
     """Slip 2: a shift of all of the second band moves its smooth signal and leaves no error."""
     problem, truth = linear((1e-9, 1e-9), 2)
-    given = dbvt.images(problem, 2, dbvt.Settings())
+    given = dbvt.images(problem, 2, dbvt.DbvtSettings())
     shifted = replace(given, signals=given.signals + torch.tensor([0.0, 7.0])[:, None, None])
     _, _, rest = objective.departures(replace(truth, offset=truth.offset + 7.0), shifted)
     assert_allclose(rest, 0.0, rtol=0, atol=1e-7)
@@ -200,7 +200,7 @@ def test_banded_solution_meets_its_equations(frames: int, stiffness: float, seed
 def test_a_step_never_raises_the_objective() -> None:
     """From a point without symmetry the objective falls monotonically, and far."""
     problem, truth = linear(QUIET, 8)
-    options = dbvt.Settings()
+    options = dbvt.DbvtSettings()
     given = dbvt.images(problem, 8, options)
     state = replace(truth, emissivity=truth.emissivity - 0.1)
     search, losses = descent.begin(state, given, options), []
@@ -215,7 +215,7 @@ def test_a_step_never_raises_the_objective() -> None:
 def test_it_stays_at_the_truth() -> None:
     """Started at the truth the emissivities move by less than 0.02 (median)."""
     problem, truth = linear(QUIET, 30)
-    options = dbvt.Settings()
+    options = dbvt.DbvtSettings()
     given = dbvt.images(problem, 30, options)
     found = continuation.minimise(truth, given, options, options, 1)
     moved = (found.unknowns.emissivity - truth.emissivity).abs().amax(dim=0)
@@ -239,7 +239,9 @@ def test_a_start_at_the_separator_is_as_good_as_random_ones() -> None:
     """Started at the subspace separator it ends no higher, and everywhere with a result."""
     scene, capture, response = glass((0.03, 0.35), 40)
     random = separation.solve(capture, response, "dbvt", seed=3)
-    started = separation.solve(capture, response, "dbvt", start="subspace", seed=3)
+    started = separation.solve(
+        capture, response, "dbvt", settings=dbvt.DbvtSettings(start="subspace"), seed=3
+    )
     of_random, of_started = errors(scene, random), errors(scene, started)
     print(f"random {of_random}, started {of_started}")
     assert np.all(np.array(of_started) <= 1.1 * np.array(of_random))
@@ -266,7 +268,10 @@ def test_same_seed_same_result() -> None:
 def test_exact_response_is_taken_out() -> None:
     """Taking out the bend of the exact response at least halves the emissivity's error."""
     scene, capture, response = glass(QUIET, 40)
-    bent = errors(scene, separation.solve(capture, response, "dbvt", bend_updates=0))
+    bent = errors(
+        scene,
+        separation.solve(capture, response, "dbvt", settings=dbvt.DbvtSettings(bend_updates=0)),
+    )
     straight = errors(scene, separation.solve(capture, response, "dbvt"))
     print(f"linear identities {bent}, bend taken out {straight}")
     assert straight[0] < 0.5 * bent[0]
@@ -275,7 +280,9 @@ def test_exact_response_is_taken_out() -> None:
 def test_too_few_steps_are_flagged() -> None:
     """A pixel that is still improving at its last step says so."""
     _, capture, response = glass(QUIET, 8)
-    result = separation.solve(capture, response, "dbvt", stages=1, steps=2)
+    result = separation.solve(
+        capture, response, "dbvt", settings=dbvt.DbvtSettings(stages=1, steps=2)
+    )
     assert np.all(result["status"].values & schema.FLAGS["not_converged"])
 
 
@@ -283,7 +290,12 @@ def test_temperatures_may_come_from_the_measured_signals() -> None:
     """Without the estimated noise the object is smoother, and nearer to the truth."""
     scene, capture, response = glass((0.03, 0.35), 30)
     smooth, raw = (
-        errors(scene, separation.solve(capture, response, "dbvt", temperatures_from=source))[1]
+        errors(
+            scene,
+            separation.solve(
+                capture, response, "dbvt", settings=dbvt.DbvtSettings(temperatures_from=source)
+            ),
+        )[1]
         for source in ("corrected", "measured")
     )
     print(f"object from corrected signals {smooth:.3f} K, from measured ones {raw:.3f} K")
@@ -294,7 +306,7 @@ def test_temperatures_may_come_from_the_measured_signals() -> None:
 def test_each_loss_can_be_left_out(name: str) -> None:
     """Without one of the losses it still ends with numbers, and with emissivities in (0, 1)."""
     problem, _ = linear((0.03, 0.05), 6)
-    result = dbvt.separate(problem, dbvt.Settings(**{name: 0.0}))  # type: ignore[arg-type]
+    result = dbvt.separate(problem, dbvt.DbvtSettings(**{name: 0.0}))  # type: ignore[arg-type]
     assert np.all((result.emissivity > 0) & (result.emissivity < 1))
 
 
@@ -316,4 +328,4 @@ def test_each_loss_can_be_left_out(name: str) -> None:
 def test_settings_refuse_nonsense(options: dict[str, float], message: str) -> None:
     """What is no search is refused, by name, value and rule."""
     with pytest.raises(ValueError, match=message):
-        dbvt.Settings(**options)  # type: ignore[arg-type]
+        dbvt.DbvtSettings(**options)  # type: ignore[arg-type]

@@ -65,7 +65,7 @@ def test_error_bars_are_true(pair: tuple[float, float]) -> None:
     """
     case = glass_case(emissivity=list(pair))
     scene, capture, response = experiments.simulate(case, RIG, TIME, 1000, seed=5)
-    result = separation.solve(capture, response, background_drift=0.0)
+    result = separation.solve(capture, response, settings=separation.SubspaceSettings(0.0))
     spread = {}
     for name in ("object_temperature", "background_temperature", "emissivity"):
         scores = (result[name] - scene[name]) / result[f"{name}_std"]
@@ -175,7 +175,7 @@ def test_large_changes_of_the_background_do_not_bias() -> None:
     """Pulses of 12 K bend the responses apart; that is taken out: no bias, true error bars."""
     case = glass_case(background={"amplitude": 12.0})
     scene, capture, response = experiments.simulate(case, Rig(highest=370.0), TIME, 400, seed=5)
-    result = separation.solve(capture, response, background_drift=0.0)
+    result = separation.solve(capture, response, settings=separation.SubspaceSettings(0.0))
     spread = {}
     for name in ("object_temperature", "emissivity", "reflection_ratio"):
         truth = scene[name] if name in scene else xr.DataArray([1.0, 2.0], dims="band")

@@ -58,7 +58,8 @@ def test_prior_widens_emissivity_and_background_alone() -> None:
     """A larger drift widens their bars; no value, and nothing of the object, changes."""
     _, capture, response = experiments.simulate(GLASS, RIG, TIME, 100, seed=3)
     none, some, much = [
-        separation.solve(capture, response, background_drift=drift) for drift in (0.0, 2.0, 20.0)
+        separation.solve(capture, response, settings=separation.SubspaceSettings(drift))
+        for drift in (0.0, 2.0, 20.0)
     ]
     for name in ("object_temperature", "background_temperature", "emissivity"):
         np.testing.assert_array_equal(none[name].values, much[name].values)
@@ -74,7 +75,8 @@ def test_drift_is_that_of_the_closed_form() -> None:
     """Over an object that warms by w a drift of up to d costs (1 - e) d / (w sqrt(3))."""
     _, capture, response = experiments.simulate(GLASS, RIG, TIME, 50, seed=4)
     none, much = (
-        separation.solve(capture, response, background_drift=drift) for drift in (0.0, 20.0)
+        separation.solve(capture, response, settings=separation.SubspaceSettings(drift))
+        for drift in (0.0, 20.0)
     )
     variances = [result["emissivity_std"].values[0, 0] ** 2 for result in (none, much)]
     added = np.sqrt(variances[1] - variances[0])
@@ -110,4 +112,4 @@ def test_bad_drift_is_a_clear_error(drift: float) -> None:
     """A prior is zero or a positive number of kelvins."""
     _, capture, response = experiments.simulate(GLASS, RIG, TIME, 2, seed=6)
     with pytest.raises(ValueError, match=f"Invalid background_drift {drift} K"):
-        separation.solve(capture, response, background_drift=drift)
+        separation.solve(capture, response, settings=separation.SubspaceSettings(drift))

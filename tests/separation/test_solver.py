@@ -8,7 +8,6 @@ import xarray as xr
 
 from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
-from dbthermal.separation import _methods as methods
 from dbthermal.separation import _tiles as tiles
 from dbthermal.simulation import Rig
 
@@ -30,10 +29,10 @@ def capture(scene: xr.Dataset) -> xr.Dataset:
 
 @pytest.mark.parametrize("name", separation.METHODS)
 def test_every_method_has_a_record(name: str) -> None:
-    """A record, whose options can be built with their defaults."""
-    assert callable(methods.get(name).separate)
-    kind = methods.get(name).settings
-    assert methods.settings(name, {}) == (None if kind is None else kind())
+    """A record, whose settings can be built with their defaults."""
+    method = separation.get_method(name)
+    assert callable(method.separate)
+    assert method.settings is None or method.settings() == method.settings()
 
 
 def test_tiles_draw_for_themselves() -> None:
@@ -48,9 +47,9 @@ def test_tiles_draw_for_themselves() -> None:
 def test_random_starts_hang_on_the_seed_alone(capture: xr.Dataset, method: str) -> None:
     """The same seed gives the same result on one thread and on two, another seed another."""
     response = Rig().response()
-    few: dict[str, Any] = {"steps": 3, "stages": 1} if method == "dbvt" else {}
+    few = separation.DbvtSettings(steps=3, stages=1) if method == "dbvt" else None
     one, two, other = (
-        separation.solve(capture, response, method, seed=seed, workers=workers, **few)
+        separation.solve(capture, response, method, settings=few, seed=seed, workers=workers)
         for seed, workers in ((1, 1), (1, 2), (2, 1))
     )
     xr.testing.assert_identical(one["emissivity"], two["emissivity"])
@@ -58,35 +57,52 @@ def test_random_starts_hang_on_the_seed_alone(capture: xr.Dataset, method: str) 
 
 
 BAD: dict[str, tuple[str, dict[str, Any], type[Exception], str]] = {
-    "unknown option": ("naive", {"begins": 3}, TypeError, "Unknown option 'begins' of method"),
-    "option of none": ("apparent", {"starts": 3}, TypeError, r"'starts' .* Has \[\]"),
-    "half a start": ("naive", {"starts": 2.5}, TypeError, r"Invalid starts 2\.5 of method 'naive'"),
-    "half a batch": ("dbvt", {"batch": 2.5}, TypeError, "Must be a whole number"),
-    "half an odd patch": ("bcp", {"patch": 5.0}, TypeError, r"Invalid patch 5\.0"),
+    "settings of another": (
+        "naive",
+        {"settings": separation.RatioSettings()},
+        TypeError,
+        "Invalid settings of type RatioSettings for method 'naive'. Must be NaiveSettings",
+    ),
+    "settings of none": (
+        "apparent",
+        {"settings": separation.NaiveSettings()},
+        TypeError,
+        "for method 'apparent'. Must be omitted",
+    ),
+    "half a start": (
+        "naive",
+        {"settings": separation.NaiveSettings(starts=2.5)},  # type: ignore[arg-type]
+        TypeError,
+        r"Invalid starts 2\.5 of method 'naive'",
+    ),
+    "half a batch": (
+        "dbvt",
+        {"settings": separation.DbvtSettings(batch=2.5)},  # type: ignore[arg-type]
+        TypeError,
+        "Must be a whole number",
+    ),
+    "half an odd patch": (
+        "bcp",
+        {"settings": separation.BcpSettings(patch=5.0)},  # type: ignore[arg-type]
+        TypeError,
+        r"Invalid patch 5\.0",
+    ),
     "negative seed": ("naive", {"seed": -1}, ValueError, "Invalid seed -1. Must be zero or"),
-    "oracle alone": ("naive", {"oracle": True}, ValueError, "Invalid truth for method 'naive'"),
-    "no such device": ("dbvt", {"device": "cuda:9"}, ValueError, "Invalid device 'cuda:9'"),
 }
 
 
-@pytest.mark.parametrize("what", BAD)
-def test_bad_options_are_named(capture: xr.Dataset, what: str) -> None:
-    """An error names the option, the value and the rule."""
-    method, options, error, message = BAD[what]
+@pytest.mark.parametrize("case", BAD)
+def test_bad_settings_are_named(capture: xr.Dataset, case: str) -> None:
+    """An error names the field, the value and the rule."""
+    method, arguments, error, message = BAD[case]
     with pytest.raises(error, match=message):
-        separation.solve(capture, Rig().response(), method, **options)
+        separation.solve(capture, Rig().response(), method, **arguments)
 
 
-def test_truth_is_for_the_oracle(scene: xr.Dataset, capture: xr.Dataset) -> None:
-    """It is refused by a method that would not use it, and where it has gaps."""
-    truth, response = scene["object_temperature"], Rig().response()
-    with pytest.raises(ValueError, match="Invalid truth for method 'subspace'"):
-        separation.solve(capture, response, truth=truth)
-    with pytest.raises(ValueError, match="Invalid truth with NaN"):
-        separation.solve(
-            capture, response, "naive", oracle=True, truth=truth.where(truth["time"] > 1)
-        )
-    separation.solve(capture, response, "naive", oracle=True, truth=truth)
+def test_a_missing_device_is_named() -> None:
+    """Where there is no second graphics processor the optimiser says so."""
+    with pytest.raises(ValueError, match="Invalid device 'cuda:9'"):
+        separation.DbvtSettings(device="cuda:9")
 
 
 def test_the_optimiser_wants_an_even_clock(capture: xr.Dataset) -> None:
@@ -106,7 +122,10 @@ def test_a_dead_pixel_harms_no_neighbour() -> None:
     dead["counts"][:, :, 10, 12] = 60000.0
     status = xr.zeros_like(clean["counts"][0, 0], dtype=np.uint16).drop_vars(["band", "time"])
     status[10, 12] = schema.FLAGS["dead_pixel"]
-    options: dict[str, Any] = {"method": "bcp", "patch": 5, "window": 9}
+    options: dict[str, Any] = {
+        "method": "bcp",
+        "settings": separation.BcpSettings(patch=5, window=9),
+    }
     found = separation.solve(dead.assign(status=status), response, **options)
     expected = separation.solve(clean, response, **options)
     name = "object_temperature"
@@ -124,7 +143,9 @@ def test_progress_is_shown(capture: xr.Dataset, capsys: pytest.CaptureFixture[st
 
 def test_options_are_recorded(capture: xr.Dataset) -> None:
     """The result says which options made it, and what is never estimated."""
-    result = separation.solve(capture, Rig().response(), "ratio", kind="narrow")
+    result = separation.solve(
+        capture, Rig().response(), "ratio", settings=separation.RatioSettings("narrow")
+    )
     assert "kind='narrow'" in result.attrs["settings"]
     for name in result.attrs["not_estimated"].split():
         assert bool(result[name].isnull().all())

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from dbthermal import store
-from dbthermal.store import _provenance as provenance
+from dbthermal.store import _provenance, _results
 
 RECORD: dict[str, Any] = {"parameters": {"frames": 3}, "commit": "unknown", "inputs": {}}
 DTYPES = st.sampled_from(["uint16", "float32", "float64", "int64", "bool"])
@@ -139,12 +139,12 @@ def test_missing_dataset_is_named(tmp_path: Path) -> None:
 def test_chunks(shape: tuple[int, ...], dtype: str, expected: tuple[int, ...]) -> None:
     """Tiles hold all frames and just over 1 MiB, or the whole frame where that is smaller."""
     variable = xr.Variable(("band", "time", "y", "x")[-len(shape) :], np.empty(shape, dtype))
-    assert store.chunks(variable) == expected
+    assert _results._chunks(variable) == expected
 
 
 def test_chunks_without_pixels() -> None:
     """A table is one chunk."""
-    assert store.chunks(xr.Variable(("material", "wavelength"), np.empty((7, 900)))) == (7, 900)
+    assert _results._chunks(xr.Variable(("material", "wavelength"), np.empty((7, 900)))) == (7, 900)
 
 
 def test_numbers_come_back_sorted(tmp_path: Path) -> None:
@@ -203,8 +203,8 @@ def test_suffix_tells_the_kind(save: Callable[..., None], tmp_path: Path) -> Non
 def test_record_holds_what_made_a_result(tmp_path: Path) -> None:
     """Parameters, versions, commit and input checksums are kept, the same each time."""
     (tmp_path / "in.txt").write_text("abc")
-    record = provenance.record({"levels": (1, 2)}, {"input": tmp_path / "in.txt"})
-    assert record == provenance.record({"levels": (1, 2)}, {"input": tmp_path / "in.txt"})
+    record = store.provenance({"levels": (1, 2)}, {"input": tmp_path / "in.txt"})
+    assert record == store.provenance({"levels": (1, 2)}, {"input": tmp_path / "in.txt"})
     assert record["parameters"] == {"levels": [1, 2]}
     assert record["versions"]["numpy"] == np.__version__
     assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?|unknown", record["commit"])
@@ -215,9 +215,9 @@ def test_record_holds_what_made_a_result(tmp_path: Path) -> None:
 def test_parameter_must_be_plain(tmp_path: Path) -> None:
     """A parameter that JSON cannot hold is refused by name."""
     with pytest.raises(ValueError, match="Invalid parameter 'noise' = nan"):
-        provenance.record({"noise": math.nan})
+        store.provenance({"noise": math.nan})
     with pytest.raises(TypeError, match="Invalid parameter 'folder' = "):
-        provenance.record({"folder": tmp_path})
+        store.provenance({"folder": tmp_path})
 
 
 def test_checksum_of_a_folder(tmp_path: Path) -> None:
@@ -225,16 +225,16 @@ def test_checksum_of_a_folder(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name / "sub").mkdir(parents=True)
         (tmp_path / name / "sub" / "file").write_text("abc")
-    before = provenance.checksum(tmp_path / "a")
-    assert before == provenance.checksum(tmp_path / "b")
+    before = store.checksum(tmp_path / "a")
+    assert before == store.checksum(tmp_path / "b")
     (tmp_path / "b" / "sub" / "file").rename(tmp_path / "b" / "file")
-    assert before != provenance.checksum(tmp_path / "b")
+    assert before != store.checksum(tmp_path / "b")
 
 
 def test_commit_is_unknown_without_git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A package outside a work tree has no commit."""
-    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "provenance.py"))
-    assert provenance.commit() == "unknown"
+    monkeypatch.setattr(_provenance, "__file__", str(tmp_path / "provenance.py"))
+    assert _provenance.commit() == "unknown"
 
 
 def film(*shapes: tuple[int, int]) -> list[np.ndarray]:

@@ -16,13 +16,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from dbthermal import store
 from dbthermal.instruments.recording import writing
 from dbthermal.instruments.recording.fetching import Limits, Reading, Run, ask, fetch
 from dbthermal.instruments.recording.tape import Tape
 from dbthermal.instruments.recording.writing import Written
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.video.source import Frame, FrameSource
-from dbthermal.store import _provenance as provenance
 
 _POLL: Final = 0.01  # least wait of the one who looks on [s]
 _BYTES: Final = 2  # of a pixel
@@ -218,7 +218,7 @@ def _tape(
         "identities": identities,
         "frame_rates": {band: source.frame_rate for band, source in sources.items()},
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
-        "provenance": provenance.record(session.content()),
+        "provenance": store.provenance(session.content()),
     }
     return Tape(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)
 

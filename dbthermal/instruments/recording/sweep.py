@@ -185,8 +185,8 @@ def bench_series(
     region : mapping
         Material to its rows and columns. The thermocouple named like it is the object's.
     correction : Dataset, optional
-        From `dbthermal.correction.fit_correction`, of all bands. With it, the counts are corrected, and
-        pixels that are bad or saturated are left out.
+        From `dbthermal.correction.fit_correction`, of all bands. With it, the counts are corrected,
+        and pixels that are bad or saturated are left out.
 
     Returns
     -------

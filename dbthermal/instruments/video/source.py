@@ -63,7 +63,7 @@ UNTIMED: Final = (
     | FrameFlag.PADDED
 )
 """A frame with one of these is recorded but is no measurement: it gets no exposure time. A repeated
-image keeps its time, for a closed aperture looks so, too; see `dbthermal.correction.find_shutter`."""
+image keeps its time, for a closed aperture looks so, too: `dbthermal.correction.find_shutter`."""
 
 DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
 """A frame with one of these has wrong counts, and maybe wrong telemetry."""

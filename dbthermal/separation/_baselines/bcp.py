@@ -32,7 +32,7 @@ from dbthermal.separation._separated import Array, Separated
 
 
 @dataclass(frozen=True)
-class Settings:
+class BcpSettings:
     """
     Options of the blackbody channel prior; none is published.
 
@@ -81,7 +81,7 @@ class Settings:
             )
 
 
-def separate(problem: Problem, settings: Settings) -> Separated:
+def separate(problem: Problem, settings: BcpSettings) -> Separated:
     """
     Remove the reflection from a whole image, each frame by itself.
 
@@ -89,7 +89,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
     ----------
     problem : Problem
         Signals of two bands, of an image of `problem.shape`.
-    settings : Settings
+    settings : BcpSettings
         Sizes of the filters, and what is known of the reflection.
 
     Returns
@@ -121,7 +121,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
     ).ranged(problem.curves[0], deviations=False)
 
 
-def _movie(problem: Problem, settings: Settings, band: int) -> tuple[Array, Array, Array]:
+def _movie(problem: Problem, settings: BcpSettings, band: int) -> tuple[Array, Array, Array]:
     """Object signal (time, pixel), reflected signal (time), mean t (pixel), of one band."""
     clean = np.empty_like(problem.signals[band])
     reflected, total = np.empty(problem.time.size), np.zeros(clean.shape[1])
@@ -171,7 +171,7 @@ def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Ar
     return np.asarray(uniform_filter(slope, window) * guide + uniform_filter(intercept, window))
 
 
-def _given(problem: Problem, settings: Settings, band: int) -> float | None:
+def _given(problem: Problem, settings: BcpSettings, band: int) -> float | None:
     """Signal of the given reflected temperature, if there is one."""
     if settings.reflected_temperature is None:
         return None
@@ -188,7 +188,7 @@ def _filled(problem: Problem, band: int, image: Array) -> Array:
     return np.where(usable, image, np.median(image[usable]))
 
 
-def _transmission(image: Array, level: float, settings: Settings) -> Array:
+def _transmission(image: Array, level: float, settings: BcpSettings) -> Array:
     """The smooth t of one frame; 1 where nothing in the patch is brighter than the reflection."""
     brightest = maximum_filter(image, settings.patch)
     coarse = np.ones_like(image)
@@ -203,7 +203,7 @@ def _transmission(image: Array, level: float, settings: Settings) -> Array:
 
 METHOD: Final = Method(
     separate,
-    settings=Settings,
+    settings=BcpSettings,
     whole_image=True,
     not_estimated=("object_temperature_std", "background_temperature_std", "emissivity_std"),
 )

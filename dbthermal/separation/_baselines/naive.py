@@ -41,7 +41,7 @@ Columns = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Settings:
+class NaiveSettings:
     """
     Options of the naive baseline.
 
@@ -57,16 +57,12 @@ class Settings:
     tolerance : float
         A start is done when its objective, a sample's mean squared residual in units of the noise's
         variance, is below this, or a step lowers it by less than this fraction [1].
-    oracle : bool
-        Keep the start whose object temperature is nearest to the truth in the root mean square,
-        which cannot be done in practice, instead of the one of least objective.
     """
 
     starts: int = 5
     spread: float = 2.0
     iterations: int = 100
     tolerance: float = 1e-6
-    oracle: bool = False
 
     def __post_init__(self) -> None:
         """Refuse numbers that are no search."""
@@ -94,33 +90,29 @@ class _State:
         return _State(**{name: value[..., columns] for name, value in vars(self).items()})
 
 
-def separate(problem: Problem, settings: Settings) -> Separated:
+def separate(problem: Problem, settings: NaiveSettings, truth: Array | None = None) -> Separated:
     """
     Separate one tile.
 
     Parameters
     ----------
     problem : Problem
-        Signals of two bands; with `truth` for an oracle's choice.
-    settings : Settings
+        Signals of two bands.
+    settings : NaiveSettings
         Starts and limits of the search.
+    truth : ndarray, shape (time, pixel), optional
+        True object temperature [K], for an experiment: the start nearest to it is kept, which
+        cannot be done in practice. Not reached from `solve`.
 
     Returns
     -------
     Separated
         Temperatures and emissivities, without deviations; `not_converged` where the start that is
         kept was still improving at the last step, or found no finite objective.
-
-    Raises
-    ------
-    ValueError
-        If the oracle is asked for and the problem has no truth.
     """
-    if settings.oracle and problem.truth is None:
-        raise ValueError("Missing truth. Method 'naive' must be given it for an oracle's choice.")
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         state = _search(problem, settings)
-        kept = state.taken(_choice(problem, state, settings))
+        kept = state.taken(_choice(state, settings, truth))
         temperatures, emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
     return (
@@ -138,18 +130,18 @@ def separate(problem: Problem, settings: Settings) -> Separated:
     )
 
 
-def _choice(problem: Problem, state: _State, settings: Settings) -> Columns:
+def _choice(state: _State, settings: NaiveSettings, truth: Array | None) -> Columns:
     """Column of the start that each pixel keeps: of least objective, or nearest the truth."""
-    pixels = problem.signals.shape[-1]
+    pixels = state.objective.size // settings.starts
     cost = state.objective.reshape(settings.starts, pixels)
-    if problem.truth is not None and settings.oracle:
+    if truth is not None:
         warm = np.exp(state.logarithms[0]).reshape(-1, settings.starts, pixels)
-        cost = np.mean((warm - problem.truth[:, np.newaxis]) ** 2, axis=0)
+        cost = np.mean((warm - truth[:, np.newaxis]) ** 2, axis=0)
     start = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=0)
     return np.asarray(start * pixels + np.arange(pixels))
 
 
-def _search(problem: Problem, settings: Settings) -> _State:
+def _search(problem: Problem, settings: NaiveSettings) -> _State:
     """Run all starts to their end; columns are the starts of all pixels, start by start."""
     signals = np.tile(problem.signals, (1, 1, settings.starts))
     state = _start(problem, signals, settings)
@@ -163,7 +155,7 @@ def _search(problem: Problem, settings: Settings) -> _State:
     return state
 
 
-def _start(problem: Problem, signals: Array, settings: Settings) -> _State:
+def _start(problem: Problem, signals: Array, settings: NaiveSettings) -> _State:
     """Random emissivities, and temperatures near the image's."""
     columns = signals.shape[-1]
     logits = logit(problem.rng.uniform(np.finfo(np.float64).tiny, 1.0, (2, columns)))
@@ -265,7 +257,7 @@ def _symmetric(matrix: tuple[Array, Array, Array], right: Array) -> Array:
 
 METHOD: Final = Method(
     separate,
-    settings=Settings,
+    settings=NaiveSettings,
     not_estimated=("object_temperature_std", "background_temperature_std", "emissivity_std"),
 )
 """Least squares without a prior, for `solve`."""

@@ -36,7 +36,7 @@ Inverse = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class Settings:
+class RatioSettings:
     """
     Options of dual-wavelength pyrometry.
 
@@ -63,7 +63,7 @@ class Settings:
             raise ValueError(f"Invalid order {self.order} of method 'ratio'. Must be at least 1.")
 
 
-def separate(problem: Problem, settings: Settings) -> Separated:
+def separate(problem: Problem, settings: RatioSettings) -> Separated:
     """
     Temperature of one tile as a gray body's before a background that emits nothing.
 
@@ -71,7 +71,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
     ----------
     problem : Problem
         Signals of two bands of `bands.FILTERS`.
-    settings : Settings
+    settings : RatioSettings
         Kind of radiance, and smoothing.
 
     Returns
@@ -118,7 +118,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
     )
 
 
-def _radiances(problem: Problem, settings: Settings) -> Array:
+def _radiances(problem: Problem, settings: RatioSettings) -> Array:
     """Radiance of each band, (2, time, pixel), smoothed; NaN where there is none."""
     signals = problem.signals
     found = np.stack(
@@ -166,7 +166,7 @@ def _inverse(curves: tuple[Curve, Curve], kind: str) -> Inverse:
 
 METHOD: Final = Method(
     separate,
-    settings=Settings,
+    settings=RatioSettings,
     not_estimated=(
         "object_temperature_std",
         "background_temperature",

@@ -45,7 +45,7 @@ _BEFORE: Final[list[int]] = []
 
 
 @dataclass(frozen=True)
-class Settings(Weights, Limits):
+class DbvtSettings(Weights, Limits):
     """
     Options of the paper's optimiser; with those of `objective.Weights` and `descent.Limits`.
 
@@ -105,7 +105,7 @@ class Settings(Weights, Limits):
             )
 
 
-def separate(problem: Problem, settings: Settings) -> Separated:
+def separate(problem: Problem, settings: DbvtSettings) -> Separated:
     """
     Separate one tile.
 
@@ -113,7 +113,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
     ----------
     problem : Problem
         Signals of two bands.
-    settings : Settings
+    settings : DbvtSettings
         The objective and how it is minimised.
 
     Returns
@@ -162,7 +162,7 @@ def _even(time: Array) -> float:
     return interval
 
 
-def images(problem: Problem, columns: int, settings: Settings) -> Images:
+def images(problem: Problem, columns: int, settings: DbvtSettings) -> Images:
     """
     Bring a tile to the device.
 
@@ -172,7 +172,7 @@ def images(problem: Problem, columns: int, settings: Settings) -> Images:
         The tile.
     columns : int
         Pixels times starts.
-    settings : Settings
+    settings : DbvtSettings
         Device and precision.
 
     Returns
@@ -189,7 +189,7 @@ def images(problem: Problem, columns: int, settings: Settings) -> Images:
     return Images(signals, deviation, sigma, interval, like)
 
 
-def start(problem: Problem, settings: Settings) -> tuple[Unknowns, Mask]:
+def start(problem: Problem, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
     """
     Draw the starts.
 
@@ -197,7 +197,7 @@ def start(problem: Problem, settings: Settings) -> tuple[Unknowns, Mask]:
     ----------
     problem : Problem
         The tile, with its source of randomness.
-    settings : Settings
+    settings : DbvtSettings
         How many, and where.
 
     Returns
@@ -225,7 +225,7 @@ def start(problem: Problem, settings: Settings) -> tuple[Unknowns, Mask]:
 
 def _inform(problem: Problem, emissivity: Array, smooth: Array) -> Mask:
     """Overwrite a start with what the subspace separator finds, where it finds all of it."""
-    found = subspace.separate(problem, subspace.Settings())
+    found = subspace.separate(problem, subspace.SubspaceSettings())
     emitted = problem.blackbody(0, found.object_temperature) * found.emissivity[0]
     known = np.all(np.isfinite(emitted), axis=0)
     known &= np.all((found.emissivity > 0) & (found.emissivity < 1), axis=0)
@@ -235,12 +235,12 @@ def _inform(problem: Problem, emissivity: Array, smooth: Array) -> Mask:
     return np.asarray(known)
 
 
-def _tensor(values: Array, settings: Settings) -> Tensor:
+def _tensor(values: Array, settings: DbvtSettings) -> Tensor:
     dtype: torch.dtype = getattr(torch, settings.precision)
     return torch.as_tensor(values, dtype=dtype, device=settings.device)
 
 
-def _search(problem: Problem, settings: Settings) -> Minimum:
+def _search(problem: Problem, settings: DbvtSettings) -> Minimum:
     """All starts to their end."""
     unknowns, informed = start(problem, settings)
     given = images(problem, informed.size, settings)
@@ -293,7 +293,7 @@ def _choice(loss: Tensor, pixels: int) -> Tensor:
     return finite.argmin(dim=0) * pixels + place
 
 
-def _report(problem: Problem, minimum: Minimum, kept: Tensor, settings: Settings) -> Separated:
+def _report(problem: Problem, minimum: Minimum, kept: Tensor, settings: DbvtSettings) -> Separated:
     """Temperatures from the emissivities, by the closed form and Newton's steps."""
     unknowns = minimum.unknowns.taken(kept)
     emissivity = _array(unknowns.emissivity)
@@ -318,7 +318,7 @@ def _array(values: Tensor) -> Array:
 
 METHOD: Final = Method(
     separate,
-    settings=Settings,
+    settings=DbvtSettings,
     minimum_frames=8,
     every_frame=True,
     not_estimated=("object_temperature_std", "background_temperature_std", "emissivity_std"),

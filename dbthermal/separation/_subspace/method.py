@@ -76,7 +76,7 @@ _BEND: Final = 0.2
 
 
 @dataclass(frozen=True)
-class Settings:
+class SubspaceSettings:
     """
     Options of the method.
 
@@ -110,7 +110,7 @@ class _Estimate:
     lateness: Array
 
 
-def separate(problem: Problem, settings: Settings) -> Separated:
+def separate(problem: Problem, settings: SubspaceSettings) -> Separated:
     """
     Separate one tile.
 
@@ -118,7 +118,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
     ----------
     problem : Problem
         Signals of two bands or more, and what is known of them.
-    settings : Settings
+    settings : SubspaceSettings
         Options.
 
     Returns
@@ -131,7 +131,7 @@ def separate(problem: Problem, settings: Settings) -> Separated:
         return _with_jumps(problem, result, settings)
 
 
-def survey(problem: Problem, settings: Settings) -> Survey:
+def survey(problem: Problem, settings: SubspaceSettings) -> Survey:
     """
     What the pixels of a tile tell of their materials, each alone.
 
@@ -139,7 +139,7 @@ def survey(problem: Problem, settings: Settings) -> Survey:
     ----------
     problem : Problem
         The tile.
-    settings : Settings
+    settings : SubspaceSettings
         Options.
 
     Returns
@@ -176,7 +176,7 @@ def _functions(problem: Problem, jump: int | None = None) -> smooth.Subspace:
 def _exact(
     problem: Problem,
     functions: smooth.Subspace,
-    settings: Settings,
+    settings: SubspaceSettings,
     finish: Callable[[Problem, _Estimate], Record],
     least: float = _BEND,
 ) -> Record:
@@ -197,7 +197,7 @@ def _exact(
 
 
 def _pass(
-    problem: Problem, straight: Problem, functions: smooth.Subspace, settings: Settings
+    problem: Problem, straight: Problem, functions: smooth.Subspace, settings: SubspaceSettings
 ) -> _Estimate:
     """Steps 1 to 4; the first three on signals whose reflections are proportional."""
     noise, shared = np.array(problem.noise), problem.shared
@@ -270,7 +270,7 @@ def _flags(problem: Problem, estimate: _Estimate) -> dict[str, Mask]:
     }
 
 
-def _with_jumps(problem: Problem, result: Separated, settings: Settings) -> Separated:
+def _with_jumps(problem: Problem, result: Separated, settings: SubspaceSettings) -> Separated:
     """Step 5: pixels that do not fit are solved anew with a jump in the subspace."""
     functions, inside = _functions(problem), jumps.candidates(problem.time)
     ramp = jumps.spread(problem.time)
@@ -295,6 +295,6 @@ def _with_jumps(problem: Problem, result: Separated, settings: Settings) -> Sepa
 
 
 METHOD: Final = Method(
-    separate, settings=Settings, minimum_frames=32, survey=survey, any_bands=True
+    separate, settings=SubspaceSettings, minimum_frames=32, survey=survey, any_bands=True
 )
 """The subspace separator, for `solve`."""

@@ -1,14 +1,13 @@
 """All methods on the same simulated pixels, over materials and noise: the paper's comparison."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
 from dbthermal import separation, simulation
-from dbthermal.separation import _methods as methods
 from dbthermal.simulation import Rig
 
 MOVING: Final = 0.5
@@ -69,8 +68,8 @@ def compare(
     noise : sequence of float
         Standard deviation of the two bands' signals [K].
     variants : mapping
-        Label -> `method` of `separation.solve` and its options; "calibrated" is given the true
-        emissivities, and an `oracle` the true temperature.
+        Label -> `method` of `separation.solve` and fields of its settings; "calibrated" is given
+        the true emissivities.
     plate : mapping
         Fields of `Plate`.
     pixels : int
@@ -97,7 +96,7 @@ def compare(
     images, strips = (scene, capture), (truth, _strip(capture, chosen))
     rows = []
     for options in variants.values():
-        whole = methods.get(options["method"]).whole_image
+        whole = separation.get_method(options["method"]).whole_image
         given, seen = images if whole else strips
         found = separation.solve(seen, response, seed=seed, **_known(given, options))
         rows.append(judge(truth, _strip(found, chosen) if whole else found))
@@ -196,10 +195,31 @@ def _strip(dataset: xr.Dataset, chosen: np.ndarray) -> xr.Dataset:
 
 
 def _known(scene: xr.Dataset, options: Options) -> dict[str, Any]:
-    """Arguments of `solve`: the options, with the truth for those who may know it."""
-    given = dict(options)
-    if methods.get(options["method"]).knows_emissivity:
+    """Arguments of `solve`, with the true emissivities for a method that must know them."""
+    given = arguments(options)
+    if separation.get_method(options["method"]).knows_emissivity:
         given["emissivity"] = scene["emissivity"]
-    if options.get("oracle"):
-        given["truth"] = scene["object_temperature"]
     return given
+
+
+def arguments(variant: Options) -> dict[str, Any]:
+    """
+    Arguments of `separation.solve` for a variant of a method.
+
+    Parameters
+    ----------
+    variant : mapping
+        `method`, fields of its settings, and other arguments of `solve`, side by side as a table
+        of parameters has them.
+
+    Returns
+    -------
+    dict
+        The same, with the fields of the settings in their record.
+    """
+    kind = separation.get_method(variant["method"]).settings
+    names = set() if kind is None else {field.name for field in fields(kind)} & variant.keys()
+    rest = {name: value for name, value in variant.items() if name not in names}
+    if kind is not None and names:
+        rest["settings"] = kind(**{name: variant[name] for name in names})
+    return rest

@@ -8,9 +8,8 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import calibration, emissivity, metrics, separation, simulation
-from dbthermal.separation import _methods as methods
 from reproduction import twins
-from reproduction.experiments.comparison import MOVING
+from reproduction.experiments.comparison import MOVING, arguments
 
 BEAD: Final = 3
 """Pixels along a side of the square that a thermocouple's bead covers."""
@@ -190,11 +189,10 @@ def _mean(
     variant: Mapping[str, Any],
 ) -> xr.DataArray:
     """Object temperature (time) [K] of one method, mean over the bead's pixels."""
-    options = dict(variant)
     seen = corrected
-    if not methods.get(options["method"]).whole_image:
+    if not separation.get_method(variant["method"]).whole_image:
         seen = corrected.isel(square)
-    found = separation.solve(seen, response, **options)["object_temperature"]
+    found = separation.solve(seen, response, **arguments(variant))["object_temperature"]
     part = found.isel(square) if found.sizes == corrected["counts"][0].sizes else found
     return part.mean(("y", "x"), skipna=False)
 

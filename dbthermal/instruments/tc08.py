@@ -1,0 +1,404 @@
+"""Pico TC-08 thermocouple logger: single readings of eight thermocouples and their cold junction.
+
+The TC-08's USB protocol is not public. Its readings come through the vendor's own library
+``libusbtc08``, which is not part of this project and is loaded only when a unit is opened. Names,
+types and error numbers are those of the header ``usbtc08.h`` that the vendor publishes.
+
+A reading without a temperature is NaN, and `Flag` says why. Not every open thermocouple can be
+detected: according to the vendor's support forum (picotech.com, topic 29871) one may also read a
+noisy room temperature. Move the blackbody, and see whether the reading follows.
+
+Tested against an emulated library object and a stub compiled from the public signatures, not
+against hardware.
+"""
+
+import ctypes
+import ctypes.util
+import importlib
+import os
+import time
+from collections.abc import Callable, Mapping
+from ctypes import POINTER, c_char, c_float, c_int8, c_int16
+from dataclasses import dataclass
+from enum import IntFlag
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal.instruments.closing import Closing
+
+if TYPE_CHECKING:
+    from dbthermal.instruments.emulated.world import World
+
+__all__ = ["ERRORS", "TC08", "Flag", "Identity", "Scan", "TC08Error", "load"]
+
+Library = Any
+"""A library bound by `load`, or an object with the same functions, such as the emulated one.
+
+Where C takes a pointer to one value, an array of length one is passed, which both accept.
+"""
+
+ENVIRONMENT: Final = "DBTHERMAL_USBTC08"
+"""Environment variable with the path of the library."""
+
+CHANNELS: Final = 9
+"""Channels of a unit: 0 is the cold junction, 1 to 8 are the sockets."""
+
+KINDS: Final = "BEJKNRST"
+"""Letters of the thermocouple types that the library converts."""
+
+KELVIN: Final = 2
+"""The library's number of the unit kelvin; 0 is °C, 1 °F, 3 °R."""
+
+OPEN_TIMEOUT: Final = 30.0
+"""Longest time that opening a unit may take [s]; the library downloads the firmware first."""
+
+_POLL = 0.05  # [s] between two progress requests
+
+ERRORS: Final[Mapping[int, str]] = MappingProxyType(
+    {
+        0: "no error",
+        1: "the operating system is not supported",
+        2: "no channels are set",
+        3: "an argument is invalid",
+        4: "the hardware version is not supported; a newer library may know it",
+        5: "incorrect mode: a single reading while streaming, or old and new functions mixed",
+        6: "the units are still being enumerated",
+        7: "the unit does not respond",
+        8: "its firmware could not be downloaded",
+        9: "its EEPROM is missing or corrupt",
+        10: "the enumerated unit is not found: it was pulled out, or another program has it",
+        11: "a threading function failed",
+        12: "the USB pipes of the unit could not be opened",
+        13: "no calibration date was found",
+        14: "the installed kernel driver (picopp) is too old",
+        15: "a function of Pico's driver failed",
+        16: "the communication with the unit is lost",
+    }
+)
+"""Meaning of the library's error numbers; 15 and 16 are often taken for one another."""
+
+
+class TC08Error(RuntimeError):
+    """A function of the library failed: `code` is its error number, explained in `ERRORS`."""
+
+    def __init__(self, action: str, code: int) -> None:
+        meaning = ERRORS.get(code, "a number that its header does not list")
+        super().__init__(f"The TC-08 could not {action}: error {code}, {meaning}.")
+        self.code = code
+
+
+class UnitInfo(ctypes.Structure):
+    """Identity of a unit as the library writes it: 40 bytes, packed or not."""
+
+    _fields_ = (
+        ("size", c_int16),  # of this structure [byte], set by the caller
+        ("driver", c_char * 12),
+        ("kernel_driver", c_int16),
+        ("hardware", c_int16),
+        ("variant", c_int16),
+        ("serial", c_char * 11),
+        ("calibration_date", c_char * 9),
+    )
+
+
+SIGNATURES: Final[Mapping[str, list[Any]]] = MappingProxyType(
+    {
+        "usb_tc08_open_unit_async": [],
+        "usb_tc08_open_unit_progress": [POINTER(c_int16), POINTER(c_int16)],
+        "usb_tc08_set_channel": [c_int16, c_int16, c_int8],
+        "usb_tc08_get_single": [c_int16, POINTER(c_float), POINTER(c_int16), c_int16],
+        "usb_tc08_get_unit_info": [c_int16, POINTER(UnitInfo)],
+        "usb_tc08_get_last_error": [c_int16],
+        "usb_tc08_close_unit": [c_int16],
+    }
+)
+"""Argument types of the functions that are used; each of them returns 16 bits."""
+
+
+class Flag(IntFlag):
+    """Reason why a reading is not a temperature; 0 if it is one."""
+
+    GOOD = 0
+    OVERFLOW = 1
+    """The voltage was beyond the converter's range."""
+    MISSING = 2
+    """The library returned NaN: open thermocouple, or channel off."""
+    OUT_OF_RANGE = 4
+    """The temperature is not positive."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """
+    One reading of all nine channels; index 0 is the cold junction.
+
+    Attributes
+    ----------
+    time : float
+        Middle of the scan on the host's clock [s]; the channels are converted one after another.
+    temperature : ndarray, shape (9,)
+        Temperature [K], NaN unless `flag` is 0.
+    flag : ndarray of uint8, shape (9,)
+        See `Flag`; channels that are off are `Flag.MISSING`.
+    """
+
+    time: float
+    temperature: npt.NDArray[np.float64]
+    flag: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Serial number, calibration date (in the vendor's format) and versions of a unit."""
+
+    serial_number: str
+    calibration_date: str
+    driver: str
+    hardware: int
+    variant: int
+    is_simulated: bool
+
+
+class TC08(Closing):
+    """
+    A TC-08, for one thread at a time; opened by `from_url`, `open` or ``with``.
+
+    Parameters
+    ----------
+    library : Library
+        From `load`, or an emulated one.
+    clock, sleep : callable
+        The host's clock [s], and waiting [s]; replaced in tests.
+    """
+
+    def __init__(
+        self,
+        library: Library,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._library = library
+        self._clock, self._sleep = clock, sleep
+        self._handle = 0
+        self._has_channels = False
+
+    @classmethod
+    def from_url(cls, url: str = "tc08:", *, world: "World | None" = None) -> Self:
+        """
+        Load the library and open the first free unit.
+
+        Parameters
+        ----------
+        url : str
+            ``tc08:``, the library being found as by `load`, ``tc08:///path/of/library.so``, or
+            ``sim://tc08`` for an emulated unit.
+        world : World, optional
+            Emulated bench, needed for ``sim://tc08`` alone.
+
+        Raises
+        ------
+        ValueError
+            If the URL is another one, or the world is missing, or given to a real unit.
+        OSError, TC08Error, TimeoutError
+            As `load` and `open`.
+        """
+        if (url == "sim://tc08") != (world is not None):
+            raise ValueError(
+                f"Invalid URL '{url}'. Must be sim://tc08 with a world, and only then."
+            )
+        if world is not None:
+            module = importlib.import_module("dbthermal.instruments.emulated.tc08")
+            return cls(module.EmulatedTC08.from_world(world)).open()
+        if url != "tc08:" and not url.startswith("tc08:///"):
+            raise ValueError(f"Invalid URL '{url}'. Must be tc08:, tc08:///path or sim://tc08.")
+        return cls(load(url.removeprefix("tc08:").removeprefix("//") or None)).open()
+
+    @property
+    def is_simulated(self) -> bool:
+        """True if the library is an emulated one; the vendor's has no such attribute."""
+        return bool(getattr(self._library, "is_simulated", False))
+
+    def open(self, *, timeout: float = OPEN_TIMEOUT) -> Self:
+        """
+        Open the first free unit, within `timeout` [s].
+
+        Raises
+        ------
+        RuntimeError
+            If it is open already.
+        ConnectionError
+            If there is no free unit.
+        TC08Error
+            If the library says why it failed.
+        TimeoutError
+            If the firmware is not downloaded in time.
+        """
+        if self._handle:
+            raise RuntimeError("The TC-08 is open already. Must be closed first.")
+        if not self._library.usb_tc08_open_unit_async():
+            raise self._error("be opened")
+        handle, percent = (c_int16 * 1)(), (c_int16 * 1)()
+        deadline = self._clock() + timeout
+        while not (progress := self._library.usb_tc08_open_unit_progress(handle, percent)):
+            if self._clock() >= deadline:
+                raise TimeoutError(
+                    f"The TC-08 is not open after {timeout} s, at {percent[0]} %. Must have its "
+                    "firmware by then: pull it out and plug it in again."
+                )
+            self._sleep(_POLL)
+        if progress < 0:
+            raise self._error("be opened")
+        if not handle[0]:
+            raise ConnectionError(
+                "No TC-08. Must be plugged in, and free: no other program may have it."
+            )
+        self._handle = int(handle[0])
+        return self
+
+    def close(self) -> None:
+        """
+        Close the unit; a second call does nothing.
+
+        Raises
+        ------
+        TC08Error
+            If the library could not, as after unplugging; the unit counts as closed.
+        """
+        handle, self._handle = self._handle, 0
+        self._has_channels = False
+        if handle and not self._library.usb_tc08_close_unit(handle):
+            raise TC08Error("close", self._library.usb_tc08_get_last_error(handle))
+
+    def __enter__(self) -> Self:
+        return self if self._handle else self.open()
+
+    def identity(self) -> Identity:
+        """Identity of the unit; TC08Error or RuntimeError if the library fails or it is closed."""
+        unit = (UnitInfo * 1)()
+        unit[0].size = ctypes.sizeof(UnitInfo)
+        if not self._library.usb_tc08_get_unit_info(self._open_handle(), unit):
+            raise self._error("tell what it is")
+        texts = (unit[0].serial, unit[0].calibration_date, unit[0].driver)
+        serial, date, driver = (text.decode("ascii", "backslashreplace") for text in texts)
+        versions = unit[0].hardware, unit[0].variant
+        return Identity(serial, date, driver, *versions, self.is_simulated)
+
+    def set_channels(self, kinds: Mapping[int, str]) -> None:
+        """
+        Set the type of each thermocouple; all other sockets are switched off.
+
+        Parameters
+        ----------
+        kinds : mapping
+            Channel, 1 to 8, to the type's letter, one of B E J K N R S T. The cold junction is
+            always read.
+
+        Raises
+        ------
+        ValueError
+            If a channel or a letter is another one, or no channel is given.
+        TC08Error, RuntimeError
+            If the library fails, or the unit is not open.
+        """
+        if not kinds:
+            raise ValueError("Invalid channels {}. Must be one at least.")
+        for channel, kind in kinds.items():
+            if channel not in range(1, CHANNELS):
+                raise ValueError(f"Invalid channel {channel}. Must lie in 1 to {CHANNELS - 1}.")
+            if len(kind) != 1 or kind not in KINDS:
+                raise ValueError(
+                    f"Invalid thermocouple '{kind}' of channel {channel}. Must be one of "
+                    f"{' '.join(KINDS)}."
+                )
+        self._has_channels = False  # until all are set
+        for channel in range(CHANNELS):
+            letter = kinds.get(channel, " ") if channel else "C"
+            if not self._library.usb_tc08_set_channel(self._open_handle(), channel, ord(letter)):
+                raise self._error(f"set channel {channel} to '{letter}'")
+        self._has_channels = True
+
+    def single(self) -> Scan:
+        """
+        Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
+
+        Returns
+        -------
+        Scan
+            Temperatures and flags of the nine channels.
+
+        Raises
+        ------
+        TC08Error, RuntimeError
+            If the library fails, the unit is not open, or no channels are set.
+        """
+        handle = self._open_handle()
+        if not self._has_channels:
+            raise RuntimeError("The TC-08 has no channels yet. Must be told them first.")
+        values, overflow = (c_float * CHANNELS)(), (c_int16 * 1)()
+        start = self._clock()
+        done = self._library.usb_tc08_get_single(handle, values, overflow, KELVIN)
+        middle = 0.5 * (start + self._clock())
+        if not done:
+            raise self._error("take a single reading")
+        return Scan(middle, *flagged(np.array(values, dtype=np.float64), overflow[0]))
+
+    def _open_handle(self) -> int:
+        if not self._handle:
+            raise RuntimeError("The TC-08 is closed. Must be opened first.")
+        return self._handle
+
+    def _error(self, action: str) -> TC08Error:
+        return TC08Error(action, self._library.usb_tc08_get_last_error(self._handle))
+
+
+def flagged(
+    values: npt.NDArray[np.float64], overflow_bits: int
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
+    """Temperatures [K], NaN unless valid, and flags, of the library's nine values [K]."""
+    overflow = (overflow_bits >> np.arange(CHANNELS)) & 1
+    flag = np.where(overflow, Flag.OVERFLOW, Flag.GOOD)
+    flag |= np.where(np.isfinite(values), Flag.GOOD, Flag.MISSING)
+    flag |= np.where(np.isfinite(values) & (values <= 0.0), Flag.OUT_OF_RANGE, Flag.GOOD)
+    return np.where(flag == 0, values, np.nan), flag.astype(np.uint8)
+
+
+def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -> Library:
+    """
+    Load the vendor's library and declare the types of its functions.
+
+    Parameters
+    ----------
+    path : str, optional
+        File of the library. Without it, the variable `ENVIRONMENT` names the file, and without
+        that, the system's own search must find ``usbtc08``.
+    environment : mapping
+        Where the variable is looked up.
+
+    Raises
+    ------
+    FileNotFoundError
+        If no library is named and none is found.
+    OSError
+        If the file cannot be loaded, or lacks a function.
+    """
+    name = path or environment.get(ENVIRONMENT) or ctypes.util.find_library("usbtc08")
+    if name is None:
+        raise FileNotFoundError(
+            "No library 'usbtc08'. Must be installed (libusbtc08 of Pico Technology, often in "
+            f"/opt/picoscope/lib), or named by its path or by the variable {ENVIRONMENT}."
+        )
+    library = ctypes.CDLL(name)
+    for function, arguments in SIGNATURES.items():
+        if not hasattr(library, function):
+            raise OSError(f"Invalid library '{name}' without {function}. Must be libusbtc08.")
+        getattr(library, function).restype = c_int16
+        getattr(library, function).argtypes = arguments
+    return library
+
+
+def __dir__() -> list[str]:
+    return __all__

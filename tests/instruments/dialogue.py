@@ -1,0 +1,91 @@
+"""A device in a byte dialogue: it answers what a test writes down, and nothing may be left over.
+
+The idea is pymeasure's ``expected_protocol``.
+"""
+
+from collections.abc import Iterable, Sequence
+from types import TracebackType
+from typing import Final
+
+from dbthermal.instruments.closing import Closing
+
+Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]
+"""What a driver must write, or None, and what the device answers, in one piece or in several."""
+
+
+class Dialogue(Closing):
+    """
+    A transport that expects certain bytes, gives certain answers, and allows no rest.
+
+    Used as a context manager it checks at its end, unless something else went wrong, that all was
+    written and all was read. An answer in several pieces takes one read for each; an empty piece
+    is a read that times out, and so is a read for which nothing is left.
+    """
+
+    is_simulated: Final = True
+
+    def __init__(self, pairs: Iterable[Pair]) -> None:
+        self._pairs = list(pairs)
+        self._written = b""
+        self._answers: list[bytes] = []
+        self._next()
+
+    def write(self, data: bytes) -> None:
+        """Compare what a driver sends with what it should."""
+        _must(not self._answers, f"Unread {self._answers!r}, but {data.hex(' ')} was written.")
+        _must(bool(self._pairs), f"Unexpected {data.hex(' ')} was written. Must be nothing more.")
+        expected = self._pairs[0][0] or b""
+        self._written += data
+        _must(
+            expected.startswith(self._written),
+            f"Unexpected {self._written.hex(' ')} was written. Must be {expected.hex(' ')}.",
+        )
+        if self._written == expected:
+            self._answer()
+
+    def read(self, size: int, timeout: float) -> bytes:  # noqa: ARG002 - no time goes by
+        """Give the next piece of the answer, at most `size` bytes of it; none if none is left."""
+        if not self._answers:
+            return b""
+        piece = self._answers.pop(0)
+        if piece[size:]:
+            self._answers.insert(0, piece[size:])
+        elif not self._answers:
+            self._next()
+        return piece[:size]
+
+    def close(self) -> None:
+        """Do nothing, so that a driver's own end does not hide what is left."""
+
+    def finish(self) -> None:
+        """Fail if something was not written or not read."""
+        _must(not self._answers, f"Left unread: {self._answers!r}. Must be nothing.")
+        _must(not self._written, f"Cut short: {self._written.hex(' ')}. Must be whole.")
+        _must(not self._pairs, f"Left unwritten: {self._pairs!r}. Must be nothing.")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self.finish()
+
+    def _answer(self) -> None:
+        """Make the answer of the first pair ready to be read."""
+        _, answer = self._pairs.pop(0)
+        pieces = [answer] if isinstance(answer, bytes) else list(answer or ())
+        self._written, self._answers = b"", pieces
+        if not pieces:
+            self._next()
+
+    def _next(self) -> None:
+        """Let the device speak, if it is to do so unasked."""
+        if self._pairs and self._pairs[0][0] is None:
+            self._answer()
+
+
+def _must(holds: bool, message: str) -> None:  # like `assert`, which -O removes
+    if not holds:
+        raise AssertionError(message)

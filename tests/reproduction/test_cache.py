@@ -1,0 +1,113 @@
+"""Cache of experiments: a result is computed once, and again where it cannot be trusted."""
+
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pytest
+import xarray as xr
+
+from reproduction import cache, experiments
+
+PLATE = {"frames": 120, "shape": [10, 24], "crossings": 6}
+
+
+def counted(folder: str, value: float, seed: int) -> xr.Dataset:
+    """Leave a mark for each call, and return something random."""
+    (Path(folder) / f"call-{len(list(Path(folder).iterdir()))}").touch()
+    if value < 0:
+        raise ValueError("interrupted")
+    return xr.Dataset({"drawn": ("n", value + np.random.default_rng(seed).random(300))})
+
+
+@pytest.fixture
+def marks(tmp_path: Path) -> Path:
+    """Folder for the marks of `counted`."""
+    (tmp_path / "marks").mkdir()
+    return tmp_path / "marks"
+
+
+def calls(marks: Path) -> int:
+    """Number of calls of `counted`."""
+    return len(list(marks.iterdir()))
+
+
+def test_a_result_is_computed_once(tmp_path: Path, marks: Path) -> None:
+    """A second call returns the same from disk; other arguments are computed."""
+    first = cache.memory(tmp_path).cache(counted)(str(marks), 1.0, seed=1)
+    again = cache.memory(tmp_path).cache(counted)(str(marks), value=1.0, seed=1)
+    xr.testing.assert_identical(first, again)
+    assert calls(marks) == 1
+    cache.memory(tmp_path).cache(counted)(str(marks), 1.0, seed=2)
+    assert calls(marks) == 2
+
+
+def test_an_interruption_keeps_what_was_done(tmp_path: Path, marks: Path) -> None:
+    """Results before a failure are kept; the failed call leaves none."""
+    experiment = cache.memory(tmp_path).cache(counted)
+    experiment(str(marks), 1.0, 1)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="interrupted"):
+            experiment(str(marks), -1.0, 1)
+    experiment(str(marks), 1.0, 1)
+    assert calls(marks) == 3
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "removed"])
+@pytest.mark.filterwarnings("ignore")
+def test_a_damaged_file_is_computed_again(tmp_path: Path, marks: Path, damage: str) -> None:
+    """Half a file, none, and a single wrong bit anywhere in it: the result is the same."""
+    experiment = cache.memory(tmp_path / "cells").cache(counted)
+    first = experiment(str(marks), 1.0, 1)
+    (path,) = (tmp_path / "cells").rglob("output.pkl")
+    whole = path.read_bytes()
+    places = range(2, len(whole), len(whole) // 12) if damage == "flipped" else [len(whole) // 2]
+    for place in places:
+        path.write_bytes(whole[: 0 if damage == "empty" else place])
+        if damage == "flipped":
+            path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        if damage == "removed":
+            path.unlink()
+        xr.testing.assert_identical(experiment(str(marks), 1.0, 1), first)
+    assert calls(marks) == 1 + len(places)
+
+
+def test_changed_code_starts_anew(
+    tmp_path: Path, marks: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A result of other source code is not used, nor is code that changed since its import."""
+    cache.memory(tmp_path).cache(counted)(str(marks), 1.0, 1)
+    monkeypatch.setattr(cache, "_fingerprint", lambda: "other")
+    with pytest.raises(RuntimeError, match=r"Changed source code\. Must be as it was imported"):
+        cache.memory(tmp_path)
+    monkeypatch.setattr(cache, "_IMPORTED", "other")
+    cache.memory(tmp_path).cache(counted)(str(marks), 1.0, 1)
+    assert calls(marks) == 2
+
+
+@pytest.mark.slow
+def test_several_processes_find_the_same(tmp_path: Path) -> None:
+    """The number of processes changes nothing."""
+    variants = {"subspace": {"method": "subspace"}}
+    common = {"emissivity": [0.86, 0.72], "noise": [0.03, 0.35], "plate": PLATE, "pixels": 4}
+    alone, shared = (
+        joblib.Parallel(workers)(
+            joblib.delayed(cache.memory(tmp_path / str(workers)).cache(experiments.compare))(
+                **common, variants=variants, seed=seed
+            )
+            for seed in (1, 2)
+        )
+        for workers in (1, 2)
+    )
+    for first, second in zip(alone, shared, strict=True):
+        xr.testing.assert_identical(first.drop_attrs(), second.drop_attrs())
+
+
+def test_grid_of_results() -> None:
+    """The last coordinate varies fastest; a missing result is refused."""
+    results = [xr.Dataset({"value": ((), float(number))}) for number in range(6)]
+    coords: dict[str, list[float]] = {"noise": [0.1, 0.2], "seed": [1, 2, 3]}
+    together = cache.gridded(results, coords)
+    assert float(together["value"].sel(noise=0.2, seed=1)) == 3.0
+    with pytest.raises(ValueError, match=r"Invalid number of results 5\. Must be 6\."):
+        cache.gridded(results[:5], coords)
