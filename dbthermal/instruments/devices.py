@@ -13,17 +13,16 @@ from dataclasses import fields
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from dbthermal.instruments import filterwheel
+from dbthermal.instruments import filterwheel, telemetry
 from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.camera import FrameSource, Stream
 from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Picture
 from dbthermal.instruments.emulated.world import ROOM, World
-from dbthermal.instruments.entries import check_one_of
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.rig import Devices, ReadingError, Thermocouples
-from dbthermal.instruments.session import Session
+from dbthermal.instruments.session import Session, check_one_of
 from dbthermal.instruments.tc08 import TC08
-from dbthermal.instruments.video.source import FrameSource
 
 __all__ = ["Devices", "ReadingError", "Thermocouples", "emulated_world", "open_devices"]
 
@@ -149,9 +148,10 @@ def _source(
     url = session.url(session.cameras[band].video)
     form = session.shape, session.frame_rate, session.telemetry_rows
     if url.startswith("v4l2:///") and world is None:
-        from dbthermal.instruments.video import v4l2, v4l2_calls  # noqa: PLC0415 - Linux only
+        from dbthermal.instruments.video import v4l2  # noqa: PLC0415 - Linux only
 
-        return v4l2.Capture.open(urlsplit(url).path, v4l2_calls.Stream(*form))
+        stream = Stream(*form)
+        return v4l2.Capture.open(urlsplit(url).path, stream, decode=telemetry.metadata)
     if not url.startswith("sim://camera/") or world is None:
         raise ValueError(
             f"Invalid address '{url}' of the camera of band '{band}'. Must be 'v4l2:///dev/...', "

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from dbthermal import store
+from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.recording.capture import mean_reading
 from dbthermal.instruments.recording.fetching import Limits, Reading
 from dbthermal.instruments.recording.record import Preview, Summary, record
@@ -31,7 +32,6 @@ from dbthermal.instruments.recording.sweep import (
 )
 from dbthermal.instruments.rig import Devices
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.video.source import SourceLostError
 
 __all__ = ["Step", "bench_series", "open_sweep", "record_scene", "record_sweep", "wait_stable"]
 

@@ -14,19 +14,13 @@ from functools import partial
 from typing import Any, Final
 
 from dbthermal.instruments.boson import Boson, BosonError, commands
-from dbthermal.instruments.boson.commands import (
-    FfcMode,
-    Ir16Mode,
-    Setting,
-    Switch,
-    TelemetryLocation,
-)
+from dbthermal.instruments.boson.commands import Ir16Mode, Setting, Switch, TelemetryLocation
+from dbthermal.instruments.camera import FfcMode, FrameFlag, FrameSource, NoFrameError
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
 from dbthermal.instruments.recording.fetching import Reading
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
-from dbthermal.instruments.video.source import FrameFlag, FrameSource, NoFrameError
 
 SCAN_AGE: Final = 1.0
 """Longest time for which a scan of all thermocouples gives the readings of its channels [s]."""

@@ -5,12 +5,12 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from dbthermal.instruments.camera import Counts
 from dbthermal.instruments.devices import Devices, emulated_world, open_devices
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording.fetching import Limits
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.video.source import Counts
 
 SHAPE = (4, 80)
 LEVELS = {"8-14": 1000, "9.5": 20_000, "11": 40_000}

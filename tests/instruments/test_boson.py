@@ -18,8 +18,9 @@ from dbthermal.instruments.boson import (
     BosonTimeoutError,
     commands,
 )
-from dbthermal.instruments.boson.commands import GainMode, Setting
+from dbthermal.instruments.boson.commands import Setting
 from dbthermal.instruments.boson.link import MAXIMUM_RECEIVED
+from dbthermal.instruments.camera import GainMode
 from dbthermal.instruments.emulated.boson_faults import DEBUG_CHANNEL
 
 SERIAL, FPA, GAIN, SET_GAIN = 0x00050002, 0x00050030, 0x00050015, 0x00050014

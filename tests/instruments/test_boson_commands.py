@@ -5,7 +5,8 @@ from enum import IntEnum
 import pytest
 
 from dbthermal.instruments.boson import commands
-from dbthermal.instruments.boson.commands import Action, FfcStatus, Ir16Mode, Reading, Setting
+from dbthermal.instruments.boson.commands import Action, Ir16Mode, Reading, Setting
+from dbthermal.instruments.camera import FfcStatus
 
 # Identifiers and layouts of openmv/openmv, drivers/boson (commit cbbb877): to read; to set and to
 # read, and the values; to do.

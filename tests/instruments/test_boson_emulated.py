@@ -19,14 +19,8 @@ from dbthermal.instruments.boson import (
     BosonTimeoutError,
     commands,
 )
-from dbthermal.instruments.boson.commands import (
-    FfcMode,
-    FfcStatus,
-    GainMode,
-    Setting,
-    Switch,
-    SyncMode,
-)
+from dbthermal.instruments.boson.commands import Setting, Switch, SyncMode
+from dbthermal.instruments.camera import FfcMode, FfcStatus, GainMode
 from dbthermal.instruments.emulated.boson import BOOT_DURATION, IMMINENT, EmulatedBoson
 from dbthermal.instruments.emulated.boson_faults import Fault
 from dbthermal.instruments.emulated.port import EmulatedPort, Loop

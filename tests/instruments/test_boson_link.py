@@ -12,8 +12,9 @@ from test_boson import reply
 
 from dbthermal.instruments import fslp
 from dbthermal.instruments.boson import Boson, BosonError, BosonStatusError, commands
-from dbthermal.instruments.boson.commands import FfcStatus, SyncMode
+from dbthermal.instruments.boson.commands import SyncMode
 from dbthermal.instruments.boson.link import REPLY_TIMEOUT, Link
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.emulated.boson_faults import Fault
 from dbthermal.instruments.transport import TransportError

@@ -7,7 +7,6 @@ and run with -m hardware: the wheel turns, a shutter closes, nothing is saved.
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +16,17 @@ from rig_openings import CAMERAS, LOGGERS, VIDEOS, WHEELS, Opened, Opening
 
 from dbthermal.instruments import inventory
 from dbthermal.instruments.boson import Boson, commands
-from dbthermal.instruments.boson.commands import FfcMode, FfcStatus
-from dbthermal.instruments.emulated import usb
+from dbthermal.instruments.camera import (
+    FfcMode,
+    FfcStatus,
+    FrameSource,
+    NoFrameError,
+    SourceLostError,
+    frames,
+)
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.tc08 import TC08, Flag
 from dbthermal.instruments.transport import TransportError
-from dbthermal.instruments.video.source import FrameSource, NoFrameError, SourceLostError, frames
 
 CLOSED = (TransportError, RuntimeError, SourceLostError)
 NAMES = {"model", "part_number", "serial_number"}
@@ -218,16 +222,9 @@ def test_silence_is_no_loss(opened: Opened) -> None:
     source.close()
 
 
-@pytest.mark.parametrize(
-    "emulated", [True, pytest.param(False, marks=pytest.mark.hardware, id="hardware")]
-)
-def test_the_rig_is_found(emulated: bool, tmp_path: Path) -> None:
+@pytest.mark.hardware
+def test_the_rig_is_found() -> None:
     """With the rig plugged in all of it is found, and nothing stands in the way."""
-    if emulated:
-        backend = usb.EmulatedBackend(usb.boson(1), usb.boson(2, bus=2), usb.apt(), usb.tc08())
-        usb.write_sysfs(tmp_path, backend)
-        found = inventory.find(backend, sysfs=tmp_path, dev=tmp_path / "dev")
-    else:
-        found = inventory.find()
+    found = inventory.find()
     assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
     assert [device.warnings for device in found] == [()] * 4

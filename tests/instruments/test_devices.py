@@ -10,7 +10,8 @@ import pytest
 from rig_session import SHAPE, TEXT, bench, pictures, replaced, rig
 
 from dbthermal.instruments.boson import Boson, BosonTimeoutError, commands
-from dbthermal.instruments.boson.commands import FfcMode, FfcStatus, Ir16Mode, Switch, SyncMode
+from dbthermal.instruments.boson.commands import Ir16Mode, Switch, SyncMode
+from dbthermal.instruments.camera import FfcMode, FfcStatus, NoFrameError
 from dbthermal.instruments.devices import (
     Devices,
     ReadingError,
@@ -24,7 +25,6 @@ from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.filterwheel import NotHomedError
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan
-from dbthermal.instruments.video.source import NoFrameError
 
 
 @pytest.fixture

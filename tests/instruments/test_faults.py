@@ -20,6 +20,7 @@ from dbthermal import correction as frames
 from dbthermal import store
 from dbthermal.instruments import apt
 from dbthermal.instruments.boson import Boson, BosonReplyError, BosonStatusError, BosonTimeoutError
+from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.devices import Devices, Thermocouples
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.boson_faults import Fault
@@ -35,7 +36,6 @@ from dbthermal.instruments.filterwheel import (
 from dbthermal.instruments.recording.capture import open_capture
 from dbthermal.instruments.tc08 import TC08, TC08Error
 from dbthermal.instruments.transport import TransportError
-from dbthermal.instruments.video.source import FrameFlag
 
 # Cameras: what goes wrong with their frames.
 

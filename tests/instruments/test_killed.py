@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import store
+from dbthermal.instruments.camera import Counts, Frame
 from dbthermal.instruments.emulated.frames import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import record, tape
@@ -18,7 +19,6 @@ from dbthermal.instruments.recording.capture import notes, open_capture
 from dbthermal.instruments.recording.contents import Note
 from dbthermal.instruments.recording.fetching import Limits, Reading
 from dbthermal.instruments.session import Camera, Device, Session
-from dbthermal.instruments.video.source import Counts, Frame
 from dbthermal.store import _durable as durable
 
 SHAPE, RATE, CHUNK = (32, 40), 200.0, 6

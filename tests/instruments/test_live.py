@@ -15,14 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
 from dbthermal.figures import LiveFigure, Panel
-from dbthermal.instruments import live
+from dbthermal.instruments import live, telemetry
+from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording.fetching import Limits, Reading
 from dbthermal.instruments.recording.record import Preview, Summary, record
 from dbthermal.instruments.session import Camera, Device, Session
-from dbthermal.instruments.video import telemetry
-from dbthermal.instruments.video.source import GOOD, Counts, Frame, FrameFlag
 
 BANDS = ("8-14", "9.5")
 DEGREE = "\N{DEGREE SIGN}C"

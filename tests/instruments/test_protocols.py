@@ -10,6 +10,7 @@ from rig_session import LEVELS, QUICK, SHAPE, TEXT, bench, replaced, rig, scene_
 
 from dbthermal import store
 from dbthermal.instruments import protocols
+from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.emulated.frames import Faults
 from dbthermal.instruments.emulated.world import World
@@ -18,7 +19,6 @@ from dbthermal.instruments.recording import sweep
 from dbthermal.instruments.recording.capture import notes, open_capture
 from dbthermal.instruments.recording.record import Preview
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.video.source import SourceLostError
 
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"))
 TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"))

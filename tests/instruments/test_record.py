@@ -11,6 +11,7 @@ import xarray as xr
 
 from dbthermal import alignment, store
 from dbthermal import correction as frames
+from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import record, tape, writing
@@ -18,7 +19,6 @@ from dbthermal.instruments.recording.capture import notes, open_capture
 from dbthermal.instruments.recording.fetching import Limits, Reading
 from dbthermal.instruments.recording.record import Preview
 from dbthermal.instruments.session import Camera, Device, Session
-from dbthermal.instruments.video.source import Counts, Frame, FrameFlag, FrameSource
 
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
 BANDS = ("8-14", "9.5")
@@ -155,7 +155,7 @@ def test_recording_goes_on_to_alignment(tmp_path: Path) -> None:
         (Faults(dropped=frozenset({7, 8})), "frames_lost", 2),
         (Faults(corrupt=frozenset({7})), "damaged", FrameFlag.DRIVER_ERROR),
         (Faults(short=frozenset({7})), "damaged", FrameFlag.WRONG_SIZE),
-        (Faults(ffc=frozenset({7})), "shutter_closed", 7),
+        (Faults(ffc=frozenset({7})), "shutter_closed", 9),
     ],
 )
 def test_faults_are_noted(faults: Faults, kind: str, value: int, tmp_path: Path) -> None:

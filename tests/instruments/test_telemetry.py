@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dbthermal.instruments.video import telemetry
-from dbthermal.instruments.video.telemetry import Telemetry
+from dbthermal.instruments import telemetry
+from dbthermal.instruments.telemetry import Telemetry
 
 COLUMNS = 640
 U16, U32 = st.integers(0, 2**16 - 1), st.integers(0, 2**32 - 1)

@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dbthermal.instruments.camera import FrameFlag, NoFrameError, SourceLostError, Stream, frames
 from dbthermal.instruments.video import v4l2, v4l2_calls
-from dbthermal.instruments.video.source import FrameFlag, NoFrameError, SourceLostError, frames
-from dbthermal.instruments.video.v4l2_calls import Stream
 
 STREAM = Stream(shape=(4, 6), telemetry_rows=2)
 BYTES = 2 * 6 * 6

@@ -12,13 +12,13 @@ import pytest
 from test_record import BANDS, CHUNK, SMALL, bench, session
 
 from dbthermal import store
+from dbthermal.instruments.camera import Frame, FrameFlag, FrameSource
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import CameraState
 from dbthermal.instruments.recording import record, tape, writing
 from dbthermal.instruments.recording.capture import notes, open_capture
 from dbthermal.instruments.recording.fetching import Limits
 from dbthermal.instruments.recording.record import Preview
-from dbthermal.instruments.video.source import Frame, FrameFlag, FrameSource
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from dbthermal.instruments.boson import commands
-from dbthermal.instruments.boson.commands import FfcStatus, Reading, Setting, SyncMode
+from dbthermal.instruments.boson.commands import Reading, Setting, SyncMode
 from dbthermal.instruments.boson.link import (
     REPEATS,
     REPLY_TIMEOUT,
@@ -22,6 +22,7 @@ from dbthermal.instruments.boson.link import (
     Link,
     Statistics,
 )
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.transport import Transport, open_serial
 

@@ -20,6 +20,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from scipy.constants import zero_Celsius
 
+from dbthermal.instruments.camera import FfcMode, FfcStatus, GainMode
 from dbthermal.instruments.fslp import REQUEST
 
 T = TypeVar("T")
@@ -31,37 +32,6 @@ class Switch(IntEnum):
 
     OFF = 0
     ON = 1
-
-
-class FfcMode(IntEnum):
-    """What starts a flat-field correction (FFC): a command, the camera itself, or an outer target.
-
-    In `EXTERNAL` the shutter stays open, and the scene has to be uniform.
-    """
-
-    MANUAL = 0
-    AUTO = 1
-    EXTERNAL = 2
-    SHUTTER_TEST = 3
-
-
-class FfcStatus(IntEnum):
-    """Where the camera is with its flat-field correction."""
-
-    NONE_PERFORMED = 0
-    IMMINENT = 1
-    IN_PROGRESS = 2
-    COMPLETE = 3
-
-
-class GainMode(IntEnum):
-    """Sensitivity; low gain has the larger range of temperatures."""
-
-    HIGH = 0
-    LOW = 1
-    AUTO = 2
-    DUAL = 3
-    MANUAL = 4
 
 
 class SyncMode(IntEnum):

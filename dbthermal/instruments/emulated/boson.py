@@ -18,7 +18,8 @@ from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import fslp
 from dbthermal.instruments.boson import commands
-from dbthermal.instruments.boson.commands import FfcMode, FfcStatus, Setting, SyncMode
+from dbthermal.instruments.boson.commands import Setting, SyncMode
+from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.emulated.boson_faults import Fault, Faults, misshapen
 from dbthermal.instruments.emulated.options import number, require_known
 from dbthermal.instruments.emulated.port import EmulatedPort

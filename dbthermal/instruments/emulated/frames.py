@@ -16,10 +16,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments.closing import Closing
-from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.video import telemetry
-from dbthermal.instruments.video.source import (
+from dbthermal.instruments import telemetry
+from dbthermal.instruments.camera import (
+    DAMAGED,
     FRAME_TIMEOUT,
     GOOD,
     Counts,
@@ -28,6 +27,8 @@ from dbthermal.instruments.video.source import (
     NoFrameError,
     SourceLostError,
 )
+from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.emulated.world import World
 
 Picture = Callable[[float], Counts]
 
@@ -151,7 +152,7 @@ class EmulatedCamera(Closing):
     frame_rate : float
         [Hz].
     telemetry_rows : int
-        0, or `dbthermal.instruments.video.telemetry.ROWS`.
+        0, or `dbthermal.instruments.telemetry.ROWS`.
     faults : Faults
         What goes wrong.
     sleep : callable
@@ -193,7 +194,7 @@ class EmulatedCamera(Closing):
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """
-        Wait for the next frame; see `dbthermal.instruments.video.source.FrameSource.read`.
+        Wait for the next frame; see `dbthermal.instruments.camera.FrameSource.read`.
 
         Parameters
         ----------
@@ -256,11 +257,12 @@ class EmulatedCamera(Closing):
         if not frozen and number not in self.faults.repeated:
             self._last = self._image(due)
         counts, flags = self._damaged(number)
-        flags |= FrameFlag.SHUTTER_CLOSED if frozen else GOOD
         flags |= GOOD if self.faults.clock_rate == 1 else FrameFlag.FOREIGN_CLOCK
         # Both clocks have the host's origin, so that rates alone differ.
         device_time = self.faults.clock_rate * (self.world.epoch + due)
-        return Frame(counts, device_time, self.world.clock(), number, flags, self._telemetry(due))
+        rows = self._telemetry(due)
+        metadata = None if rows is None or flags & DAMAGED else telemetry.metadata(rows)
+        return Frame(counts, device_time, self.world.clock(), number, flags, rows, metadata)
 
     def _image(self, time: float) -> Counts:
         """Counts through the filter in the beam, with the offsets since the last correction."""

@@ -8,10 +8,9 @@ from typing import Any, Final
 import numpy as np
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments.boson.commands import FfcStatus
+from dbthermal.instruments import telemetry
+from dbthermal.instruments.camera import DAMAGED, Counts, FfcStatus, Frame, FrameFlag
 from dbthermal.instruments.recording.record import Preview
-from dbthermal.instruments.video import telemetry
-from dbthermal.instruments.video.source import DAMAGED, Counts, Frame, FrameFlag
 
 WINDOW: Final = 3.0
 """Time over which a frame rate is measured [s]."""

@@ -10,9 +10,9 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from dbthermal.instruments.camera import Frame, FrameSource, NoFrameError, SourceLostError
 from dbthermal.instruments.recording.contents import Note
 from dbthermal.instruments.recording.tape import CHUNK
-from dbthermal.instruments.video.source import Frame, FrameSource, NoFrameError, SourceLostError
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Final
 
 from dbthermal import store
+from dbthermal.instruments.camera import Frame, FrameSource
 from dbthermal.instruments.recording import writing
 from dbthermal.instruments.recording.fetching import Limits, Reading, Run, ask, fetch
 from dbthermal.instruments.recording.tape import Tape
 from dbthermal.instruments.recording.writing import Written
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.video.source import Frame, FrameSource
 
 _POLL: Final = 0.01  # least wait of the one who looks on [s]
 _BYTES: Final = 2  # of a pixel

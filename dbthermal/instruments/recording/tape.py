@@ -19,23 +19,27 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import store
-from dbthermal.alignment import _clocks as clocks
-from dbthermal.instruments.recording.contents import ABOUT, TELEMETRY, VARIABLES, Note
-from dbthermal.instruments.video import telemetry
-from dbthermal.instruments.video.source import (
+from dbthermal.alignment import fill_times
+from dbthermal.instruments.camera import (
     DAMAGED,
     GOOD,
     UNTIMED,
     Counts,
+    FfcStatus,
     Frame,
     FrameFlag,
     FrameSource,
+    Metadata,
+    Shutter,
+    next_shutter,
 )
+from dbthermal.instruments.recording.contents import ABOUT, TELEMETRY, VARIABLES, Note
 
 CHUNK: Final = 30
 """Frames of a chunk: half a second at 60 Hz, which is what a kill may cost."""
 
 _AHEAD: Final = 1e-3  # by how much a stamp may be later than the frame was there [s]
+_STALE: Final = 3.0  # age at which a reading of the serial line says no more of the shutter [s]
 _HELD: Final = 1.0  # how long a note may wait for a chunk before it is written without one [s]
 _FILLS: Final = MappingProxyType(
     {"frame_flags": int(FrameFlag.PADDED), "sequence": -1, "frame_counter": -1}
@@ -51,7 +55,8 @@ class _Band:
     image: Counts | None = None
     sequence: int | None = None
     device_time: float = -math.inf
-    closed: bool = False
+    shutter: Shutter = field(default_factory=Shutter)
+    ffc_status: tuple[float, FfcStatus | None] = (-math.inf, None)
     last_correction: int | None = None
     counts: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
@@ -125,7 +130,7 @@ class Tape:
         """Band to its ``frames``, ``lost``, ``refused`` and ``damaged``, numbers of frames."""
         return {band: dict(state.counts) for band, state in self._bands.items()}
 
-    def frame(self, band: str, frame: Frame, refused: int = 0) -> None:
+    def frame(self, band: str, frame: Frame, refused: int = 0) -> FrameFlag:
         """
         Take a frame; write the chunk if it is whole.
 
@@ -137,13 +142,18 @@ class Tape:
             As it came from the source.
         refused : int
             Frames of this band that came since the one before and were not taken.
+
+        Returns
+        -------
+        FrameFlag
+            All flags of the frame, those of the driver and of the recorder.
         """
         state = self._bands[band]
         flags = frame.flags | self._compared(band, frame, refused)
+        flags |= self._watch_shutter(band, frame, flags)
         if flags & DAMAGED:
             state.counts["damaged"] += 1
             self.note(Note.DAMAGED, band, frame.host_time, int(flags))
-        self._watch_shutter(band, frame)
         timed = not flags & (UNTIMED | FrameFlag.FOREIGN_CLOCK)
         values: dict[str, Any] = {
             "counts": frame.counts,
@@ -160,6 +170,7 @@ class Tape:
         state.counts["frames"] += 1
         if state.filled == self._chunk:
             self._write(band)
+        return flags
 
     def note(self, kind: Note, source: str, time: float, value: float = math.nan) -> None:
         """
@@ -176,6 +187,9 @@ class Tape:
         value : float
             See `Note`.
         """
+        band = source.removeprefix("ffc ")
+        if kind is Note.READING and source != band and band in self._bands:
+            self._bands[band].ffc_status = time, FfcStatus(int(value))
         row = time - self._origin, int(kind), self._names.index(source), value
         self._notes.append(row)
         if row[0] - self._notes[0][0] > _HELD:
@@ -243,27 +257,38 @@ class Tape:
         state.device_time = frame.device_time
         return GOOD
 
-    def _watch_shutter(self, band: str, frame: Frame) -> None:
+    def _watch_shutter(self, band: str, frame: Frame, flags: FrameFlag) -> FrameFlag:
+        """Flag of a closed shutter, from telemetry, serial line and image."""
         state = self._bands[band]
-        closed = FrameFlag.SHUTTER_CLOSED in frame.flags
-        if closed != state.closed:
-            kind = Note.SHUTTER_CLOSED if closed else Note.SHUTTER_OPEN
+        read_at, status = state.ffc_status
+        before, state.shutter = (
+            state.shutter,
+            next_shutter(
+                state.shutter,
+                repeated=FrameFlag.IMAGE_REPEATED in flags,
+                last_ffc_frame=frame.metadata.last_ffc_frame if frame.metadata else None,
+                ffc_status=status if frame.host_time - read_at <= _STALE else None,
+            ),
+        )
+        if state.shutter.closed != before.closed:
+            kind = Note.SHUTTER_CLOSED if state.shutter.closed else Note.SHUTTER_OPEN
             self.note(kind, band, frame.host_time, frame.sequence)
-            state.closed = closed
+        return FrameFlag.SHUTTER_CLOSED if state.shutter.closed else GOOD
 
     def _decoded(self, band: str, frame: Frame) -> dict[str, Any]:
-        """Telemetry as it came, and what of it is of use frame by frame."""
+        """Telemetry as it came, and its values that are stored for each frame."""
         if frame.telemetry is None:
             return {}
-        if frame.flags & DAMAGED:  # its telemetry may be, too: it is kept, but not believed
-            unknown = {"fpa_temperature": math.nan, "frame_counter": -1}
-            return {"telemetry": frame.telemetry, **unknown}
-        state, fields = self._bands[band], telemetry.decode(frame.telemetry)
-        if state.last_correction not in {None, fields.last_ffc_frame}:
-            self.note(Note.CORRECTION, band, frame.host_time, fields.last_ffc_frame)
-        state.last_correction = fields.last_ffc_frame
-        names = ("fpa_temperature", "frame_counter")
-        return {"telemetry": frame.telemetry, **{name: getattr(fields, name) for name in names}}
+        state, fields = self._bands[band], frame.metadata or Metadata()
+        if fields.last_ffc_frame is not None:
+            if state.last_correction not in {None, fields.last_ffc_frame}:
+                self.note(Note.CORRECTION, band, frame.host_time, fields.last_ffc_frame)
+            state.last_correction = fields.last_ffc_frame
+        return {
+            "telemetry": frame.telemetry,
+            "fpa_temperature": fields.fpa_temperature,
+            "frame_counter": fields.frame_counter,
+        }
 
     def _write(self, band: str) -> None:
         state = self._bands[band]
@@ -297,7 +322,7 @@ class Tape:
     def _times(self, band: str) -> npt.NDArray[np.float64] | None:
         """Exposure times without holes; None where there are not two."""
         stamps = self.recording.read("exposure_time", band)
-        return clocks.filled(stamps) if np.isfinite(stamps).sum() > 1 else None
+        return fill_times(stamps) if np.isfinite(stamps).sum() > 1 else None
 
 
 def _common_format(sources: Mapping[str, FrameSource]) -> tuple[tuple[int, int], int]:

@@ -10,14 +10,14 @@ import queue
 import shutil
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from dbthermal.instruments.camera import Frame, FrameFlag
 from dbthermal.instruments.recording.contents import Note
 from dbthermal.instruments.recording.fetching import Run
 from dbthermal.instruments.recording.tape import Tape
-from dbthermal.instruments.video.source import Frame, FrameFlag
 
 _POLL: Final = 0.05  # how long the writer waits before it looks whether all is over [s]
 _HELD: Final = 2.0  # how long after the start a frame may still come that a driver held [s]
@@ -140,8 +140,8 @@ def _take(tape: Tape, written: Written, band: str, frame: Frame, refused: int) -
     early = frame.device_time < written.start and frame.host_time < written.start + _HELD
     if band not in written.frames and early and not own_clock:
         return
-    tape.frame(band, frame, refused)
-    written.frames[band] = frame
+    flags = tape.frame(band, frame, refused)
+    written.frames[band] = replace(frame, flags=flags)
     written.totals = tape.totals
 
 

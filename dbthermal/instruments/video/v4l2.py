@@ -9,23 +9,26 @@ calls, not against a camera.
 
 import errno
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final, Self
 
 import numpy as np
 
-from dbthermal.instruments.closing import Closing
-from dbthermal.instruments.video import v4l2_calls as calls
-from dbthermal.instruments.video.source import (
+from dbthermal.instruments.camera import (
+    DAMAGED,
     FRAME_TIMEOUT,
     GOOD,
     Counts,
     Frame,
     FrameFlag,
+    Metadata,
     NoFrameError,
     SourceLostError,
+    Stream,
 )
-from dbthermal.instruments.video.v4l2_calls import Kernel, Stream
+from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.video import v4l2_calls as calls
+from dbthermal.instruments.video.v4l2_calls import Kernel
 
 _ERROR: Final = 0x40  # V4L2_BUF_FLAG_ERROR
 _CLOCK_MASK: Final = 0xE000  # V4L2_BUF_FLAG_TIMESTAMP_MASK
@@ -61,15 +64,28 @@ class Capture(Closing):
 
     is_simulated: Final = False
 
-    def __init__(self, path: str, stream: Stream, kernel: Kernel | None = None) -> None:
+    def __init__(
+        self,
+        path: str,
+        stream: Stream,
+        kernel: Kernel | None = None,
+        decode: Callable[[Any], Metadata] | None = None,
+    ) -> None:
         self.path, self.stream = path, stream
+        self._decode = decode
         self.identity: Mapping[str, str] = {"device": path}
         self._kernel = kernel or Kernel()
         self._file: int | None = None
         self._maps: list[Any] = []
 
     @classmethod
-    def open(cls, path: str, stream: Stream | None = None, kernel: Kernel | None = None) -> Self:
+    def open(
+        cls,
+        path: str,
+        stream: Stream | None = None,
+        kernel: Kernel | None = None,
+        decode: Callable[[Any], Metadata] | None = None,
+    ) -> Self:
         """
         Open a node, agree on format and rate, and start the stream.
 
@@ -81,6 +97,8 @@ class Capture(Closing):
             What to ask of the camera; 640 x 512 pixels at 60 Hz, without telemetry.
         kernel : Kernel, optional
             Calls to the kernel.
+        decode : callable, optional
+            Reads the metadata of a frame from its telemetry rows.
 
         Returns
         -------
@@ -94,7 +112,7 @@ class Capture(Closing):
         ValueError
             If the node gives no Y16, or the driver agrees to another format or rate.
         """
-        capture = cls(path, stream or Stream(), kernel)
+        capture = cls(path, stream or Stream(), kernel, decode)
         capture._start()
         return capture
 
@@ -115,7 +133,7 @@ class Capture(Closing):
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """
-        Wait for the next frame; see `dbthermal.instruments.video.source.FrameSource.read`.
+        Wait for the next frame; see `dbthermal.instruments.camera.FrameSource.read`.
 
         Parameters
         ----------
@@ -222,7 +240,10 @@ class Capture(Closing):
         flags |= FrameFlag.WRONG_SIZE if used != image.nbytes else GOOD
         flags |= FrameFlag.FOREIGN_CLOCK if said & _CLOCK_MASK != _MONOTONIC else GOOD
         counts, telemetry = _split(image.astype(np.uint16, copy=False), self.stream)
-        return Frame(counts, seconds + _MICRO * micros, host_time, sequence, flags, telemetry)
+        whole = telemetry is not None and not flags & DAMAGED
+        metadata = self._decode(telemetry) if self._decode and whole else None
+        time = seconds + _MICRO * micros
+        return Frame(counts, time, host_time, sequence, flags, telemetry, metadata)
 
 
 def _buffer(index: int) -> bytearray:

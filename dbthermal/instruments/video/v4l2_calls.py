@@ -21,6 +21,7 @@ try:
 except ImportError as missing:  # Windows
     raise ImportError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.") from missing
 
+from dbthermal.instruments.camera import Stream
 
 Y16: Final = 0x20363159
 """Pixel format ``Y16 ``: 16 bits a pixel, little-endian, before any gain control."""
@@ -65,34 +66,6 @@ _VIDEO_CAPTURE: Final = 0x1  # V4L2_CAP_VIDEO_CAPTURE
 _STREAMING: Final = 0x04000000  # V4L2_CAP_STREAMING
 _BYTES: Final = 2  # of a pixel
 _RATE_TOLERANCE: Final = 1e-3
-
-
-@dataclass(frozen=True)
-class Stream:
-    """
-    What to ask of a camera.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        Rows and columns of the image, without telemetry [pixel].
-    frame_rate : float
-        Rate [Hz]; a Boson offers 60 and 30.
-    telemetry_rows : int
-        Rows of telemetry besides: 2 for a Boson with telemetry on.
-    telemetry_first : bool
-        Whether these are above the image, as the camera is set.
-    """
-
-    shape: tuple[int, int] = (512, 640)
-    frame_rate: float = 60.0
-    telemetry_rows: int = 0
-    telemetry_first: bool = False
-
-    @property
-    def rows(self) -> int:
-        """Rows of the whole frame."""
-        return self.shape[0] + self.telemetry_rows
 
 
 @dataclass(frozen=True)

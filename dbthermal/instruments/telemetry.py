@@ -19,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.constants import zero_Celsius
 
+from dbthermal.instruments.camera import Metadata
+
 Words = npt.NDArray[np.uint16]
 
 ROWS: Final = 2
@@ -170,6 +172,12 @@ def decode(rows: Words, *, high_word_first: bool = True) -> Telemetry:
         software_revision=tuple(revision),  # type: ignore[arg-type]
         **values,
     )
+
+
+def metadata(rows: Words) -> Metadata:
+    """Metadata of a frame, from its telemetry rows; see `decode`."""
+    fields = decode(rows)
+    return Metadata(fields.frame_counter, fields.last_ffc_frame, fields.fpa_temperature)
 
 
 def encode(

@@ -1,0 +1,405 @@
+"""The interface of a camera: all that recorder, sessions and live view need of any camera.
+
+`FrameSource` gives frames with two clocks, a number, flags and metadata; `CameraControl`, which a
+camera may lack, sets its modes and tells its temperature and its shutter. `KINDS` names the module
+of each kind of camera, which is imported when a session asks for it. `next_shutter` turns what a
+camera tells into the flag of a closed shutter, for all cameras alike. A damaged frame is handed on
+and says so in its flags: to hide or mend it is not the driver's task.
+"""
+
+import importlib
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from types import MappingProxyType
+from typing import Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = [
+    "DAMAGED",
+    "FEWEST_COPIES",
+    "FRAME_TIMEOUT",
+    "GOOD",
+    "KINDS",
+    "MEANINGS",
+    "UNTIMED",
+    "CameraControl",
+    "CameraKind",
+    "Counts",
+    "FfcMode",
+    "FfcStatus",
+    "Frame",
+    "FrameFlag",
+    "FrameSource",
+    "GainMode",
+    "Identity",
+    "Metadata",
+    "NoFrameError",
+    "Shutter",
+    "SourceLostError",
+    "Stream",
+    "camera_kind",
+    "frames",
+    "next_shutter",
+]
+
+Counts = npt.NDArray[np.uint16]
+Identity = Mapping[str, str | bool]
+
+FRAME_TIMEOUT: Final = 1.0
+"""Longest wait for a frame by default [s]; a Boson gives 30 or 60 a second."""
+
+FEWEST_COPIES: Final = 3
+"""Copies in a row from which a camera without telemetry counts as closed, as in
+`dbthermal.correction.find_shutter`: fewer are lost frames."""
+
+KINDS: Final = MappingProxyType(
+    {
+        "boson": "dbthermal.instruments.boson",
+    }
+)
+"""Module of each kind of camera; its ``KIND`` is a `CameraKind`."""
+
+
+class FrameFlag(IntFlag):
+    """State of one frame; `MEANINGS` has a sentence for each bit."""
+
+    DRIVER_ERROR = 1
+    WRONG_SIZE = 2
+    FOREIGN_CLOCK = 4
+    SHUTTER_CLOSED = 8
+    FRAMES_LOST_BEFORE = 16
+    SEQUENCE_STANDS = 32
+    TIME_STANDS = 64
+    TIME_WRONG = 128
+    PADDED = 256
+    IMAGE_REPEATED = 512
+
+
+GOOD: Final = FrameFlag(0)
+"""No flag."""
+
+MEANINGS: Final = MappingProxyType(
+    {
+        FrameFlag.DRIVER_ERROR: "the driver says that the data are damaged",
+        FrameFlag.WRONG_SIZE: "fewer or more bytes than a frame has: what is missing is 0",
+        FrameFlag.FOREIGN_CLOCK: "the device time is not on the host's monotonic clock",
+        FrameFlag.SHUTTER_CLOSED: "the shutter is closed, or the offsets were just renewed",
+        FrameFlag.FRAMES_LOST_BEFORE: "the sequence number leaps: frames are missing before it",
+        FrameFlag.SEQUENCE_STANDS: "the sequence number does not rise: repeated, or started anew",
+        FrameFlag.TIME_STANDS: "the device time does not rise, or is not known",
+        FrameFlag.TIME_WRONG: "the device time is before the start, or after the host's",
+        FrameFlag.PADDED: "no frame: the band has fewer than another, and its last one is repeated",
+        FrameFlag.IMAGE_REPEATED: "no pixel differs from the frame before: frozen, or saturated",
+    }
+)
+"""The first three are set by the driver, the others by the recorder, which sees the frame before.
+"""
+
+UNTIMED: Final = (
+    FrameFlag.DRIVER_ERROR
+    | FrameFlag.WRONG_SIZE
+    | FrameFlag.SEQUENCE_STANDS
+    | FrameFlag.TIME_STANDS
+    | FrameFlag.TIME_WRONG
+    | FrameFlag.PADDED
+)
+"""A frame with one of these is recorded but is no measurement: it gets no exposure time. A repeated
+image keeps its time, for a closed aperture looks so, too."""
+
+DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
+"""A frame with one of these has wrong counts, and maybe wrong telemetry."""
+
+
+class FfcStatus(IntEnum):
+    """State of a camera's flat-field correction (FFC)."""
+
+    NONE_PERFORMED = 0
+    IMMINENT = 1
+    IN_PROGRESS = 2
+    COMPLETE = 3
+
+
+class FfcMode(IntEnum):
+    """Trigger of a flat-field correction: a command, the camera itself, or an external target.
+
+    In `EXTERNAL` the shutter stays open, and the scene has to be uniform.
+    """
+
+    MANUAL = 0
+    AUTO = 1
+    EXTERNAL = 2
+    SHUTTER_TEST = 3
+
+
+class GainMode(IntEnum):
+    """Sensitivity; low gain has the larger range of temperatures."""
+
+    HIGH = 0
+    LOW = 1
+    AUTO = 2
+    DUAL = 3
+    MANUAL = 4
+
+
+class NoFrameError(TimeoutError):
+    """No frame came in time; the next one may."""
+
+
+class SourceLostError(ConnectionError):
+    """The source is gone, unplugged or closed, and gives no more frames."""
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """
+    What a camera says of one frame besides its image.
+
+    Attributes
+    ----------
+    frame_counter : int
+        Camera's own number of the frame, -1 if not known.
+    last_ffc_frame : int or None
+        `frame_counter` at the last flat-field correction.
+    fpa_temperature : float
+        Of the focal-plane array [K].
+    """
+
+    frame_counter: int = -1
+    last_ffc_frame: int | None = None
+    fpa_temperature: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """
+    One frame as it came.
+
+    Attributes
+    ----------
+    counts : ndarray of uint16, shape (y, x)
+        Raw signal [count]; the frame's own, no driver writes to it again.
+    device_time : float
+        When the frame was exposed, by the camera's or the kernel's stamp [s]; NaN if not known.
+    host_time : float
+        When the host had it, on its monotonic clock [s].
+    sequence : int
+        Number that the driver gives each frame; a leap is a loss.
+    flags : FrameFlag
+        Damage, and kind of its clock; 0 is good.
+    telemetry : ndarray of uint16, shape (row, x), or None
+        Telemetry rows as they came; see `dbthermal.instruments.telemetry.decode`.
+    metadata : Metadata or None
+        Decoded from the telemetry; None without telemetry, or if the frame is damaged.
+    """
+
+    counts: Counts
+    device_time: float
+    host_time: float
+    sequence: int
+    flags: FrameFlag = GOOD
+    telemetry: Counts | None = None
+    metadata: Metadata | None = None
+
+
+@dataclass(frozen=True)
+class Stream:
+    """
+    Format of a stream of frames.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Rows and columns of the image, without telemetry [pixel].
+    frame_rate : float
+        Rate [Hz].
+    telemetry_rows : int
+        Rows of telemetry besides: 2 for a Boson with telemetry on.
+    telemetry_first : bool
+        Whether these are above the image, as the camera is set.
+    """
+
+    shape: tuple[int, int] = (512, 640)
+    frame_rate: float = 60.0
+    telemetry_rows: int = 0
+    telemetry_first: bool = False
+
+    @property
+    def rows(self) -> int:
+        """Rows of the whole frame."""
+        return self.shape[0] + self.telemetry_rows
+
+
+class FrameSource(Protocol):
+    """An open camera that gives frames, one after the other."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the image, without telemetry [pixel]."""
+
+    @property
+    def telemetry_rows(self) -> int:
+        """Rows of telemetry that come with each frame, 0 for none."""
+
+    @property
+    def frame_rate(self) -> float:
+        """Nominal rate [Hz]."""
+
+    @property
+    def identity(self) -> Mapping[str, str]:
+        """Model, serial number and device; text by name."""
+
+    @property
+    def is_simulated(self) -> bool:
+        """True if the camera is emulated."""
+
+    def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
+        """
+        Wait at most `timeout` [s] for the next frame; damaged ones are returned, too, with flags.
+
+        `NoFrameError` if none came in time, `SourceLostError` if the camera is gone or closed.
+        """
+
+    def close(self) -> None:
+        """Stop and release the device; a second call does nothing."""
+
+
+class CameraControl(Protocol):
+    """The command port of a camera that has one; what fails is a RuntimeError or an OSError."""
+
+    @property
+    def is_simulated(self) -> bool:
+        """True if the camera is emulated."""
+
+    def identity(self) -> Identity:
+        """Serial number, versions and ``is_simulated``, by name, for the record of a capture."""
+
+    def prepare(self, telemetry_rows: int) -> None:
+        """Set 16-bit counts, telemetry and FFC on command only; ValueError if one is not kept."""
+
+    def run_ffc(self) -> int:
+        """Run a flat-field correction, wait for its end, return its frame on the camera's count."""
+
+    def ffc_status(self) -> FfcStatus:
+        """State of the flat-field correction, and so of the shutter."""
+
+    def fpa_temperature(self) -> float:
+        """Temperature of the focal-plane array [K]."""
+
+    def ffc_mode(self) -> FfcMode:
+        """Trigger of a flat-field correction."""
+
+    def gain_mode(self) -> GainMode:
+        """Sensitivity."""
+
+    def close(self) -> None:
+        """Release the port; a second call does nothing."""
+
+
+@dataclass(frozen=True)
+class CameraKind:
+    """
+    One kind of camera, as its module names it in ``KIND``.
+
+    Attributes
+    ----------
+    open_frames : callable
+        Opens the frames of a hardware address in a format.
+    open_control : callable or None
+        Opens the command port of an address, given the emulated bench or None.
+    telemetry_rows : tuple of int
+        Numbers of telemetry rows that it can give.
+    """
+
+    open_frames: Callable[[str, Stream], FrameSource]
+    open_control: Callable[[str, object | None], CameraControl] | None = None
+    telemetry_rows: tuple[int, ...] = (0,)
+
+
+def camera_kind(name: str) -> CameraKind:
+    """Import the kind of camera of this name; ValueError if it is not one of `KINDS`."""
+    if name not in KINDS:
+        raise ValueError(f"Unknown kind of camera '{name}'. Must be one of {sorted(KINDS)}.")
+    kind: CameraKind = importlib.import_module(KINDS[name]).KIND
+    return kind
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """
+    State of one camera's shutter after a frame; see `next_shutter`.
+
+    Attributes
+    ----------
+    closed : bool
+        Whether the frame is flagged `FrameFlag.SHUTTER_CLOSED`.
+    copies : int
+        Frames in a row, up to this one, that repeat the image before.
+    last_ffc_frame : int or None
+        Number of the last flat-field correction's frame, as far as telemetry told it.
+    """
+
+    closed: bool = False
+    copies: int = 0
+    last_ffc_frame: int | None = None
+
+
+def next_shutter(
+    before: Shutter,
+    *,
+    repeated: bool,
+    last_ffc_frame: int | None = None,
+    ffc_status: FfcStatus | None = None,
+) -> Shutter:
+    """
+    State of a camera's shutter after one more frame, from what the camera tells.
+
+    A camera freezes its image while the shutter is closed. A frame counts as closed if
+
+    - telemetry says that the offsets were renewed since the frame before (`last_ffc_frame`
+      changed), be it at the start or at the end of the correction: then one frame more is lost, but
+      no renewal is missed, even where the frozen frames were lost on the way; or
+    - it repeats the image, and the frame before counted as closed, or the serial line says that a
+      correction is imminent or in progress (a reading is older than its frame, so that it does not
+      count against an image that changes); or
+    - it is the `FEWEST_COPIES`-th copy in a row or a later one, of a camera without telemetry. A
+      serial line alone may miss an event: it is asked once a second, and stalls meanwhile.
+
+    The flag is per band and frame, and is known with the frame. It marks an event at least once,
+    not always from its first copy: `dbthermal.correction.find_shutter(capture, closed=...)` takes
+    ``(frame_flags & SHUTTER_CLOSED) != 0`` (band, time) as `closed`, and every run of copies that
+    holds or touches a flagged frame becomes one event with renewed offsets, which
+    `dbthermal.correction.mark_shutter` takes out.
+
+    Parameters
+    ----------
+    before : Shutter
+        After the frame before; ``Shutter()`` before the first.
+    repeated : bool
+        No pixel differs from the frame before.
+    last_ffc_frame : int, optional
+        From the frame's telemetry (`Metadata`); None if there is none, or the frame is damaged.
+    ffc_status : FfcStatus, optional
+        Latest reading of the serial line; None if there is none, or it is too old.
+
+    Returns
+    -------
+    Shutter
+        After this frame.
+    """
+    known = before.last_ffc_frame if last_ffc_frame is None else last_ffc_frame
+    renewed = before.last_ffc_frame not in {None, known}
+    copies = before.copies + 1 if repeated else 0
+    announced = ffc_status in {FfcStatus.IMMINENT, FfcStatus.IN_PROGRESS}
+    frozen = known is None and copies >= FEWEST_COPIES
+    closed = renewed or (repeated and (before.closed or announced or frozen))
+    return Shutter(closed, copies, known)
+
+
+def frames(source: FrameSource, number: int, timeout: float = FRAME_TIMEOUT) -> Iterator[Frame]:
+    """Yield a number of frames, waiting at most `timeout` [s] for each."""
+    for _ in range(number):
+        yield source.read(timeout)
