@@ -25,7 +25,7 @@ from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import ROOM, World
 from dbthermal.instruments.live import Watch
-from dbthermal.instruments.recording.record import Preview, Summary
+from dbthermal.instruments.recording import Preview, Summary
 from dbthermal.instruments.session import Session
 
 FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)

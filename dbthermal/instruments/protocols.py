@@ -4,7 +4,7 @@ Gain, offset and response are calibrated before a blackbody that goes through se
 the emissivity bench goes through them with samples. At each temperature the wheel goes through its
 filters, and each of these is a recording of its own, begun only when the temperature rests. What
 was recorded is opened by `open_sweep` and `bench_series`, a scene by
-`dbthermal.instruments.recording.capture.open_capture`.
+`dbthermal.instruments.recording.open_capture`.
 """
 
 import threading
@@ -19,21 +19,24 @@ import numpy as np
 
 from dbthermal import store
 from dbthermal.instruments.camera import SourceLostError
-from dbthermal.instruments.recording.capture import mean_reading
-from dbthermal.instruments.recording.fetching import Limits, Reading
-from dbthermal.instruments.recording.record import Preview, Summary, record
-from dbthermal.instruments.recording.sweep import (
+from dbthermal.instruments.recording import (
+    Limits,
+    Preview,
+    Reading,
+    Summary,
+    mean_reading,
+    record,
+)
+from dbthermal.instruments.recording._sweep import (
     BLACKBODY,
-    bench_series,
     is_complete,
-    open_sweep,
     require_filter,
     step_path,
 )
 from dbthermal.instruments.rig import Devices
 from dbthermal.instruments.session import Session
 
-__all__ = ["Step", "bench_series", "open_sweep", "record_scene", "record_sweep", "wait_stable"]
+__all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]
 
 STABILITY_PERIOD: Final = 1.0
 """Time from reading to reading while a temperature is awaited [s]."""
@@ -115,8 +118,8 @@ def wait_stable(
             readings.popleft()
         sleep(STABILITY_PERIOD)
     raise TimeoutError(
-        f"No rest at {temperature} K within {steps.timeout} s: last {values[-1]} K. Must stay "
-        f"within {steps.stability} K for {steps.window} s, and within {steps.tolerance} K of it."
+        f"No rest at {temperature} K within {steps.timeout:g} s: last {values[-1]} K. Must stay "
+        f"within {steps.stability} K for {steps.window:g} s, and within {steps.tolerance} K of it."
     )
 
 
@@ -212,7 +215,7 @@ def record_scene(
     path : str or Path
         Store to make, ``*.zarr``.
     limits, preview, stop : optional
-        As for `dbthermal.instruments.recording.record.record`.
+        As for `dbthermal.instruments.recording.record`.
 
     Returns
     -------

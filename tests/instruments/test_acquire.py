@@ -9,13 +9,12 @@ import pytest
 from rig_session import LEVELS, TEXT, bench, pictures, replaced, scene_text
 
 from dbthermal import acquire
-from dbthermal.instruments import inventory, protocols
+from dbthermal.instruments import inventory, protocols, recording
 from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording.capture import open_capture
-from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.recording import Preview, open_capture
 from dbthermal.instruments.session import Session
 
 TWO = replaced(
@@ -51,7 +50,7 @@ def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "11: " in said
     assert "FPA 35.0 \N{DEGREE SIGN}C, FFC complete" in said
     assert f"{folder / 'plate_01_11.zarr'}: duration" in said
-    movies = protocols.open_sweep(folder, "plate", frames=8)
+    movies = recording.open_sweep(folder, "plate", frames=8)
     exact = np.add.outer(list(LEVELS.values()), [2900, 3000])
     np.testing.assert_array_equal(movies["counts"][:, :, 0, 0, 0], exact)
 

@@ -32,7 +32,7 @@ from dbthermal.instruments.filterwheel import (
     StalledWheelError,
     WheelError,
 )
-from dbthermal.instruments.recording.capture import open_capture
+from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.tc08 import TC08, TC08Error
 from dbthermal.instruments.transport import TransportError
 

@@ -19,8 +19,7 @@ from dbthermal.instruments import live, telemetry
 from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording.fetching import Limits, Reading
-from dbthermal.instruments.recording.record import Preview, Summary, record
+from dbthermal.instruments.recording import Limits, Preview, Reading, Summary, record
 from dbthermal.instruments.session import Camera, Device, Session
 
 BANDS = ("8-14", "9.5")
@@ -325,7 +324,8 @@ def test_recording_without_a_notebook(tmp_path: Path) -> None:
 
 def test_import_is_light() -> None:
     """Neither the package nor the watch loads matplotlib or IPython: the first picture does."""
-    code = "import sys, dbthermal.live; print({'matplotlib', 'IPython', 'torch'} & {*sys.modules})"
+    heavy = "{'matplotlib', 'IPython', 'torch'}"
+    code = f"import sys, dbthermal.instruments.live; print({heavy} & {{*sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from dbthermal.instruments.live._watch import FFC, FPA, WINDOW, Status, Watch, celsius, ffc_state
-from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.recording import Preview
 
 if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it
     from matplotlib.figure import Figure

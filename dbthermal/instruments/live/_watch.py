@@ -10,7 +10,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import DAMAGED, Counts, FfcStatus, Frame, FrameFlag
-from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.recording import Preview
 
 WINDOW: Final = 3.0
 """Time over which a frame rate is measured [s]."""

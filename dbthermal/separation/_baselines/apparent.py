@@ -7,36 +7,37 @@ from typing import Final
 
 import numpy as np
 
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Separated, flag
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._tiles import Estimate, Method, Tile
 
 
-def separate(problem: Problem) -> Separated:
+def separate(tile: Tile) -> Estimate:
     """
     Apparent temperature of one tile.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         Signals; only those of the quieter band are used.
 
     Returns
     -------
-    Separated
+    Estimate
         Object temperature, NaN where no temperature gives the signal, with the flag
         `outside_response`. Nothing else is estimated.
     """
-    temperature = problem.temperature(0, problem.signals[0])
+    temperature = tile.temperature(0, tile.signals[0])
     unknown = np.full_like(temperature, np.nan)
     none = np.full((2, temperature.shape[1]), np.nan)
-    return Separated(
+    return Estimate(
         object_temperature=temperature,
         object_temperature_std=unknown,
         background_temperature=unknown,
         background_temperature_std=unknown,
         emissivity=none,
         emissivity_std=none,
-        status=flag({"outside_response": np.any(np.isnan(temperature), axis=0)}),
+        status=status_bits({Status.OUTSIDE_RESPONSE: np.any(np.isnan(temperature), axis=0)}),
     )
 
 

@@ -26,9 +26,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from dbthermal import planck
-from dbthermal.curves import require_range
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Separated
+from dbthermal.response import require_range
+from dbthermal.separation._tiles import Array, Estimate, Method, Tile
 
 
 @dataclass(frozen=True)
@@ -81,20 +80,20 @@ class BcpSettings:
             )
 
 
-def separate(problem: Problem, settings: BcpSettings) -> Separated:
+def separate(tile: Tile, settings: BcpSettings) -> Estimate:
     """
     Remove the reflection from a whole image, each frame by itself.
 
     Parameters
     ----------
-    problem : Problem
-        Signals of two bands, of an image of `problem.shape`.
+    tile : Tile
+        Signals of two bands, of an image of `tile.shape`.
     settings : BcpSettings
         Sizes of the filters, and what is known of the reflection.
 
     Returns
     -------
-    Separated
+    Estimate
         Object temperature from the quieter band; background temperature, that of the reflected
         signal A, the same in all pixels; emissivity of each band: the mean over time of its own t.
         No deviations. Pixels without a temperature, as dead ones, are filled with the frame's
@@ -105,12 +104,12 @@ def separate(problem: Problem, settings: BcpSettings) -> Separated:
     ValueError
         If the reflected temperature lies outside the response's range.
     """
-    object_signal, reflected, transmission = _movie(problem, settings, 0)
-    transmissions = np.stack([transmission, _movie(problem, settings, 1)[2]])
-    usable = np.isfinite(problem.temperature(0, problem.signals[0]))
-    warm = np.where(usable, problem.temperature(0, object_signal), np.nan)
-    cold = np.tile(problem.temperature(0, reflected)[:, np.newaxis], warm.shape[1])
-    return Separated(
+    object_signal, reflected, transmission = _movie(tile, settings, 0)
+    transmissions = np.stack([transmission, _movie(tile, settings, 1)[2]])
+    usable = np.isfinite(tile.temperature(0, tile.signals[0]))
+    warm = np.where(usable, tile.temperature(0, object_signal), np.nan)
+    cold = np.tile(tile.temperature(0, reflected)[:, np.newaxis], warm.shape[1])
+    return Estimate(
         object_temperature=warm,
         object_temperature_std=np.full_like(warm, np.nan),
         background_temperature=cold,
@@ -118,22 +117,22 @@ def separate(problem: Problem, settings: BcpSettings) -> Separated:
         emissivity=transmissions,
         emissivity_std=np.full_like(transmissions, np.nan),
         status=np.zeros(warm.shape[1], dtype=np.uint32),
-    ).ranged(problem.curves[0], deviations=False)
+    ).check_range(tile.curves[0], deviations=False)
 
 
-def _movie(problem: Problem, settings: BcpSettings, band: int) -> tuple[Array, Array, Array]:
+def _movie(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array, Array]:
     """Object signal (time, pixel), reflected signal (time), mean t (pixel), of one band."""
-    clean = np.empty_like(problem.signals[band])
-    reflected, total = np.empty(problem.time.size), np.zeros(clean.shape[1])
-    given = _given(problem, settings, band)
-    for frame, signal in enumerate(problem.signals[band]):
-        image = _filled(problem, band, signal).reshape(problem.shape)
+    clean = np.empty_like(tile.signals[band])
+    reflected, total = np.empty(tile.time.size), np.zeros(clean.shape[1])
+    given = _given(tile, settings, band)
+    for frame, signal in enumerate(tile.signals[band]):
+        image = _filled(tile, band, signal).reshape(tile.shape)
         level = float(np.percentile(image, settings.percentile)) if given is None else given
         transmission = _transmission(image, level, settings)
         above = (image - level) / np.maximum(transmission, settings.least_transmission)
         clean[frame], reflected[frame] = (above + level).ravel(), level
         total += transmission.ravel()
-    return clean, reflected, total / problem.time.size
+    return clean, reflected, total / tile.time.size
 
 
 def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Array:
@@ -171,18 +170,18 @@ def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Ar
     return np.asarray(uniform_filter(slope, window) * guide + uniform_filter(intercept, window))
 
 
-def _given(problem: Problem, settings: BcpSettings, band: int) -> float | None:
+def _given(tile: Tile, settings: BcpSettings, band: int) -> float | None:
     """Signal of the given reflected temperature, if there is one."""
     if settings.reflected_temperature is None:
         return None
-    curve = problem.curves[band]
+    curve = tile.curves[band]
     level = require_range(settings.reflected_temperature, curve, "reflected_temperature")
-    return float(problem.blackbody(band, level))
+    return float(tile.blackbody(band, level))
 
 
-def _filled(problem: Problem, band: int, image: Array) -> Array:
+def _filled(tile: Tile, band: int, image: Array) -> Array:
     """The frame with its median in place of pixels that no temperature gives."""
-    usable = np.isfinite(problem.temperature(band, image))
+    usable = np.isfinite(tile.temperature(band, image))
     if not np.any(usable):
         return image
     return np.where(usable, image, np.median(image[usable]))

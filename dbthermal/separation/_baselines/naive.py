@@ -23,8 +23,9 @@ import numpy.typing as npt
 from scipy.special import expit, logit
 
 from dbthermal import planck
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Mask, Separated, flag
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Tile
 
 # Damping of the first step, relative to the diagonal of the normal equations, and its range; the
 # Schur complement is proportional to the damping, and is rounding below the least.
@@ -90,13 +91,13 @@ class _State:
         return _State(**{name: value[..., columns] for name, value in vars(self).items()})
 
 
-def separate(problem: Problem, settings: NaiveSettings, truth: Array | None = None) -> Separated:
+def separate(tile: Tile, settings: NaiveSettings, truth: Array | None = None) -> Estimate:
     """
     Separate one tile.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         Signals of two bands.
     settings : NaiveSettings
         Starts and limits of the search.
@@ -106,27 +107,27 @@ def separate(problem: Problem, settings: NaiveSettings, truth: Array | None = No
 
     Returns
     -------
-    Separated
+    Estimate
         Temperatures and emissivities, without deviations; `not_converged` where the start that is
         kept was still improving at the last step, or found no finite objective.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
-        state = _search(problem, settings)
+        state = _search(tile, settings)
         kept = state.taken(_choice(state, settings, truth))
         temperatures, emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
     return (
-        Separated(
+        Estimate(
             object_temperature=temperatures[0],
             object_temperature_std=np.full_like(temperatures[0], np.nan),
             background_temperature=temperatures[1],
             background_temperature_std=np.full_like(temperatures[1], np.nan),
             emissivity=emissivity,
             emissivity_std=np.full_like(emissivity, np.nan),
-            status=flag({"not_converged": kept.going | lost}),
+            status=status_bits({Status.NOT_CONVERGED: kept.going | lost}),
         )
-        .without(lost, lost, lost)
-        .ranged(problem.curves[0], deviations=False)
+        .undefine(lost, lost, lost)
+        .check_range(tile.curves[0], deviations=False)
     )
 
 
@@ -141,37 +142,37 @@ def _choice(state: _State, settings: NaiveSettings, truth: Array | None) -> Colu
     return np.asarray(start * pixels + np.arange(pixels))
 
 
-def _search(problem: Problem, settings: NaiveSettings) -> _State:
+def _search(tile: Tile, settings: NaiveSettings) -> _State:
     """Run all starts to their end; columns are the starts of all pixels, start by start."""
-    signals = np.tile(problem.signals, (1, 1, settings.starts))
-    state = _start(problem, signals, settings)
+    signals = np.tile(tile.signals, (1, 1, settings.starts))
+    state = _start(tile, signals, settings)
     for _ in range(settings.iterations):
         columns = state.going
         if not np.any(columns):
             break
-        moved = _step(problem, signals[..., columns], state.taken(columns), settings.tolerance)
+        moved = _step(tile, signals[..., columns], state.taken(columns), settings.tolerance)
         for name, value in vars(state).items():
             value[..., columns] = getattr(moved, name)
     return state
 
 
-def _start(problem: Problem, signals: Array, settings: NaiveSettings) -> _State:
+def _start(tile: Tile, signals: Array, settings: NaiveSettings) -> _State:
     """Random emissivities, and temperatures near the image's."""
     columns = signals.shape[-1]
-    logits = logit(problem.rng.uniform(np.finfo(np.float64).tiny, 1.0, (2, columns)))
-    shifts = settings.spread * problem.rng.standard_normal((2, 1, columns))
-    logarithms = np.log(problem.temperature(0, signals[0]) + shifts)
-    objective = _objective(_residual(problem, signals, expit(logits), np.exp(logarithms)))
+    logits = logit(tile.rng.uniform(np.finfo(np.float64).tiny, 1.0, (2, columns)))
+    shifts = settings.spread * tile.rng.standard_normal((2, 1, columns))
+    logarithms = np.log(tile.temperature(0, signals[0]) + shifts)
+    objective = _objective(_residual(tile, signals, expit(logits), np.exp(logarithms)))
     damping = np.full(columns, _FIRST_DAMPING)
     return _State(logits, logarithms, damping, objective, np.isfinite(objective))
 
 
-def _residual(problem: Problem, signals: Array, emissivity: Array, temperatures: Array) -> Array:
+def _residual(tile: Tile, signals: Array, emissivity: Array, temperatures: Array) -> Array:
     """Signals less the model, in units of the noise, (band, time, column)."""
     rest = np.empty_like(signals)
     for band, share in enumerate(emissivity):
-        warm, cold = (problem.blackbody(band, part) for part in temperatures)
-        rest[band] = (signals[band] - cold - share * (warm - cold)) / problem.noise[band]
+        warm, cold = (tile.blackbody(band, part) for part in temperatures)
+        rest[band] = (signals[band] - cold - share * (warm - cold)) / tile.noise[band]
     return rest
 
 
@@ -180,15 +181,15 @@ def _objective(residual: Array) -> Array:
     return np.asarray(np.mean(residual**2, axis=(0, 1)))
 
 
-def _step(problem: Problem, signals: Array, state: _State, tolerance: float) -> _State:
+def _step(tile: Tile, signals: Array, state: _State, tolerance: float) -> _State:
     """One damped step of every column; it is taken where it lowers the objective."""
-    logits_step, logarithms_step = _solve(problem, signals, state)
+    logits_step, logarithms_step = _solve(tile, signals, state)
     tried = replace(
         state,
         logits=state.logits + logits_step,
         logarithms=state.logarithms + logarithms_step,
     )
-    residual = _residual(problem, signals, expit(tried.logits), np.exp(tried.logarithms))
+    residual = _residual(tile, signals, expit(tried.logits), np.exp(tried.logarithms))
     objective = _objective(residual)
     better = objective < state.objective  # false where it is NaN
     better &= np.all(np.abs(logits_step) < _LONGEST, axis=0)
@@ -205,10 +206,10 @@ def _step(problem: Problem, signals: Array, state: _State, tolerance: float) -> 
     )
 
 
-def _solve(problem: Problem, signals: Array, state: _State) -> tuple[Array, Array]:
+def _solve(tile: Tile, signals: Array, state: _State) -> tuple[Array, Array]:
     """Solve the damped normal equations: steps of the logits and of the logarithms."""
-    inner, border = _jacobian(problem, state)
-    residual = _residual(problem, signals, expit(state.logits), np.exp(state.logarithms))
+    inner, border = _jacobian(tile, state)
+    residual = _residual(tile, signals, expit(state.logits), np.exp(state.logarithms))
     # Marquardt's damping, in proportion to the diagonal, and Levenberg's, of every logarithm and
     # logit alike: without it an emissivity of 0 or 1 within rounding is a singular system.
     harder, damping = 1.0 + state.damping, state.damping
@@ -229,7 +230,7 @@ def _solve(problem: Problem, signals: Array, state: _State) -> tuple[Array, Arra
     return logits, force - logits[0] * solved[0] - logits[1] * solved[1]
 
 
-def _jacobian(problem: Problem, state: _State) -> tuple[Array, Array]:
+def _jacobian(tile: Tile, state: _State) -> tuple[Array, Array]:
     """
     Derivatives of the model in units of the noise.
 
@@ -240,10 +241,10 @@ def _jacobian(problem: Problem, state: _State) -> tuple[Array, Array]:
     inner = np.empty((2, *temperatures.shape))
     border = np.empty_like(temperatures)
     for band, share in enumerate(shares):
-        slopes = problem.curves[band].slope(temperatures) * temperatures / problem.noise[band]
+        slopes = tile.curves[band].slope(temperatures) * temperatures / tile.noise[band]
         inner[band] = slopes * np.stack([share, 1.0 - share])[:, np.newaxis]
-        warm, cold = (problem.blackbody(band, part) for part in temperatures)
-        border[band] = share * (1.0 - share) * (warm - cold) / problem.noise[band]
+        warm, cold = (tile.blackbody(band, part) for part in temperatures)
+        border[band] = share * (1.0 - share) * (warm - cold) / tile.noise[band]
     return inner, border
 
 

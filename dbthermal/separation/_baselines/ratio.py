@@ -19,9 +19,10 @@ from scipy.interpolate import CubicSpline
 
 from dbthermal import _smooth as smooth
 from dbthermal import bands, planck
-from dbthermal.curves import Curve
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Separated, flag
+from dbthermal.response import Curve
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._tiles import Array, Estimate, Method, Tile
 
 KINDS: Final = ("wide", "narrow")
 r"""Kinds of radiance: in the whole band, or spectral at the band's centre; both by Planck's law.
@@ -63,20 +64,20 @@ class RatioSettings:
             raise ValueError(f"Invalid order {self.order} of method 'ratio'. Must be at least 1.")
 
 
-def separate(problem: Problem, settings: RatioSettings) -> Separated:
+def separate(tile: Tile, settings: RatioSettings) -> Estimate:
     """
     Temperature of one tile as a gray body's before a background that emits nothing.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         Signals of two bands of `bands.FILTERS`.
     settings : RatioSettings
         Kind of radiance, and smoothing.
 
     Returns
     -------
-    Separated
+    Estimate
         Object temperature, NaN where no temperature in the response's range has the ratio, with the
         flag `outside_response`; emissivity, the same in both bands: radiance over that of a
         blackbody at this temperature, in the quieter band, mean over the frames that have one.
@@ -90,46 +91,46 @@ def separate(problem: Problem, settings: RatioSettings) -> Separated:
         If the ratio of the radiances is not monotonic over the response's range, as for 8-14 and
         10.6 um, which is stationary near 33 C; or there are fewer frames than polynomials.
     """
-    first, second = problem.curves
+    first, second = tile.curves
     inverse = _inverse((first, second), settings.kind)
-    radiances = _radiances(problem, settings)
+    radiances = _radiances(tile, settings)
     with np.errstate(invalid="ignore", divide="ignore"):
         temperature = inverse(np.log(radiances[0] / radiances[1]))
     known = ~np.isnan(temperature)
-    expected = _radiance(problem.curves[0], settings.kind, temperature)
+    expected = _radiance(tile.curves[0], settings.kind, temperature)
     share = np.divide(radiances[0], expected, out=np.zeros_like(expected), where=known)
     frames = known.sum(axis=0)
     mean = np.full(frames.shape, np.nan)
     np.divide(share.sum(axis=0), frames, out=mean, where=frames > 0)
     unknown = np.full_like(temperature, np.nan)
-    return Separated(
+    return Estimate(
         object_temperature=temperature,
         object_temperature_std=unknown,
         background_temperature=unknown.copy(),
         background_temperature_std=unknown.copy(),
         emissivity=np.stack([mean, mean]),
         emissivity_std=np.full((2, mean.size), np.nan),
-        status=flag(
+        status=status_bits(
             {
-                "outside_response": frames < temperature.shape[0],
-                "nonphysical_emissivity": (mean <= 0) | (mean >= 1),
+                Status.OUTSIDE_RESPONSE: frames < temperature.shape[0],
+                Status.NONPHYSICAL_EMISSIVITY: (mean <= 0) | (mean >= 1),
             }
         ),
     )
 
 
-def _radiances(problem: Problem, settings: RatioSettings) -> Array:
+def _radiances(tile: Tile, settings: RatioSettings) -> Array:
     """Radiance of each band, (2, time, pixel), smoothed; NaN where there is none."""
-    signals = problem.signals
+    signals = tile.signals
     found = np.stack(
         [
-            _radiance(curve, settings.kind, problem.temperature(band, signals[band]))
-            for band, curve in enumerate(problem.curves)
+            _radiance(curve, settings.kind, tile.temperature(band, signals[band]))
+            for band, curve in enumerate(tile.curves)
         ]
     )
     if settings.order is None:
         return found
-    functions = smooth.basis(problem.time, settings.order)
+    functions = smooth.basis(tile.time, settings.order)
     return np.asarray(functions @ (functions.T @ found))
 
 

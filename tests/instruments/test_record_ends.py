@@ -15,10 +15,15 @@ from dbthermal import store
 from dbthermal.instruments.camera import Frame, FrameFlag, FrameSource
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import CameraState
-from dbthermal.instruments.recording import record, tape, writing
-from dbthermal.instruments.recording.capture import notes, open_capture
-from dbthermal.instruments.recording.fetching import Limits
-from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.recording import (
+    Limits,
+    Preview,
+    _recorder,
+    notes,
+    open_capture,
+    record,
+)
+from dbthermal.instruments.recording._capture_file import CaptureFile
 
 
 @pytest.fixture(autouse=True)
@@ -38,13 +43,13 @@ def interrupt(_: Preview | None = None) -> None:
 
 def slow_down(monkeypatch: pytest.MonkeyPatch) -> None:
     """Writing a frame takes 0.03 s, three times as long as to take one."""
-    frame = tape.Tape.frame
+    frame = CaptureFile.frame
 
-    def slow(own: tape.Tape, band: str, shot: Frame, refused: int = 0) -> None:
+    def slow(own: CaptureFile, band: str, shot: Frame, refused: int = 0) -> FrameFlag:
         time.sleep(0.03)
-        frame(own, band, shot, refused)
+        return frame(own, band, shot, refused)
 
-    monkeypatch.setattr(tape.Tape, "frame", slow)
+    monkeypatch.setattr(CaptureFile, "frame", slow)
 
 
 def test_slow_disk_refuses_frames_and_counts_them(
@@ -53,7 +58,7 @@ def test_slow_disk_refuses_frames_and_counts_them(
     """Every frame of a queue that overflows is either there or counted as refused or lost."""
     limits, path = Limits(chunk=CHUNK, reserve=0, queue=2), tmp_path / "a.zarr"
     slow_down(monkeypatch)
-    summary = record.record(session(0.5), bench(), path, limits=limits)
+    summary = record(session(0.5), bench(), path, limits=limits)
     opened = open_capture(path)
     for place, band in enumerate(BANDS):
         total = summary.totals[band]
@@ -82,7 +87,7 @@ def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
             time.sleep(0.01)
         seen.append(chunks)
 
-    record.record(session(1.0), bench(), path, limits=SMALL, preview=draw)
+    record(session(1.0), bench(), path, limits=SMALL, preview=draw)
     assert seen[0] >= 1
 
 
@@ -105,7 +110,7 @@ def test_keyboard_interrupt_keeps_everything(
     monkeypatch.setattr(EmulatedCamera, "read", counting)
     limits, path = Limits(chunk=CHUNK, reserve=0, preview_period=0.3), tmp_path / "a.zarr"
     with pytest.raises(KeyboardInterrupt):
-        record.record(
+        record(
             session(60.0),
             bench(),
             path,
@@ -134,7 +139,7 @@ def test_a_lost_camera_is_told_though_it_was_stopped(tmp_path: Path) -> None:
         if not state(sources, "8-14").plugged:
             stop.set()
 
-    summary = record.record(session(9.0), sources, path, limits=SMALL, preview=look, stop=stop)
+    summary = record(session(9.0), sources, path, limits=SMALL, preview=look, stop=stop)
     assert (summary.ended, store.open_dataset(path).attrs["complete"]) == ("source lost", False)
 
 
@@ -142,7 +147,7 @@ def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
     """A band without a frame is no complete recording, and the log says how long it was mute."""
     sources, path = bench(), tmp_path / "a.zarr"
     state(sources, "9.5").streaming = False
-    summary = record.record(session(), sources, path, limits=SMALL)
+    summary = record(session(), sources, path, limits=SMALL)
     assert (summary.ended, summary.totals["9.5"]["frames"]) == ("no frames", 0)
     assert store.open_dataset(path).attrs["complete"] is False
     assert ("no_frame", "9.5", 0.1) in [note[1:] for note in notes(path)]
@@ -150,7 +155,7 @@ def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
 
 def test_wrong_stamps_cost_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A camera whose stamps are all of long ago is recorded, without times, once none is held."""
-    monkeypatch.setattr(writing, "_HELD", 0.1)
+    monkeypatch.setattr(_recorder, "_HELD", 0.1)
     read = EmulatedCamera.read
 
     def stampless(camera: EmulatedCamera, timeout: float = 1.0) -> Frame:
@@ -158,7 +163,7 @@ def test_wrong_stamps_cost_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyP
         return replace(frame, device_time=0.0) if camera.name == "9.5" else frame
 
     monkeypatch.setattr(EmulatedCamera, "read", stampless)
-    record.record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)
+    record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)
     opened = store.open_dataset(tmp_path / "a.zarr")
     frames = slice(0, opened.attrs["frames_written"]["9.5"])
     one = opened.sel(band="9.5").isel(time=frames)
@@ -169,16 +174,16 @@ def test_wrong_stamps_cost_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_second_interrupt_stops_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Interrupted again while it waits for the writer, it returns; the writer ends its work."""
-    path, free, close = tmp_path / "a.zarr", threading.Event(), tape.Tape.close
+    path, free, close = tmp_path / "a.zarr", threading.Event(), CaptureFile.close
 
-    def interrupted_close(own: tape.Tape, *, complete: bool, ended: str) -> None:
+    def interrupted_close(own: CaptureFile, *, complete: bool, ended: str) -> None:
         interrupt()
         free.wait(20)
         close(own, complete=complete, ended=ended)
 
-    monkeypatch.setattr(tape.Tape, "close", interrupted_close)
+    monkeypatch.setattr(CaptureFile, "close", interrupted_close)
     with pytest.raises(KeyboardInterrupt):
-        record.record(session(60.0), bench(), path, limits=SMALL, preview=interrupt)
+        record(session(60.0), bench(), path, limits=SMALL, preview=interrupt)
     assert store.open_dataset(path).attrs["closed"] is False
     free.set()
     (writer,) = (thread for thread in threading.enumerate() if thread.name == "writer")
@@ -194,5 +199,5 @@ def test_a_thread_that_exits_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(EmulatedCamera, "read", leave)
     with pytest.raises(SystemExit, match="left"):
-        record.record(session(9.0), bench(), tmp_path / "a.zarr", limits=SMALL)
+        record(session(9.0), bench(), tmp_path / "a.zarr", limits=SMALL)
     assert store.open_dataset(tmp_path / "a.zarr").attrs["ended"] == "error"

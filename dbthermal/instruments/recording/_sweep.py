@@ -1,7 +1,7 @@
-"""What a sweep recorded: at each temperature, through each filter, a recording of its own.
+"""Reader of a blackbody sweep: one recording for each temperature and filter.
 
-The folder is all that is read, not what a program remembers of the sweep: the recordings say which
-session they are of. Temperatures are those that were read while it was recorded.
+Only the folder is read: the recordings say which session they are of. Temperatures are the readings
+during the recordings, not the set points.
 """
 
 from collections.abc import Iterator, Mapping
@@ -14,54 +14,22 @@ import xarray as xr
 
 from dbthermal import schema, store
 from dbthermal.correction import correct
-from dbthermal.instruments.recording.capture import good_frames, mean_reading, notes, open_capture
+from dbthermal.instruments.recording._capture import good_frames, mean_reading, notes, open_capture
 
 BLACKBODY = "blackbody"
-"""Name of the reading that is the blackbody's temperature [K]."""
+"""Name of the reading of the blackbody's temperature [K]."""
 
 Region = tuple[slice, slice]
 
 
 def step_path(folder: str | Path, name: str, number: int, band: str | None) -> Path:
-    """
-    Where a recording of a sweep is.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Of the sweep.
-    name : str
-        Of the session.
-    number : int
-        Of the temperature, from 0.
-    band : str or None
-        Of the filter in the beam; None without a wheel.
-
-    Returns
-    -------
-    Path
-        ``<name>_<number>_<band>.zarr``.
-    """
+    """Path of a recording: ``<name>_<number>_<band>.zarr``, or without a wheel no band."""
     behind = "" if band is None else f"_{band}"
     return Path(folder) / f"{name}_{number:02d}{behind}.zarr"
 
 
 def require_filter(path: str | Path, band: str | None) -> None:
-    """
-    Raise unless a filter stayed in the beam during a recording.
-
-    Parameters
-    ----------
-    path : str or Path
-        Folder ``*.zarr``.
-    band : str or None
-        Of the filter; None without a wheel, where there is nothing to look at.
-
-    Raises
-    ------
-    ValueError
-        If a reading of the wheel found another slot, or failed.
-    """
+    """ValueError unless the filter of a band stayed in the beam throughout a recording."""
     if band is None:
         return
     filters = store.open_dataset(path).attrs["provenance"]["parameters"]["filters"]
@@ -74,19 +42,7 @@ def require_filter(path: str | Path, band: str | None) -> None:
 
 
 def is_complete(path: str | Path) -> bool:
-    """
-    Whether a recording went to its planned end.
-
-    Parameters
-    ----------
-    path : str or Path
-        Folder ``*.zarr``.
-
-    Returns
-    -------
-    bool
-        False too if it was cut short before it said anything.
-    """
+    """Whether a recording went to its planned end; False, too, if the folder does not exist."""
     try:
         return bool(store.open_dataset(path).attrs.get("complete", False))
     except FileNotFoundError:
@@ -95,7 +51,7 @@ def is_complete(path: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """What the recordings of a folder say of their session."""
+    """Session of a sweep, as its recordings tell it."""
 
     folder: Path
     name: str
@@ -105,7 +61,7 @@ class _Sweep:
     attrs: Mapping[str, Any]
 
     def steps(self) -> Iterator[list[Path]]:
-        """Recordings of each temperature, one for each filter; all there and complete."""
+        """Recordings of each temperature, one for each filter; ValueError unless complete."""
         for number in range(len(self.temperatures)):
             paths = [step_path(self.folder, self.name, number, band) for band in self.bands]
             for path in paths:
@@ -121,16 +77,16 @@ class _Sweep:
 
 def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
     """
-    Put the recordings of a blackbody sweep together.
+    Join the recordings of a blackbody sweep into one dataset.
 
     Parameters
     ----------
     folder : str or Path
-        Where `dbthermal.instruments.protocols.record_sweep` wrote them.
+        Of `dbthermal.instruments.protocols.record_sweep`.
     name : str
         Of the session.
     frames : int
-        Frames of each to take, the first ones of each band that are whole and show the blackbody.
+        Frames to take of each: the first ones of each band that are whole and show the blackbody.
 
     Returns
     -------
@@ -174,12 +130,12 @@ def bench_series(
     correction: xr.Dataset | None = None,
 ) -> dict[str, xr.Dataset]:
     """
-    Put the recordings of an emissivity bench together, a measurement for each step.
+    Mean counts and temperatures of an emissivity bench, a measurement for each step.
 
     Parameters
     ----------
     folder : str or Path
-        Where `dbthermal.instruments.protocols.record_sweep` wrote them.
+        Of `dbthermal.instruments.protocols.record_sweep`.
     name : str
         Of the session.
     region : mapping
@@ -207,12 +163,12 @@ def bench_series(
     columns: dict[str, list[dict[str, Any]]] = {material: [] for material in region}
     for paths in sweep.steps():
         background = _agreed(paths, BLACKBODY, sweep.stability)
-        seen = list(_bands(paths))
+        captures = list(_bands(paths))
         for material, place in region.items():
             columns[material].append(
                 {
                     "counts": {
-                        band: _mean(capture, band, place, correction) for band, capture in seen
+                        band: _mean(capture, band, place, correction) for band, capture in captures
                     },
                     "object_temperature": _agreed(paths, material, sweep.stability),
                     "background_temperature": background,
@@ -225,26 +181,26 @@ def bench_series(
 
 
 def _find(folder: str | Path, name: str) -> _Sweep:
-    """Look what a sweep was to be, in the first recording that is there."""
+    """Description of a sweep, from the first of its recordings."""
     for path in sorted(Path(folder).glob(f"{name}_[0-9][0-9]*.zarr")):
         attrs = store.open_dataset(path).attrs
         session = attrs["provenance"]["parameters"]
         if session["name"] == name and session["blackbody"] is not None:
             filters = session["filters"].values()
-            own = [band for band in session["cameras"] if band in filters]
+            behind = [band for band in session["cameras"] if band in filters]
             return _Sweep(
                 Path(folder),
                 name,
                 session["blackbody"]["temperatures"],
                 session["blackbody"]["stability"],
-                session["sweep"] or own or [None],
+                session["sweep"] or behind or [None],
                 {name: attrs[name] for name in ("is_simulated", "origin")},
             )
     raise FileNotFoundError(f"No recording of a sweep '{name}' in '{folder}'. Must have one.")
 
 
 def _agreed(paths: list[Path], source: str, stability: float) -> float:
-    """Mean of a reading over the recordings of a step, in which it must be the same."""
+    """Mean of a reading over the recordings of a step; ValueError if they differ."""
     means = [mean_reading(path, source) for path in paths]
     if np.ptp(means) > stability:
         raise ValueError(
@@ -287,21 +243,21 @@ def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset
     place = {"y": region[0], "x": region[1]}
     good = good_frames(capture, band)
     part = capture[["counts"]].sel(band=[band]).isel(time=good).isel(place)
-    what = f"of band '{band}' in '{capture.attrs['path']}'"
+    source = f"of band '{band}' in '{capture.attrs['path']}'"
     if part["counts"].size == 0:
-        raise ValueError(f"No frame or no pixel {what}. Must have one.")
+        raise ValueError(f"No frame or no pixel {source}. Must have one.")
     counts = part["counts"]
     if correction is not None:
         corrected = correct(part, correction.isel(place))
         counts = corrected["counts"].where(corrected["status"] == 0)
-    found = float(counts.astype(np.float64).mean())
-    if not np.isfinite(found):
-        raise ValueError(f"No good pixel {what}. Must have one.")
-    return found
+    mean = float(counts.astype(np.float64).mean())
+    if not np.isfinite(mean):
+        raise ValueError(f"No good pixel {source}. Must have one.")
+    return mean
 
 
 def _contact(rows: list[dict[str, Any]]) -> xr.Dataset:
-    """Put measurements together."""
+    """Series of one material, stage `contact`, from its measurements."""
     variables = schema.STAGES["contact"]
     bands = list(rows[0]["counts"])
     counts = [[row["counts"][band] for row in rows] for band in bands]

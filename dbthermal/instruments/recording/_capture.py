@@ -1,4 +1,4 @@
-"""What was recorded, as the stage `capture`: ready for correction, alignment and separation."""
+"""Reader of recordings: the stage `capture`, the log, and an overview of a folder."""
 
 from pathlib import Path
 
@@ -10,34 +10,33 @@ from dbthermal import schema, store
 from dbthermal.alignment import exposure_times, fill_times
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
 
-Array = npt.NDArray[np.float64]
-
 
 def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     r"""
-    Open a recording, also one that was cut short, or is being written.
+    Open a recording as stage `capture`, also one that was cut short or is being written.
 
     Parameters
     ----------
     path : str or Path
-        Folder ``*.zarr``, from `dbthermal.instruments.recording.record.record`.
+        Folder ``*.zarr``, from `record`.
     fitted : bool
-        Whether exposure times come from a line through both clocks, :math:`h = a + b d` with the
-        device's time d and the host's h, by least squares, for a camera whose stamps are on a clock
-        of its own. They are then late by the mean time that a frame takes to the host.
+        True for a camera whose stamps are on a clock of its own: its exposure times then come from
+        a line through both clocks, :math:`h = a + b d` with the device's time d and the host's h,
+        by least squares. They are late by the mean time that a frame takes to the host.
 
     Returns
     -------
     Dataset
-        Stage `capture`: `counts` (band, time, y, x) [count], read when used, `exposure_time` (band,
-        time) [s], NaN for a frame that is damaged, missing or of no new number, and what is in
-        `contents.VARIABLES` but the log, see `notes`. `time` is when the
-        first band was exposed. Where it was fitted, attribute ``clock_rates`` has b of each band.
+        `counts` (band, time, y, x) [count], read when used; `exposure_time` (band, time) [s], NaN
+        for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
+        ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
+        any. `time` is when the first band was exposed [s]. For the log see `notes`. If fitted,
+        attribute ``clock_rates`` has b of each band.
 
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If the folder does not exist.
     ValueError
         If a band has fewer than two frames with a time: too short, or a camera's own clock.
     """
@@ -54,7 +53,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
 
 def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
     """
-    Read the log of a recording.
+    Log of a recording: readings, losses, shutter events, in the order of writing.
 
     Parameters
     ----------
@@ -64,13 +63,13 @@ def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
     Returns
     -------
     list of tuple
-        Time [s], kind (a name of `contents.Note` in lower case), source and
-        value of each note, in the order of writing.
+        Time [s], kind (such as ``"reading"`` or ``"frames_lost"``), source and value of each note;
+        the store's attributes explain the values.
 
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If the folder does not exist.
     """
     recording = store.open_dataset(path)
     kinds = {number: name for name, number in recording.attrs["log_kinds"].items()}
@@ -84,26 +83,9 @@ def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
 
 def mean_reading(path: str | Path, source: str) -> float:
     """
-    Mean of what an instrument read during a recording.
+    Mean of an instrument's readings during a recording, in its unit, without failed ones.
 
-    Parameters
-    ----------
-    path : str or Path
-        Folder ``*.zarr``.
-    source : str
-        Name of the reading.
-
-    Returns
-    -------
-    float
-        In the reading's unit, over those that did not fail.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no recording.
-    ValueError
-        If it has no such reading, or all failed.
+    FileNotFoundError if the recording does not exist; ValueError if it has no such reading.
     """
     values = [note[3] for note in notes(path) if note[1:3] == ("reading", source)]
     if not values:
@@ -113,19 +95,20 @@ def mean_reading(path: str | Path, source: str) -> float:
 
 def overview(folder: str | Path) -> xr.Dataset:
     """
-    What the recordings in a folder hold, and whether they are whole.
+    Table of the recordings in a folder: frames, losses, rate and completeness of each band.
 
     Parameters
     ----------
     folder : str or Path
-        With recordings; what else is in it is passed over.
+        With recordings; other files in it are passed over.
 
     Returns
     -------
     Dataset
-        One row a recording and band: `frames`, of which `damaged`; `lost` by camera or driver, and
-        `refused` by a full queue; `frame_rate` by the good frames' stamps [Hz], NaN without two;
-        `complete`, whether the recording went to its planned end. Coordinates `recording`, `band`.
+        One row for each recording and band: `frames`, of which `damaged`; `lost` by camera or
+        driver, and `refused` by a full queue; `frame_rate` by the good frames' stamps [Hz], NaN
+        without two; `complete`, whether the recording went to its planned end. Coordinates
+        `recording` and `band`.
 
     Raises
     ------
@@ -153,21 +136,7 @@ def _rate_and_end(recording: xr.Dataset, band: str) -> dict[str, float | bool]:
 
 
 def good_frames(capture: xr.Dataset, band: str) -> npt.NDArray[np.intp]:
-    """
-    Frames of one band that are whole, have a time, and show the view and not the shutter.
-
-    Parameters
-    ----------
-    capture : Dataset
-        From `open_capture`.
-    band : str
-        Its name.
-
-    Returns
-    -------
-    ndarray
-        Their places in `time`.
-    """
+    """Positions in `time` of a band's frames that are whole, have a time, and show the view."""
     one = capture.sel(band=band)
     has_view = (one["frame_flags"].values & int(FrameFlag.SHUTTER_CLOSED)) == 0
     return np.flatnonzero(np.isfinite(one["exposure_time"].values) & has_view)
