@@ -7,7 +7,7 @@ stems := $(basename $(notdir $(sort $(wildcard notebooks/*.ipynb))))
 full := $(stems:%=results/full/%.ipynb)
 recorded := $(basename $(notdir $(sort $(wildcard params/recorded/*.yaml))))
 smoke := $(stems:%=results/smoke/%.ipynb)
-sources := $(shell find dbthermal -type f -not -path '*/__pycache__/*') $(wildcard data_manifest.yaml)
+sources := $(shell find dbthermal notebooks/reproduction -type f -not -path '*/__pycache__/*') $(wildcard data_manifest.yaml)
 papermill := $(python) -m papermill --kernel python3 --no-progress-bar --log-level WARNING
 
 # A mirror of the outside files is named from here, but read from the notebooks' folder too.
@@ -31,7 +31,8 @@ export JUPYTER_CONFIG_DIR := $(CURDIR)/.venv/etc/jupyter
 export JUPYTER_DATA_DIR := $(CURDIR)/.venv/share/jupyter
 export MPLCONFIGDIR := $(CURDIR)/.venv/share/matplotlib
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
-unexport JUPYTER_PATH MPLBACKEND PYTHONHOME PYTHONPATH
+unexport JUPYTER_PATH MPLBACKEND PYTHONHOME
+export PYTHONPATH := $(CURDIR)/notebooks
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -76,14 +77,14 @@ smoke: $(smoke) ## run the notebooks with their own small values into results/sm
 reproduce: $(full) $(recorded:%=results/rig/%.ipynb) ## run the notebooks in order, with the values in params/, into results/full
 
 verify: .venv/installed ## compare results/full with the stored reference numbers
-	$(python) -m dbthermal.verify
+	$(python) -m reproduction.verify
 
 record: .venv/installed ## keep the numbers of results/full as the reference, and its scene as the picture in the README
-	$(python) -m dbthermal.verify --record
+	$(python) -m reproduction.verify --record
 	cp results/full/04_separation_twin.png notebooks/separated_scene.png
 
 data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
-	$(python) -m dbthermal.manifest
+	$(python) -m reproduction.manifest
 
 bench: .venv/installed ## measure time and memory
 	$(python) -m pytest -m bench --capture=no
