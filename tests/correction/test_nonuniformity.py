@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from dbthermal import correction as frames
 from dbthermal import schema
+from dbthermal.correction import blackbody_statistics, correct, fit_correction
+from dbthermal.schema import Status
 
 TEMPERATURES = np.array([288.15, 298.15, 308.15, 318.15])
 LEVELS = np.array([20000.0, 21200.0, 22500.0, 23900.0])  # counts of an ideal pixel
@@ -80,10 +81,10 @@ def correction() -> xr.Dataset:
     arrays(float, (3, 4), elements=st.floats(0.7, 1.4)),
     arrays(float, (3, 4), elements=st.floats(-2000.0, 2000.0)),
 )
-def test_known_gain_and_offset_come_back(gain: frames.Array, offset: frames.Array) -> None:
+def test_known_gain_and_offset_come_back(gain: np.ndarray, offset: np.ndarray) -> None:
     """Without noise the fit returns each pixel's own gain and offset, whatever they are."""
     made = centred(gain, offset)
-    fitted = frames.fit_correction(made, threshold=1e6)
+    fitted = fit_correction(made, threshold=1e6)
     corrected = fitted["gain"] * made["counts"] + fitted["offset"]
     expected = np.broadcast_to(LEVELS[:, np.newaxis, np.newaxis], (4, 3, 4))
     assert not fitted["bad"].any()
@@ -94,15 +95,13 @@ def test_known_gain_and_offset_come_back(gain: frames.Array, offset: frames.Arra
 
 def test_two_temperatures_are_enough() -> None:
     """Through two points the line is exact."""
-    fitted = frames.fit_correction(
-        blackbody([[0.9, 1.1]], [[50.0, -50.0]], LEVELS[:2]), threshold=9
-    )
+    fitted = fit_correction(blackbody([[0.9, 1.1]], [[50.0, -50.0]], LEVELS[:2]), threshold=9)
     np.testing.assert_allclose(fitted["residual"], 0.0, rtol=0, atol=1e-9)
 
 
 def test_least_squares_against_polyfit(ideal: xr.Dataset) -> None:
     """With noise a pixel's line is the one that an independent least squares gives."""
-    fitted = frames.fit_correction(ideal)
+    fitted = fit_correction(ideal)
     pixel = ideal["counts"].values[0, :, 4, 7]
     gain, offset = np.polyfit(pixel - 21000.0, fitted["level"].values[0], 1)
     assert fitted["gain"].values[0, 4, 7] == pytest.approx(gain, abs=1e-10)
@@ -111,7 +110,7 @@ def test_least_squares_against_polyfit(ideal: xr.Dataset) -> None:
 
 def test_residual_is_the_noise(ideal: xr.Dataset) -> None:
     """Two of four degrees of freedom are left: 2 counts of noise leave an RMS of sqrt(2) counts."""
-    fitted = frames.fit_correction(ideal)
+    fitted = fit_correction(ideal)
     assert not fitted["bad"].any()
     assert float(fitted["residual"][0]) == pytest.approx(2.0**0.5, rel=0.06)
 
@@ -131,11 +130,11 @@ def test_residual_is_the_noise(ideal: xr.Dataset) -> None:
     ],
     ids=["stuck", "dead", "falling", "NaN", "inf", "saturated", "zero", "low gain", "bent"],
 )
-def test_bad_pixel_is_found_and_left_out(ideal: xr.Dataset, samples: frames.Array) -> None:
+def test_bad_pixel_is_found_and_left_out(ideal: xr.Dataset, samples: np.ndarray) -> None:
     """Each kind of bad pixel is marked, alone, and does not shift the others' level."""
     spoiled = ideal.copy(deep=True)
     spoiled["counts"][0, :, 5, 6] = samples
-    fitted = frames.fit_correction(spoiled)
+    fitted = fit_correction(spoiled)
     assert fitted["bad"].dtype == bool
     np.testing.assert_array_equal(np.argwhere(fitted["bad"].values), [[0, 5, 6]])
     rest = ideal["counts"].values.reshape(4, -1)[:, np.arange(192) != 5 * 16 + 6]
@@ -146,32 +145,32 @@ def test_bad_pixel_is_found_and_left_out(ideal: xr.Dataset, samples: frames.Arra
 
 def test_pixels_that_are_alike_are_all_good() -> None:
     """Where no pixel differs from another, rounding makes no outlier."""
-    fitted = frames.fit_correction(blackbody(np.ones((5, 5)), np.zeros((5, 5))))
+    fitted = fit_correction(blackbody(np.ones((5, 5)), np.zeros((5, 5))))
     assert not fitted["bad"].any()
     np.testing.assert_allclose(fitted["gain"], 1.0, rtol=0, atol=1e-12)
 
 
 def test_threshold_is_the_caller_s(ideal: xr.Dataset) -> None:
     """A lower threshold marks the pixel of the largest gain; one of zero or less is refused."""
-    gain = frames.fit_correction(ideal)["gain"].values
-    marked = frames.fit_correction(ideal, threshold=2.0)["bad"].values
+    gain = fit_correction(ideal)["gain"].values
+    marked = fit_correction(ideal, threshold=2.0)["bad"].values
     assert marked.flat[np.argmax(gain)]
     assert 0.0 < marked.mean() < 0.3
     with pytest.raises(ValueError, match=re.escape("Invalid threshold 0 of bad pixels")):
-        frames.fit_correction(ideal, threshold=0)
+        fit_correction(ideal, threshold=0)
 
 
 def test_fit_leaves_its_input(ideal: xr.Dataset) -> None:
     """The frames are read, not changed."""
     before = ideal.copy(deep=True)
-    frames.fit_correction(ideal)
+    fit_correction(ideal)
     xr.testing.assert_identical(ideal, before)
 
 
 def test_one_temperature_is_not_enough() -> None:
     """A gain needs two levels."""
     with pytest.raises(ValueError, match="Invalid blackbody frames of 1 temperature"):
-        frames.fit_correction(blackbody([[1.0]], [[0.0]], LEVELS[:1]))
+        fit_correction(blackbody([[1.0]], [[0.0]], LEVELS[:1]))
 
 
 def test_most_pixels_must_be_usable() -> None:
@@ -179,18 +178,18 @@ def test_most_pixels_must_be_usable() -> None:
     made = blackbody(np.ones((2, 2)), np.zeros((2, 2)))
     made["counts"][0, 1, 0] = np.nan
     with pytest.raises(ValueError, match=re.escape("band '8-14': 2 of 4 pixels are usable")):
-        frames.fit_correction(made)
+        fit_correction(made)
 
 
 def test_level_must_rise_with_temperature() -> None:
     """Frames under another's temperature are refused."""
     with pytest.raises(ValueError, match=r"Invalid levels .* Must rise"):
-        frames.fit_correction(blackbody(np.ones((2, 2)), np.zeros((2, 2)), LEVELS[[1, 0, 2]]))
+        fit_correction(blackbody(np.ones((2, 2)), np.zeros((2, 2)), LEVELS[[1, 0, 2]]))
 
 
 def test_correct_applies_gain_and_offset(capture: xr.Dataset, correction: xr.Dataset) -> None:
     """Each band gets its own maps, by name and not by place."""
-    result = frames.correct(capture, correction)
+    result = correct(capture, correction)
     for band in ("8-14", "9.5"):
         maps, raw = correction.sel(band=band), capture["counts"].sel(band=band).astype(float)
         expected = (maps["gain"] * raw + maps["offset"]).transpose("time", "y", "x")
@@ -204,10 +203,10 @@ def test_corrected_blackbody_is_uniform(rng: np.random.Generator) -> None:
     """What the fit learned from noisy frames makes a new frame of the blackbody even."""
     gain, offset = 1.0 + 0.03 * rng.standard_normal((12, 16)), 200 * rng.standard_normal((12, 16))
     made = centred(gain, offset)
-    fitted = frames.fit_correction(made + 0.5 * rng.standard_normal(made["counts"].shape))
+    fitted = fit_correction(made + 0.5 * rng.standard_normal(made["counts"].shape))
     movie = made["counts"].round().astype(np.uint16).rename(temperature="time")
     movie = movie.assign_coords(time=np.arange(4.0))
-    corrected = frames.correct(movie.to_dataset(name="counts"), fitted)["counts"]
+    corrected = correct(movie.to_dataset(name="counts"), fitted)["counts"]
     assert made["counts"].std(("y", "x")).min() > 500.0  # count
     assert corrected.std(("y", "x")).max() < 1.0
 
@@ -216,8 +215,8 @@ def test_status_tells_dead_from_saturated(capture: xr.Dataset, correction: xr.Da
     """A bit a cause, from whichever band it comes; the counts stay as they are."""
     capture["counts"][1, 2, 0, 1] = 65535
     capture["counts"][0, 1, 1, 3] = 0
-    result = frames.correct(capture, correction)
-    saturated, dead = schema.FLAGS["saturated"], schema.FLAGS["dead_pixel"]
+    result = correct(capture, correction)
+    saturated, dead = Status.SATURATED, Status.DEAD_PIXEL
     np.testing.assert_array_equal(
         result["status"], [[0, saturated, 0, 0], [0, 0, 0, saturated | dead]]
     )
@@ -229,15 +228,13 @@ def test_status_tells_dead_from_saturated(capture: xr.Dataset, correction: xr.Da
 
 def test_maximum_is_the_detector_s(capture: xr.Dataset, correction: xr.Dataset) -> None:
     """A detector of fewer bits saturates lower."""
-    result = frames.correct(
-        capture, correction.assign(bad=correction["bad"] & False), maximum=20047
-    )
+    result = correct(capture, correction.assign(bad=correction["bad"] & False), maximum=20047)
     np.testing.assert_array_equal(result["status"], [[0, 0, 0, 0], [0, 0, 0, 128]])
 
 
 def test_provenance_is_written(capture: xr.Dataset, correction: xr.Dataset) -> None:
     """The result says what was done to it, with which parameters, beside what it was."""
-    attrs = frames.correct(capture, correction).attrs
+    attrs = correct(capture, correction).attrs
     assert attrs == {
         "camera": "simulated",
         "gain_offset_corrected": 1,
@@ -252,7 +249,7 @@ def test_correct_leaves_its_input(capture: xr.Dataset, correction: xr.Dataset) -
     """Neither capture nor correction is changed, and other variables are handed on."""
     capture["fpa_temperature"] = ("time", [300.0, 300.1, 300.2])
     before = capture.copy(deep=True), correction.copy(deep=True)
-    result = frames.correct(capture, correction)
+    result = correct(capture, correction)
     xr.testing.assert_identical(capture, before[0])
     xr.testing.assert_identical(correction, before[1])
     xr.testing.assert_identical(result["fpa_temperature"], capture["fpa_temperature"])
@@ -260,39 +257,39 @@ def test_correct_leaves_its_input(capture: xr.Dataset, correction: xr.Dataset) -
 
 def test_corrected_twice_is_refused(capture: xr.Dataset, correction: xr.Dataset) -> None:
     """A second correction would undo the first; scaled counts are no raw ones."""
-    corrected = frames.correct(capture, correction)
+    corrected = correct(capture, correction)
     with pytest.raises(ValueError, match="corrected before"):
-        frames.correct(corrected, correction)
+        correct(corrected, correction)
     with pytest.raises(TypeError, match="Invalid dtype float64 of the capture's counts"):
-        frames.correct(capture.astype(float), correction)
+        correct(capture.astype(float), correction)
 
 
 def test_unordered_time_is_refused(capture: xr.Dataset, correction: xr.Dataset) -> None:
     """The stage's own rules hold."""
     with pytest.raises(ValueError, match="Unordered 'time'"):
-        frames.correct(capture.isel(time=[0, 2, 1]), correction)
+        correct(capture.isel(time=[0, 2, 1]), correction)
 
 
 def test_band_must_be_corrected(capture: xr.Dataset, correction: xr.Dataset) -> None:
     """A band without a correction is named."""
     with pytest.raises(ValueError, match=re.escape("Missing band '9.5' in the correction")):
-        frames.correct(capture, correction.isel(band=[1, 2]))
+        correct(capture, correction.isel(band=[1, 2]))
 
 
 def test_pixels_must_be_the_same(capture: xr.Dataset, correction: xr.Dataset) -> None:
     """A correction of another size, or of another window of the detector, is refused."""
     with pytest.raises(ValueError, match="Invalid size 4 of 'x' of the capture"):
-        frames.correct(capture, correction.isel(x=slice(3)))
+        correct(capture, correction.isel(x=slice(3)))
     with pytest.raises(ValueError, match="Invalid 'y' of the capture"):
-        frames.correct(capture.assign_coords(y=[0, 1]), correction.assign_coords(y=[1, 2]))
+        correct(capture.assign_coords(y=[0, 1]), correction.assign_coords(y=[1, 2]))
 
 
 def test_correction_must_be_whole(capture: xr.Dataset, correction: xr.Dataset) -> None:
     """A gain of NaN would pass in silence; bad pixels that are not marked, too."""
     with pytest.raises(ValueError, match="Invalid gain of the correction: not finite"):
-        frames.correct(capture, correction.assign(gain=correction["gain"] * np.nan))
+        correct(capture, correction.assign(gain=correction["gain"] * np.nan))
     with pytest.raises(ValueError, match="Missing 'bad'"):
-        frames.correct(capture, correction.drop_vars("bad"))
+        correct(capture, correction.drop_vars("bad"))
 
 
 @pytest.fixture
@@ -309,7 +306,7 @@ def movies(rng: np.random.Generator) -> xr.Dataset:
 
 def test_noise_of_movies(movies: xr.Dataset) -> None:
     """Mean frames and noise come back; the standard deviation of this median is 0.6 %."""
-    result = schema.check(frames.blackbody_statistics(movies), "blackbody_frames")
+    result = schema.check(blackbody_statistics(movies), "blackbody_frames")
     np.testing.assert_allclose(result["noise"], [20.0, 60.0], rtol=0.02)
     levels = result["counts"].mean(("y", "x"))
     np.testing.assert_allclose(levels, [LEVELS, LEVELS], rtol=0, atol=4.0)  # count
@@ -319,7 +316,7 @@ def test_noise_of_movies(movies: xr.Dataset) -> None:
 @pytest.mark.parametrize("count", [2, 3, 6])
 def test_noise_of_few_frames(movies: xr.Dataset, count: int) -> None:
     """The median's bias at few frames is removed: 33 % at two."""
-    result = frames.blackbody_statistics(movies.isel(frame=slice(count)))
+    result = blackbody_statistics(movies.isel(frame=slice(count)))
     np.testing.assert_allclose(result["noise"], [20.0, 60.0], rtol=0.05)
 
 
@@ -327,13 +324,13 @@ def test_drift_is_no_noise(movies: xr.Dataset) -> None:
     """A drift of 200 counts over the movie is not taken for noise."""
     drift = xr.DataArray(np.linspace(0.0, 200.0, 12).round().astype(np.uint16), dims="frame")
     drifting = movies + drift
-    noise = frames.blackbody_statistics(drifting.transpose(*movies["counts"].dims))["noise"]
+    noise = blackbody_statistics(drifting.transpose(*movies["counts"].dims))["noise"]
     assert float(noise[1]) == pytest.approx(60.0, rel=0.04)
 
 
 def test_statistics_feed_the_fit(movies: xr.Dataset) -> None:
     """The stages fit together: movies, frames, correction."""
-    correction = frames.fit_correction(frames.blackbody_statistics(movies))
+    correction = fit_correction(blackbody_statistics(movies))
     assert correction["gain"].dims == ("band", "y", "x")
     np.testing.assert_allclose(correction["level"], [LEVELS, LEVELS], rtol=0, atol=4.0)  # count
 
@@ -341,8 +338,8 @@ def test_statistics_feed_the_fit(movies: xr.Dataset) -> None:
 def test_movies_must_vary(movies: xr.Dataset) -> None:
     """One frame, or a frozen image, has no noise."""
     with pytest.raises(ValueError, match="Invalid movies of 1 frame"):
-        frames.blackbody_statistics(movies.isel(frame=[0]))
+        blackbody_statistics(movies.isel(frame=[0]))
     with pytest.raises(ValueError, match=re.escape("Invalid noise 0.0 count")):
-        frames.blackbody_statistics(movies.isel(frame=[0, 0, 0]))
+        blackbody_statistics(movies.isel(frame=[0, 0, 0]))
     with pytest.raises(ValueError, match=re.escape("Invalid noise nan count")):
-        frames.blackbody_statistics(movies.astype(float).where(movies["frame"] != 1))
+        blackbody_statistics(movies.astype(float).where(movies["frame"] != 1))
