@@ -95,7 +95,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
             f"Invalid capture of {frames} frames and {pixels} usable pixels to estimate a noise "
             f"from. Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise."
         )
-    functions = smooth.basis(time, min(_ORDER, frames // 4))
+    functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]
     # What the smooth functions took of the noise.
     kept = 1.0 - functions.shape[1] / frames

@@ -20,8 +20,8 @@ def undo_drift(corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5
     r"""
     Take from all of a band the drift that a patch of constant temperature shows.
 
-    The patch's mean is smoothed by polynomials in time (`smooth.basis`), in each segment between
-    two shutter events by itself, and
+    The patch's mean is smoothed by polynomials in time (`smooth.polynomial_basis`), in each
+    segment between two shutter events by itself, and
 
     .. math:: I'(t) = I(t) - [c(t) - c(t_0)]
 
@@ -225,7 +225,7 @@ def _smooth(level: xr.DataArray, segment: npt.NDArray[np.generic], order: int) -
     for part in np.unique(segment):
         here = (segment == part) & np.isfinite(values)
         if here.any():
-            functions = smooth.basis(time[here], min(order, int(here.sum())))
+            functions = smooth.polynomial_basis(time[here], min(order, int(here.sum())))
             fitted = functions @ (functions.T @ values[here])
             curve[here] = fitted - fitted[0]
     return curve

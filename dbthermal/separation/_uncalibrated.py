@@ -79,7 +79,7 @@ def reflections(
     inside = _check(signal, mask, correlated)
     frames = signal.sizes["time"]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
-    functions = smooth.basis(signal["time"].values, order)
+    functions = smooth.polynomial_basis(signal["time"].values, order)
     rapid = np.stack([part - functions @ (functions.T @ part) for part in values])
     quiet = inside & (np.abs(_correlation(rapid)) < UNCORRELATED)
     _require(quiet, f"correlation below {UNCORRELATED} in magnitude")

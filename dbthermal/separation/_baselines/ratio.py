@@ -48,7 +48,7 @@ class RatioSettings:
         far as a band is narrow.
     order : int or None
         The two radiances are smoothed by least squares with this many polynomials of time
-        (`smooth.basis`) before their ratio is taken; None leaves them as they are.
+        (`smooth.polynomial_basis`) before their ratio is taken; None leaves them as they are.
     """
 
     kind: str = "wide"
@@ -130,7 +130,7 @@ def _radiances(tile: Tile, settings: RatioSettings) -> Array:
     )
     if settings.order is None:
         return found
-    functions = smooth.basis(tile.time, settings.order)
+    functions = smooth.polynomial_basis(tile.time, settings.order)
     return np.asarray(functions @ (functions.T @ found))
 
 
