@@ -15,7 +15,7 @@ from dbthermal.separation._uncalibrated import reflections
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
-    from dbthermal.separation._baselines.ratio import RatioSettings
+    from dbthermal.separation._baselines.pyrometry import RatioSettings
     from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
@@ -38,7 +38,7 @@ _SETTINGS: Final = {
     "BcpSettings": "_baselines.bcp",
     "DbvtSettings": "_dbvt",
     "NaiveSettings": "_baselines.naive",
-    "RatioSettings": "_baselines.ratio",
+    "RatioSettings": "_baselines.pyrometry",
     "SubspaceSettings": "_subspace.method",
 }
 
