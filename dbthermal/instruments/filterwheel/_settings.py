@@ -1,6 +1,4 @@
-"""What depends on one wheel and its controller: scales, filters, speeds, limits of time.
-
-What the public descriptions leave uncertain is a setting here, and says so.
+"""Properties of one wheel and its controller: scales, filters, speeds, limits of time.
 
 References
 ----------
@@ -10,6 +8,7 @@ units, and addresses). Facts alone, no code.
 """
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -20,7 +19,6 @@ from dbthermal.instruments import apt
 POSITIONS: Final = 6
 """Slots of the wheel, numbered from 1."""
 
-_DEGREES = 360.0
 _POSITIVE = (
     *("velocity", "home_velocity", "acceleration", "tolerance", "reply_timeout", "home_timeout"),
     *("move_timeout", "start_timeout", "stall_timeout", "poll_interval"),
@@ -37,10 +35,8 @@ class Scale:
     ----------
     turn : int
         Counts of one turn of the wheel.
-    velocity : float
-        Device units of a velocity of one count/s.
-    acceleration : float
-        Device units of an acceleration of one count/s^2.
+    velocity, acceleration : float
+        Device units of one count/s and of one count/s^2.
     """
 
     turn: int
@@ -49,58 +45,25 @@ class Scale:
 
     def target(self, position: int, offset: float = 0.0) -> int:
         """
-        Absolute place of a slot.
+        Absolute place [count] of a slot, `offset` [deg] being that of slot 1 after homing.
 
-        A sixth of a turn is no whole number of counts. Each place is rounded by itself, so that
-        errors of up to half a count never add up.
-
-        Parameters
-        ----------
-        position : int
-            Slot, 1 to 6.
-        offset : float
-            From where the wheel is after homing to slot 1 [deg].
-
-        Returns
-        -------
-        int
-            [count].
-
-        Raises
-        ------
-        ValueError
-            If there is no such slot.
+        A sixth of a turn is not a whole number of counts. Each place is rounded by itself, so that
+        errors of up to half a count never add up. ValueError if the slot is not 1 to 6.
         """
         if position not in range(1, POSITIONS + 1):
             raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
-        return round(((position - 1) / POSITIONS + offset / _DEGREES) * self.turn)
+        return round(((position - 1) / POSITIONS + offset / 360.0) * self.turn)
 
     def position(self, count: int, tolerance: float, offset: float = 0.0) -> int | None:
-        """
-        Slot at a place of the wheel.
-
-        Parameters
-        ----------
-        count : int
-            Place, of any turn [count].
-        tolerance : float
-            Largest distance from the slot [deg].
-        offset : float
-            As in `target` [deg].
-
-        Returns
-        -------
-        int or None
-            1 to 6, or None between two slots.
-        """
-        sixths = (count / self.turn - offset / _DEGREES) * POSITIONS
+        """Slot within `tolerance` [deg] of a place [count] of any turn; None between two slots."""
+        sixths = (count / self.turn - offset / 360.0) * POSITIONS
         nearest = round(sixths)
-        near = abs(sixths - nearest) * _DEGREES / POSITIONS <= tolerance
+        near = abs(sixths - nearest) * 360.0 / POSITIONS <= tolerance
         return nearest % POSITIONS + 1 if near else None
 
     def degrees(self, counts: int) -> float:
         """Angle [deg] of a number of counts."""
-        return counts / self.turn * _DEGREES
+        return counts / self.turn * 360.0
 
     def device_velocity(self, velocity: float) -> int:
         """Velocity in device units, of one in turns/s."""
@@ -120,57 +83,58 @@ BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
 MODELS: Final[Mapping[str, Scale]] = MappingProxyType(
     {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
 )
-"""How the names of controllers that drive a wheel begin. A unit sold as BSC201 says SCC201."""
+"""Beginnings of the model names that are accepted; some BSC201 call themselves SCC201."""
+
+CHANNEL: Final = 1
+"""Channel of the motor at its address."""
+
+FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
+"""State that is an error. Whether a wheel's controller sets these is uncertain."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """
-    One wheel.
+    Properties of one wheel.
 
     Attributes
     ----------
     filters : mapping
         Band in each slot, by its number 1 to 6. Slots left out hold no filter.
     serial_number : int, optional
-        Of the controller; another one is then refused.
+        Serial number of the controller; another one is then refused.
+    addresses : tuple of tuple
+        Where the controller is looked for, in this order: address of its identity, and of its
+        motor. A BSC20x is a rack and silently ignores messages to a unit.
     home_offset : float
-        From where the wheel is after homing to slot 1 [deg]. Differs from wheel to wheel: look.
+        From the position after homing to slot 1 [deg]. Differs from wheel to wheel: look.
     home_direction, home_limit_switch : int, optional
         1 forward, 2 reverse; 1 the reverse switch, 4 the forward one. Which a wheel needs is
-        uncertain: what the controller has is kept unless they are given.
+        uncertain: None keeps what the controller has.
     velocity, home_velocity : float
         [turn/s].
     acceleration : float
         [turn/s^2].
     tolerance : float
-        How far from a slot the wheel may be [deg], less than half the way to the next, 30.
-    models : mapping
-        How the names of the controllers begin that are accepted, and their scales.
-    addresses : tuple of tuple
-        Where to look for the controller, in this order: the address that tells who it is, and the
-        motor's. A BSC20x is a rack and ignores in silence what is sent to a unit.
-    channel : int
-        Of the motor at its address, from 1.
-    faults : StatusBits
-        State that is an error. That a wheel's controller sets these is uncertain.
+        Largest distance of the wheel from a slot [deg], below half the way to the next, 30.
     reply_timeout, home_timeout, move_timeout : float
         Longest wait for a reply, for the home switch, for a move [s].
     start_timeout : float
         Longest wait until a move is seen to start [s].
     stall_timeout : float
-        Longest time in which the position may stand in a move [s].
+        Longest time for which the position may not change in a move [s].
     poll_interval : float
-        From one look at the motor to the next [s].
+        Time between two status requests [s].
 
     Raises
     ------
     ValueError
-        If a filter is in no slot, or two have one name, or a number is out of its range.
+        If a slot is not 1 to 6, two filters have one name, or a number is out of its range.
     """
 
     filters: Mapping[int, str] = field(default_factory=dict)
     serial_number: int | None = None
+    addresses: tuple[tuple[int, int], ...] = ((apt.UNIT, apt.UNIT), (apt.RACK, apt.BAY_1))
     home_offset: float = 0.0
     home_direction: int | None = None
     home_limit_switch: int | None = None
@@ -178,10 +142,6 @@ class Settings:
     home_velocity: float = 0.2
     acceleration: float = 1.0
     tolerance: float = 0.1
-    models: Mapping[str, Scale] = field(default_factory=lambda: MODELS)
-    addresses: tuple[tuple[int, int], ...] = ((apt.UNIT, apt.UNIT), (apt.RACK, apt.BAY_1))
-    channel: int = 1
-    faults: apt.StatusBits = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
     reply_timeout: float = 1.0
     home_timeout: float = 60.0
     move_timeout: float = 20.0
@@ -190,16 +150,20 @@ class Settings:
     poll_interval: float = 0.05
 
     def __post_init__(self) -> None:
-        self._check_filters()
+        for position in self.filters:
+            BSC20X.target(position)
+        repeated = [name for name, count in Counter(self.filters.values()).items() if count > 1]
+        if repeated:
+            raise ValueError(f"Repeated filter '{repeated[0]}'. Each must have a name of its own.")
         for name in _POSITIVE:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"Invalid {name} {value} of the wheel. Must be positive.")
-        if self.tolerance >= _DEGREES / POSITIONS / 2:
+        if self.tolerance >= 180.0 / POSITIONS:
             raise ValueError(f"Invalid tolerance {self.tolerance} deg. Must be less than 30 deg.")
         if not self.addresses:
             raise ValueError("Invalid addresses () of the wheel. Must be one pair at least.")
-        if not -_DEGREES < self.home_offset < _DEGREES:
+        if not -360.0 < self.home_offset < 360.0:
             raise ValueError(f"Invalid home_offset {self.home_offset}. Must lie in (-360, 360).")
         for name, allowed in _HOME.items():
             value = getattr(self, name)
@@ -207,35 +171,9 @@ class Settings:
                 raise ValueError(f"Invalid {name} {value}. Must be one of {allowed}, or None.")
 
     def position(self, band: str) -> int:
-        """
-        Slot of a band's filter.
-
-        Parameters
-        ----------
-        band : str
-            One of `filters`.
-
-        Returns
-        -------
-        int
-            1 to 6.
-
-        Raises
-        ------
-        ValueError
-            If no filter is called so.
-        """
+        """Slot of a band's filter; ValueError if no filter has this name."""
         for position, name in self.filters.items():
             if name == band:
                 return position
         bands = sorted(self.filters.values())
         raise ValueError(f"Invalid band '{band}' of the wheel. Must be one of {bands}.")
-
-    def _check_filters(self) -> None:
-        """Raise if a filter is nowhere, or two have the same name."""
-        for position in self.filters:
-            BSC20X.target(position)
-        names = list(self.filters.values())
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"Repeated filter '{name}'. Each must have a name of its own.")
