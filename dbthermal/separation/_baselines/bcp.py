@@ -111,8 +111,8 @@ def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array,
     known = None
     if settings.reflected_temperature is not None:
         curve = tile.curves[band]
-        level = require_range(settings.reflected_temperature, curve, "reflected_temperature")
-        known = float(tile.blackbody(band, level))
+        value = require_range(settings.reflected_temperature, curve, "reflected_temperature")
+        known = float(tile.blackbody(band, value))
     for frame, signal in enumerate(tile.signals[band]):
         image = _filled(tile, band, signal).reshape(tile.shape)
         level = float(np.percentile(image, settings.percentile)) if known is None else known
