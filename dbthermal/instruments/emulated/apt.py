@@ -24,16 +24,9 @@ from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.emulated.world import World
 
 SERIAL_NUMBER: Final = 40_000_000
-"""Default serial number of a controller."""
-
-NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")
-"""Notes in its `Info`."""
-
-SLOWEST: Final = 1.0
-"""Velocity below which the motor does not move at all [count/s]."""
-
-WINDOW: Final = 1.0
-"""Largest distance of the wheel from a slot whose filter is in the beam [deg]."""
+NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")  # in its `Info`
+SLOWEST: Final = 1.0  # [count/s] velocity below which the motor does not move at all
+WINDOW: Final = 1.0  # [deg] largest distance of the wheel from a slot that is in the beam
 
 
 class Model(NamedTuple):
@@ -50,10 +43,7 @@ _UNIT = Model(25_600, 1.0, 1.0, is_rack=False)
 MODELS: Final = MappingProxyType(
     {"BSC201": _RACK, "BSC203": _RACK, "SCC201": _RACK, "BSC101": _UNIT, "KDC101": _UNIT}
 )
-"""Controllers by the name they give, KDC101 being one that drives no wheel.
-
-The driver has these numbers from a place of its own.
-"""
+"""Controllers by the name they give (KDC101 drives no wheel), with numbers of their own."""
 
 
 @dataclass(frozen=True)
