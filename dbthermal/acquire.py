@@ -56,7 +56,7 @@ def ask_for_blackbody(name: str, temperature: float) -> None:
     """
     celsius = f"{temperature - zero_Celsius:.2f} degC"
     question = (
-        f"\n{name}: set the blackbody to {celsius} and press Enter; a stable reading is awaited. "
+        f"\n{name}: set the blackbody to {celsius} and press Enter; then its rest is awaited. "
     )
     try:
         input(question)

@@ -32,21 +32,10 @@ _ALARM: Final = "#b3001b"
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """
-    Picture and texts of one band.
+    """Picture and texts of one band; the text stands below the picture, the warning across it."""
 
-    Attributes
-    ----------
-    image : ndarray, shape (y, x), or None
-        Raw signal [count]; None before the first frame.
-    limits : tuple of float
-        Counts that are black and white [count].
-    text, warning : str
-        Lines below the picture, and across it.
-    """
-
-    image: npt.NDArray[Any] | None
-    limits: tuple[float, float]
+    image: npt.NDArray[Any] | None  # raw signal (y, x) [count]; None before the first frame
+    limits: tuple[float, float]  # counts that are black and white [count]
     text: str
     warning: str = ""
 

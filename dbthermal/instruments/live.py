@@ -51,47 +51,22 @@ _IN_PROGRESS: Final = _FFC_STATES[FfcStatus.IN_PROGRESS]
 
 @dataclass(frozen=True)
 class Status:
-    """
-    Recording state of one band.
-
-    Attributes
-    ----------
-    band : str
-        Its name.
-    frame_rate : float
-        Frames recorded per second of the last window, by the host's times of arrival [Hz]; 0 if
-        none came in it, NaN before there are two.
-    frames, lost, refused, damaged : int
-        Numbers of frames since the recording began.
-    fpa_temperature : float
-        Of the focal-plane array, from the reading ``fpa <band>`` or the telemetry [K], or NaN.
-    ffc : str
-        State of the flat-field correction (FFC): ``"in progress"`` if the last frame is flagged as
-        shutter closed, else the reading ``ffc <band>``, ``"no answer"`` or ``"unknown"``.
-    ffc_age : float
-        Time since a correction was last seen in this recording [s]: 0 during one, NaN before.
-    limits : tuple of float
-        1st and 99th percentile of the last frame [count]; NaN before it, as are those below.
-    lowest, highest : float
-        Least and greatest count of the last frame [count].
-    dead, saturated : float
-        Shares of its pixels at 0 and at 65535 [1].
-    """
+    """Recording state of one band; numbers of its last frame are NaN before it."""
 
     band: str
-    frame_rate: float
+    frame_rate: float  # over the last window, by the times of arrival [Hz]; 0 if none came in it
     frames: int
     lost: int
     refused: int
     damaged: int
-    fpa_temperature: float = math.nan
-    ffc: str = "unknown"
-    ffc_age: float = math.nan
-    limits: tuple[float, float] = (math.nan, math.nan)
-    lowest: float = math.nan
-    highest: float = math.nan
-    dead: float = math.nan
-    saturated: float = math.nan
+    fpa_temperature: float = math.nan  # from the reading "fpa <band>", or the telemetry [K]
+    ffc: str = "unknown"  # "in progress", by flag of the last frame, or reading "ffc <band>"
+    ffc_age: float = math.nan  # since a correction was last seen in this recording [s]
+    limits: tuple[float, float] = (math.nan, math.nan)  # 1st and 99th percentile [count]
+    lowest: float = math.nan  # [count]
+    highest: float = math.nan  # [count]
+    dead: float = math.nan  # share of pixels at 0 [1]
+    saturated: float = math.nan  # share of pixels at 65535 [1]
 
     @property
     def text(self) -> str:

@@ -49,26 +49,11 @@ STABILITY_PERIOD: Final = 1.0
 
 @dataclass(frozen=True)
 class Step:
-    """
-    One recording of a sweep.
+    """One recording of a sweep, through the filter of `band` (None without a wheel)."""
 
-    Attributes
-    ----------
-    number : int
-        Of the temperature, from 0.
-    temperature : float
-        Set point of the blackbody [K].
-    blackbody : float
-        Mean of its readings during the recording [K].
-    band : str or None
-        Of the filter in the beam; None without a wheel.
-    summary : Summary
-        Result of the recording.
-    """
-
-    number: int
-    temperature: float
-    blackbody: float
+    number: int  # of the temperature, from 0
+    temperature: float  # set point of the blackbody [K]
+    blackbody: float  # mean of its readings during the recording [K]
     band: str | None
     summary: Summary
 
@@ -103,8 +88,7 @@ def wait_stable(
     Raises
     ------
     TimeoutError
-        If within `timeout` the readings of no window lay within `stability` of one another and
-        their mean within `tolerance` of `temperature`.
+        If it is not stable within the session's `timeout`.
     ValueError
         If the session has no blackbody.
     """
@@ -171,14 +155,12 @@ def record_sweep(
     Raises
     ------
     ValueError
-        If there is no blackbody in the session or the readings; or a recording is there that is
-        incomplete, or of another temperature, or during which the wheel turned.
+        If the session has no blackbody, or none is read; or a recording exists that is incomplete,
+        of another temperature, or during which the wheel turned.
     TimeoutError
-        As `wait_stable`; the steps before are kept.
+        As `wait_stable`; the recordings before are kept.
     SourceLostError
         If a camera is lost on the way.
-    BosonError, WheelError, ReadingError, OSError
-        As `Devices.correct_offsets`, `Devices.select`, `Devices.readings` and `record`.
     """
     session = devices.session
     extra = {} if read_blackbody is None else {BLACKBODY: Reading(read_blackbody)}
@@ -209,28 +191,21 @@ def record_scene(
     stop: threading.Event | None = None,
 ) -> Summary:
     """
-    Record a scene with all devices. An emulated scene begins with the recording.
-
-    Call `Devices.prepare` before.
+    Record a scene with all devices; an emulated scene begins with the recording.
 
     Parameters
     ----------
     devices : Devices
-        Of any session.
+        Of any session; call `Devices.prepare` before.
     path : str or Path
-        Store to make, ``*.zarr``.
+        Folder ``*.zarr`` to make.
     limits, preview, stop : optional
-        As for `dbthermal.instruments.recording.record`.
+        As for `dbthermal.instruments.recording.record`, whose errors it raises.
 
     Returns
     -------
     Summary
-        How it went.
-
-    Raises
-    ------
-    FileExistsError, OSError, ValueError
-        As `record`.
+        How it ended, and numbers of frames.
     """
     identities, expected = devices.identities(), devices.session.filtered
     if devices.wheel is not None and devices.wheel.band() != expected:
