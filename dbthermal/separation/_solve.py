@@ -34,20 +34,20 @@ from dbthermal.separation._tiles import (
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
-    from dbthermal.separation._baselines.ratio import RatioSettings
+    from dbthermal.separation._baselines.pyrometry import RatioSettings
     from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
     Settings = SubspaceSettings | DbvtSettings | NaiveSettings | RatioSettings | BcpSettings
 
 _MODULES: Final = {
-    "subspace": "_subspace.method",
-    "calibrated": "_baselines.calibrated",
-    "dbvt": "_dbvt.method",
-    "naive": "_baselines.naive",
-    "ratio": "_baselines.ratio",
-    "bcp": "_baselines.bcp",
-    "apparent": "_baselines.apparent",
+    "subspace": ("_subspace.method", "METHOD"),
+    "calibrated": ("_baselines.calibrated", "METHOD"),
+    "dbvt": ("_dbvt.method", "METHOD"),
+    "naive": ("_baselines.naive", "METHOD"),
+    "ratio": ("_baselines.pyrometry", "RATIO"),
+    "bcp": ("_baselines.bcp", "METHOD"),
+    "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -216,7 +216,8 @@ def get_method(name: str) -> Method:
     """
     if name not in METHODS:
         raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}.")
-    method: Method = importlib.import_module(f"dbthermal.separation.{_MODULES[name]}").METHOD
+    module, record = _MODULES[name]
+    method: Method = getattr(importlib.import_module(f"dbthermal.separation.{module}"), record)
     return method
 
 

@@ -10,8 +10,6 @@ from dbthermal.instruments.emulated.apt import EmulatedApt, start
 from dbthermal.instruments.emulated.port import Loop
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import (
-    BSC10X,
-    BSC20X,
     FilterWheel,
     NoReplyError,
     NotHomedError,
@@ -19,6 +17,7 @@ from dbthermal.instruments.filterwheel import (
     WheelError,
     WrongDeviceError,
 )
+from dbthermal.instruments.filterwheel._settings import BSC10X, BSC20X
 from dbthermal.instruments.transport import TransportError
 
 SETTINGS = Settings(filters=FILTERS)

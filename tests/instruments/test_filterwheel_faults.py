@@ -10,7 +10,6 @@ from rig_devices import Clock, WheelBench
 from dbthermal.instruments import apt
 from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.filterwheel import (
-    ControllerError,
     FilterWheel,
     NoReplyError,
     NotHomedError,
@@ -170,12 +169,12 @@ def test_errors_of_the_controller() -> None:
     bench = WheelBench()
     wheel = bench.homed()
     bench.device.faults.notice = "motor hot"
-    with pytest.raises(ControllerError, match="It reported error 1 of message 0x0480: motor hot"):
+    with pytest.raises(WheelError, match="It reported error 1 of message 0x0480: motor hot"):
         wheel.move_to(3)
     assert not bench.sent(apt.Id.MOT_MOVE_ABSOLUTE)
     wheel.move_to(3)
     bench.device.faults.notice = "motor cold"
-    with pytest.raises(ControllerError, match="motor cold"):
+    with pytest.raises(WheelError, match="motor cold"):
         wheel.home()
 
 

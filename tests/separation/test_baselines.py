@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dbthermal import bands, planck, schema, separation, simulation
 from dbthermal import response as responses
-from dbthermal.separation._baselines import bcp, naive, ratio
+from dbthermal.separation._baselines import bcp, naive, pyrometry
 from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Background, Rig
 
@@ -121,7 +121,7 @@ def test_naive_says_when_it_stopped_early(glass: Tile) -> None:
     [
         ({"starts": 0}, "Invalid starts 0 of method 'naive'. Must be at least 1."),
         ({"iterations": 0}, "Invalid iterations 0 of method 'naive'"),
-        ({"spread": -1.0}, r"Invalid spread \[K\] of method 'naive' -1.0"),
+        ({"shift_std": -1.0}, r"Invalid shift_std \[K\] of method 'naive' -1.0"),
         ({"tolerance": 0.0}, "Invalid tolerance of method 'naive' 0.0"),
     ],
 )
@@ -134,10 +134,10 @@ def test_naive_refuses_what_is_no_search(options: dict[str, float], message: str
 WARM = np.linspace(290.0, 340.0, 24)[:, np.newaxis]
 
 
-@pytest.mark.parametrize("kind", ratio.KINDS)
+@pytest.mark.parametrize("kind", pyrometry.KINDS)
 def test_ratio_of_a_blackbody(kind: str) -> None:
     """A blackbody's temperature is exact within 0.01 mK, in either kind of radiance."""
-    found = ratio.separate(seen(WARM, WARM, (1.0, 1.0)), ratio.RatioSettings(kind, order=None))
+    found = pyrometry.ratio(seen(WARM, WARM, (1.0, 1.0)), pyrometry.RatioSettings(kind, order=None))
     np.testing.assert_allclose(found.object_temperature, WARM, rtol=0, atol=1e-5)  # K
     np.testing.assert_allclose(found.emissivity, 1.0, rtol=0, atol=1e-6)
     assert np.all(np.isnan(found.background_temperature))
@@ -158,11 +158,11 @@ def gray_body(kind: str, share: float) -> Tile:
     return replace(empty, signals=np.stack(signals))
 
 
-@pytest.mark.parametrize("kind", ratio.KINDS)
+@pytest.mark.parametrize("kind", pyrometry.KINDS)
 @pytest.mark.parametrize("share", [0.95, 0.6])
 def test_ratio_of_a_gray_body(kind: str, share: float) -> None:
     """Without a background a gray body's temperature and emissivity are exact."""
-    found = ratio.separate(gray_body(kind, share), ratio.RatioSettings(kind, order=None))
+    found = pyrometry.ratio(gray_body(kind, share), pyrometry.RatioSettings(kind, order=None))
     np.testing.assert_allclose(found.object_temperature, WARM, rtol=0, atol=1e-5)  # K
     np.testing.assert_allclose(found.emissivity, share, rtol=0, atol=1e-6)
     assert np.all(found.status == 0)
@@ -174,7 +174,7 @@ def test_ratio_against_wien() -> None:
     radiances = [planck.spectral_radiance(centre, WARM) for centre in (first, second)]
     excess = np.log(radiances[0] / radiances[1]) - 5 * np.log(second / first)
     wien = planck.SECOND_RADIATION_CONSTANT * (1 / second - 1 / first) / excess
-    found = ratio.separate(gray_body("narrow", 0.8), ratio.RatioSettings("narrow", order=None))
+    found = pyrometry.ratio(gray_body("narrow", 0.8), pyrometry.RatioSettings("narrow", order=None))
     difference = wien - found.object_temperature
     print("Wien less Planck", difference.min(), difference.max())
     assert 2.0 < np.abs(difference).min() < np.abs(difference).max() < 6.0  # K
@@ -187,8 +187,8 @@ def test_ratio_smooths_before_it_divides() -> None:
     noise = np.random.default_rng(1).standard_normal(tile.signals.shape)
     noisy = replace(tile, signals=tile.signals + noise * [[[0.03]], [[0.35]]])
     plain, smooth = (
-        np.sqrt(np.nanmean((ratio.separate(noisy, setting).object_temperature - warm) ** 2))
-        for setting in (ratio.RatioSettings(order=None), ratio.RatioSettings())
+        np.sqrt(np.nanmean((pyrometry.ratio(noisy, setting).object_temperature - warm) ** 2))
+        for setting in (pyrometry.RatioSettings(order=None), pyrometry.RatioSettings())
     )
     assert plain / smooth == pytest.approx(24**0.5, rel=0.2)
 
@@ -197,13 +197,13 @@ def test_ratio_refuses_a_stationary_pair() -> None:
     """10.6 against 8-14 um turns near 33 C: no temperature follows from its ratio."""
     tile = tile_of(np.zeros((2, 8, 1)), (1, 1), ("8-14", "10.6"))
     with pytest.raises(ValueError, match=r"'8-14', '10.6' .* stationary near 30\d\.\d K"):
-        ratio.separate(tile, ratio.RatioSettings())
+        pyrometry.ratio(tile, pyrometry.RatioSettings())
 
 
 def test_ratio_out_of_range_is_undefined() -> None:
     """Where emissivities differ strongly no temperature has the ratio: NaN, and a flag."""
     tile = seen(WARM + 20.0, np.full_like(WARM, 290.0), (0.9, 0.4))
-    found = ratio.separate(tile, ratio.RatioSettings(order=None))
+    found = pyrometry.ratio(tile, pyrometry.RatioSettings(order=None))
     assert np.isnan(found.object_temperature).any()
     assert np.all(found.status & schema.FLAGS["outside_response"])
 
@@ -218,7 +218,7 @@ def test_ratio_out_of_range_is_undefined() -> None:
 def test_ratio_refuses_other_settings(options: dict[str, object], message: str) -> None:
     """Kinds that do not exist, smoothing by no function."""
     with pytest.raises(ValueError, match=message):
-        ratio.RatioSettings(**options)  # type: ignore[arg-type]
+        pyrometry.RatioSettings(**options)  # type: ignore[arg-type]
 
 
 HOT, ROOM = 320.0, 295.0
@@ -315,7 +315,7 @@ def test_bcp_refuses_a_room_beyond_the_response() -> None:
         bcp.separate(half_black(), bcp.BcpSettings(reflected_temperature=500.0))
 
 
-METHODS = {"naive": naive.METHOD, "ratio": ratio.METHOD, "bcp": bcp.METHOD}
+METHODS = {"naive": naive.METHOD, "ratio": pyrometry.RATIO, "bcp": bcp.METHOD}
 
 
 @pytest.fixture(scope="module")

@@ -24,16 +24,9 @@ from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.emulated.world import World
 
 SERIAL_NUMBER: Final = 40_000_000
-"""Default serial number of a controller."""
-
-NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")
-"""Notes in its `Info`."""
-
-SLOWEST: Final = 1.0
-"""Velocity below which the motor does not move at all [count/s]."""
-
-WINDOW: Final = 1.0
-"""Largest distance of the wheel from a slot whose filter is in the beam [deg]."""
+NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")  # in its `Info`
+SLOWEST: Final = 1.0  # [count/s] velocity below which the motor does not move at all
+WINDOW: Final = 1.0  # [deg] largest distance of the wheel from a slot that is in the beam
 
 
 class Model(NamedTuple):
@@ -50,10 +43,7 @@ _UNIT = Model(25_600, 1.0, 1.0, is_rack=False)
 MODELS: Final = MappingProxyType(
     {"BSC201": _RACK, "BSC203": _RACK, "SCC201": _RACK, "BSC101": _UNIT, "KDC101": _UNIT}
 )
-"""Controllers by the name they give, KDC101 being one that drives no wheel.
-
-The driver has these numbers from a place of its own.
-"""
+"""Controllers by the name they give (KDC101 drives no wheel), with numbers of their own."""
 
 
 @dataclass(frozen=True)
@@ -93,25 +83,9 @@ class EmulatedApt:
     """
     A controller and a wheel; a `Device` of `dbthermal.instruments.emulated.port`.
 
-    Parameters
-    ----------
-    world : World
-        Its clock is used, and its wheel is turned.
-    model : str
-        Name of the controller, one of `MODELS`.
-    serial_number : int
-        Serial number of the controller.
-    slot_offset : float
-        From the wheel's home switch to its slot 1 [deg].
-
-    Attributes
-    ----------
-    position, wheel : int, float
-        Counter of commanded steps, and place of the wheel from its home switch [count].
-    enabled, homed : bool
-        True if the motor has current, and if it found its switch.
-    plugged : bool
-        Set it to False to pull out the cable.
+    It uses the world's clock and turns the world's wheel, whose slot 1 is `slot_offset` [deg] from
+    the home switch. `position` counts the commanded steps, `wheel` is the place of the wheel from
+    its home switch [count]; `plugged` is set to False to pull out the cable.
     """
 
     is_simulated: Final = True
@@ -269,9 +243,8 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     """
     Start an emulated wheel for ``sim://apt``, on a pseudo-terminal of its own.
 
-    The options are ``model``, ``sn`` (serial number), ``offset`` (slot 1 from the home switch
-    [deg]) and ``name``, which says nothing more: a world has one wheel. ValueError if another is
-    given, or a value is invalid. Close the port to end the wheel.
+    Its options are ``model``, ``sn`` (serial number), ``offset`` (of slot 1 from the home switch
+    [deg]) and ``name``, without effect; ValueError if one is unknown or invalid.
     """
     require_known(options, ("model", "sn", "offset", "name"))
     device = EmulatedApt(

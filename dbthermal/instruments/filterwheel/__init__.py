@@ -11,7 +11,6 @@ Tested against public byte vectors and an emulator, not against hardware.
 """
 
 from dbthermal.instruments.filterwheel._controller import (
-    ControllerError,
     NoReplyError,
     NotHomedError,
     StalledWheelError,
@@ -19,18 +18,14 @@ from dbthermal.instruments.filterwheel._controller import (
     WheelTimeoutError,
     WrongDeviceError,
 )
-from dbthermal.instruments.filterwheel._settings import BSC10X, BSC20X, Scale, Settings
+from dbthermal.instruments.filterwheel._settings import Settings
 from dbthermal.instruments.filterwheel._wheel import FilterWheel, Identity
 
 __all__ = [
-    "BSC10X",
-    "BSC20X",
-    "ControllerError",
     "FilterWheel",
     "Identity",
     "NoReplyError",
     "NotHomedError",
-    "Scale",
     "Settings",
     "StalledWheelError",
     "WheelError",

@@ -19,17 +19,10 @@ from dbthermal.instruments.apt import Id
 from dbthermal.instruments.filterwheel._settings import CHANNEL, MODELS, Scale, Settings
 from dbthermal.instruments.transport import Transport
 
-ATTEMPTS: Final = 2
-"""Number of times that a request is sent before its reply is given up."""
-
-READ_SIZE: Final = 256
-"""Largest number of bytes that are read at once."""
-
-MAXIMUM_UNSOLICITED: Final = 65536
-"""Largest number of unsolicited bytes: a line that talks without end is another device's."""
-
-ACCURACY: Final = 0.01
-"""Largest relative difference of a speed that is read back [1]."""
+ATTEMPTS: Final = 2  # number of times that a request is sent before its reply is given up
+READ_SIZE: Final = 256  # largest number of bytes that are read at once
+MAXIMUM_UNSOLICITED: Final = 65536  # [byte] a line that talks without end is another device's
+ACCURACY: Final = 0.01  # largest relative difference of a speed that is read back
 
 _EVENTS = (Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED)
 _NOTICES = (Id.HW_RESPONSE, Id.HW_RICHRESPONSE)
@@ -50,10 +43,6 @@ class WheelTimeoutError(WheelError, TimeoutError):
 
 class WrongDeviceError(WheelError):
     """Another device is at this address."""
-
-
-class ControllerError(WheelError):
-    """The controller itself reported an error."""
 
 
 class StalledWheelError(WheelError):
@@ -155,7 +144,7 @@ class Controller:
         """
         Begin a move to an absolute place [count].
 
-        ControllerError if the controller has reported an error, and then nothing is sent.
+        WheelError if the controller has reported an error, and then nothing is sent.
         """
         self._forget_events()
         self._send(Id.MOT_MOVE_ABSOLUTE, data=apt.Position(CHANNEL, target).pack())
@@ -164,21 +153,16 @@ class Controller:
         """Stop by a ramp; TransportError if the device is gone."""
         self._send(Id.MOT_MOVE_STOP, CHANNEL, apt.NO)
 
-    def take_event(self, identifier: Id) -> bool:
-        """True if the motor reported this since the last start of a motion, or the last call."""
-        kept = [
-            event for event in self._events if (event.id, event.source) != (identifier, self.motor)
-        ]
-        taken = len(kept) < len(self._events)
-        self._events = kept
-        return taken
+    def has_reported(self, identifier: Id) -> bool:
+        """True if the motor reported this since the last start of a motion."""
+        return (identifier, self.motor) in {(event.id, event.source) for event in self._events}
 
     def raise_notice(self) -> None:
-        """ControllerError with the text of the errors that the controller reported by itself."""
+        """WheelError with the text of the errors that the controller reported by itself."""
         if self._notices:
             reported = self._reported()
             self._notices.clear()
-            raise ControllerError(f"The controller is not well.{reported}")
+            raise WheelError(f"The controller is not well.{reported}")
 
     def _identified(self) -> tuple[apt.Info, Scale]:
         if self._identity is None:

@@ -16,8 +16,7 @@ from typing import Final
 
 from dbthermal.instruments import apt
 
-POSITIONS: Final = 6
-"""Slots of the wheel, numbered from 1."""
+POSITIONS: Final = 6  # slots of the wheel, numbered from 1
 
 _POSITIVE = (
     *("velocity", "home_velocity", "acceleration", "tolerance", "reply_timeout", "home_timeout"),
@@ -85,11 +84,9 @@ MODELS: Final[Mapping[str, Scale]] = MappingProxyType(
 )
 """Beginnings of the model names that are accepted; some BSC201 call themselves SCC201."""
 
-CHANNEL: Final = 1
-"""Channel of the motor at its address."""
-
+CHANNEL: Final = 1  # of the motor at its address
 FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
-"""State that is an error. Whether a wheel's controller sets these is uncertain."""
+"""State that is an error; it is uncertain if a wheel's controller sets these bits."""
 
 
 @dataclass(frozen=True)

@@ -26,31 +26,22 @@ from dbthermal.instruments.transport import SerialTransport, Transport, open_ser
 if TYPE_CHECKING:
     from dbthermal.instruments.emulated.world import World
 
-BAUDRATE: Final = 115_200
-"""Speed of the line [bit/s]."""
-
-SETTLING: Final = 0.05
-"""Wait between taking RTS down and up, as in the maker's example [s]."""
+BAUDRATE: Final = 115_200  # [bit/s]
+SETTLING: Final = 0.05  # [s] between taking RTS down and up, as in the maker's example
 
 MOVING: Final = (
     apt.StatusBits.MOVING_FORWARD | apt.StatusBits.MOVING_REVERSE | apt.StatusBits.HOMING
 )
 """Bits of a wheel that moves. The jogging bits are left out: they were seen to stick."""
 
-CONFIRMATIONS: Final = 2
-"""Consecutive status replies that must agree before a motion counts as over, or as failed."""
+CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
 
 _LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Identity:
-    """
-    Identity of the controller, for a capture's record.
-
-    The model is as the controller says, which is not always what is on the label; `addresses` are
-    its own and its motor's.
-    """
+    """Identity of the controller; the model it gives is not always the one on its label."""
 
     model: str
     serial_number: int
@@ -124,14 +115,10 @@ class FilterWheel(Closing):
 
         Raises
         ------
-        NoReplyError
-            If nothing replies, or a controller does and its motor does not.
-        WrongDeviceError
-            If the device speaks another language, is another model or has another serial number.
-        WheelError
-            If the controller does not take the speeds, or does not enable the motor.
-        TransportError
-            If the device is gone.
+        NoReplyError, WrongDeviceError
+            If nothing replies, or the device is another one.
+        WheelError, TransportError
+            If the controller does not take the speeds or enable the motor, or is gone.
         """
         info = self._controller.find()
         self._controller.prepare()
@@ -161,11 +148,9 @@ class FilterWheel(Closing):
 
         Raises
         ------
-        StalledWheelError
-            If the wheel does not start, stops before the switch was found, or the controller
-            reports a fault.
-        WheelTimeoutError
-            If the switch is not found within the settings' `home_timeout`; the wheel was stopped.
+        StalledWheelError, WheelTimeoutError
+            If the wheel does not start or stops before the switch, the controller reports a fault,
+            or it takes longer than the settings' `home_timeout`; the wheel was stopped.
         WheelError
             If it is still moving, or the controller reports an error or does not take the speeds.
         NoReplyError, TransportError
@@ -218,16 +203,7 @@ class FilterWheel(Closing):
             raise
 
     def select(self, band: str) -> None:
-        """
-        Turn a band's filter into the beam.
-
-        Raises
-        ------
-        ValueError
-            If no filter of the settings has this name.
-        WheelError, TransportError
-            As `move_to`.
-        """
+        """Turn a band's filter into the beam; ValueError if it has none, else as `move_to`."""
         self.move_to(self.settings.position(band))
 
     def position(self) -> int:
@@ -236,10 +212,8 @@ class FilterWheel(Closing):
 
         Raises
         ------
-        WheelError
-            If the wheel is between two slots, or moving, or was not homed.
-        TransportError
-            If the device is gone.
+        WheelError, TransportError
+            If the wheel is between two slots, moving, or not homed, or the device is gone.
         """
         status = self._require_rest()
         self._require_home(status)
@@ -253,16 +227,7 @@ class FilterWheel(Closing):
         return position
 
     def band(self) -> str:
-        """
-        Name of the filter in the beam.
-
-        Raises
-        ------
-        WheelError
-            As `position`, or if this slot has no filter.
-        TransportError
-            If the device is gone.
-        """
+        """Name of the filter in the beam; raises as `position`, and if this slot has no filter."""
         position = self.position()
         if position not in self.settings.filters:
             known = dict(self.settings.filters)
@@ -315,7 +280,7 @@ class FilterWheel(Closing):
                 f"The controller reports {faults.name}, and the wheel was stopped. Must be none."
             )
         motion.update(status, self._clock())
-        motion.reported |= controller.take_event(motion.end)
+        motion.reported = controller.has_reported(motion.end)
         return status
 
     def _check(self, motion: "_Motion", status: apt.Status) -> None:

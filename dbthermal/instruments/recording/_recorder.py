@@ -44,15 +44,10 @@ _BYTES: Final = 2  # of a pixel
 @dataclass(frozen=True)
 class Reading:
     """
-    Another instrument that is read beside the frames.
+    Another instrument that is read beside the frames; `read` may take its time.
 
-    Attributes
-    ----------
-    read : callable
-        Gives a number; may take its time. OSError, RuntimeError and ValueError are noted as a
-        failed reading; any other error ends the recording.
-    units : str
-        Of the number.
+    OSError, RuntimeError and ValueError of it are noted as a failed reading; any other error ends
+    the recording.
     """
 
     read: Callable[[], float]
@@ -61,34 +56,15 @@ class Reading:
 
 @dataclass(frozen=True)
 class Limits:
-    """
-    Sizes and waiting times of a recording.
+    """Sizes and waiting times of a recording."""
 
-    Attributes
-    ----------
-    chunk : int
-        Frames of a chunk: the most that a kill may cost.
-    queue : int
-        Frames of each band held until they are written.
-    reserve : int
-        Space that must stay free [byte].
-    silence : float
-        Wait for a frame before it is noted that none came [s].
-    reading_period : float
-        Time from reading to reading [s].
-    patience : float
-        Wait, at the end, for a device that hangs [s].
-    preview_period : float
-        Least time from preview to preview [s].
-    """
-
-    chunk: int = CHUNK
-    queue: int = 120
-    reserve: int = 10**9
-    silence: float = 1.0
-    reading_period: float = 1.0
-    patience: float = 10.0
-    preview_period: float = 0.2
+    chunk: int = CHUNK  # frames of a chunk: the most that a kill may cost
+    queue: int = 120  # frames of each band held until they are written
+    reserve: int = 10**9  # space that must stay free [byte]
+    silence: float = 1.0  # wait for a frame before it is noted that none came [s]
+    reading_period: float = 1.0  # time from reading to reading [s]
+    patience: float = 10.0  # wait, at the end, for a device that hangs [s]
+    preview_period: float = 0.2  # least time from preview to preview [s]
 
 
 @dataclass(frozen=True)
@@ -96,41 +72,23 @@ class Preview:
     """
     State of a recording while it goes on.
 
-    Attributes
-    ----------
-    time : float
-        Since the start [s].
-    frames : mapping
-        Band to its last frame, without the bands that had none.
-    totals : mapping
-        Band to numbers of frames: ``frames``, ``lost``, ``refused``, ``damaged``.
-    readings : mapping
-        Name to the last value of each reading, NaN if it failed.
-    units : mapping
-        Name to unit of each reading; in kelvin unless named.
+    `totals` has numbers of frames for each band: ``frames``, ``lost``, ``refused``, ``damaged``.
     """
 
-    time: float
-    frames: Mapping[str, Frame]
+    time: float  # since the start [s]
+    frames: Mapping[str, Frame]  # last frame of each band that had one
     totals: Mapping[str, Mapping[str, int]]
-    readings: Mapping[str, float]
-    units: Mapping[str, str] = field(default_factory=dict)
+    readings: Mapping[str, float]  # last value of each reading, NaN if it failed
+    units: Mapping[str, str] = field(default_factory=dict)  # of the readings, else kelvin
 
 
 @dataclass(frozen=True)
 class Summary:
     """
-    Result of a recording.
+    Result of a recording, with `totals` as in `Preview`.
 
-    Attributes
-    ----------
-    path : Path
-        Folder ``*.zarr``.
-    ended : str
-        Why it ended: ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last
-        source is lost), or ``"no frames"`` if a band had none.
-    totals : mapping
-        As in `Preview`.
+    `ended` is ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is
+    lost), or ``"no frames"`` if a band had none.
     """
 
     path: Path
@@ -187,12 +145,12 @@ def record(  # noqa: PLR0913 - all but the first three are by name
     FileExistsError
         If `path` exists.
     OSError
-        If there is too little space, before or on the way; what was recorded is kept.
+        If there is too little space, before or on the way.
     ValueError
         If the sources are not the session's, or are emulated where it says hardware, or vice versa.
     Exception
-        Error of a source, a reading or the preview; what was recorded is kept. So it is after an
-        interrupt by the keyboard. A second interrupt ends the wait, not the writing.
+        Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
+        what was recorded is kept. A second interrupt ends the wait, not the writing.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)

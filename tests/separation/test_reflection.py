@@ -1,4 +1,4 @@
-"""Reflections in a movie's own units: made movies whose ratio, noise and scaling are known."""
+"""Reflections as pictures: made movies whose ratio, noise and scaling are known, and a result's."""
 
 import re
 from collections.abc import Callable
@@ -9,13 +9,16 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dbthermal import _smooth as smooth
-from dbthermal import separation
+from dbthermal import response as responses
+from dbthermal import separation, simulation
+from dbthermal.simulation import Background, Rig
 
 Floats = NDArray[np.float64]
 FRAMES, HEIGHT, WIDTH = 240, 24, 40
 RATIO = 2.1
 NOISE = np.array([0.004, 0.005])
 TIME = np.arange(FRAMES) / 10.0  # s
+FILM = np.arange(350) / 10.0  # s
 
 
 def pulses() -> Floats:
@@ -56,13 +59,13 @@ def signal() -> xr.DataArray:
 @pytest.fixture(scope="module")
 def found(signal: xr.DataArray) -> xr.Dataset:
     """Its reflections."""
-    return separation.reflections(signal)
+    return separation.uncalibrated_reflection(signal)
 
 
 @pytest.mark.parametrize("scaling", [0.0, 0.002])
 def test_ratio_and_noise(scaling: float) -> None:
     """The ratio comes back within 3 %, the ratio of the noises within 5 %, scaled or not."""
-    attrs = separation.reflections(movie(scaling)).attrs
+    attrs = separation.uncalibrated_reflection(movie(scaling)).attrs
     assert attrs["pooled_ratio"] == pytest.approx(RATIO, rel=0.03)
     assert attrs["noise_ratio"] == pytest.approx((NOISE[1] / NOISE[0]) ** 2, rel=0.05)
     assert attrs["correlated_pixels"] == HEIGHT * WIDTH // 2
@@ -89,7 +92,7 @@ def test_emission_and_reflection_are_the_first_band(
 
 def test_reflection_is_the_true_one(found: xr.Dataset) -> None:
     """It is off by what the noise of the best linear estimate leaves, the scaling taken out."""
-    functions = smooth.basis(TIME, found.attrs["order"])
+    functions = smooth.polynomial_basis(TIME, found.attrs["order"])
     true = pulses().reshape(FRAMES, -1)
     true -= functions @ (functions.T @ true)
     error = found["reflection"].values.reshape(FRAMES, -1) - true
@@ -106,14 +109,19 @@ def test_units_and_provenance(signal: xr.DataArray, found: xr.Dataset) -> None:
         "reflection": "1",
         "emission": "1",
     }
-    assert separation.reflections(signal.assign_attrs(units="K"))["emission"].attrs["units"] == "K"
+    assert (
+        separation.uncalibrated_reflection(signal.assign_attrs(units="K"))["emission"].attrs[
+            "units"
+        ]
+        == "K"
+    )
     assert (found.attrs["radiometric"], found.attrs["order"]) == (0, 9)
 
 
 def test_unit_does_not_matter(signal: xr.DataArray, found: xr.Dataset) -> None:
     """Bands in units of their own give the ratio in those units, and the same reflection."""
     scale = xr.DataArray([100.0, 300.0], dims="band")
-    other = separation.reflections(scale * signal)
+    other = separation.uncalibrated_reflection(scale * signal)
     assert other.attrs["pooled_ratio"] == pytest.approx(3 * found.attrs["pooled_ratio"], rel=1e-9)
     np.testing.assert_allclose(other["reflection"], 100 * found["reflection"], rtol=0, atol=1e-5)
 
@@ -122,7 +130,7 @@ def test_mask(signal: xr.DataArray, found: xr.Dataset) -> None:
     """What lies outside the mask has no part in ratio and noise, but is separated, too."""
     mask = xr.DataArray(np.arange(HEIGHT) < 18, dims="y").expand_dims(x=WIDTH, axis=1)
     spoiled = signal.where(mask, signal * xr.DataArray([1.0, 0.2], dims="band"))
-    masked = separation.reflections(spoiled.transpose(*signal.dims), mask=mask)
+    masked = separation.uncalibrated_reflection(spoiled.transpose(*signal.dims), mask=mask)
     assert masked.attrs["correlated_pixels"] == 18 * WIDTH // 2
     assert masked.attrs["pooled_ratio"] == pytest.approx(RATIO, rel=0.03)
     assert masked.attrs["noise_ratio"] == pytest.approx((NOISE[1] / NOISE[0]) ** 2, rel=0.05)
@@ -155,4 +163,41 @@ def test_refused(
 ) -> None:
     """Other dims, NaN, and movies without enough pixels to tell noise from reflection."""
     with pytest.raises(ValueError, match=re.escape(message)):
-        separation.reflections(change(signal), **options)  # type: ignore[arg-type]
+        separation.uncalibrated_reflection(change(signal), **options)  # type: ignore[arg-type]
+
+
+def emissivity_of(*values: float) -> xr.DataArray:
+    """Emissivity (band) of the rig's two bands."""
+    return xr.DataArray(list(values), dims="band", coords={"band": ["8-14", "9.5"]})
+
+
+def test_reflected_change() -> None:
+    """It is the share of the background's change that the first band sees, for objects that change
+    and for those that do not.
+    """
+    rig, value = Rig(noise=(0.003, 0.035)), emissivity_of(0.86, 0.72)
+    for stop in (293.15, 303.15):  # a constant object, and one that warms
+        rng = np.random.default_rng(4)
+        scene = simulation.independent_pixels(
+            FILM, value, Background(), 40, rng, start=293.15, stop=stop
+        )
+        capture = simulation.observe(scene, rig.response(), rng)
+        result = separation.solve(capture, rig.response())
+        apparent = responses.apparent_temperature(rig.response(), capture["counts"])
+        found = separation.reflected_change(apparent, result)
+        true = 0.14 * (
+            scene["background_temperature"] - scene["background_temperature"].mean("time")
+        )
+        assert found.dims == ("time", "y", "x")
+        assert float(found.notnull().all("time").mean()) > 0.95
+        error = float(np.sqrt(((found - true) ** 2).mean()))
+        print(f"object to {stop} K: {error:.3f} K")
+        assert error < 0.02  # [K], of changes of 0.4 K
+
+
+def test_reflected_change_of_another_band() -> None:
+    """Bands in another order are refused."""
+    result = xr.Dataset(coords={"band": ["8-14", "9.5"]})
+    apparent = xr.DataArray(np.zeros((2, 1, 1, 1)), dims=("band", "time", "y", "x"))
+    with pytest.raises(ValueError, match=r"Invalid first band '9\.5'. Must be '8-14'"):
+        separation.reflected_change(apparent.assign_coords(band=["9.5", "8-14"]), result)
