@@ -15,7 +15,7 @@ from dbthermal.instruments.boson import Boson, BosonError, BosonStatusError, com
 from dbthermal.instruments.boson.commands import SyncMode
 from dbthermal.instruments.boson.link import REPLY_TIMEOUT, Link
 from dbthermal.instruments.camera import FfcStatus
-from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import Closing
 from dbthermal.instruments.emulated.boson_faults import Fault
 from dbthermal.instruments.transport import TransportError
 

@@ -8,7 +8,7 @@ import pytest
 from rig_devices import Clock, WheelBench
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import Closing
 from dbthermal.instruments.filterwheel import (
     BSC20X,
     FilterWheel,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import Closing
 from dbthermal.instruments.filterwheel.controller import Controller
 from dbthermal.instruments.filterwheel.link import NotHomedError, StalledWheelError, WheelError
 from dbthermal.instruments.filterwheel.motion import MOVING, Motion
