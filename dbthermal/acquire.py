@@ -12,17 +12,16 @@ Exit status: 0 if all was recorded, 1 if a device or a recording failed, 2 if th
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.devices import Devices, emulated_world, open_devices
-from dbthermal.instruments.emulated import blackbody, usb
+from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import ROOM, World
 from dbthermal.instruments.live import Watch
@@ -95,24 +94,25 @@ def ask_for_blackbody(name: str, temperature: float) -> None:
 
 def plugged_in(session: Session) -> str:
     """
-    Say what is on the bus; the devices may open even where it cannot be looked at.
+    Report of the USB bus; the devices may open even where it cannot be listed.
 
     Parameters
     ----------
     session : Session
-        Its frame rate says which bandwidth is needed; if it is simulated, so is the bus.
+        Its frame rate determines the bandwidth that is needed.
 
     Returns
     -------
     str
-        See `dbthermal.instruments.inventory.describe`; without libusb, what is missing.
+        See `dbthermal.instruments.inventory.describe`; for an emulated session, or without
+        libusb, that the bus was not looked at.
     """
-    plugged: AbstractContextManager[dict[str, Any]] = nullcontext({})
-    with usb.rig() if session.simulated else plugged as bus:
-        try:
-            return inventory.describe(inventory.find(**bus, frame_rate=session.frame_rate))
-        except inventory.LibusbMissingError as error:
-            return f"The bus was not looked at: {error}"
+    if session.simulated:
+        return f"Session '{session.name}' is emulated: the USB bus was not looked at."
+    try:
+        return inventory.describe(inventory.find(frame_rate=session.frame_rate))
+    except inventory.LibusbMissingError as error:
+        return f"The USB bus was not looked at: {error}"
 
 
 def main(
@@ -140,8 +140,8 @@ def main(
     options = _parser().parse_args(arguments)
     try:
         session = Session.load(options.session)
-    except (OSError, TypeError, ValueError) as error:
-        print(f"No session in '{options.session}': {error}", file=sys.stderr)
+    except (OSError, ValueError) as error:
+        print(f"Invalid session: {error}", file=sys.stderr)
         return 2
     session = replace(session, simulated=True) if options.simulate else session
     try:

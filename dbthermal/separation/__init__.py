@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
     from dbthermal.separation._baselines.ratio import RatioSettings
-    from dbthermal.separation._dbvt.method import DbvtSettings
+    from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 __all__ = [
@@ -37,7 +37,7 @@ __all__ = [
 # The settings are imported with their method when they are first asked for: one needs torch.
 _SETTINGS: Final = {
     "BcpSettings": "_baselines.bcp",
-    "DbvtSettings": "_dbvt.method",
+    "DbvtSettings": "_dbvt",
     "NaiveSettings": "_baselines.naive",
     "RatioSettings": "_baselines.ratio",
     "SubspaceSettings": "_subspace.method",

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal import mixing
 from dbthermal.curves import Curve
 from dbthermal.separation._separated import Array, Mask, Separated, Survey
 
@@ -113,6 +114,16 @@ class Problem:
             Temperature [K]; NaN where there is none.
         """
         return self.curves[band].temperature(signal + self.reference)
+
+    def mixed(self, emissivity: Array, temperatures: Array) -> Array:
+        """Signals (band, time, pixel) [K] of object and background (2, time, pixel) [K]."""
+        x, y = temperatures
+        return np.stack(
+            [
+                mixing.mixed(share, self.blackbody(band, x), self.blackbody(band, y))
+                for band, share in enumerate(emissivity)
+            ]
+        )
 
     def at(self, frames: Mask) -> "Problem":
         """

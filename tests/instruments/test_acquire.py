@@ -1,6 +1,7 @@
 """One command records a session, from its file to movies that open, and says how it went."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +79,7 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("text", "status", "message"),
     [
-        ("name: plate", 2, "Missing 'simulated' in the session"),
+        ("name: plate", 2, "Missing 'simulated'. Must be given"),
         (TEXT.replace("sim://tc08", "sim://tc09"), 1, "Failed: Invalid URL 'sim://tc09'"),
     ],
 )
@@ -94,7 +95,7 @@ def test_failures_have_a_status(
 def test_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A file that is not there is named."""
     assert acquire.main([str(tmp_path / "a.yaml"), str(tmp_path)]) == 2
-    assert "No session in" in capsys.readouterr().err
+    assert "Invalid session: " in capsys.readouterr().err
 
 
 def test_interrupted(
@@ -154,8 +155,10 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
         raise inventory.LibusbMissingError("no libusb")
 
     monkeypatch.setattr(inventory, "find", missing)
-    session = Session.from_yaml(TEXT)
-    assert acquire.plugged_in(session) == "The bus was not looked at: no libusb"
+    emulated = Session.from_yaml(TEXT)
+    real = replace(emulated, simulated=False)
+    assert acquire.plugged_in(real) == "The USB bus was not looked at: no libusb"
+    assert "is emulated: the USB bus was not" in acquire.plugged_in(emulated)
 
 
 def test_progress_is_a_line() -> None:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from dbthermal import _smooth as smooth
 from dbthermal import limits, mixing, simulation
 from dbthermal import response as responses
+from dbthermal.separation._baselines.calibrated import temperature_variance
 from dbthermal.simulation import Background, Rig
 
 RIG = Rig()
@@ -58,7 +59,7 @@ def test_ratio_without_rest_is_the_closed_form(background: dict[str, Any]) -> No
 
 
 def test_known_emissivities_give_the_closed_form() -> None:
-    """One temperature a frame and known emissivities: the bound is `calibrated_variance`."""
+    """One temperature a frame and known emissivities: the bound is that of `calibrated`."""
     scene = scene_of(0.86, 0.72).isel(time=slice(0, 12))
     found = limits.bounds(scene, RIG.response(), order=12, resting=False, emissivity_std=0.0)
     curves = [responses.curve(RIG.response(), name) for name in RIG.bands]
@@ -73,7 +74,7 @@ def test_known_emissivities_give_the_closed_form() -> None:
     )
     noise = responses.noise(RIG.response(), list(RIG.bands))
     std = noise / [curve.reference_slope for curve in curves]
-    variance = limits.calibrated_variance(mixed, (std[0], std[1]), temperatures, np.zeros(2))
+    variance = temperature_variance(mixed, (std[0], std[1]), temperatures, np.zeros(2))
     for name, expected in zip(("object", "background"), np.sqrt(variance), strict=True):
         np.testing.assert_allclose(found[f"{name}_temperature_std"], expected, rtol=1e-9)
     assert not found["emissivity_std"].any()

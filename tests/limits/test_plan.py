@@ -9,6 +9,7 @@ import xarray as xr
 
 from dbthermal import emissivity, limits, simulation
 from dbthermal.figures import _limits as drawn
+from dbthermal.limits._planner import _truth
 from dbthermal.simulation import Rig
 
 
@@ -26,12 +27,15 @@ def test_plan_is_the_bound(materials: Materials) -> None:
     """The plan of glass is `bounds` of the same film with the rig's own response."""
     table, noise = materials
     row = table.sel(material=["plate window glass"])
-    truth = limits.Recording().truth(row["emissivity"].values.T)
+    truth = _truth(limits.CaptureDesign(), row["emissivity"].values.T)
     rig = Rig(bands=("8-14", "9.5"), noise=(1.0, 1.0))
     response = rig.response()
     of_glass = row["emissivity"].isel(material=0).sel(band=list(rig.bands))
     scene = simulation.scene(
-        truth.time, truth.warm[..., None], truth.cold[..., None], of_glass.drop_vars("material")
+        truth.time,
+        truth.object_temperature[..., None],
+        truth.background_temperature[..., None],
+        of_glass.drop_vars("material"),
     )
     response["noise"] = noise.sel(band=list(rig.bands)) * response["noise"].assign_attrs(
         units="count"
@@ -111,10 +115,10 @@ def test_bad_plan_is_a_clear_error(
 @pytest.mark.parametrize(
     "change", [{"seconds": 0.0}, {"rate": -1.0}, {"duration": 6.0}, {"seconds": 0.1}]
 )
-def test_bad_recording_is_a_clear_error(change: dict[str, float]) -> None:
-    """Numbers that are no film are refused."""
+def test_bad_design_is_a_clear_error(change: dict[str, float]) -> None:
+    """Conditions that are no capture are refused."""
     with pytest.raises(ValueError, match="Must"):
-        replace(limits.Recording(), **change)
+        replace(limits.CaptureDesign(), **change)
 
 
 def texts(figure: Any) -> set[str]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema, store
-from dbthermal.alignment import _clocks as clocks
+from dbthermal.alignment import exposure_times, fill_times
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
 
 Array = npt.NDArray[np.float64]
@@ -47,7 +47,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         opened = _fitted(opened)
     # The coordinate must be there for the stamps to be looked at, of which it is made.
     numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
-    time = clocks.filled(clocks.exposures(numbered)[0])
+    time = fill_times(exposure_times(numbered)[0])
     seconds = {**schema.COORDINATES["time"].attrs, "long_name": "time since the start"}
     return schema.check(numbered.assign_coords(time=("time", time, seconds)), "capture")
 

@@ -9,10 +9,9 @@ from enum import IntEnum, IntFlag
 from types import MappingProxyType
 from typing import Any, Final
 
-from dbthermal.alignment import _clocks as clocks
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import MEANINGS
-from dbthermal.schema import STAGES, Variable
+from dbthermal.schema import EXPOSURE_TIME, STAGES, Variable
 
 
 class Note(IntEnum):
@@ -100,7 +99,7 @@ _LAYOUT: Final = (
 VARIABLES: Final = MappingProxyType(
     {
         "counts": STAGES["capture"]["counts"],
-        "exposure_time": clocks.EXPOSURE_TIME,
+        "exposure_time": EXPOSURE_TIME,
         "device_time": Variable(
             ("band", "time"), "float64", "s", "device's stamp of the frame, as it came"
         ),

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import store
-from dbthermal.alignment import _clocks as clocks
+from dbthermal.alignment import fill_times
 from dbthermal.instruments.camera import (
     DAMAGED,
     GOOD,
@@ -322,7 +322,7 @@ class Tape:
     def _times(self, band: str) -> npt.NDArray[np.float64] | None:
         """Exposure times without holes; None where there are not two."""
         stamps = self.recording.read("exposure_time", band)
-        return clocks.filled(stamps) if np.isfinite(stamps).sum() > 1 else None
+        return fill_times(stamps) if np.isfinite(stamps).sum() > 1 else None
 
 
 def _common_format(sources: Mapping[str, FrameSource]) -> tuple[tuple[int, int], int]:

@@ -1,19 +1,16 @@
-"""An emulated USB bus for pyusb, on which the rig's devices are plugged in, and Linux's view of it.
+"""An emulated USB bus for pyusb, Linux's sysfs of it, and its serial ports: for the inventory.
 
-`EmulatedBackend` takes the place of libusb. It answers what an inventory may ask: which devices
-there are, and their strings. Everything that would disturb a live device is refused with an error,
-so that a test sees it. No device's own protocol is emulated here.
+Everything that would disturb a live device is refused with an error, so that a test sees it. No
+device's own protocol is emulated here.
 """
 
 import errno
 from array import array
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any, Final, Literal, NoReturn
+from typing import Any, Literal, NoReturn
 
 import usb.backend
 import usb.core
@@ -34,101 +31,58 @@ class EmulatedDevice:
         USB identity.
     serial : str
         Serial number, none if empty.
-    bus, address : int
+    bus : int
         Where it is.
     ports : tuple of int
         Ports on the way.
     speed : int
         As libusb numbers it; 2 is full, 3 high.
-    nodes : dict
-        Interface, from 0, to its kernel driver and the node that it makes: ``("uvcvideo",
-        "video0")``; see `write_sysfs`.
+    video, tty : tuple of str
+        Names of its nodes.
     fault : str
-        What happens when its strings are read: ``"permission"``, ``"unplugged"``, ``"timeout"``,
-        ``"damaged"`` (bytes that are no text), ``"mute"`` (no strings), ``"unsupported"``.
+        What happens when its strings are read: ``"damaged"`` are bytes that are no text,
+        ``"mute"`` is no strings.
     """
 
     vendor: int
     product: int
     serial: str
     bus: int = 1
-    address: int = 1
     ports: tuple[int, ...] = (1,)
     speed: int = 3
-    nodes: dict[int, tuple[str, str]] = field(default_factory=dict)
+    video: tuple[str, ...] = ()
+    tty: tuple[str, ...] = ()
     fault: Fault = ""
+
+    @property
+    def path(self) -> str:
+        """Bus and ports."""
+        return f"{self.bus}-{'.'.join(str(port) for port in self.ports)}"
 
 
 def boson(number: int = 1, **settings: Any) -> EmulatedDevice:
-    """
-    Give a camera with two video nodes and a serial one.
-
-    Parameters
-    ----------
-    number : int
-        From 1; it gives the serial number, the port and the nodes.
-    **settings
-        Of `EmulatedDevice`, in place of these.
-
-    Returns
-    -------
-    EmulatedDevice
-        The camera.
-    """
-    nodes = {
-        0: ("uvcvideo", f"video{2 * number - 2}"),
-        1: ("uvcvideo", f"video{2 * number - 1}"),
-        2: ("cdc_acm", f"ttyACM{number - 1}"),
-    }
-    own = {"serial": f"EMULATED{number}", "ports": (number,), "address": number, "nodes": nodes}
+    """A camera with two video nodes and a serial one; `number`, from 1, is in all its names."""
+    own: dict[str, Any] = {"serial": f"EMULATED{number}", "ports": (number,)}
+    own["video"] = (f"video{2 * number - 2}", f"video{2 * number - 1}")
+    own["tty"] = (f"ttyACM{number - 1}",)
     return EmulatedDevice(0x09CB, 0x4007, **{**own, **settings})
 
 
 def apt(**settings: Any) -> EmulatedDevice:
-    """
-    Give an APT controller on its FTDI chip, at full speed.
-
-    Parameters
-    ----------
-    **settings
-        Of `EmulatedDevice`.
-
-    Returns
-    -------
-    EmulatedDevice
-        The controller.
-    """
-    own = {"serial": "EMULATED", "ports": (3,), "address": 3, "speed": 2}
-    own["nodes"] = {0: ("ftdi_sio", "ttyUSB0")}
+    """An APT controller on its FTDI chip, at full speed."""
+    own: dict[str, Any] = {"serial": "EMULATED", "ports": (3,), "speed": 2, "tty": ("ttyUSB0",)}
     return EmulatedDevice(0x0403, 0xFAF0, **{**own, **settings})
 
 
 def tc08(**settings: Any) -> EmulatedDevice:
-    """
-    Give a TC-08, at full speed, without a kernel driver.
-
-    Parameters
-    ----------
-    **settings
-        Of `EmulatedDevice`.
-
-    Returns
-    -------
-    EmulatedDevice
-        The logger.
-    """
-    own: dict[str, Any] = {"serial": "EMULATED", "ports": (4,), "address": 4, "speed": 2}
+    """A TC-08, at full speed, without a kernel driver."""
+    own: dict[str, Any] = {"serial": "EMULATED", "ports": (4,), "speed": 2}
     return EmulatedDevice(0x0CE9, 0x1000, **{**own, **settings})
 
 
 class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
     """
     A backend of pyusb with devices of its own.
-
-    Parameters
-    ----------
-    *devices : EmulatedDevice
-        What is plugged in; `devices` may be changed at any time.
 
     Attributes
     ----------
@@ -138,11 +92,7 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         Handles that are open now.
     answer : callable
         Gives the descriptor of a device's string; a test may send anything.
-    is_simulated : bool
-        True.
     """
-
-    is_simulated: Final = True
 
     def __init__(self, *devices: EmulatedDevice) -> None:
         self.devices = list(devices)
@@ -170,10 +120,10 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
             iProduct=0,
             iSerialNumber=1 if dev.serial else 0,
             bNumConfigurations=1,
-            address=dev.address,
+            address=dev.ports[0],
             bus=dev.bus,
-            port_number=dev.ports[-1] if dev.ports else None,
-            port_numbers=dev.ports or None,
+            port_number=dev.ports[-1],
+            port_numbers=dev.ports,
             speed=dev.speed,
         )
 
@@ -254,71 +204,30 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         raise AssertionError(f"Invalid {function} on a live device. Must only be looked at.")
 
 
-def write_sysfs(root: Path, backend: EmulatedBackend) -> None:
-    """
-    Write what Linux's sysfs would hold of the devices that are plugged in.
-
-    Parameters
-    ----------
-    root : Path
-        Folder that takes the place of ``/sys``.
-    backend : EmulatedBackend
-        The bus.
-    """
-    for device in backend.devices:
-        name = f"{device.bus}-{'.'.join(str(port) for port in device.ports)}"
-        real = root / "devices" / f"usb{device.bus}" / name
-        real.mkdir(parents=True)
-        if device.serial:
-            (real / "serial").write_text(f"{device.serial}\n", encoding="utf-8")
-        for number, (driver, node) in device.nodes.items():
-            interface = real / f"{name}:1.{number}"
-            family = "video4linux" if node.startswith("video") else "tty"
-            above = interface / node if node.startswith("ttyUSB") else interface
-            (above / family / node).mkdir(parents=True)
-            (interface / "driver").symlink_to(root / "bus" / "usb" / "drivers" / driver)
-        link = root / "bus" / "usb" / "devices" / name
-        link.parent.mkdir(parents=True, exist_ok=True)
-        link.symlink_to(real)
+def write_sysfs(root: Path, devices: tuple[EmulatedDevice, ...]) -> None:
+    """Write what Linux's sysfs, here `root`, would hold of the devices' video nodes."""
+    for device in devices:
+        folder = root / "bus" / "usb" / "devices" / device.path
+        folder.mkdir(parents=True)
+        for number, node in enumerate(device.video):
+            (folder / f"{device.path}:1.{number}" / "video4linux" / node).mkdir(parents=True)
 
 
-@contextmanager
-def rig() -> Iterator[dict[str, Any]]:
-    """
-    Plug in two cameras on a bus each, a wheel's controller and a thermocouple logger.
-
-    Yields
-    ------
-    dict
-        Arguments for `dbthermal.instruments.inventory.find`; the files behind them are removed in
-        the end.
-    """
-    backend = EmulatedBackend(boson(1), boson(2, bus=2), apt(), tc08())
-    with TemporaryDirectory() as folder:
-        root = Path(folder)
-        write_sysfs(root, backend)
-        for node in (node for device in backend.devices for _, node in device.nodes.values()):
-            (root / "dev").mkdir(exist_ok=True)
-            (root / "dev" / node).touch()
-        yield {"backend": backend, "sysfs": root, "dev": root / "dev"}
+def serial_ports(dev: Path, devices: tuple[EmulatedDevice, ...]) -> list[SimpleNamespace]:
+    """Serial ports as pyserial lists them: a converter's is at the device, others at interfaces."""
+    return [
+        SimpleNamespace(
+            device=str(dev / node),
+            location=device.path if "USB" in node else f"{device.path}:1.2",
+            serial_number=device.serial or None,
+        )
+        for device in devices
+        for node in device.tty
+    ]
 
 
 def string_descriptor(device: EmulatedDevice, index: int) -> bytes:
-    """
-    Give a string of a device as its bytes.
-
-    Parameters
-    ----------
-    device : EmulatedDevice
-        The device.
-    index : int
-        Of the string; 0 lists the languages.
-
-    Returns
-    -------
-    bytes
-        The descriptor.
-    """
+    """Give a string of a device as its bytes; index 0 lists the languages."""
     if device.fault == "mute":
         return bytes((2, _STRING))
     if index == 0:
