@@ -20,10 +20,10 @@ from typing import Final
 from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import inventory, protocols
-from dbthermal.instruments.devices import Devices, emulated_world, open_devices
+from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.emulated import blackbody
-from dbthermal.instruments.emulated.frames import Picture
-from dbthermal.instruments.emulated.world import ROOM, World
+from dbthermal.instruments.emulated.camera import Picture
+from dbthermal.instruments.emulated.world import World, emulated_world
 from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording.record import Preview, Summary
 from dbthermal.instruments.session import Session
@@ -220,9 +220,8 @@ def _setter(devices: Devices) -> Callable[[float], None]:
 
 
 def _world(session: Session) -> World:
-    """Bench on which all but the blackbody is as warm as the room."""
-    places = dict.fromkeys(session.thermocouples.values(), ROOM)
-    return emulated_world(session, scene=lambda _: places, waits=True)
+    """Bench at room temperature except the blackbody."""
+    return emulated_world(session, waits=True)
 
 
 if __name__ == "__main__":

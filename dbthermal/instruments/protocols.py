@@ -19,6 +19,7 @@ import numpy as np
 
 from dbthermal import store
 from dbthermal.instruments.camera import SourceLostError
+from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording.capture import mean_reading
 from dbthermal.instruments.recording.fetching import Limits, Reading
 from dbthermal.instruments.recording.record import Preview, Summary, record
@@ -30,7 +31,6 @@ from dbthermal.instruments.recording.sweep import (
     require_filter,
     step_path,
 )
-from dbthermal.instruments.rig import Devices
 from dbthermal.instruments.session import Session
 
 __all__ = ["Step", "bench_series", "open_sweep", "record_scene", "record_sweep", "wait_stable"]

@@ -234,7 +234,9 @@ class Capture(Closing):
         captures, identity = _capability(file, self._kernel)
         offered = _formats(file, self._kernel) if captures else []
         if Y16 not in offered:
-            names = [code.to_bytes(4, "little").decode("ascii", "backslashreplace") for code in offered]
+            names = [
+                code.to_bytes(4, "little").decode("ascii", "backslashreplace") for code in offered
+            ]
             raise ValueError(f"Invalid video node '{self.path}' with {names}. Must offer 'Y16 '.")
         self._agree_on_format(file)
         self._agree_on_rate(file)

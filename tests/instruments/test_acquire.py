@@ -12,7 +12,7 @@ from dbthermal import acquire
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated.frames import Picture
+from dbthermal.instruments.emulated.camera import Picture
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording.capture import open_capture
 from dbthermal.instruments.recording.record import Preview

@@ -4,11 +4,12 @@ from collections.abc import Iterator
 
 import pytest
 from dialogue import Dialogue
+from loop import Loop
 from rig_devices import FILTERS, WheelBench
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.emulated.apt import EmulatedApt, start
-from dbthermal.instruments.emulated.port import EmulatedPort, Loop
+from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import (
     BSC10X,

@@ -8,7 +8,6 @@ import pytest
 from rig_devices import Clock, WheelBench
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.transport import Closing
 from dbthermal.instruments.filterwheel import (
     BSC20X,
     FilterWheel,
@@ -20,7 +19,7 @@ from dbthermal.instruments.filterwheel import (
 )
 from dbthermal.instruments.filterwheel.link import MAXIMUM_UNASKED
 from dbthermal.instruments.filterwheel.motion import Motion
-from dbthermal.instruments.transport import TransportError
+from dbthermal.instruments.transport import Closing, TransportError
 
 
 class Endless(Closing):

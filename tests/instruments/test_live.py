@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from faulty_camera import Faults, FaultyCamera, Movie
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
 from dbthermal.figures import LiveFigure, Panel
 from dbthermal.instruments import live, telemetry
-from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
+from dbthermal.instruments.camera import DAMAGED, GOOD, Counts, Frame, FrameFlag
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording.fetching import Limits, Reading
 from dbthermal.instruments.recording.record import Preview, Summary, record
@@ -30,12 +30,13 @@ RAMP = (5000 + np.arange(384, dtype=np.uint16)).reshape(16, 24)
 
 def frame(counts: Counts = RAMP, flags: FrameFlag = GOOD, rows: Counts | None = None) -> Frame:
     """A frame whose clocks do not matter."""
-    return Frame(counts, 0.0, 0.0, 0, flags, rows)
+    metadata = None if rows is None or flags & DAMAGED else telemetry.metadata(rows)
+    return Frame(counts, 0.0, 0.0, 0, flags, rows, metadata)
 
 
 def rows(fpa_temperature: float, last_ffc_frame: int = 0) -> Counts:
     """Telemetry of a frame."""
-    fields = telemetry.Telemetry(fpa_temperature=fpa_temperature, last_ffc_frame=last_ffc_frame)
+    fields = {"fpa_temperature": fpa_temperature, "last_ffc_frame": last_ffc_frame}
     return telemetry.encode(fields, 640)
 
 
@@ -84,8 +85,8 @@ def recording(path: Path, view: live.View) -> Summary:
     movie, faults = Movie(wide[None], 60.0, endless=True), Faults(ffc=frozenset(range(1, 6000)))
     for number, band in enumerate(BANDS):
         world.add_camera(band, number)
-        sources[band] = EmulatedCamera(
-            world, band, {band: movie}, band, wide.shape, 100.0, telemetry.ROWS, faults
+        sources[band] = FaultyCamera(
+            world, band, {band: movie}, band, wide.shape, 100.0, telemetry.ROWS, faults=faults
         )
 
     def show(shown: Preview) -> None:

@@ -12,13 +12,20 @@ hardware.
 import threading
 import time as system_time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, TypeVar
 
 from dbthermal.instruments import fslp, telemetry
 from dbthermal.instruments.boson import commands
-from dbthermal.instruments.boson.commands import Ir16Mode, Reading, Setting, Switch, TelemetryLocation
+from dbthermal.instruments.boson.commands import (
+    Ir16Mode,
+    Reading,
+    Setting,
+    Switch,
+    TelemetryLocation,
+)
 from dbthermal.instruments.camera import (
     CameraKind,
     FfcMode,
@@ -258,7 +265,7 @@ class Boson(Closing):
         return self.read(setting.reading)
 
     def set(self, setting: Setting[EnumT], value: EnumT) -> None:
-        """Set one of `commands.SETTINGS` until power-off; a wrong value is a ValueError, and not sent."""
+        """Set one of `commands.SETTINGS` until power-off; a wrong value is a ValueError."""
         self._tell(f"set {setting.name}", setting.set_command, setting.data(value))
 
     def serial_number(self) -> int:
@@ -343,7 +350,7 @@ class Boson(Closing):
             )
 
 
-def _open_frames(url: str, stream: Stream) -> FrameSource:
+def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:
     """Frames of a Boson on Linux, with its telemetry."""
     from dbthermal.instruments import v4l2  # noqa: PLC0415 - Linux only
 
@@ -351,6 +358,8 @@ def _open_frames(url: str, stream: Stream) -> FrameSource:
 
 
 def _open_control(url: str, world: object | None) -> Boson:
+    if url.startswith("sim:") and not url.startswith("sim://boson/"):
+        raise ValueError(f"Invalid address '{url}' of a camera. Must be 'sim://boson/<name>'.")
     return Boson.from_url(url, world=world)
 
 

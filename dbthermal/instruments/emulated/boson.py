@@ -9,7 +9,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 from scipy.constants import zero_Celsius
 
@@ -104,12 +104,14 @@ class EmulatedBoson:
     def _all_handlers(self) -> dict[int, Handler]:
         """Size of the data, and function, of each command; a value out of range gives None."""
         camera = self.camera
-        values: dict[commands.Reading[object], Callable[[], tuple[int | bytes, ...]]] = {
+        values: dict[commands.Reading[Any], Callable[[], tuple[int | bytes, ...]]] = {
             commands.SERIAL_NUMBER: lambda: (camera.serial_number,),
             commands.PART_NUMBER: lambda: (b"EMULATED-BOSON-640",),
             commands.SENSOR_SERIAL_NUMBER: lambda: (camera.serial_number,),
             commands.SOFTWARE_REVISION: lambda: (0, 0, 0),
-            commands.FPA_TEMPERATURE: lambda: (round(10 * (camera.fpa_temperature - zero_Celsius)),),
+            commands.FPA_TEMPERATURE: lambda: (
+                round(10 * (camera.fpa_temperature - zero_Celsius)),
+            ),
             commands.FFC_IN_PROGRESS: lambda: (self._ffc_status() == FfcStatus.IN_PROGRESS,),
             commands.FFC_STATUS: lambda: (self._ffc_status(),),
             commands.LAST_FFC_FRAME: lambda: (camera.last_ffc_frame,),
@@ -118,7 +120,8 @@ class EmulatedBoson:
         for reading, read in values.items():
             handlers[reading.command] = 0, _packed(reading.layout, read)
         for setting in commands.SETTINGS:
-            handlers[setting.set_command] = 4, self._setter(setting.set_command, len(setting.kind))
+            kind: Any = setting.kind  # an enumeration, whose members are numbered from 0
+            handlers[setting.set_command] = 4, self._setter(setting.set_command, len(kind))
             handlers[setting.reading.command] = 0, self._getter(setting.set_command)
         return handlers
 

@@ -236,14 +236,15 @@ def emulated_world(session: Session, **settings: Any) -> World:
     session : Session
         Its thermocouples are at the places that they are named after.
     **settings
-        As for `World`.
+        As for `World`; by default all places but the blackbody are at room temperature.
 
     Returns
     -------
     World
         For `dbthermal.instruments.devices.open_devices`.
     """
-    world = World(filters=session.filters, **settings)
+    room = dict.fromkeys(session.thermocouples.values(), ROOM)
+    world = World(filters=session.filters, **{"scene": lambda _: room, **settings})
     world.furnish(session)
     return world
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.transport import Closing
 from dbthermal.instruments.filterwheel.controller import Controller
 from dbthermal.instruments.filterwheel.link import NotHomedError, StalledWheelError, WheelError
 from dbthermal.instruments.filterwheel.motion import MOVING, Motion
 from dbthermal.instruments.filterwheel.settings import Settings
-from dbthermal.instruments.transport import SerialTransport, Transport, open_serial
+from dbthermal.instruments.transport import Closing, SerialTransport, Transport, open_serial
 
 if TYPE_CHECKING:
     from dbthermal.instruments.emulated.world import World

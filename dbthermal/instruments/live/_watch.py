@@ -8,8 +8,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments import telemetry
-from dbthermal.instruments.camera import DAMAGED, Counts, FfcStatus, Frame, FrameFlag
+from dbthermal.instruments.camera import Counts, FfcStatus, Frame, FrameFlag, Metadata
 from dbthermal.instruments.recording.record import Preview
 
 WINDOW: Final = 3.0
@@ -250,17 +249,15 @@ def _is_other(before: Preview, now: Preview) -> bool:
     )
 
 
-def _telemetry(band: str, preview: Preview | None) -> telemetry.Telemetry | None:
-    """Telemetry of the last frame, if it has any and is whole."""
+def _metadata(band: str, preview: Preview | None) -> Metadata | None:
+    """Metadata of the last frame, from its telemetry."""
     frame = preview.frames.get(band) if preview else None
-    if frame is None or frame.telemetry is None or frame.flags & DAMAGED:
-        return None
-    return telemetry.decode(frame.telemetry)
+    return None if frame is None else frame.metadata
 
 
 def _corrected(band: str, before: Preview | None, now: Preview) -> bool:
     """Whether the telemetry says that the offsets were renewed between two previews."""
-    earlier, later = _telemetry(band, before), _telemetry(band, now)
+    earlier, later = _metadata(band, before), _metadata(band, now)
     if earlier is None or later is None:
         return False
     return earlier.last_ffc_frame != later.last_ffc_frame
@@ -268,7 +265,7 @@ def _corrected(band: str, before: Preview | None, now: Preview) -> bool:
 
 def _fpa(band: str, preview: Preview) -> float:
     reading = preview.readings.get(FPA + band, math.nan)
-    fields = _telemetry(band, preview)
+    fields = _metadata(band, preview)
     if math.isfinite(reading) or fields is None:
         return reading
     return fields.fpa_temperature
