@@ -30,7 +30,7 @@ from dbthermal.instruments.camera import (
     camera_kind,
 )
 from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
-from dbthermal.instruments.recording.fetching import Reading
+from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import Session, check_one_of
 from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 
@@ -130,7 +130,7 @@ class Devices:
 
     def readings(self) -> dict[str, Reading]:
         """
-        Instruments that are read beside the frames, for `recording.record.record`.
+        Instruments that are read beside the frames, for `recording.record`.
 
         Returns
         -------

@@ -54,14 +54,9 @@ HIGH_SPEED_PAYLOAD: Final = 13 * 512 * 8 * 8000
 Universal Serial Bus Specification 2.0, table 5-10.
 """
 
-PIXELS: Final = 640 * 512
-"""Pixels of a frame of 16 bits."""
-
-SLOW: Final = 30.0
-"""Lower of the two frame rates that a Boson offers over USB [Hz]."""
-
-RULES: Final = "/etc/udev/rules.d/70-dbthermal.rules"
-"""File of the udev rules; its number is below 73, or ``uaccess`` comes too late."""
+PIXELS: Final = 640 * 512  # of a frame, 16 bits each
+SLOW: Final = 30.0  # [Hz] lower of the two frame rates that a Boson offers over USB
+RULES: Final = "/etc/udev/rules.d/70-dbthermal.rules"  # below 73, or ``uaccess`` comes too late
 
 
 class LibusbMissingError(RuntimeError):

@@ -11,8 +11,8 @@ import xarray as xr
 
 from dbthermal import mixing, schema
 from dbthermal import response as responses
-from dbthermal.curves import Curve, require_range
 from dbthermal.limits._fisher import QUANTITIES, Array, Mask, Truth, deviations, smallest_order
+from dbthermal.response import Curve, require_range
 
 # Difference [K] below which two background temperatures are one level.
 _LEVEL: Final = 1e-6

@@ -18,7 +18,7 @@ import xarray as xr
 
 from dbthermal import calibration, mixing, planck, schema
 from dbthermal import response as responses
-from dbthermal.curves import Curve, require_range
+from dbthermal.response import Curve, require_range
 from dbthermal.simulation._samples import Sample, band_emissivity
 
 Array = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
-from dbthermal.correction import _lag as lags
+from dbthermal.correction import lag_coefficients
 from dbthermal.simulation._clocks import repeat_frames
 
 Array = npt.NDArray[np.float64]
@@ -218,7 +218,7 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
 
     the exact solution of :math:`\tau \dot I = z - I` for a signal held from each frame to the
     next, at rest before the first. What is given should be without noise: that of the read-out
-    does not pass through the pixel. `frames.undo_lag` is the inverse.
+    does not pass through the pixel. `correction.undo_lag` is the inverse.
 
     Parameters
     ----------
@@ -239,14 +239,12 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
         a band has none.
     """
     counts = _floating(corrected).copy(deep=True)
-    interval = np.diff(counts["time"].values.astype(np.float64))
-    for band, constant in enumerate(lags.time_constants(time_constant, counts)):
-        _, new = lags.memory(interval, constant)
-        movie = counts.values[band]
+    _, new = lag_coefficients(time_constant, counts)
+    for movie, weight in zip(counts.values, new, strict=True):
         for frame in range(1, movie.shape[0]):
             # In place, each frame from the lagging one before.
             step = movie[frame] - movie[frame - 1]
-            movie[frame] = movie[frame - 1] + new[frame - 1] * step
+            movie[frame] = movie[frame - 1] + weight[frame - 1] * step
     return corrected.assign(counts=counts)
 
 

@@ -9,7 +9,7 @@ from dbthermal.instruments.camera import Counts
 from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.emulated.camera import Picture
 from dbthermal.instruments.emulated.world import World, emulated_world
-from dbthermal.instruments.recording.fetching import Limits
+from dbthermal.instruments.recording import Limits
 from dbthermal.instruments.session import Session
 
 SHAPE = (4, 80)

@@ -14,10 +14,14 @@ from dbthermal import store
 from dbthermal.instruments.camera import Counts, Frame
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording import record, tape
-from dbthermal.instruments.recording.capture import notes, open_capture
-from dbthermal.instruments.recording.contents import Note
-from dbthermal.instruments.recording.fetching import Limits, Reading
+from dbthermal.instruments.recording import (
+    Limits,
+    Reading,
+    notes,
+    open_capture,
+    record,
+)
+from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 from dbthermal.instruments.session import Camera, Device, Session
 from dbthermal.store import _durable as durable
 
@@ -42,7 +46,7 @@ def record_until_killed(path: Path, duration: float, pipe: Connection) -> None:
     session = Session("killed", True, "scene", duration, cameras, RATE, SHAPE)
     limits = Limits(chunk=CHUNK, reserve=0, preview_period=0.0, reading_period=0.02)
     readings = {"plate": Reading(lambda: 300.0)}
-    record.record(
+    record(
         session,
         dict(sources),
         path,
@@ -55,9 +59,7 @@ def record_until_killed(path: Path, duration: float, pipe: Connection) -> None:
 def killed(path: Path, delay: float, duration: float = 60.0) -> list[int]:
     """Kill a recording some time after its first frame; frames that it had taken by then."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(
-        [__name__, "dbthermal.store", "dbthermal.instruments.recording.record"]
-    )
+    context.set_forkserver_preload([__name__, "dbthermal.store", "dbthermal.instruments.recording"])
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=record_until_killed, args=(path, duration, theirs))
     process.start()
@@ -183,13 +185,13 @@ def frame(number: int) -> Frame:
     return Frame(picture(time), time, time, number)
 
 
-def two_bands(path: Path) -> tape.Tape:
-    """A tape of two bands, in chunks of three frames, which is handed frames by hand."""
+def two_bands(path: Path) -> CaptureFile:
+    """A capture file of two bands, in chunks of three frames, which is handed frames by hand."""
     world, sources = World(), {}
     for number, band in enumerate(BANDS):
         world.add_camera(band, number)
         sources[band] = EmulatedCamera(world, band, {band: picture}, band, SHAPE, RATE)
-    return tape.Tape(path, sources, readings={"plate": "K"}, origin=0.0, attrs={}, chunk=3)
+    return CaptureFile(path, sources, readings={"plate": "K"}, origin=0.0, attrs={}, chunk=3)
 
 
 def check_left(left: Path, committed: list[int]) -> None:
@@ -227,7 +229,7 @@ def test_power_loss_costs_the_last_chunk(
             lose()
         disk.sync(path)
 
-    recorded: tape.Tape | None = None
+    recorded: CaptureFile | None = None
     monkeypatch.setattr(durable, "_THREADS", 1)
     monkeypatch.setattr(durable, "_to_disk", sync)
     recorded = two_bands(tmp_path / "disk" / "a.zarr")

@@ -17,7 +17,7 @@ from dbthermal.separation import DbvtSettings
 from dbthermal.separation._dbvt import method as dbvt
 from dbthermal.separation._dbvt import newton, objective
 from dbthermal.separation._dbvt.objective import Images, Unknowns
-from dbthermal.separation._problem import Problem
+from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Background, Rig
 
 TIME = np.arange(350) / 10.0
@@ -43,7 +43,7 @@ def errors(scene: xr.Dataset, result: xr.Dataset) -> tuple[float, float]:
     return float(of_emissivity.median()), float(((of_object**2).mean("time") ** 0.5).median())
 
 
-def linear(noise: tuple[float, float], pixels: int) -> tuple[Problem, Unknowns]:
+def linear(noise: tuple[float, float], pixels: int) -> tuple[Tile, Unknowns]:
     """Glass as the paper's linear identities have it, and the true unknowns but for the noise."""
     scene, _, response = glass(noise, pixels)
     curves = [responses.curve(response, band, "linear") for band in ("8-14", "9.5")]
@@ -55,8 +55,8 @@ def linear(noise: tuple[float, float], pixels: int) -> tuple[Problem, Unknowns]:
     smooth, second = (torch.as_tensor(e * warm + (1 - e) * rest) for e in GLASS)
     emissivity = torch.tensor(GLASS, dtype=torch.float64)[:, None].repeat(1, pixels)
     truth = Unknowns(smooth, second[0], emissivity, torch.zeros(signals.shape, dtype=torch.float64))
-    problem = Problem(signals, TIME, (curves[0], curves[1]), noise, (1, pixels), rng)
-    return problem, truth
+    tile = Tile(signals, TIME, (curves[0], curves[1]), noise, (1, pixels), rng)
+    return tile, truth
 
 
 def anywhere(frames: int = 12, columns: int = 3) -> tuple[Unknowns, Images]:
@@ -77,8 +77,8 @@ def anywhere(frames: int = 12, columns: int = 3) -> tuple[Unknowns, Images]:
 
 def test_reconstruction_is_exact_at_the_truth() -> None:
     """Without noise the true smooth signals and k2 give back the second band to rounding."""
-    problem, truth = linear((1e-9, 1e-9), 6)
-    _, _, rest = objective.departures(truth, dbvt.tensors(problem, 6, DbvtSettings()))
+    tile, truth = linear((1e-9, 1e-9), 6)
+    _, _, rest = objective.departures(truth, dbvt.tensors(tile, 6, DbvtSettings()))
     assert_allclose(rest, 0.0, rtol=0, atol=1e-7)  # K; a noise of 1e-9 K was needed
 
 
@@ -94,8 +94,8 @@ def test_second_smooth_signal_follows_the_recursion() -> None:
 
 def test_reconstruction_starts_from_the_second_band() -> None:
     """Slip 2: a shift of all of the second band moves its smooth signal and leaves no error."""
-    problem, truth = linear((1e-9, 1e-9), 2)
-    given = dbvt.tensors(problem, 2, DbvtSettings())
+    tile, truth = linear((1e-9, 1e-9), 2)
+    given = dbvt.tensors(tile, 2, DbvtSettings())
     shifted = replace(given, signals=given.signals + torch.tensor([0.0, 7.0])[:, None, None])
     _, _, rest = objective.departures(replace(truth, offset=truth.offset + 7.0), shifted)
     assert_allclose(rest, 0.0, rtol=0, atol=1e-7)
@@ -192,9 +192,9 @@ def test_banded_solution_meets_its_equations(frames: int, stiffness: float, seed
 
 def test_a_step_never_raises_the_objective() -> None:
     """From a point without symmetry the objective falls monotonically, and far."""
-    problem, truth = linear(QUIET, 8)
+    tile, truth = linear(QUIET, 8)
     options = DbvtSettings()
-    given = dbvt.tensors(problem, 8, options)
+    given = dbvt.tensors(tile, 8, options)
     state = replace(truth, emissivity=truth.emissivity - 0.1)
     search, losses = newton.begin(state, given, options), []
     for _ in range(30):
@@ -207,9 +207,9 @@ def test_a_step_never_raises_the_objective() -> None:
 
 def test_it_stays_at_the_truth() -> None:
     """Started at the truth the emissivities move by less than 0.02 (median)."""
-    problem, truth = linear(QUIET, 30)
+    tile, truth = linear(QUIET, 30)
     options = DbvtSettings()
-    given = dbvt.tensors(problem, 30, options)
+    given = dbvt.tensors(tile, 30, options)
     found = dbvt.homotopy(truth, given, options, 1)
     moved = (found.unknowns.emissivity - truth.emissivity).abs().amax(dim=0)
     print(f"moved from the truth by {float(moved.median()):.4f}")
@@ -300,9 +300,9 @@ def test_temperatures_may_come_from_the_measured_signals() -> None:
 @pytest.mark.parametrize("name", ["huber", "reconstruction", "smoothness", "noise", "noise_mean"])
 def test_each_loss_can_be_left_out(name: str) -> None:
     """Without one of the losses it still ends with numbers, and with emissivities in (0, 1)."""
-    problem, _ = linear((0.03, 0.05), 6)
-    problem = problem.at(TIME < 10.0)
-    result = dbvt.separate(problem, DbvtSettings(**{name: 0.0}))  # type: ignore[arg-type]
+    tile, _ = linear((0.03, 0.05), 6)
+    tile = tile.select_frames(TIME < 10.0)
+    result = dbvt.separate(tile, DbvtSettings(**{name: 0.0}))  # type: ignore[arg-type]
     assert np.all((result.emissivity > 0) & (result.emissivity < 1))
 
 

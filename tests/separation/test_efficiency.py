@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from dbthermal import _smooth as smooth
 from dbthermal import limits, separation
 from dbthermal import response as responses
-from dbthermal.curves import Curve
+from dbthermal.response import Curve
 from dbthermal.separation._subspace import reflection_ratio as direction
 from dbthermal.simulation import Rig
 from reproduction import experiments

@@ -27,12 +27,13 @@ import torch
 from torch import Tensor
 
 from dbthermal import mixing
+from dbthermal.schema import Status
 from dbthermal.separation._baselines import calibrated
 from dbthermal.separation._dbvt import DbvtSettings, newton, objective
 from dbthermal.separation._dbvt.objective import Images, Unknowns
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Mask, Separated, flag
+from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import method as subspace
+from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Tile
 
 # Largest departure of an interval from the median one, relative to it.
 _UNEVEN: Final = 0.5
@@ -43,7 +44,7 @@ _THREADS: Final = threading.Lock()
 _BEFORE: Final[list[int]] = []
 
 
-def separate(problem: Problem, settings: DbvtSettings) -> Separated:
+def separate(tile: Tile, settings: DbvtSettings) -> Estimate:
     """
     Temperatures and emissivities without deviations.
 
@@ -52,9 +53,9 @@ def separate(problem: Problem, settings: DbvtSettings) -> Separated:
     """
     ignored = np.errstate(invalid="ignore", divide="ignore", over="ignore")
     with ignored, torch.inference_mode(), _one_thread():
-        minimum = _search(problem, settings)
-        kept = _least(minimum.loss, problem.signals.shape[-1])
-        return _report(problem, minimum, kept, settings)
+        minimum = _search(tile, settings)
+        kept = _least(minimum.loss, tile.signals.shape[-1])
+        return _report(tile, minimum, kept, settings)
 
 
 @contextmanager
@@ -140,31 +141,31 @@ def _even(time: Array) -> float:
     return interval
 
 
-def tensors(problem: Problem, columns: int, settings: DbvtSettings) -> Images:
+def tensors(tile: Tile, columns: int, settings: DbvtSettings) -> Images:
     """Signals of a tile on the device, for every start; columns are pixels times starts."""
     one = _tensor(np.ones(columns), settings)
-    signals = _tensor(problem.signals, settings).repeat(1, 1, columns // problem.signals.shape[-1])
-    sigma = torch.stack([noise * one for noise in problem.noise])
+    signals = _tensor(tile.signals, settings).repeat(1, 1, columns // tile.signals.shape[-1])
+    sigma = torch.stack([noise * one for noise in tile.noise])
     noise = torch.zeros_like(signals)
     deviation = objective.deviation(signals, noise, sigma, settings.deviation_floor)
-    return Images(signals, deviation, sigma, one * _even(problem.time), one)
+    return Images(signals, deviation, sigma, one * _even(tile.time), one)
 
 
-def _starts(problem: Problem, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
+def _starts(tile: Tile, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
     """
     Starts, and those of them (column,) that are the subspace separator's.
 
     Columns are the pixels of the first start, of the second, and so on.
     """
-    frames, pixels = problem.signals.shape[1:]
+    frames, pixels = tile.signals.shape[1:]
     columns = pixels * settings.starts
-    emissivity = problem.rng.uniform(settings.margin, 1.0 - settings.margin, (2, columns))
-    smooth = np.tile(problem.signals[0] * (not settings.smooth_from_zero), settings.starts)
+    emissivity = tile.rng.uniform(settings.margin, 1.0 - settings.margin, (2, columns))
+    smooth = np.tile(tile.signals[0] * (not settings.smooth_from_zero), settings.starts)
     informed = np.zeros(columns, dtype=bool)
     if settings.start == "subspace":
-        informed[:pixels] = _inform(problem, emissivity[:, :pixels], smooth[:, :pixels])
+        informed[:pixels] = _inform(tile, emissivity[:, :pixels], smooth[:, :pixels])
     # Mean over time of I_2 - k_1 [I1~(t) - I1~(0)]
-    second = np.tile(problem.signals[1], settings.starts)
+    second = np.tile(tile.signals[1], settings.starts)
     rise = emissivity[1] / emissivity[0] * (smooth - smooth[0])
     offset = np.mean(second - rise, axis=0) * (not settings.smooth_from_zero)
     noise = np.zeros((2, frames, columns))
@@ -172,15 +173,15 @@ def _starts(problem: Problem, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
     return Unknowns(*(_tensor(part, settings) for part in parts)), informed
 
 
-def _inform(problem: Problem, emissivity: Array, smooth: Array) -> Mask:
+def _inform(tile: Tile, emissivity: Array, smooth: Array) -> Mask:
     """Overwrite a start with the subspace separator's solution, where it is complete."""
-    solution = subspace.separate(problem, subspace.SubspaceSettings())
+    solution = subspace.separate(tile, subspace.SubspaceSettings())
     share = solution.emissivity[0]
-    emitted = problem.blackbody(0, solution.object_temperature)
+    emitted = tile.blackbody(0, solution.object_temperature)
     known = np.all(np.isfinite(emitted * share), axis=0)
     known &= np.all((solution.emissivity > 0) & (solution.emissivity < 1), axis=0)
     # The smooth signal is that of the object before the median background.
-    rest = np.median(mixing.background(share, problem.signals[0], emitted), axis=0)
+    rest = np.median(mixing.background(share, tile.signals[0], emitted), axis=0)
     emissivity[:, known] = solution.emissivity[:, known]
     smooth[:, known] = mixing.mixed(share, emitted, rest)[:, known]
     return np.asarray(known)
@@ -191,10 +192,10 @@ def _tensor(values: Array, settings: DbvtSettings) -> Tensor:
     return torch.as_tensor(values, dtype=dtype, device=settings.device)
 
 
-def _search(problem: Problem, settings: DbvtSettings) -> Minimum:
+def _search(tile: Tile, settings: DbvtSettings) -> Minimum:
     """Minimum of every start: random ones by homotopy, informed ones without."""
-    unknowns, informed = _starts(problem, settings)
-    images = tensors(problem, informed.size, settings)
+    unknowns, informed = _starts(tile, settings)
+    images = tensors(tile, informed.size, settings)
     for mask, stages in ((~informed, settings.stages), (informed, 1)):
         columns = torch.as_tensor(np.flatnonzero(mask), device=images.share.device)
         if columns.numel():
@@ -203,7 +204,7 @@ def _search(problem: Problem, settings: DbvtSettings) -> Minimum:
     minimum = homotopy(unknowns, images, settings, 1)
     bend = np.zeros(unknowns.smooth.shape)
     for _ in range(settings.bend_updates):
-        update = _nonlinearity(problem, minimum.unknowns, images, bend)
+        update = _nonlinearity(tile, minimum.unknowns, images, bend)
         if np.array_equal(update, bend):
             break
         bend = update
@@ -212,7 +213,7 @@ def _search(problem: Problem, settings: DbvtSettings) -> Minimum:
     return minimum
 
 
-def _nonlinearity(problem: Problem, unknowns: Unknowns, images: Images, bend: Array) -> Array:
+def _nonlinearity(tile: Tile, unknowns: Unknowns, images: Images, bend: Array) -> Array:
     r"""
     Departure of the second band from the linear identities (time, column) [K].
 
@@ -228,10 +229,10 @@ def _nonlinearity(problem: Problem, unknowns: Unknowns, images: Images, bend: Ar
     # u_1(x) = (z_2 - k_2 z_1) / (1 - k_2), u_1(y) = (z_2 - k_1 z_1) / (1 - k_1)
     for ratio in (reflection, emission):
         signal = (second - ratio * first) / (1 - ratio)
-        temperature = problem.temperature(0, signal)
-        curve = problem.curves[0]
+        temperature = tile.temperature(0, signal)
+        curve = tile.curves[0]
         inside &= np.all((temperature >= curve.lowest) & (temperature <= curve.highest), axis=0)
-        departures.append(problem.blackbody(1, temperature) - signal)
+        departures.append(tile.blackbody(1, temperature) - signal)
     return np.where(inside, mixing.mixed(emissivity[1], *departures), 0.0)
 
 
@@ -242,23 +243,23 @@ def _least(loss: Tensor, pixels: int) -> Tensor:
     return finite.argmin(dim=0) * pixels + place
 
 
-def _report(problem: Problem, minimum: Minimum, kept: Tensor, settings: DbvtSettings) -> Separated:
+def _report(tile: Tile, minimum: Minimum, kept: Tensor, settings: DbvtSettings) -> Estimate:
     """Temperatures at the emissivities of the kept columns, by the calibrated closed form."""
     unknowns = minimum.unknowns.select(kept)
     emissivity = _array(unknowns.emissivity)
     lost = ~np.isfinite(_array(minimum.loss[kept]))
-    signals = problem.signals
+    signals = tile.signals
     if settings.temperatures_from == "corrected":
         signals = signals - _array(unknowns.noise)
     solution = calibrated.separate(
-        replace(problem, signals=signals, emissivity=emissivity, emissivity_std=None)
+        replace(tile, signals=signals, emissivity=emissivity, emissivity_std=None)
     )
     unfinished: Mask = lost | ~minimum.converged[kept].cpu().numpy()
     return replace(
         solution,
         **{name: np.full_like(getattr(solution, name), np.nan) for name in METHOD.not_estimated},
-        status=solution.status | flag({"not_converged": unfinished}),
-    ).without(lost, lost, lost)
+        status=solution.status | status_bits({Status.NOT_CONVERGED: unfinished}),
+    ).undefine(lost, lost, lost)
 
 
 def _array(values: Tensor) -> Array:

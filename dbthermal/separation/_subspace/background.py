@@ -2,13 +2,12 @@
 
 import numpy as np
 
-from dbthermal.separation._problem import Problem
-from dbthermal.separation._separated import Array
 from dbthermal.separation._subspace.emission import Emission
 from dbthermal.separation._subspace.reflection_ratio import Direction
+from dbthermal.separation._tiles import Array, Tile
 
 
-def estimate(problem: Problem, emission: Emission, found: Direction) -> tuple[Array, Array]:
+def estimate(tile: Tile, emission: Emission, found: Direction) -> tuple[Array, Array]:
     r"""
     Background temperature from all bands, weighted by their noise.
 
@@ -22,7 +21,7 @@ def estimate(problem: Problem, emission: Emission, found: Direction) -> tuple[Ar
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         The tile.
     emission : Emission
         Object and emissivities.
@@ -34,24 +33,24 @@ def estimate(problem: Problem, emission: Emission, found: Direction) -> tuple[Ar
     tuple of ndarray, shape (time, pixel)
         Background temperature [K], NaN where none gives such a signal, and its variance [K^2].
     """
-    bands = range(len(problem.noise))
-    noise = np.array(problem.noise)[:, np.newaxis]
+    bands = range(len(tile.noise))
+    noise = np.array(tile.noise)[:, np.newaxis]
     reflectivity = 1.0 - emission.emissivity
     precision = (reflectivity / noise) ** 2
     total = precision.sum(axis=0)
     weights = precision / total
     reflected = [
-        (problem.signals[m] - emission.emissivity[m] * problem.blackbody(m, emission.temperature))
+        (tile.signals[m] - emission.emissivity[m] * tile.blackbody(m, emission.temperature))
         / reflectivity[m]
         for m in bands
     ]
     # Start from the mean signal, then one Gauss-Newton step on the exact responses.
-    start = problem.temperature(0, np.asarray(sum(weights[m] * reflected[m] for m in bands)))
-    slopes = [curve.slope(start) for curve in problem.curves]
+    start = tile.temperature(0, np.asarray(sum(weights[m] * reflected[m] for m in bands)))
+    slopes = [curve.slope(start) for curve in tile.curves]
     curvature = sum(weights[m] * slopes[m] ** 2 for m in bands)
-    step = sum(weights[m] * slopes[m] * (reflected[m] - problem.blackbody(m, start)) for m in bands)
+    step = sum(weights[m] * slopes[m] * (reflected[m] - tile.blackbody(m, start)) for m in bands)
     background = start + step / curvature
-    first, first_noise = emission.emissivity[0], problem.noise[0]
+    first, first_noise = emission.emissivity[0], tile.noise[0]
     emitted = (weights * emission.emissivity / reflectivity).sum(axis=0)
     contrast = background - emission.temperature
     through = contrast * first + emitted * emission.per_direction
@@ -64,7 +63,7 @@ def estimate(problem: Problem, emission: Emission, found: Direction) -> tuple[Ar
     return background, np.asarray(variance)
 
 
-def bend(problem: Problem, emission: Emission, background: Array) -> Array:
+def bend(tile: Tile, emission: Emission, background: Array) -> Array:
     r"""
     What the responses' differences add to the reflections of the bands but the first.
 
@@ -75,7 +74,7 @@ def bend(problem: Problem, emission: Emission, background: Array) -> Array:
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         The tile.
     emission : Emission
         Object and emissivities.
@@ -87,11 +86,11 @@ def bend(problem: Problem, emission: Emission, background: Array) -> Array:
     ndarray, shape (band - 1, time, pixel)
         Signal [K]; zero where a background or an emissivity is not physical.
     """
-    first = problem.blackbody(0, background)
+    first = tile.blackbody(0, background)
     signal = np.stack(
         [
-            (1.0 - emission.emissivity[m]) * (problem.blackbody(m, background) - first)
-            for m in range(1, len(problem.noise))
+            (1.0 - emission.emissivity[m]) * (tile.blackbody(m, background) - first)
+            for m in range(1, len(tile.noise))
         ]
     )
     physical = np.all((emission.emissivity > 0) & (emission.emissivity < 1), axis=0)

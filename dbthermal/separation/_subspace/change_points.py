@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._separated import Array, Mask
+from dbthermal.separation._tiles import Array, Mask
 
 Whole = npt.NDArray[np.intp]
 

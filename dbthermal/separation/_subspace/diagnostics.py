@@ -5,8 +5,8 @@ from typing import Final
 import numpy as np
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._separated import Array
 from dbthermal.separation._subspace.reflection_ratio import Direction
+from dbthermal.separation._tiles import Array
 
 MEMORY_LAGS: Final = 5
 """Frames over which `memory` looks for a correlation."""

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._separated import Array
 from dbthermal.separation._subspace.regression import Line
+from dbthermal.separation._tiles import Array
 
 # Degrees of the polynomials over which a spectrum is averaged: from, and up to, not including;
 # and degrees of freedom lost: of the first three, one is along the object's curve.

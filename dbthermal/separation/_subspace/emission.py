@@ -7,11 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._problem import Problem
-from dbthermal.separation._separated import Array
 from dbthermal.separation._subspace import drift_prior as slow
 from dbthermal.separation._subspace import regression as robust
 from dbthermal.separation._subspace.reflection_ratio import Direction, ratio_variance
+from dbthermal.separation._tiles import Array, Tile
 
 _ROUNDS: Final = 2
 # Energy of the object's change over that of its noise, below which its emissivity is not told.
@@ -58,14 +57,14 @@ class Emission:
 
 
 def estimate(
-    problem: Problem, functions: smooth.Subspace, found: Direction, prior: slow.Prior
+    tile: Tile, functions: smooth.Subspace, found: Direction, prior: slow.Prior
 ) -> Emission:
     """
     Alternate the object temperature and the emissivity, steps 2 and 3 of `subspace`.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         The tile.
     functions : Subspace
         Smooth functions.
@@ -81,39 +80,39 @@ def estimate(
     """
     smoothed = np.einsum("bp,bcp->cp", found.weights, found.coefficients)
     clean = functions.own @ smoothed
-    temperature = problem.temperature(1, clean)
+    temperature = tile.temperature(1, clean)
     middle = _middle(found.ratio)
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
-    guess = robust.plain_slope(problem.blackbody(0, temperature), problem.signals[0])
+    guess = robust.plain_slope(tile.blackbody(0, temperature), tile.signals[0])
     emissivity = np.where((guess > 0) & (guess < 1), guess, middle)
-    temperature = _newton(problem, found, emissivity, clean, temperature)[0]
+    temperature = _newton(tile, found, emissivity, clean, temperature)[0]
     line: robust.Line | None = None
     for _ in range(_ROUNDS):
-        own = problem.blackbody(0, temperature)
-        line = robust.regress(own, problem.signals[0], problem.noise[0], start=line)
+        own = tile.blackbody(0, temperature)
+        line = robust.regress(own, tile.signals[0], tile.noise[0], start=line)
         constant = line.spread < _OBJECT_TO_NOISE * found.order * found.across
         emissivity = np.where(constant, middle, line.slope)
-        if problem.shared is not None:
-            given = found.given & np.isfinite(problem.shared.emissivity)
+        if tile.material is not None:
+            given = found.given & np.isfinite(tile.material.emissivity)
             constant = constant & ~given
-            emissivity = np.where(given, problem.shared.emissivity, emissivity)
-        temperature, steepness, emitted = _newton(problem, found, emissivity, clean, temperature)
+            emissivity = np.where(given, tile.material.emissivity, emissivity)
+        temperature, steepness, emitted = _newton(tile, found, emissivity, clean, temperature)
     assert line is not None
     per_direction = (emitted - functions.own @ found.coefficients[0]) / steepness
     leverage = functions.leverage()[:, found.order - 1]
     smooth_variance = leverage * found.across / steepness**2
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
-    left_out = smooth_variance * np.log(problem.time.size) / found.order
-    expected = problem.noise[0] ** 2 + emissivity**2 * (
+    left_out = smooth_variance * np.log(tile.time.size) / found.order
+    expected = tile.noise[0] ** 2 + emissivity**2 * (
         per_direction**2 * found.spread * found.across + smooth_variance + left_out
     )
     own_variance = line.variance + emissivity**2 * found.across / line.spread
-    drifting = slow.variance(line, own, 1.0 - emissivity, functions, problem.noise[0], prior)
-    if problem.shared is not None:
-        given = found.given & np.isfinite(problem.shared.emissivity)
-        own_variance = np.where(given, problem.shared.own_variance, own_variance)
-        drifting = np.where(given, problem.shared.common_variance, drifting)
+    drifting = slow.variance(line, own, 1.0 - emissivity, functions, tile.noise[0], prior)
+    if tile.material is not None:
+        given = found.given & np.isfinite(tile.material.emissivity)
+        own_variance = np.where(given, tile.material.noise_variance, own_variance)
+        drifting = np.where(given, tile.material.drift_variance, drifting)
     return Emission(
         temperature=temperature,
         per_direction=per_direction,
@@ -166,7 +165,7 @@ def _middle(ratio: Array) -> Array:
 
 
 def _newton(
-    problem: Problem, found: Direction, emissivity: Array, clean: Array, temperature: Array
+    tile: Tile, found: Direction, emissivity: Array, clean: Array, temperature: Array
 ) -> tuple[Array, Array, Array]:
     r"""
     One step towards the object, :math:`h(x) = \sum w_m e_m u_m(x) = q`.
@@ -175,10 +174,10 @@ def _newton(
     \epsilon` beside its own signal, at the old x.
     """
     factors = found.weights * (1.0 - found.ratio * (1.0 - emissivity))
-    own = [problem.blackbody(band, temperature) for band in range(len(factors))]
-    slopes = [curve.slope(temperature) for curve in problem.curves]
+    own = [tile.blackbody(band, temperature) for band in range(len(factors))]
+    slopes = [curve.slope(temperature) for curve in tile.curves]
     value, steepness = _weighted(own, factors), _weighted(slopes, factors)
-    other = own[1] if len(own) == 2 else _weighted(own[1:], _shares(found, problem.noise))
+    other = own[1] if len(own) == 2 else _weighted(own[1:], _shares(found, tile.noise))
     emitted = other - emissivity * (other - own[0])
     return temperature + (clean - value) / steepness, steepness, np.asarray(emitted)
 

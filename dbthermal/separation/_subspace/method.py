@@ -22,15 +22,15 @@ formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from scipy.special import ndtri
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Mask, Record, Separated, Survey, flag, updated
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import (
     background,
     emission,
@@ -47,6 +47,7 @@ from dbthermal.separation._subspace import (
 from dbthermal.separation._subspace import (
     reflection_ratio as direction,
 )
+from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Survey, Tile
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -73,6 +74,9 @@ _NORMAL95: Final = float(ndtri(0.975))
 # Energy of the bend between the two responses, in units of the second band's noise, from which it
 # is worth taking out: it moves no linear function of the signal by more standard deviations.
 _BEND: Final = 0.2
+
+
+Record = TypeVar("Record", Estimate, Survey)
 
 
 @dataclass(frozen=True)
@@ -110,34 +114,34 @@ class _Estimate:
     lateness: Array
 
 
-def separate(problem: Problem, settings: SubspaceSettings) -> Separated:
+def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """
     Separate one tile.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         Signals of two bands or more, and what is known of them.
     settings : SubspaceSettings
         Options.
 
     Returns
     -------
-    Separated
+    Estimate
         Temperatures, emissivities, standard deviations and flags.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        result = _exact(problem, _functions(problem), settings, _report)
-        return _with_jumps(problem, result, settings)
+        result = _exact(tile, _functions(tile), settings, _report)
+        return _with_jumps(tile, result, settings)
 
 
-def survey(problem: Problem, settings: SubspaceSettings) -> Survey:
+def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
     """
     What the pixels of a tile tell of their materials, each alone.
 
     Parameters
     ----------
-    problem : Problem
+    tile : Tile
         The tile.
     settings : SubspaceSettings
         Options.
@@ -149,88 +153,91 @@ def survey(problem: Problem, settings: SubspaceSettings) -> Survey:
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         # Together the pixels see what is too small to be seen in each.
-        return _exact(problem, _functions(problem), settings, _tell, least=0.0)
+        return _exact(tile, _functions(tile), settings, _tell, least=0.0)
 
 
-def _tell(problem: Problem, estimate: _Estimate) -> Survey:
+def _tell(tile: Tile, estimate: _Estimate) -> Survey:
     """Only broken models are left out: a choice by the estimate itself would bias the sum."""
-    status = _report(problem, estimate).status
+    status = _report(tile, estimate).status
     fit, found = estimate.emission, estimate.found
     moving = (status & _BROKEN) == 0
     return Survey(
         scatter=np.where(moving, found.scatter, 0.0),
-        frames=moving * np.asarray(problem.time.size - found.order, dtype=np.float64),
+        frames=moving * np.asarray(tile.time.size - found.order, dtype=np.float64),
         ratio=found.ratio,
-        weights=found.weights,
+        null_weights=found.weights,
         emissivity=np.where(status == 0, fit.emissivity[0], np.nan),
-        own_variance=fit.own_variance,
-        common_variance=fit.common_variance,
+        noise_variance=fit.own_variance,
+        drift_variance=fit.common_variance,
     )
 
 
-def _functions(problem: Problem, jump: int | None = None) -> smooth.Subspace:
-    order = min(direction.HIGHEST_ORDER, problem.time.size // 4)
-    return smooth.subspace(problem.time, order, segment=problem.segment, jump=jump)
+def _functions(tile: Tile, jump: int | None = None) -> smooth.Subspace:
+    order = min(direction.HIGHEST_ORDER, tile.time.size // 4)
+    return smooth.subspace(tile.time, order, segment=tile.segment, jump=jump)
 
 
 def _exact(
-    problem: Problem,
+    tile: Tile,
     functions: smooth.Subspace,
     settings: SubspaceSettings,
-    finish: Callable[[Problem, _Estimate], Record],
+    finish: Callable[[Tile, _Estimate], Record],
     least: float = _BEND,
 ) -> Record:
     """Steps 1 to 4, where it matters a second time on signals with proportional reflections."""
-    estimate = _pass(problem, problem, functions, settings)
-    result = finish(problem, estimate)
-    bend = background.bend(problem, estimate.emission, estimate.background)
+    estimate = _pass(tile, tile, functions, settings)
+    result = finish(tile, estimate)
+    bend = background.bend(tile, estimate.emission, estimate.background)
     apart = bend - bend.mean(axis=1, keepdims=True)
     energy = np.einsum("btp,btp->bp", apart, apart)
-    bent = np.any(energy > (least * np.array(problem.noise[1:])[:, np.newaxis]) ** 2, axis=0)
+    bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
     if not np.any(bent):
         return result
-    part = problem.of(bent)
+    part = tile.select_pixels(bent)
     straight = part.signals.copy()
     straight[1:] -= bend[..., bent]
     again = _pass(part, replace(part, signals=straight), functions, settings)
-    return updated(result, bent, finish(part, again))
+    return result.replace_pixels(bent, finish(part, again))
 
 
 def _pass(
-    problem: Problem, straight: Problem, functions: smooth.Subspace, settings: SubspaceSettings
+    tile: Tile, straight: Tile, functions: smooth.Subspace, settings: SubspaceSettings
 ) -> _Estimate:
     """Steps 1 to 4; the first three on signals whose reflections are proportional."""
-    noise, shared = np.array(problem.noise), problem.shared
-    known = None if shared is None else direction.Known(shared.ratio, shared.spread)
+    noise, shared = np.array(tile.noise), tile.material
+    known = None if shared is None else direction.Known(shared.ratio, shared.inverse_energy)
     found = direction.estimate(straight.signals, functions, noise, known)
     prior = slow.Prior(settings.background_drift)
     object_found = emission.estimate(straight, functions, found, prior)
-    reflected = background.estimate(problem, object_found, found)
+    reflected = background.estimate(tile, object_found, found)
     left = residual.of_combination(straight.signals, functions, found)
-    lateness = residual.lateness(left, straight.signals[0], functions, found, problem.noise[0])
+    lateness = residual.lateness(left, straight.signals[0], functions, found, tile.noise[0])
     return _Estimate(found, object_found, *reflected, residual.memory(left), lateness)
 
 
-def _report(problem: Problem, estimate: _Estimate) -> Separated:
+def _report(tile: Tile, estimate: _Estimate) -> Estimate:
     """Standard deviations, flags, and NaN where a quantity is undefined."""
     found, fit = estimate.found, estimate.emission
-    flags = _flags(problem, estimate)
-    still, undefined = flags["no_background_motion"], flags["no_background_motion"] | flags["gray"]
+    flags = _flags(tile, estimate)
+    still, undefined = (
+        flags[Status.NO_BACKGROUND_MOTION],
+        flags[Status.NO_BACKGROUND_MOTION] | flags[Status.GRAY],
+    )
     unidentified = undefined | fit.constant
-    of_ratio = direction.ratio_variance(found, np.array(problem.noise))
-    result = Separated(
+    of_ratio = direction.ratio_variance(found, np.array(tile.noise))
+    result = Estimate(
         object_temperature=fit.temperature,
         object_temperature_std=_object_std(estimate),
         background_temperature=estimate.background,
         background_temperature_std=np.sqrt(estimate.background_variance),
         emissivity=fit.emissivity,
-        emissivity_std=np.sqrt(emission.variance(found, fit, np.array(problem.noise))),
+        emissivity_std=np.sqrt(emission.variance(found, fit, np.array(tile.noise))),
         reflection_ratio=np.where(still, np.nan, found.ratio),
         reflection_ratio_std=np.where(still, np.nan, np.sqrt(of_ratio)),
-        status=flag(flags),
+        status=status_bits(flags),
     )
-    no_background = unidentified | flags["nonphysical_emissivity"]
-    return result.without(undefined, unidentified, no_background).ranged(problem.curves[0])
+    no_background = unidentified | flags[Status.NONPHYSICAL_EMISSIVITY]
+    return result.undefine(undefined, unidentified, no_background).check_range(tile.curves[0])
 
 
 def _object_std(estimate: _Estimate) -> Array:
@@ -246,10 +253,10 @@ def _object_std(estimate: _Estimate) -> Array:
     return np.asarray(np.sqrt(through + fit.smooth_variance))
 
 
-def _flags(problem: Problem, estimate: _Estimate) -> dict[str, Mask]:
+def _flags(tile: Tile, estimate: _Estimate) -> dict[Status, Mask]:
     """What is wrong with each pixel."""
     found, fit = estimate.found, estimate.emission
-    frames, others = problem.time.size, len(problem.noise) - 1
+    frames, others = tile.time.size, len(tile.noise) - 1
     still = ~found.given & (found.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames))
     # Not even in the quietest band is there more than its noise.
     still |= ~found.given & (found.scatter[0, 0] <= 0)
@@ -259,38 +266,39 @@ def _flags(problem: Problem, estimate: _Estimate) -> dict[str, Mask]:
     nonphysical = told & np.any((fit.emissivity <= 0) | (fit.emissivity >= 1), axis=0)
     misfit = 2.0 * _MISFIT_SIGMAS / np.sqrt(2.0 * others * (frames - found.order))
     return {
-        "no_background_motion": still,
-        "gray": gray,
-        "constant_object": ~still & ~gray & fit.constant,
-        "background_never_rests": told & fit.restless,
-        "nonphysical_emissivity": nonphysical,
-        "roles_may_be_swapped": told & ~nonphysical & (fit.emissivity.mean(axis=0) < 0.5),
-        "bands_apart": ~still & (estimate.lateness > _APART_SIGMAS),
-        "object_not_smooth": (estimate.memory > _MEMORY_SIGMAS) | (found.misfit > 1.0 + misfit),
+        Status.NO_BACKGROUND_MOTION: still,
+        Status.GRAY: gray,
+        Status.CONSTANT_OBJECT: ~still & ~gray & fit.constant,
+        Status.BACKGROUND_NEVER_RESTS: told & fit.restless,
+        Status.NONPHYSICAL_EMISSIVITY: nonphysical,
+        Status.ROLES_MAY_BE_SWAPPED: told & ~nonphysical & (fit.emissivity.mean(axis=0) < 0.5),
+        Status.BANDS_APART: ~still & (estimate.lateness > _APART_SIGMAS),
+        Status.OBJECT_NOT_SMOOTH: (estimate.memory > _MEMORY_SIGMAS)
+        | (found.misfit > 1.0 + misfit),
     }
 
 
-def _with_jumps(problem: Problem, result: Separated, settings: SubspaceSettings) -> Separated:
+def _with_jumps(tile: Tile, result: Estimate, settings: SubspaceSettings) -> Estimate:
     """Step 5: pixels that do not fit are solved anew with a jump in the subspace."""
-    functions, inside = _functions(problem), jumps.candidates(problem.time)
-    ramp = jumps.spread(problem.time)
+    functions, inside = _functions(tile), jumps.candidates(tile.time)
+    ramp = jumps.spread(tile.time)
     if inside.size == 0:
         return result
-    suspect = ((result.status & _SUSPECT) != 0) | jumps.alone(problem.signals[0], functions, ramp)
+    suspect = ((result.status & _SUSPECT) != 0) | jumps.alone(tile.signals[0], functions, ramp)
     if not np.any(suspect):
         return result
-    noise = np.array(problem.noise)
-    frame, gain = jumps.find(problem.signals[..., suspect], functions, noise, inside, ramp)
+    noise = np.array(tile.noise)
+    frame, gain = jumps.find(tile.signals[..., suspect], functions, noise, inside, ramp)
     first = np.full(suspect.shape, -1)
     first[suspect] = np.where(gain > 0, frame, -1)
     for jump in np.unique(first[first >= 0]):
-        kept = jumps.outside(problem.time, int(jump), problem.segment)
+        kept = jumps.outside(tile.time, int(jump), tile.segment)
         before = int(kept[:jump].sum())
-        part = problem.of(first == jump).at(kept)
+        part = tile.select_pixels(first == jump).select_frames(kept)
         functions = _functions(part, jump=before if 0 < before < part.time.size else None)
         again = _exact(part, functions, settings, _report)
         again = replace(again, status=again.status | np.uint32(schema.FLAGS["object_jump"]))
-        result = updated(result, first == jump, again.spread(kept))
+        result = result.replace_pixels(first == jump, again.expand_frames(kept))
     return result
 
 
