@@ -133,13 +133,13 @@ def metadata(rows: Counts) -> Metadata:
     return Metadata(counter, last, values["fpa_temperature"])
 
 
-def encode(values: Mapping[str, float], columns: int) -> Counts:
+def encode(values: Mapping[str, float], columns: int, rows: int = ROWS) -> Counts:
     """
-    Write fields as telemetry rows (`ROWS`, columns), 0 elsewhere, as an emulated camera does.
+    Write fields as telemetry (rows, columns), 0 elsewhere, as an emulated camera does.
 
-    ValueError if the columns are too few, or a value does not fit its field.
+    ValueError if these are too few, or a value does not fit its field.
     """
-    words = np.zeros(ROWS * columns, dtype=np.uint16)
+    words = np.zeros(rows * columns, dtype=np.uint16)
     _checked(words)
     for name, value in values.items():
         field = FIELDS[name]
@@ -151,7 +151,7 @@ def encode(values: Mapping[str, float], columns: int) -> Counts:
             )
         parts = [number >> _WORD_BITS * place & 0xFFFF for place in range(field.words)]
         words[field.span] = parts[::-1]
-    return words.reshape(ROWS, columns)
+    return words.reshape(rows, columns)
 
 
 def _checked(rows: Counts) -> Counts:

@@ -11,10 +11,11 @@ import importlib
 from collections.abc import Callable
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Final, Protocol, Self
+from typing import TYPE_CHECKING, Final, Protocol, Self
 from urllib.parse import parse_qsl, urlsplit
 
-import serial
+if TYPE_CHECKING:
+    import serial
 
 __all__ = [
     "EMULATORS",
@@ -105,7 +106,7 @@ class SerialTransport(Closing):
 
     def __init__(
         self,
-        port: serial.Serial,
+        port: "serial.Serial",
         url: str,
         *,
         is_simulated: bool,
@@ -238,8 +239,10 @@ def _options(url: str) -> dict[str, str]:
     return options
 
 
-def _open_port(path: str, *, baudrate: int, rtscts: bool) -> serial.Serial:
+def _open_port(path: str, *, baudrate: int, rtscts: bool) -> "serial.Serial":
     """Open a port for this program alone."""
+    import serial  # noqa: PLC0415 - an optional package, which drivers of other devices do without
+
     try:
         return serial.Serial(
             path, baudrate, rtscts=rtscts, exclusive=True, write_timeout=WRITE_TIMEOUT

@@ -165,7 +165,7 @@ class EmulatedCamera(Closing):
             "last_ffc_temperature": state.last_ffc_temperature,
             "uptime": time,
         }
-        return telemetry.encode(values, self.shape[1])
+        return telemetry.encode(values, self.shape[1], self.telemetry_rows)
 
 
 def open_frames(
