@@ -5,8 +5,8 @@ nothing is reset, claimed or detached from its kernel driver, for the devices ma
 camera's video nodes are those below its USB device in Linux's sysfs, so that two equal cameras are
 distinguished by the ports they are plugged into.
 
-Whether a Boson's USB serial number is always the camera's own is not certain: ask the camera
-itself. Tested against an emulated backend and a written sysfs tree, not against hardware.
+A Boson's USB serial number may not always be the camera's own: ask the camera itself. Tested
+against an emulated backend and a written sysfs tree, not against hardware.
 """
 
 import errno

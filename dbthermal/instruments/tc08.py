@@ -192,6 +192,16 @@ class TC08(Closing):
             If the URL is another one, or the world is missing, or given to a real unit.
         OSError, TC08Error, TimeoutError
             As `load` and `open`.
+
+        Examples
+        --------
+        >>> from dbthermal.instruments.emulated.world import World
+        >>> bench = World(blackbody_temperature=310.0)
+        >>> bench.thermocouples[1] = "blackbody"
+        >>> with TC08.from_url("sim://tc08", world=bench) as logger:
+        ...     logger.set_channels({1: "T"})
+        ...     print(f"{logger.single().temperature[1]:.2f} K")
+        310.00 K
         """
         if (url == "sim://tc08") != (world is not None):
             raise ValueError(

@@ -82,25 +82,9 @@ class EmulatedApt:
     """
     A controller and a wheel; a `Device` of `dbthermal.instruments.emulated.port`.
 
-    Parameters
-    ----------
-    world : World
-        Its clock is used, and its wheel is turned.
-    model : str
-        Name of the controller, one of `MODELS`.
-    serial_number : int
-        Serial number of the controller.
-    slot_offset : float
-        From the wheel's home switch to its slot 1 [deg].
-
-    Attributes
-    ----------
-    position, wheel : int, float
-        Counter of commanded steps, and place of the wheel from its home switch [count].
-    enabled, homed : bool
-        True if the motor has current, and if it found its switch.
-    plugged : bool
-        Set it to False to pull out the cable.
+    It uses the world's clock and turns the world's wheel, whose slot 1 is `slot_offset` [deg] from
+    the home switch. `position` counts the commanded steps, `wheel` is the place of the wheel from
+    its home switch [count]; `plugged` is set to False to pull out the cable.
     """
 
     is_simulated: Final = True
@@ -258,9 +242,8 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     """
     Start an emulated wheel for ``sim://apt``, on a pseudo-terminal of its own.
 
-    The options are ``model``, ``sn`` (serial number), ``offset`` (slot 1 from the home switch
-    [deg]) and ``name``, which says nothing more: a world has one wheel. ValueError if another is
-    given, or a value is invalid. Close the port to end the wheel.
+    Its options are ``model``, ``sn`` (serial number), ``offset`` (of slot 1 from the home switch
+    [deg]) and ``name``, without effect; ValueError if one is unknown or invalid.
     """
     require_known(options, ("model", "sn", "offset", "name"))
     device = EmulatedApt(

@@ -86,7 +86,7 @@ MODELS: Final[Mapping[str, Scale]] = MappingProxyType(
 
 CHANNEL: Final = 1  # of the motor at its address
 FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
-"""State that is an error. Whether a wheel's controller sets these is uncertain."""
+"""State that is an error; it is uncertain if a wheel's controller sets these bits."""
 
 
 @dataclass(frozen=True)
