@@ -11,7 +11,7 @@ import dbthermal
 PACKAGE = Path(dbthermal.__file__).parent
 LAYERS = (
     "schema planck mixing _smooth",
-    "curves noise",
+    "noise",
     "response bands correction alignment metrics figures store readers",
     "calibration emissivity limits",
     "separation",

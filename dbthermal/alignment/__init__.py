@@ -1,9 +1,17 @@
-"""Two cameras or more onto one clock and one grid.
+"""Alignment of two cameras or more: one clock and one pixel grid.
 
-Registration needs OpenCV and is imported by name: `alignment.registration`.
+`register` estimates where the pixels of the first view lie in the others (it needs OpenCV, the
+extra ``alignment``), `time_offset` by how much one camera is exposed later than the first, and
+`align` brings all bands onto one clock and onto the grid of the first.
 """
 
+from dbthermal.alignment._clocks import exposure_times, fill_times
 from dbthermal.alignment._offset import time_offset
+from dbthermal.alignment._registration import register
 from dbthermal.alignment._resampling import align
 
-__all__ = ["align", "time_offset"]
+__all__ = ["align", "exposure_times", "fill_times", "register", "time_offset"]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,4 +1,4 @@
-"""When each camera's frames were exposed, which of them are missing, and how to reach between."""
+"""Exposure times of each camera, missing frames, and linear interpolation between frames."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -13,15 +13,11 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.intp]
 
-EXPOSURE_TIME: Final = schema.Variable(
-    ("band", "time"), "float64", "s", "when the frame was exposed"
-)
-"""Optional variable `exposure_time` of a capture: each camera's own stamps, NaN for no frame."""
-
-SAME: Final = 0.01
-"""A sample nearer than this to the wanted time is taken as it is [frame period]."""
-
+# A sample nearer than this to the wanted time is taken as it is [frame period].
+_COINCIDENT: Final = 0.01
+# Longest gap across which a line is drawn [frame period].
 _GAP: Final = 1.5
+# Largest relative deviation of a time step from the median of an even clock [1].
 _EVEN: Final = 0.05
 _MINIMUM_FRAMES: Final = 2
 
@@ -29,64 +25,43 @@ _MINIMUM_FRAMES: Final = 2
 @dataclass(frozen=True)
 class Interpolation:
     r"""
-    Which two frames a line through goes at each wanted time.
-
-    .. math:: I(t) = (1 - w) I_{before} + w I_{after}
+    Linear interpolation in time, :math:`I(t) = (1 - w) I_{before} + w I_{after}`.
 
     For a signal that changes by sudden steps, and for a random walk, this line is the expected
-    value between two samples: what it misses has mean zero and is independent of what it gives, so
-    a regression on it is not biased [1]_. At a step it misses by up to the half of it, though.
+    value between two samples: its error has mean zero and is independent of its value, so that a
+    regression on it is not biased (Berkson 1950, doi:10.1080/01621459.1950.10483349). At a step its
+    error is up to half of the step, though.
 
-    Attributes
-    ----------
-    before, after : ndarray of int, shape (wanted,)
-        Frames.
-    share : ndarray, shape (wanted,)
-        w, the weight of the frame after [1].
-    known : ndarray of bool, shape (wanted,)
-        False where the line would reach over a gap or past an end.
-    stamps : ndarray, shape (time,)
-        When the frames were exposed [s].
-
-    References
-    ----------
-    .. [1] Berkson (1950), Journal of the American Statistical Association 45, 164,
-       doi:10.1080/01621459.1950.10483349
+    `before`, `after` (wanted): frames; `weight` (wanted): w [1]; `valid` (wanted): false across a
+    gap or past an end; `stamps` (time): exposure times [s].
     """
 
     before: Indices
     after: Indices
-    share: Array
-    known: Mask
+    weight: Array
+    valid: Mask
     stamps: Array
 
     def apply(
-        self, frames: npt.NDArray[Any], out: npt.NDArray[Any], largest: float = np.inf
+        self, frames: npt.NDArray[Any], out: npt.NDArray[Any], largest_step: float = np.inf
     ) -> None:
         """
-        Write the interpolated frames, NaN where they are not known.
+        Write the interpolated frames (wanted, ...) into `out`, NaN where not valid.
 
-        Parameters
-        ----------
-        frames : ndarray, shape (time, ...)
-            Samples, in any unit.
-        out : ndarray, shape (wanted, ...)
-            Where the result goes, floating.
-        largest : float
-            Step between two samples, in their unit, beyond which nothing between them is known.
+        Between two samples that differ by more than `largest_step` no value is known: NaN.
         """
-        for place, share in enumerate(self.share):
+        for place, weight in enumerate(self.weight):
             before, after = frames[self.before[place]], frames[self.after[place]]
-            if not self.known[place]:
+            if not self.valid[place]:
                 out[place] = np.nan
-            elif share in (0.0, 1.0):  # a sample as it is: NaN times zero is not zero
-                out[place] = after if share else before
+            elif weight in (0.0, 1.0):  # a sample as it is: NaN times zero is not zero
+                out[place] = after if weight else before
             else:
-                out[place] = (1.0 - share) * before + share * after
-                out[place][self._step(frames, place) > largest] = np.nan
+                out[place] = (1.0 - weight) * before + weight * after
+                out[place][self._step(frames, place) > largest_step] = np.nan
 
     def _step(self, frames: npt.NDArray[Any], place: int) -> npt.NDArray[Any]:
-        """Change between two samples, or how much it is more than beside them: the smaller."""
+        """Change between two samples, or its excess over the neighbouring changes if smaller."""
         before, after = int(self.before[place]), int(self.after[place])
         change, time = frames[after] - frames[before], self.stamps
         rates = [
@@ -95,73 +70,72 @@ class Interpolation:
             if early >= 0 and late < len(frames) and np.isfinite(time[late] - time[early])
         ]
         width = time[after] - time[before]
-        known = [np.where(np.isnan(rate), change, rate * width) for rate in rates]
-        more = change - sum(known) / max(len(known), 1)
-        return np.asarray(np.minimum(np.abs(change), np.abs(more)))
+        beside = [np.where(np.isnan(rate), change, rate * width) for rate in rates]
+        excess = change - sum(beside) / max(len(beside), 1)
+        return np.asarray(np.minimum(np.abs(change), np.abs(excess)))
 
     def within(self, segment: Indices) -> "Interpolation":
-        """
-        Leave out what would mix samples from both sides of a shutter event.
-
-        Parameters
-        ----------
-        segment : ndarray of int, shape (time,)
-            From `segments`.
-
-        Returns
-        -------
-        Interpolation
-            The same, known in fewer places.
-        """
-        mixed = (segment[self.before] != segment[self.after]) & (self.share % 1.0 > 0)
-        return replace(self, known=self.known & ~mixed)
+        """Same interpolation, not valid between frames of different segments (time)."""
+        mixed = (segment[self.before] != segment[self.after]) & (self.weight % 1.0 > 0)
+        return replace(self, valid=self.valid & ~mixed)
 
     def labels(self, segment: Indices) -> Indices:
-        """
-        Segment that each interpolated frame is of.
-
-        Parameters
-        ----------
-        segment : ndarray of int, shape (time,)
-            From `segments`.
-
-        Returns
-        -------
-        ndarray of int, shape (wanted,)
-            Of the frame after where that is taken as it is, else of the one before.
-        """
-        return np.where(self.share == 1, segment[self.after], segment[self.before])
+        """Segment (wanted) of each interpolated frame, from those of the samples (time)."""
+        return np.where(self.weight == 1, segment[self.after], segment[self.before])
 
 
-def exposures(corrected: xr.Dataset) -> Array:
+def exposure_times(corrected: xr.Dataset) -> Array:
     """
-    When each band's frames were exposed.
+    Exposure times of each band's frames.
 
     Parameters
     ----------
     corrected : Dataset
-        Stage `corrected` of `schema`, optionally with `exposure_time` (band, time) [s].
+        Stage `capture` or `corrected` of `schema`, optionally with `exposure_time` (band, time)
+        [s].
 
     Returns
     -------
     ndarray, shape (band, time)
-        The stamps [s], NaN where there is no frame; without stamps, `time` in every band.
+        Times [s], NaN where there is no frame; without `exposure_time`, `time` in every band.
 
     Raises
     ------
     TypeError, ValueError
-        If the stamps have other dims or another unit, fewer than two of a band are finite, or
+        If the times have other dims or another unit, fewer than two of a band are finite, or
         they do not increase.
     """
     counts = corrected["counts"]
     if "exposure_time" not in corrected:
         stamps = np.tile(corrected["time"].values.astype(np.float64), (counts.sizes["band"], 1))
     else:
-        schema.check_variable(corrected["exposure_time"], EXPOSURE_TIME, "'exposure_time'")
+        schema.check_variable(corrected["exposure_time"], schema.EXPOSURE_TIME, "'exposure_time'")
         stamps = corrected["exposure_time"].values.astype(np.float64)
     for band, row in zip(counts["band"].values, stamps, strict=True):
         _check_stamps(row[~np.isnan(row)], str(band))
     return stamps
+
+
+def fill_times(stamps: Array) -> Array:
+    """
+    Exposure times with those of missing frames interpolated.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (time,)
+        Exposure times of one camera [s], NaN where there is no frame.
+
+    Returns
+    -------
+    ndarray, shape (time,)
+        Times [s], strictly increasing; before the first and after the last frame, a frame period
+        apart.
+    """
+    slots, step = np.arange(stamps.size), frame_period(stamps)
+    recorded = np.flatnonzero(np.isfinite(stamps))
+    inside = np.interp(slots, recorded, stamps[recorded])
+    early, late = np.minimum(slots - recorded[0], 0), np.maximum(slots - recorded[-1], 0)
+    return np.asarray(inside + step * (early + late))
 
 
 def _check_stamps(stamps: Array, band: str) -> None:
@@ -180,24 +154,7 @@ def _check_stamps(stamps: Array, band: str) -> None:
 
 
 def segments(corrected: xr.Dataset) -> Indices:
-    """
-    How many shutter events came before each frame.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        Optionally with `segment` (time).
-
-    Returns
-    -------
-    ndarray of int, shape (time,)
-        The numbers; all 0 where nothing is known of them.
-
-    Raises
-    ------
-    ValueError
-        If they have other dims, or are no whole numbers.
-    """
+    """Number of shutter events before each frame (time), 0 without a variable `segment`."""
     if "segment" not in corrected:
         return np.zeros(corrected.sizes["time"], dtype=np.intp)
     segment = corrected["segment"]
@@ -211,19 +168,9 @@ def segments(corrected: xr.Dataset) -> Indices:
 
 def missing(frames: npt.NDArray[Any]) -> Mask:
     """
-    Frames that hold nothing: NaN in all pixels, or a copy of the frame before.
+    Frames (time) that are NaN in all pixels, or a copy of the frame before.
 
-    A driver that loses a frame may hand out the last one again. Noise repeats a whole frame never.
-
-    Parameters
-    ----------
-    frames : ndarray, shape (time, ...)
-        Samples of one band.
-
-    Returns
-    -------
-    ndarray of bool, shape (time,)
-        Where they are missing.
+    A driver that loses a frame may deliver the last one again; noise never repeats a whole frame.
     """
     result = np.array([bool(np.all(np.isnan(frame))) for frame in frames])
     for place in range(1, len(frames)):
@@ -231,67 +178,19 @@ def missing(frames: npt.NDArray[Any]) -> Mask:
     return result
 
 
-def period(stamps: Array) -> float:
-    """
-    Frame period of one camera.
-
-    Parameters
-    ----------
-    stamps : ndarray, shape (time,)
-        Exposure times [s], NaN where there is no frame.
-
-    Returns
-    -------
-    float
-        Median step between frames [s].
-    """
+def frame_period(stamps: Array) -> float:
+    """Median step [s] between the frames of one camera."""
     return float(np.median(np.diff(stamps[np.isfinite(stamps)])))
 
 
-def filled(stamps: Array) -> Array:
+def even_times(stamps: Array) -> Array:
     """
-    Exposure times without holes: a slot without a frame gets a time between its neighbours.
+    Evenly spaced times [s] that all cameras, exposure times (band, time), can be brought to.
 
-    Parameters
-    ----------
-    stamps : ndarray, shape (time,)
-        Exposure times [s], NaN where there is no frame.
-
-    Returns
-    -------
-    ndarray, shape (time,)
-        Times [s], strictly increasing; before the first and after the last frame, a frame period
-        apart.
+    The stamps themselves where all bands share even ones (steps within 5 % of their median); else
+    from the last camera's start to the first one's end, in steps of the longest frame period.
     """
-    slots, step = np.arange(stamps.size), period(stamps)
-    good = np.flatnonzero(np.isfinite(stamps))
-    inside = np.interp(slots, good, stamps[good])
-    early, late = np.minimum(slots - good[0], 0), np.maximum(slots - good[-1], 0)
-    return np.asarray(inside + step * (early + late))
-
-
-def even(stamps: Array) -> Array:
-    """
-    Evenly spaced times that all cameras can be brought to.
-
-    Parameters
-    ----------
-    stamps : ndarray, shape (band, time)
-        Exposure times [s], NaN where there is no frame.
-
-    Returns
-    -------
-    ndarray, shape (any,)
-        The stamps themselves where all bands share even ones (steps within 5 % of their median);
-        else from the last camera's start to the first one's end, in steps of the longest frame
-        period [s].
-
-    Raises
-    ------
-    ValueError
-        If the cameras' recordings do not overlap by two frames.
-    """
-    step = max(period(row) for row in stamps)
+    step = max(frame_period(row) for row in stamps)
     shared = bool(np.all(stamps == stamps[0]))
     if shared and np.all(np.abs(np.diff(stamps[0]) - step) <= _EVEN * step):
         return np.asarray(stamps[0])
@@ -306,38 +205,23 @@ def even(stamps: Array) -> Array:
 
 def interpolation(stamps: Array, present: Mask, wanted: Array) -> Interpolation:
     """
-    Find the frames between which each wanted time lies.
+    Interpolation of the frames present, exposed at `stamps` (time) [s], at times `wanted` [s].
 
-    Parameters
-    ----------
-    stamps : ndarray, shape (time,)
-        Exposure times [s], NaN where there is no frame.
-    present : ndarray of bool, shape (time,)
-        Which frames hold something, see `missing`.
-    wanted : ndarray, shape (wanted,)
-        Times [s].
-
-    Returns
-    -------
-    Interpolation
-        Known where a frame was exposed at that time (within `SAME` of a period), or one each
-        before and after it, no more than one and a half frame periods apart.
-
-    Raises
-    ------
-    ValueError
-        If fewer than two frames hold something.
+    Valid where a frame was exposed within 1 % of a period of the wanted time, or one each before
+    and after it, no more than one and a half frame periods apart.
     """
-    good = np.flatnonzero(present & np.isfinite(stamps))
-    if good.size < _MINIMUM_FRAMES:
+    usable = np.flatnonzero(present & np.isfinite(stamps))
+    if usable.size < _MINIMUM_FRAMES:
         raise ValueError(
-            f"Invalid capture of {good.size} frames that hold something. Must be at least "
-            f"{_MINIMUM_FRAMES}: the others are NaN or copies of the frame before."
+            f"Invalid capture of {usable.size} valid frames. Must be at least {_MINIMUM_FRAMES}: "
+            "the others are NaN or copies of the frame before."
         )
-    times, step = stamps[good], period(stamps[good])
-    right = np.clip(np.searchsorted(times, wanted), 1, good.size - 1)
+    times, step = stamps[usable], frame_period(stamps[usable])
+    right = np.clip(np.searchsorted(times, wanted), 1, usable.size - 1)
     width = times[right] - times[right - 1]
-    share = (wanted - times[right - 1]) / width
-    share = np.where(np.abs(share - np.rint(share)) * width <= SAME * step, np.rint(share), share)
-    known = (share == 0) | (share == 1) | ((share > 0) & (share < 1) & (width <= _GAP * step))
-    return Interpolation(good[right - 1], good[right], share, known, stamps)
+    weight = (wanted - times[right - 1]) / width
+    nearest = np.rint(weight)
+    weight = np.where(np.abs(weight - nearest) * width <= _COINCIDENT * step, nearest, weight)
+    between = (weight > 0) & (weight < 1) & (width <= _GAP * step)
+    valid = (weight == 0) | (weight == 1) | between
+    return Interpolation(usable[right - 1], usable[right], weight, valid, stamps)

@@ -27,68 +27,53 @@ import xarray as xr
 from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
+from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-PIXELS: Final = 16384
-"""Pixels, at most, of which a capture is judged; a full frame would say it no better."""
-
-MINIMUM_FRAMES: Final = 32
-"""Fewest frames from which an offset is estimated."""
-
+# Pixels, at most, of which a capture is judged; a full frame would say it no better.
+_PIXELS: Final = 16384
+# Fewest frames from which an offset is estimated.
+_MINIMUM_FRAMES: Final = 32
 # Groups of pixels whose agreement tells the offset's standard deviation.
 _GROUPS: Final = 16
 _SIGNIFICANCE: Final = 6.0
 _ORDER: Final = 8
-_UNUSABLE: Final = np.uint16(
-    schema.FLAGS["dead_pixel"] | schema.FLAGS["saturated"] | schema.FLAGS["invalid_samples"]
-)
+_UNUSABLE: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 
 @dataclass(frozen=True)
-class _Shared:
+class _Pair:
     """
     Two bands on one clock of even steps.
 
-    Attributes
-    ----------
-    signals : ndarray, shape (2, time, pixel)
-        Counts [count], NaN in missing frames.
-    labels : ndarray of int, shape (2, time)
-        Number of shutter events before each frame.
-    times : ndarray, shape (time,)
-        Times [s].
+    `signals` (2, time, pixel): counts [count], NaN in missing frames; `segments` (2, time): number
+    of shutter events before each frame; `times` (time) [s].
     """
 
     signals: Array
-    labels: clocks.Indices
+    segments: clocks.Indices
     times: Array
 
-    def shifted(self, lag: int) -> "_Shared":
-        """Take the first band so many frames later."""
+    def shifted(self, lag: int) -> "_Pair":
+        """Pair with the first band taken `lag` frames later."""
         frames = self.times.size - abs(lag)
         late, early = max(lag, 0), max(-lag, 0)
-        signals, labels = (
+        signals, segments = (
             np.stack([part[0][late : late + frames], part[1][early : early + frames]])
-            for part in (self.signals, self.labels)
+            for part in (self.signals, self.segments)
         )
-        return _Shared(signals, labels, self.times[:frames])
+        return _Pair(signals, segments, self.times[:frames])
 
 
 @dataclass(frozen=True)
 class _Covariances:
     """
-    Covariances of a group of pixels in a row, frames apart in columns.
+    Covariances of groups of pixels, in rows, by lag, in columns.
 
-    Attributes
-    ----------
-    lags : ndarray of int, shape (lag,)
-        Frames by which the first band is taken later.
-    cross : ndarray, shape (group, lag)
-        C, of the first band with the second.
-    auto : ndarray, shape (group, 2)
-        R of the first band, one and two frames apart.
+    `lags` (lag): frames by which the first band is taken later; `cross` (group, lag): C, of the
+    first band with the second; `auto` (group, 2): R of the first band, one and two frames apart.
     """
 
     lags: npt.NDArray[np.int_]
@@ -103,8 +88,8 @@ def time_offset(
     Time by which a band is exposed later than the first.
 
     Positive: frame n of this band was exposed that much **later** than frame n of the first.
-    Where the capture has the cameras' own stamps, it is what is left of a lag beyond them: this
-    band's stamps are to be raised by it.
+    Where the capture has the cameras' own stamps, it is the lag beyond them: this band's stamps
+    are to be raised by it.
 
     Parameters
     ----------
@@ -114,9 +99,9 @@ def time_offset(
         shutter events: their steps are no motion. Missing frames are NaN or copies of the frame
         before. Frames dropped with neither stamp nor copy are not noticed.
     band : str, optional
-        Name of the band; the second, unless given.
+        Name of the band; by default the second.
     search : int
-        Largest lag looked for, either way [frame].
+        Largest lag to search, either way [frame].
     precision : float
         Largest standard deviation of the offset [frame].
 
@@ -128,10 +113,10 @@ def time_offset(
     Raises
     ------
     TypeError, ValueError
-        If the capture is not as `schema` has it, there is no such band, the search does not fit
+        If the capture is not as `schema` has it, the band is missing, the search does not fit
         the capture's length, or there are fewer than 16 usable pixels; if nothing moves in both
-        bands, their likeness is greatest at an end of the search, or the offset is less well known
-        than `precision`.
+        bands, their covariance is greatest at an end of the search, or the offset is less well
+        known than `precision`.
 
     Notes
     -----
@@ -143,22 +128,39 @@ def time_offset(
     Cameras side by side see a reflection at different pixels. Where most of what is reflected moves
     one way, it comes to a pixel of one view earlier, and this looks like an offset; what moves
     either way cancels. Where there is such a parallax, measure the offset otherwise and give it.
+
+    Examples
+    --------
+    A background that steps at random, seen by the second camera half a frame later.
+
+    >>> import numpy as np, xarray as xr
+    >>> rng, time = np.random.default_rng(1), np.arange(200) / 10.0
+    >>> steps = rng.normal(0, 20, (802, 64)) * (rng.random((802, 64)) < 0.05)
+    >>> signal = np.cumsum(steps, axis=0)
+    >>> counts = np.stack([signal[:800:4], signal[2:802:4]]).reshape(2, 200, 8, 8)
+    >>> corrected = xr.Dataset(
+    ...     {"counts": (("band", "time", "y", "x"), counts + rng.normal(0, 1, counts.shape))},
+    ...     {"band": ["8-14", "9.5"], "time": time},
+    ... )
+    >>> round(time_offset(corrected), 2)  # the frame period is 0.1 s
+    0.05
     """
     place = _check(corrected, band, search)
     pair = corrected.isel(band=[0, place])
-    shared = _on_one_clock(sample(pair), clocks.exposures(pair), clocks.segments(pair))
-    what = f"of band '{pair['band'].values[1]}' against '{pair['band'].values[0]}'"
-    lag = _peak(_covariances(shared, search), what)
+    shared = _on_one_clock(sample(pair), clocks.exposure_times(pair), clocks.segments(pair))
+    label = f"of band '{pair['band'].values[1]}' against '{pair['band'].values[0]}'"
+    lag = _peak(_covariances(shared, search), label)
     # Whole frames first: smooth functions over the same scene take the same out of both bands.
-    found = _covariances(shared.shifted(lag), 1)
-    delays = [lag + _delay(part) for part in (found, *_leave_one_out(found))]
-    spread = np.sqrt((_GROUPS - 1) * np.var(delays[1:]))
-    if not spread <= precision:
+    covariances = _covariances(shared.shifted(lag), 1)
+    delays = [lag + _delay(part) for part in (covariances, *_leave_one_out(covariances))]
+    # Jackknife over n groups: var = (n - 1) mean (d_i - mean d)^2.
+    std = np.sqrt((_GROUPS - 1) * np.var(delays[1:]))
+    if not std <= precision:
         raise ValueError(
-            f"Invalid time offset {what}: {delays[0]:.2f} +- {spread:.2f} frames. Must be known "
+            f"Invalid time offset {label}: {delays[0]:.2f} +- {std:.2f} frames. Must be known "
             f"within {precision}: too little moves, or in too few pixels; give the offset."
         )
-    return float(delays[0] * clocks.period(shared.times))
+    return float(delays[0] * clocks.frame_period(shared.times))
 
 
 def _check(corrected: xr.Dataset, band: str | None, search: int) -> int:
@@ -168,10 +170,10 @@ def _check(corrected: xr.Dataset, band: str | None, search: int) -> int:
     if len(names) < 2:
         raise ValueError(f"Invalid bands {names} of the capture. Must be at least two.")
     frames = counts.sizes["time"]
-    if frames < MINIMUM_FRAMES:
+    if frames < _MINIMUM_FRAMES:
         raise ValueError(
             f"Invalid capture of {frames} frames for a time offset. "
-            f"Must have at least {MINIMUM_FRAMES}."
+            f"Must have at least {_MINIMUM_FRAMES}."
         )
     if not 1 <= search <= frames // 4:
         raise ValueError(f"Invalid search of {search} frames. Must lie in [1, {frames // 4}].")
@@ -183,25 +185,12 @@ def _check(corrected: xr.Dataset, band: str | None, search: int) -> int:
 
 def sample(corrected: xr.Dataset) -> Array:
     """
-    Counts of usable pixels spread evenly over the image, missing frames NaN.
+    Counts (band, time, pixel) of usable pixels on an even grid, NaN in missing frames.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`.
-
-    Returns
-    -------
-    ndarray, shape (band, time, pixel)
-        Counts [count] of the pixels that change in every band, and are finite in every frame that
-        is not missing.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than 16 such pixels.
+    Usable is a pixel that is not flagged as dead, saturated or invalid, changes in every band, and
+    is finite in every frame that is not missing.
     """
-    step = max(1, int(np.sqrt(corrected.sizes["y"] * corrected.sizes["x"] / PIXELS)))
+    step = max(1, int(np.sqrt(corrected.sizes["y"] * corrected.sizes["x"] / _PIXELS)))
     part = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
     counts = part["counts"].values.astype(np.float64)
     counts = counts.reshape(*counts.shape[:2], -1)
@@ -221,40 +210,28 @@ def sample(corrected: xr.Dataset) -> Array:
 
 
 def present(frames: npt.NDArray[Any]) -> Mask:
-    """
-    Frames of a sample that hold something.
-
-    Parameters
-    ----------
-    frames : ndarray, shape (time, pixel)
-        From `sample`.
-
-    Returns
-    -------
-    ndarray of bool, shape (time,)
-        Where they do.
-    """
+    """Frames (time) of a `sample` (time, pixel) that are not missing."""
     return np.asarray(~np.isnan(frames[:, 0]))
 
 
-def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices) -> _Shared:
+def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices) -> _Pair:
     """Both bands on evenly spaced times; as they are, where they are already."""
-    times = clocks.even(stamps)
+    times = clocks.even_times(stamps)
     if stamps.shape[1] == times.size and np.all(stamps == times):
-        return _Shared(signals, np.stack([segment, segment]), times)
+        return _Pair(signals, np.stack([segment, segment]), times)
     result = np.empty((len(signals), times.size, signals.shape[2]))
-    labels = np.empty(result.shape[:2], dtype=np.intp)
-    for place, (movie, own) in enumerate(zip(signals, stamps, strict=True)):
-        plan = clocks.interpolation(own, present(movie), times).within(segment)
+    segments = np.empty(result.shape[:2], dtype=np.intp)
+    for place, (movie, row) in enumerate(zip(signals, stamps, strict=True)):
+        plan = clocks.interpolation(row, present(movie), times).within(segment)
         plan.apply(movie, result[place])
-        labels[place] = plan.labels(segment)
-    return _Shared(result, labels, times)
+        segments[place] = plan.labels(segment)
+    return _Pair(result, segments, times)
 
 
-def _covariances(shared: _Shared, search: int) -> _Covariances:
+def _covariances(shared: _Pair, search: int) -> _Covariances:
     """Covariances of the rapid changes, in groups of pixels."""
     # One step at a shutter event of either band, the same for both.
-    _, segment = np.unique(shared.labels, axis=1, return_inverse=True)
+    _, segment = np.unique(shared.segments, axis=1, return_inverse=True)
     one, other = (present(movie) for movie in shared.signals)
     first, second = (
         _rapid(movie, shared.times, here, segment)
@@ -267,17 +244,17 @@ def _covariances(shared: _Shared, search: int) -> _Covariances:
 
 
 def _rapid(movie: Array, times: Array, here: Mask, segment: clocks.Indices) -> Array:
-    """What smooth functions and steps leave of a signal, (time, pixel); 0 in missing frames."""
-    if here.sum() < MINIMUM_FRAMES:
+    """Residual of a signal (time, pixel) on smooth functions and steps; 0 in missing frames."""
+    if here.sum() < _MINIMUM_FRAMES:
         raise ValueError(
-            f"Invalid capture of {here.sum()} frames that hold something. "
-            f"Must be at least {MINIMUM_FRAMES} for a time offset."
+            f"Invalid capture of {here.sum()} valid frames. "
+            f"Must be at least {_MINIMUM_FRAMES} for a time offset."
         )
     steps = segment[here][:, np.newaxis] == np.unique(segment[here])[1:]
-    functions, _ = np.linalg.qr(np.hstack([smooth.basis(times[here], _ORDER), steps]))
-    left = np.zeros_like(movie)
-    left[here] = movie[here] - functions @ (functions.T @ movie[here])
-    return left
+    functions, _ = np.linalg.qr(np.hstack([smooth.polynomial_basis(times[here], _ORDER), steps]))
+    residual = np.zeros_like(movie)
+    residual[here] = movie[here] - functions @ (functions.T @ movie[here])
+    return residual
 
 
 def _lagged(first: Array, second: Array, one: Mask, other: Mask, lag: int) -> Array:
@@ -293,37 +270,41 @@ def _lagged(first: Array, second: Array, one: Mask, other: Mask, lag: int) -> Ar
     return np.asarray(grouped / np.sum(one[late] & other[early]))
 
 
-def _peak(found: _Covariances, what: str) -> int:
-    """Lag at which the bands are most alike [frame]."""
-    total = found.cross.sum(axis=0)
+def _peak(covariances: _Covariances, label: str) -> int:
+    """Lag of the largest covariance of the bands [frame], which must be significant."""
+    total = covariances.cross.sum(axis=0)
     peak = 2 + int(np.argmax(total[2:-2]))
-    groups = found.cross[:, peak]
+    groups = covariances.cross[:, peak]
     score = groups.mean() / (groups.std(ddof=1) / np.sqrt(_GROUPS))
     if not score > _SIGNIFICANCE:
         raise ValueError(
-            f"Missing time offset {what}: no rapid change that both bands see (a covariance of "
+            f"Missing time offset {label}: no rapid change that both bands see (a covariance of "
             f"{score:.1f} standard deviations). Must exceed {_SIGNIFICANCE:g}; give the offset."
         )
-    if peak in (2, found.lags.size - 3):
+    if peak in (2, covariances.lags.size - 3):
         raise ValueError(
-            f"Invalid time offset {what}: the bands are most alike {found.lags[peak]} frames "
-            "apart, at the end of the search. Must lie inside; search farther."
+            f"Invalid time offset {label}: the largest covariance is at {covariances.lags[peak]} "
+            "frames, the end of the search. Must lie inside; search farther."
         )
-    return int(found.lags[peak])
+    return int(covariances.lags[peak])
 
 
-def _leave_one_out(found: _Covariances) -> list[_Covariances]:
-    """The same without each group of pixels in turn."""
+def _leave_one_out(covariances: _Covariances) -> list[_Covariances]:
+    """Covariances without each group of pixels in turn, for the jackknife."""
     keep = [np.arange(_GROUPS) != group for group in range(_GROUPS)]
-    return [_Covariances(found.lags, found.cross[one], found.auto[one]) for one in keep]
+    return [
+        _Covariances(covariances.lags, covariances.cross[one], covariances.auto[one])
+        for one in keep
+    ]
 
 
-def _delay(found: _Covariances) -> float:
+def _delay(covariances: _Covariances) -> float:
     """Offset [frame] within a frame of lag 0, from the pair of frames it lies best between."""
-    cross, (near, far) = found.cross.sum(axis=0), found.auto.sum(axis=0)
+    cross, (near, far) = covariances.cross.sum(axis=0), covariances.auto.sum(axis=0)
     delays = []
     for lag in (-1, 0):
-        place = int(np.argmax(found.lags == lag))
+        # C_-1 -+ C_2 = (h0 -+ h1)(R1 -+ R2) of the frames m - 1 and m + 2: delta = h1 / (h0 + h1).
+        place = int(np.argmax(covariances.lags == lag))
         before, after = cross[place - 1], cross[place + 2]
         share = 0.5 - 0.5 * (before - after) / (near - far) * (near + far) / (before + after)
         delays.append((abs(float(share) - 0.5), lag + float(share)))

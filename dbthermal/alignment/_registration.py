@@ -1,8 +1,7 @@
 """Registration of several views of one object, by the enhanced correlation coefficient."""
 
-from typing import Final
+from typing import Final, Literal
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
@@ -14,31 +13,27 @@ from dbthermal.alignment._resampling import TRANSFORM
 
 Array = npt.NDArray[np.float64]
 
-MODELS: Final = ("translation", "affine", "homography")
-"""Kinds of transform, of two, six and eight numbers."""
-
-_MOTIONS: Final = {
-    "translation": cv2.MOTION_TRANSLATION,
-    "affine": cv2.MOTION_AFFINE,
-    "homography": cv2.MOTION_HOMOGRAPHY,
-}
+# Kinds of transform, of two, six and eight numbers.
+_MODELS: Final = ("translation", "affine", "homography")
 # Coarse to fine: widths of the blur as a share of the image's height, the last one a pixel or so.
 _BLURS: Final = (0.08, 0.04, 0.02)
 _FINEST: Final = 0.7
 _SMALLEST: Final = 16
-# A bad pixel stays where it is in every view, and would pull the transform towards none.
-_WITHOUT_BAD_PIXELS: Final = 3
-_STOP: Final = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-7)
-_LIKENESS: Final = 0.5
+# A bad pixel stays where it is in every view, and would pull the transform towards the identity.
+_MEDIAN_WINDOW: Final = 3
+# Steps, and relative change of the correlation, at which the maximisation stops.
+_STEPS, _TOLERANCE = 200, 1e-7
+_LEAST_CORRELATION: Final = 0.5
 
 
-def register(corrected: xr.Dataset, *, model: str = "homography") -> xr.DataArray:
+def register(
+    corrected: xr.Dataset, *, model: Literal["translation", "affine", "homography"] = "homography"
+) -> xr.DataArray:
     r"""
-    Find where each pixel of the first view is in the others.
+    Estimate the transform from the pixels of the first view to those of the others.
 
-    Pictures of the object are compared: the means over time, in which the background is blurred.
-    The transform maximises their correlation, which neither gain nor offset of a view changes
-    [1]_, at blurs from coarse to fine.
+    Means over time, in which the background is blurred, are compared. The transform maximises their
+    correlation, which neither gain nor offset of a view changes [1]_, at blurs from coarse to fine.
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
@@ -49,8 +44,8 @@ def register(corrected: xr.Dataset, *, model: str = "homography") -> xr.DataArra
     Parameters
     ----------
     corrected : Dataset
-        Stage `corrected` of `schema`: views of one object, not farther apart than a tenth of the
-        image or so.
+        Stage `corrected` of `schema`: views of one object, displaced by at most about a tenth of
+        the image.
     model : {"translation", "affine", "homography"}
         Kind of transform. An affine one fits cameras that look the same way.
 
@@ -63,28 +58,29 @@ def register(corrected: xr.Dataset, *, model: str = "homography") -> xr.DataArra
 
     Raises
     ------
+    ImportError
+        If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
         If the capture is not as `schema` has it, the model is unknown, the image is smaller than
-        16 pixels either way, a mean is not finite, or two views do not resemble one another (a
-        correlation below 0.5).
+        16 pixels either way, a mean is not finite, or the correlation of two views is below 0.5.
 
     References
     ----------
     .. [1] Evangelidis, Psarakis (2008), IEEE Transactions on Pattern Analysis and Machine
        Intelligence 30, 1858, doi:10.1109/TPAMI.2008.113
     """
-    if model not in MODELS:
-        raise ValueError(f"Unknown model '{model}'. Must be one of {MODELS}.")
+    if model not in _MODELS:
+        raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")
     counts = schema.check(corrected, "corrected")["counts"]
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
         raise ValueError(
             f"Invalid image of {counts.sizes['y']} by {counts.sizes['x']} pixels to be registered. "
             f"Must be at least {_SMALLEST} either way."
         )
-    pictures = [_picture(view) for view in counts]
+    means = [_mean_image(view) for view in counts]
     matrices = [np.eye(3)]
-    for view, picture in zip(counts[1:], pictures[1:], strict=True):
-        matrices.append(_transform(pictures[0], picture, model, str(view["band"].item())))
+    for view, mean in zip(counts[1:], means[1:], strict=True):
+        matrices.append(_transform(means[0], mean, model, str(view["band"].item())))
     return xr.DataArray(
         np.stack(matrices),
         dims=TRANSFORM.dims,
@@ -94,7 +90,7 @@ def register(corrected: xr.Dataset, *, model: str = "homography") -> xr.DataArra
     )
 
 
-def _picture(view: xr.DataArray) -> Array:
+def _mean_image(view: xr.DataArray) -> Array:
     """Mean over time of a view (y, x), without single bad pixels; mean 0, standard deviation 1."""
     frames = np.asarray(view.values)
     mean = frames[~clocks.missing(frames)].mean(axis=0, dtype=np.float64)
@@ -103,29 +99,30 @@ def _picture(view: xr.DataArray) -> Array:
             f"Invalid view in band '{view['band'].item()}': {np.sum(~np.isfinite(mean))} pixels "
             "are not finite. Must be finite in every frame that is not missing."
         )
-    mean = median_filter(mean, size=_WITHOUT_BAD_PIXELS)
-    spread = mean.std()
-    if not spread > 0:
+    mean = median_filter(mean, size=_MEDIAN_WINDOW)
+    contrast = mean.std()
+    if not contrast > 0:
         raise ValueError(
             f"Invalid view in band '{view['band'].item()}': all pixels are alike. Must show an "
             "object."
         )
-    return np.asarray((mean - mean.mean()) / spread)
+    return np.asarray((mean - mean.mean()) / contrast)
 
 
 def _transform(first: Array, other: Array, model: str, band: str) -> Array:
-    """Homography (3, 3) that takes pixels of the first picture to the other's."""
-    matrix, likeness = np.eye(3), 0.0
-    steps = [(share * first.shape[0], "affine") for share in _BLURS]
-    steps[0] = (steps[0][0], "translation")
-    for blur, kind in [*steps, (_FINEST, model)]:
-        simpler = MODELS[min(MODELS.index(kind), MODELS.index(model))]
-        pair = [gaussian_filter(picture, blur).astype(np.float32) for picture in (first, other)]
-        matrix, likeness = _maximise(pair, matrix, simpler, band)
-    if not likeness >= _LIKENESS:
+    """Homography (3, 3) from pixels of the first mean image (y, x) to those of the other."""
+    matrix, correlation = np.eye(3), 0.0
+    stages = [(share * first.shape[0], "affine") for share in _BLURS]
+    stages[0] = (stages[0][0], "translation")
+    for blur, kind in [*stages, (_FINEST, model)]:
+        simpler = _MODELS[min(_MODELS.index(kind), _MODELS.index(model))]
+        pair = [gaussian_filter(image, blur).astype(np.float32) for image in (first, other)]
+        matrix, correlation = _maximise(pair, matrix, simpler, band)
+    if not correlation >= _LEAST_CORRELATION:
         raise ValueError(
-            f"Invalid view in band '{band}': its correlation with the first is {likeness:.2f}. "
-            f"Must be at least {_LIKENESS}; they do not show the same, or lie too far apart."
+            f"Invalid view in band '{band}': its correlation with the first is {correlation:.2f}. "
+            f"Must be at least {_LEAST_CORRELATION}; they do not show the same, or lie too far "
+            "apart."
         )
     return matrix
 
@@ -134,18 +131,21 @@ def _maximise(
     pair: list[npt.NDArray[np.float32]], start: Array, kind: str, band: str
 ) -> tuple[Array, float]:
     """Transform of the highest correlation near a start, and that correlation."""
+    import cv2  # noqa: PLC0415  (optional: only registration needs it)
+
     rows = 3 if kind == "homography" else 2
-    given = start[:rows].astype(np.float32)
+    motion = getattr(cv2, f"MOTION_{kind.upper()}")
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _TOLERANCE)
     everywhere = np.ones(pair[1].shape, dtype=np.uint8)
     try:
-        likeness, found = cv2.findTransformECC(
-            pair[0], pair[1], given, _MOTIONS[kind], _STOP, everywhere, 1
+        correlation, estimate = cv2.findTransformECC(
+            pair[0], pair[1], start[:rows].astype(np.float32), motion, stop, everywhere, 1
         )
     except cv2.error as error:
         raise ValueError(
             f"Invalid view in band '{band}': no transform to the first is found ({error.err}). "
-            "Must show the same object, not farther apart than a tenth of the image."
+            "Must show the same object, displaced by at most a tenth of the image."
         ) from error
     matrix = np.eye(3)
-    matrix[:rows] = found
-    return matrix / matrix[2, 2], float(likeness)
+    matrix[:rows] = estimate
+    return matrix / matrix[2, 2], float(correlation)

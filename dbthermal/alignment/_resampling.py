@@ -1,4 +1,4 @@
-"""Two cameras or more onto one clock and one grid, the frame count kept."""
+"""Resampling of all bands onto one clock and one pixel grid, the number of frames kept."""
 
 from dataclasses import replace
 from typing import Any, Final
@@ -20,11 +20,11 @@ Movie = npt.NDArray[np.float32]
 TRANSFORM: Final = schema.Variable(
     ("band", "row", "column"), "float64", "1", "pixel of the first view to pixel of this one"
 )
-"""What registration gives: for each band a 3x3 homography on (x, y, 1), in pixels."""
+"""Transform of `register`: for each band a 3x3 homography on (x, y, 1), in pixels."""
 
-# Median absolute deviation -> standard deviation of a normal distribution.
-# Deviations of noise beyond which a step lies between two frames.
+# Standard deviations of noise beyond which a step lies between two frames.
 _STEP: Final = 5.0
+# Median absolute deviation -> standard deviation of a normal distribution.
 _MAD: Final = 1.0 / float(ndtri(0.75))
 # A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
 _DIGITS: Final = 9
@@ -38,13 +38,13 @@ def align(
     clock: str | None = None,
 ) -> xr.Dataset:
     r"""
-    Bring all bands onto one clock, and onto the first band's grid.
+    Resample all bands onto one clock, and onto the first band's grid.
 
     The samples of one band are not touched in time, and its noise stays white: the noisiest, by
     its noise relative to its signal, unless `clock` names another. The other bands are
-    interpolated at its exposure times, on the line between the frames before and after: for a
-    background that moves in steps or at random the expected value, see `clocks.Interpolation`. An
-    offset of whole frames is a pure shift.
+    interpolated at its exposure times, on the line between the frames before and after, which for
+    a background that moves in steps or at random is the expected value. An offset of whole frames
+    is a pure shift.
 
     Frames are NaN in a band where the line would reach over a gap, over a change of `segment`, or
     past an end, and where its camera gave none: NaN, or a copy of the frame before. Nothing is
@@ -58,10 +58,10 @@ def align(
         (time), which counts shutter events; `status` (y, x).
     offset : float or DataArray, optional
         How much later than the first band the others were exposed, beyond what stamps say [s]: a
-        number for two bands, or (band), 0 in the first. Estimated by `time_offset` unless given,
-        from the views as registered by `transform`.
+        number for two bands, or (band), 0 in the first. By default `time_offset` of
+        the views as registered by `transform`.
     transform : DataArray, optional
-        (band, row, column), from `registration.register`: the views are warped by bilinear
+        (band, row, column), from `register`: the views are warped by bilinear
         interpolation. Pixels outside a view are NaN.
     clock : str, optional
         Band whose samples are not touched in time.
@@ -70,11 +70,11 @@ def align(
     -------
     Dataset
         Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
-        the exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
+        exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
         `status` is that of all the pixels that it may be made of. Attributes tell what was done:
         `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band), `transform` (the
-        matrices, row by row). `exposure_time` is gone, and what else was told frame by frame on the
-        clocks before, as `drift` is; other maps are handed on, not warped.
+        matrices, row by row). `exposure_time` and other variables over `time` on the clocks before,
+        as `drift`, are dropped; other maps are handed on, not warped.
 
     Raises
     ------
@@ -87,6 +87,21 @@ def align(
     frames; in the quieter of two bands it hardly counts. Where a signal steps between two
     frames, by five standard deviations of noise, nothing is interpolated: when it changed is not
     known. Such a sample is NaN.
+
+    Examples
+    --------
+    A shift by one whole frame: the last frame has no counterpart.
+
+    >>> import numpy as np, xarray as xr
+    >>> rng, time = np.random.default_rng(1), np.arange(40) / 10.0
+    >>> counts = rng.normal(20000, 5, (2, 40, 4, 4)).astype(np.float32)
+    >>> corrected = xr.Dataset(
+    ...     {"counts": (("band", "time", "y", "x"), counts)},
+    ...     {"band": ["8-14", "9.5"], "time": time},
+    ... )
+    >>> aligned = align(corrected, offset=-0.1, clock="8-14")
+    >>> bool((aligned.counts[1, :-1] == counts[1, 1:]).all()), aligned.frames_lost
+    (True, [0, 1])
     """
     names = [str(name) for name in schema.check(corrected, "corrected")["band"].values]
     matrices = None if transform is None else _matrices(transform, names)
@@ -94,23 +109,23 @@ def align(
         # First of all: what moves passes an unregistered view earlier or later.
         corrected = _registered(corrected, matrices)
     counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
-    stamps = clocks.exposures(corrected) + offsets[:, np.newaxis]
+    stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     noise, relative = _noise(corrected, stamps)
-    kept = int(np.argmax(relative)) if clock is None else names.index(_known(clock, names))
-    times, segment = clocks.filled(stamps[kept]), clocks.segments(corrected)
+    reference = int(np.argmax(relative)) if clock is None else _place(clock, names)
+    times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
     aligned = np.empty(counts.shape, dtype=np.float32)
-    for band, own in enumerate(stamps):
+    for band, row in enumerate(stamps):
         movie = np.asarray(counts.isel(band=band).values, dtype=np.float32)
         absent = clocks.missing(movie)
         if absent.any():
             movie = np.where(absent[:, np.newaxis, np.newaxis], np.float32(np.nan), movie)
-        plan = clocks.interpolation(own, ~absent, times).within(segment)
-        plan = replace(plan, known=plan.known & (plan.labels(segment) == segment))
+        plan = clocks.interpolation(row, ~absent, times).within(segment)
+        plan = replace(plan, valid=plan.valid & (plan.labels(segment) == segment))
         plan.apply(movie, aligned[band], _largest(noise[band], movie))
     lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
     result = _assembled(corrected, aligned, times)
     return result.assign_attrs(
-        clock=names[kept],
+        clock=names[reference],
         time_offset=offsets.tolist(),
         frames_lost=lost.tolist(),
         **({} if matrices is None else {"transform": matrices.ravel().tolist()}),
@@ -118,24 +133,7 @@ def align(
 
 
 def warp(frames: npt.NDArray[Any], matrix: Array) -> Movie:
-    r"""
-    Look at a view where the first view's pixels are in it, by bilinear interpolation.
-
-    .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
-
-    Parameters
-    ----------
-    frames : ndarray, shape (time, y, x)
-        Samples of the view.
-    matrix : ndarray, shape (3, 3)
-        H: from pixel (x, y) of the first view to that of this one, counted from 0 at the centre of
-        the first pixel.
-
-    Returns
-    -------
-    ndarray of float32, shape (time, y, x)
-        The samples at (x', y'); NaN outside the view.
-    """
+    """Samples (time, y, x) at the first view's pixels, bilinear; NaN outside the view."""
     places = positions(matrix, frames.shape[1:])
     inside = np.all(
         (places >= 0) & (places <= np.array(frames.shape[1:])[:, None, None] - 1), axis=0
@@ -149,20 +147,10 @@ def warp(frames: npt.NDArray[Any], matrix: Array) -> Movie:
 
 
 def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
-    """
-    Where the pixels of the first view are in another.
+    r"""
+    Row and column (2, y, x) [pixel], in another view, of the pixels of the first.
 
-    Parameters
-    ----------
-    matrix : ndarray, shape (3, 3)
-        See `warp`.
-    shape : tuple of int
-        Rows and columns.
-
-    Returns
-    -------
-    ndarray, shape (2, y, x)
-        Row and column [pixel].
+    .. math:: (x', y', 1)^T \propto H (x, y, 1)^T, counted from 0 at the centre of the first pixel.
     """
     rows, columns = np.indices(shape, dtype=np.float64)
     across, down, scale = np.einsum(
@@ -171,22 +159,21 @@ def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
     return np.asarray(np.round(np.stack([down, across]) / scale, _DIGITS))
 
 
-def _offsets(corrected: xr.Dataset, given: float | xr.DataArray | None, names: list[str]) -> Array:
+def _offsets(corrected: xr.Dataset, offset: float | xr.DataArray | None, names: list[str]) -> Array:
     """Offset of each band against the first [s]."""
-    if given is None:
-        found = [time_offset(corrected, band=name) for name in names[1:]]
-        return np.array([0.0, *found])
-    if isinstance(given, xr.DataArray):
-        places = schema.band_positions(given, names, "the time offset")
-        if given.attrs.get("units", "s") != "s":
-            raise ValueError(f"Invalid unit '{given.attrs['units']}' of the offset. Must be 's'.")
-        values = given.values[places].astype(np.float64)
+    if offset is None:
+        return np.array([0.0, *(time_offset(corrected, band=name) for name in names[1:])])
+    if isinstance(offset, xr.DataArray):
+        places = schema.band_positions(offset, names, "the time offset")
+        if offset.attrs.get("units", "s") != "s":
+            raise ValueError(f"Invalid unit '{offset.attrs['units']}' of the offset. Must be 's'.")
+        values = offset.values[places].astype(np.float64)
     else:
         if len(names) != 2:
             raise ValueError(
-                f"Invalid offset {given} s for bands {names}. Must be one for each, (band)."
+                f"Invalid offset {offset} s for bands {names}. Must be one for each, (band)."
             )
-        values = np.array([0.0, float(given)])
+        values = np.array([0.0, float(offset)])
     if values[0] != 0 or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Invalid offset {values.tolist()} s. Must be finite, and 0 in band '{names[0]}', the "
@@ -207,14 +194,14 @@ def _matrices(transform: xr.DataArray, names: list[str]) -> Array:
     return np.asarray(values)
 
 
-def _known(name: str, names: list[str]) -> str:
-    if name not in names:
-        raise ValueError(f"Unknown clock '{name}'. Must be one of the bands {names}.")
-    return name
+def _place(clock: str, names: list[str]) -> int:
+    if clock not in names:
+        raise ValueError(f"Unknown clock '{clock}'. Must be one of the bands {names}.")
+    return names.index(clock)
 
 
 def _largest(noise: float, movie: Movie) -> float:
-    """Step that noise does not make: a difference less the mean of its two neighbours [count]."""
+    """Largest step [count] of noise: a difference less the mean of its two neighbours."""
     rounding = 8.0 * np.finfo(np.float32).eps * np.nanmax(np.abs(movie), initial=0.0)
     return float(_STEP * np.sqrt(3.0) * noise + rounding)
 

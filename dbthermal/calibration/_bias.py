@@ -6,7 +6,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal import curves, planck
+from dbthermal import planck
+from dbthermal.response import Curve
 
 Array = npt.NDArray[np.float64]
 
@@ -84,7 +85,7 @@ class Bias:
         """
         return self.air_temperature + (reading - self.air_temperature) / self._felt
 
-    def emitted(self, curve: curves.Curve, temperature: Array, std: float) -> tuple[Array, Array]:
+    def emitted(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
         r"""
         Effect of the thermocouple's errors on the object's own signal.
 
@@ -111,7 +112,7 @@ class Bias:
         offset = np.full_like(temperature, self.object_tolerance / 3.0**0.5)
         return np.asarray(scale * std), np.asarray(scale * np.stack([offset, contact]))
 
-    def reflection(self, curve: curves.Curve, temperature: Array) -> Array:
+    def reflection(self, curve: Curve, temperature: Array) -> Array:
         r"""
         Signal that the object reflects, by the middle s of the stray part.
 
@@ -132,7 +133,7 @@ class Bias:
         room = curve.counts(self.air_temperature)
         return np.asarray(room + self._mirrored * (curve.counts(temperature) - room))
 
-    def reflected(self, curve: curves.Curve, temperature: Array, std: float) -> tuple[Array, Array]:
+    def reflected(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
         """
         Effect of the blackbody's errors on the reflected signal, of which it is 1 - s.
 

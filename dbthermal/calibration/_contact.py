@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import curves, planck, schema
+from dbthermal import planck, schema
 from dbthermal import response as responses
 from dbthermal.calibration._bias import NO_BIAS, Bias
+from dbthermal.response import Curve, require_range
 
 Array = npt.NDArray[np.float64]
 
@@ -147,8 +148,8 @@ def fit_emissivity(
     mixtures = []
     for index, name in enumerate(names):
         curve = responses.curve(response, name)
-        curves.require_range(warm, curve, "object temperature")
-        curves.require_range(cold, curve, "background temperature")
+        require_range(warm, curve, "object temperature")
+        require_range(cold, curve, "background temperature")
         counts = measured["counts"].values[index].astype(np.float64)
         mixtures.append(_contact(curve, counts, (warm, cold), stds, float(noises[index]), bias))
     return fitted(mixtures, names)
@@ -212,7 +213,7 @@ def fitted(mixtures: list[Mixture], names: list[str]) -> xr.Dataset:
 
 
 def _contact(
-    curve: curves.Curve,
+    curve: Curve,
     counts: Array,
     temperatures: tuple[Array, Array],
     stds: Array,

@@ -4,10 +4,11 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import curves, planck
+from dbthermal import planck
 from dbthermal import response as responses
 from dbthermal.calibration._bias import NO_BIAS, Bias
 from dbthermal.calibration._contact import Mixture, check_measurements, fitted
+from dbthermal.response import Curve, require_range
 
 Array = npt.NDArray[np.float64]
 
@@ -75,7 +76,7 @@ def reflector_emissivity(
     mixtures = []
     for index, name in enumerate(names):
         curve = responses.curve(response, name)
-        curves.require_range(warm, curve, "object temperature")
+        require_range(warm, curve, "object temperature")
         counts, foil = (
             measured[part].values[index].astype(np.float64)
             for part in ("counts", "reflected_counts")
@@ -85,7 +86,7 @@ def reflector_emissivity(
 
 
 def _mixture(
-    curve: curves.Curve,
+    curve: Curve,
     counts: tuple[Array, Array],
     warm: Array,
     stds: Array,

@@ -7,7 +7,7 @@ the real drivers `emulated` answers in place of the hardware, and says so:
 - `boson` over `fslp`, `filterwheel` over `apt`: both on the byte streams of `transport`, which
   `dialogue` notes and plays back; `tc08`, with `thermocouple` for type T;
 - `video`: the frames, by V4L2, with their telemetry;
-- `inventory` and `permissions`: what is plugged in, and what stands in the way;
+- `inventory`: what is plugged in, and what stands in the way;
 - `session` of `entries`: what is to be recorded; `devices` opens its `rig`, `protocols` use it;
 - `recording`: how that is written, and opened again.
 

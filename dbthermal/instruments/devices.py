@@ -19,10 +19,9 @@ from dbthermal.instruments.camera import FrameSource, Stream
 from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Picture
 from dbthermal.instruments.emulated.world import ROOM, World
-from dbthermal.instruments.entries import check_one_of
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.rig import Devices, ReadingError, Thermocouples
-from dbthermal.instruments.session import Session
+from dbthermal.instruments.session import Session, check_one_of
 from dbthermal.instruments.tc08 import TC08
 
 __all__ = ["Devices", "ReadingError", "Thermocouples", "emulated_world", "open_devices"]

@@ -1,79 +1,66 @@
-"""What of the rig is plugged in, which node belongs to which device, and what stands in the way.
+"""Devices of the rig on the USB bus: their nodes, and what keeps them from being used.
 
-The bus is only looked at: no configuration is set, nothing is reset, claimed or taken from its
-kernel driver, for the devices may be recording. What a device says of itself is read through pyusb;
-which ``/dev/video*`` and ``/dev/ttyACM*`` belong to it, from Linux's sysfs: both hang below the
-same USB device there, so that two equal cameras are told apart by the ports they are in.
+The bus is only listed, through pyusb, and the serial ports by pyserial: no configuration is set,
+nothing is reset, claimed or detached from its kernel driver, for the devices may be recording. A
+camera's video nodes are those below its USB device in Linux's sysfs, so that two equal cameras are
+distinguished by the ports they are plugged into.
 
-Whether a Boson's USB serial number is always the camera's own is not certain: ask the camera
-itself. Tested against an emulated backend and a written sysfs tree, not against hardware.
+A Boson's USB serial number may not always be the camera's own: ask the camera itself. Tested
+against an emulated backend and a written sysfs tree, not against hardware.
 """
 
 import errno
+import os
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
 import usb.core
 import usb.util
+from serial.tools import list_ports
 
-from dbthermal.instruments import permissions
+__all__ = ["KINDS", "Device", "Kind", "LibusbMissingError", "describe", "find"]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """
-    A device of the rig, as the bus knows it.
-
-    Attributes
-    ----------
-    key, name : str
-        Short name, and that for people.
-    vendor, product : int
-        Its USB identity.
-    nodes : tuple of str
-        Families of nodes that its kernel drivers make: ``"video"``, ``"serial"``.
-    """
+    """Type of device: its USB identity, and the Linux module that makes each family of nodes."""
 
     key: str
     name: str
     vendor: int
     product: int
-    nodes: tuple[str, ...] = ()
+    modules: tuple[tuple[str, str], ...] = ()
 
 
 # 09cb:4007 after FLIR/UVC-Boson and flirpy; 0403:faf0, an FTDI chip with Thorlabs's identity, after
 # Thorlabs/Motion_Control_Examples; 0ce9:1000 after datalogd's documentation.
 KINDS: Final = (
-    Kind("boson", "FLIR Boson", 0x09CB, 0x4007, ("video", "serial")),
-    Kind("apt", "Thorlabs APT controller", 0x0403, 0xFAF0, ("serial",)),
+    Kind("boson", "FLIR Boson", 0x09CB, 0x4007, (("video", "uvcvideo"), ("serial", "cdc_acm"))),
+    Kind("apt", "Thorlabs APT controller", 0x0403, 0xFAF0, (("serial", "ftdi_sio"),)),
     Kind("tc08", "Pico TC-08", 0x0CE9, 0x1000),
 )
-"""The devices that are looked for."""
+"""Types of devices that are looked for."""
 
 SPEEDS: Final = MappingProxyType({1: "low", 2: "full", 3: "high", 4: "super", 5: "super plus"})
 """Name of each speed of libusb: 1.5, 12, 480, 5000 and 10000 Mbit/s."""
 
 HIGH_SPEED_PAYLOAD: Final = 13 * 512 * 8 * 8000
-"""Most that a high-speed bus carries [bit/s]: 13 bulk packets of 512 bytes in 125 us.
+"""Largest data rate of a high-speed bus [bit/s]: 13 bulk packets of 512 bytes in 125 us.
 
 Universal Serial Bus Specification 2.0, table 5-10.
 """
 
-SLOW: Final = 30.0
-"""The slower of the two frame rates that a Boson offers over USB [Hz]."""
-
-MODULES: Final = MappingProxyType(
-    {("boson", "video"): "uvcvideo", ("boson", "serial"): "cdc_acm", ("apt", "serial"): "ftdi_sio"}
-)
-"""Linux module that makes the nodes of a kind and family; an old ftdi_sio is told of 0403:faf0."""
+PIXELS: Final = 640 * 512  # of a frame, 16 bits each
+SLOW: Final = 30.0  # [Hz] lower of the two frame rates that a Boson offers over USB
+RULES: Final = "/etc/udev/rules.d/70-dbthermal.rules"  # below 73, or ``uaccess`` comes too late
 
 
 class LibusbMissingError(RuntimeError):
-    """There is no libusb, without which pyusb sees nothing."""
+    """No libusb is installed, without which pyusb lists nothing."""
 
 
 @dataclass(frozen=True)
@@ -84,33 +71,29 @@ class Device:
     Attributes
     ----------
     kind : Kind
-        What it is.
-    bus, address : int
-        Where it is; the address is new each time it is plugged in.
+        Its type.
+    bus : int
+        Number of its bus.
     ports : tuple of int
-        Port of each hub on the way, the root's first; stays the same.
+        Port of each hub on the way, the root's first.
     speed : str
         One of `SPEEDS`, or ``"unknown"``.
-    serial : str, optional
-        Its USB serial number; from sysfs where the device itself may not be opened.
+    serial : str or None
+        USB serial number; from its serial port where the device itself may not be opened.
     video_nodes, serial_nodes : tuple of str
-        ``/dev/video0``, ``/dev/ttyACM0``. A camera has several of the former, one for pictures.
+        ``/dev/video0``, ``/dev/ttyACM0``. A camera has several video nodes, one with images.
     warnings : tuple of str
-        What stands in the way, each with what to do.
-    is_simulated : bool
-        True on an emulated backend.
+        Obstacles to its use, each with the remedy.
     """
 
     kind: Kind
     bus: int
-    address: int
     ports: tuple[int, ...]
     speed: str
     serial: str | None = None
     video_nodes: tuple[str, ...] = ()
     serial_nodes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = field(default=())
-    is_simulated: bool = False
+    warnings: tuple[str, ...] = ()
 
     @property
     def path(self) -> str:
@@ -118,47 +101,31 @@ class Device:
         return f"{self.bus}-{'.'.join(str(port) for port in self.ports)}"
 
     def warned(self, *warnings: str | None) -> "Device":
-        """Return it with more warnings; None is none."""
+        """Device with further warnings; None is skipped."""
         return replace(self, warnings=(*self.warnings, *(text for text in warnings if text)))
-
-
-def video_rate(frame_rate: float, width: int = 640, height: int = 512) -> float:
-    """
-    Data rate of a camera's 16-bit video.
-
-    Parameters
-    ----------
-    frame_rate : float
-        Frame rate [Hz].
-    width, height : int
-        Size of a frame [pixel].
-
-    Returns
-    -------
-    float
-        Rate [bit/s], without what the bus adds: 314.6e6 at 640 x 512 and 60 Hz.
-    """
-    return 16.0 * width * height * frame_rate
 
 
 def find(
     backend: Any = None,
     *,
+    serial_ports: Iterable[Any] | None = None,
     sysfs: Path = Path("/sys"),
     dev: Path = Path("/dev"),
     frame_rate: float = 60.0,
 ) -> list[Device]:
     """
-    Look for the devices of the rig.
+    List the rig's devices that are plugged in.
 
     Parameters
     ----------
     backend : IBackend, optional
-        Of pyusb; without it, the libusb that is installed.
+        Backend of pyusb; by default the libusb that is installed.
+    serial_ports : iterable of ListPortInfo, optional
+        Serial ports; by default those that pyserial lists.
     sysfs, dev : Path
-        Where Linux keeps its devices and nodes; tests have their own.
+        Linux's trees of devices and nodes; replaced in tests.
     frame_rate : float
-        At which the cameras are to run [Hz], for the bandwidth.
+        Frame rate of the cameras [Hz], for the bandwidth.
 
     Returns
     -------
@@ -168,43 +135,32 @@ def find(
     Raises
     ------
     LibusbMissingError
-        If no backend is given and there is no libusb.
+        If no backend is given and no libusb is installed.
     usb.core.USBError
         If the bus itself cannot be listed.
     """
-    found = []
+    terminals = list(list_ports.comports() if serial_ports is None else serial_ports)
+    devices = []
     for kind in KINDS:
-        devices = [_device(kind, raw, sysfs, dev) for raw in _enumerate(backend, kind)]
-        found += sorted(devices, key=lambda device: (device.bus, device.ports))
-    is_simulated = bool(getattr(backend, "is_simulated", False))
-    found = [replace(device, is_simulated=is_simulated) for device in found]
-    cameras = [device for device in found if device.kind.key == "boson"]
-    return [_with_bandwidth(device, cameras, frame_rate) for device in found]
+        of_kind = [_device(kind, raw, terminals, sysfs, dev) for raw in _enumerate(backend, kind)]
+        devices += sorted(of_kind, key=lambda device: (device.bus, device.ports))
+    cameras = [device for device in devices if device.kind.key == "boson"]
+    return [
+        device.warned(_bandwidth(device, cameras, frame_rate)) if device in cameras else device
+        for device in devices
+    ]
 
 
 def describe(devices: Iterable[Device]) -> str:
-    """
-    Say in words what was found, what is missing and what to do.
-
-    Parameters
-    ----------
-    devices : iterable of Device
-        From `find`.
-
-    Returns
-    -------
-    str
-        A line for each device, warnings below it, and one for each kind that is not there.
-    """
-    known = list(devices)
+    """Text with a line for each device, its warnings below it, and one for each missing kind."""
+    listed = list(devices)
     lines = []
     for kind in KINDS:
-        of_kind = [device for device in known if device.kind == kind]
+        of_kind = [device for device in listed if device.kind == kind]
         for device in of_kind:
             nodes = " ".join((*device.video_nodes, *device.serial_nodes)) or "no nodes"
-            name = f"{'emulated ' if device.is_simulated else ''}{kind.name}"
             serial = device.serial or "without serial number"
-            lines.append(f"{name} {serial}: {device.path}, {device.speed} speed, {nodes}")
+            lines.append(f"{kind.name} {serial}: {device.path}, {device.speed} speed, {nodes}")
             lines += [f"  ! {warning}" for warning in device.warnings]
         if not of_kind:
             usb_id = f"{kind.vendor:04x}:{kind.product:04x}"
@@ -216,10 +172,10 @@ def describe(devices: Iterable[Device]) -> str:
 
 
 def _enumerate(backend: Any, kind: Kind) -> Iterator[Any]:
-    """List pyusb's devices of one kind."""
-    wanted = {"idVendor": kind.vendor, "idProduct": kind.product}
+    """Yield pyusb's devices of one kind."""
+    identity = {"idVendor": kind.vendor, "idProduct": kind.product}
     try:
-        yield from usb.core.find(find_all=True, backend=backend, **wanted)
+        yield from usb.core.find(find_all=True, backend=backend, **identity)
     except usb.core.NoBackendError as error:
         raise LibusbMissingError(
             "No libusb found. Must be installed to see USB devices: "
@@ -227,42 +183,33 @@ def _enumerate(backend: Any, kind: Kind) -> Iterator[Any]:
         ) from error
 
 
-def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
-    """Say all of one device that it, and sysfs, know."""
+def _device(kind: Kind, raw: Any, terminals: list[Any], sysfs: Path, dev: Path) -> Device:
+    """Device of the bus with its nodes and with what stands in the way of their use."""
     ports = tuple(raw.port_numbers or ())
-    device = Device(kind, raw.bus, raw.address, ports, SPEEDS.get(raw.speed, "unknown"))
+    device = Device(kind, raw.bus, ports, SPEEDS.get(raw.speed, "unknown"))
     serial, problem = _serial_number(kind, raw)
-    folder = sysfs / "bus" / "usb" / "devices" / device.path
-    if not ports or not folder.is_dir():
-        return replace(device, serial=serial).warned(
-            problem, f"Its nodes are not known: there is no {folder}." if kind.nodes else None
-        )
-    serial = _written(folder / "serial") if serial is None else serial
-    video = _nodes(dev, folder.glob("*:*/video4linux/video*"))
-    tty = _nodes(dev, [*folder.glob("*:*/tty/tty*"), *folder.glob("*:*/ttyUSB*/tty/tty*")])
-    device = replace(device, serial=serial, video_nodes=video, serial_nodes=tty)
-    families = {"video": video, "serial": tty}
-    lacking = [_lacking(kind, name) for name in kind.nodes if not families[name]]
-    denied = permissions.denied_nodes([*video, *tty], kind.vendor, kind.product)
-    if problem == permissions.denied_device(kind.vendor, kind.product) and serial and kind.nodes:
-        problem = None  # its number is known from sysfs, and its drivers open its nodes
-    return device.warned(problem, *lacking, *denied)
-
-
-def _lacking(kind: Kind, family: str) -> str:
-    """Say what to do for nodes that no kernel driver made."""
-    module = MODULES[kind.key, family]
-    text = f"It has no {family} node. Must have its kernel driver: run 'sudo modprobe {module}'"
-    if module != "ftdi_sio":
-        return f"{text}."
-    return (
-        f"{text}, and if there is still none, 'echo {kind.vendor:04x} {kind.product:04x} | "
-        "sudo tee /sys/bus/usb-serial/drivers/ftdi_sio/new_id'."
+    # A port's location is that of its device, or of one of the device's interfaces: 1-2.4:1.2.
+    tty = [port for port in terminals if (port.location or "").split(":")[0] == device.path]
+    entries = (sysfs / "bus" / "usb" / "devices" / device.path).glob("*:*/video4linux/video*")
+    nodes = {
+        "video": _ordered(str(dev / entry.name) for entry in entries),
+        "serial": _ordered(port.device for port in tty),
+    }
+    if serial is None and tty:
+        serial = tty[0].serial_number
+        if serial and problem == _denied_device(kind):
+            problem = None  # its serial number is known, and its kernel drivers open its nodes
+    missing = [_missing(kind, name, module) for name, module in kind.modules if not nodes[name]]
+    if missing and not sysfs.is_dir():
+        missing = [f"Its nodes are not known: there is no {sysfs}."]
+    device = replace(
+        device, serial=serial, video_nodes=nodes["video"], serial_nodes=nodes["serial"]
     )
+    return device.warned(problem, *missing, *_denied_nodes(kind, device))
 
 
 def _serial_number(kind: Kind, raw: Any) -> tuple[str | None, str | None]:
-    """Read the serial number; where that fails, say why."""
+    """Serial number of a device, and the reason if it cannot be read."""
     if not raw.iSerialNumber:
         return None, None
     try:
@@ -280,50 +227,103 @@ def _serial_number(kind: Kind, raw: Any) -> tuple[str | None, str | None]:
         usb.util.dispose_resources(raw)
 
 
-def _problem(kind: Kind, error: Exception) -> str:
-    """Say what an error of the bus means, and what to do."""
-    number = getattr(error, "errno", None)
-    if number in {errno.EACCES, errno.EPERM}:
-        return permissions.denied_device(kind.vendor, kind.product)
-    if number in {errno.ENODEV, errno.ENOENT}:
+def _problem(kind: Kind, error: Any) -> str:
+    """Meaning of an error of the bus, and the remedy."""
+    if error.errno in {errno.EACCES, errno.EPERM}:
+        return _denied_device(kind)
+    if error.errno in {errno.ENODEV, errno.ENOENT}:
         return "It was unplugged while it was looked at."
     return f"It does not answer: {error}. Plug it in again."
 
 
-def _written(entry: Path) -> str | None:
-    """Text of an entry of sysfs; None if there is none, as of a device that was just pulled out."""
-    try:
-        return entry.read_text(encoding="utf-8", errors="backslashreplace").strip()
-    except OSError:
-        return None
+def _ordered(nodes: Iterable[str]) -> tuple[str, ...]:
+    """Nodes in the order of their numbers."""
+    return tuple(sorted(nodes, key=lambda node: (len(re.sub(r"\D", "", node)), node)))
 
 
-def _nodes(dev: Path, entries: Iterable[Path]) -> tuple[str, ...]:
-    """Give the nodes of sysfs entries, in the order of their numbers."""
-    names = {entry.name for entry in entries}
-    ordered = sorted(names, key=lambda name: (len(re.sub(r"\D", "", name)), name))
-    return tuple(str(dev / name) for name in ordered)
+def _missing(kind: Kind, family: str, module: str) -> str:
+    """Advice for nodes that no kernel driver made; an old ftdi_sio does not know 0403:faf0."""
+    text = f"It has no {family} node. Must have its kernel driver: run 'sudo modprobe {module}'"
+    if module != "ftdi_sio":
+        return f"{text}."
+    return (
+        f"{text}, and if there is still none, 'echo {kind.vendor:04x} {kind.product:04x} | "
+        "sudo tee /sys/bus/usb-serial/drivers/ftdi_sio/new_id'."
+    )
 
 
-def _with_bandwidth(device: Device, cameras: list[Device], frame_rate: float) -> Device:
-    """Warn if a camera's video does not fit the bus, alone or with the others on it."""
-    if device.kind.key != "boson":
-        return device
-    one = video_rate(frame_rate) / 1e6
+def _bandwidth(device: Device, cameras: list[Device], frame_rate: float) -> str | None:
+    """Warning if a camera's video does not fit its bus, alone or with the others on it."""
+    rate = 16e-6 * PIXELS * frame_rate  # [Mbit/s]
     if device.speed in {"low", "full"}:
-        return device.warned(
-            f"It runs at {device.speed} speed, and {frame_rate:g} frames/s take {one:.1f} Mbit/s. "
+        return (
+            f"It runs at {device.speed} speed, and {frame_rate:g} frames/s take {rate:.1f} Mbit/s. "
             "Must be at high speed: use another port or cable."
         )
     same = [camera for camera in cameras if (camera.bus, camera.speed) == (device.bus, "high")]
-    total, most = one * len(same), HIGH_SPEED_PAYLOAD / 1e6
-    if device not in same or total <= most:
-        return device
+    total, limit = rate * len(same), HIGH_SPEED_PAYLOAD / 1e6
+    if device not in same or total <= limit:
+        return None
     together = len({camera.ports[:1] for camera in same}) == 1
     how = "and the root port" if together else "though not the root port (ask the controller)"
     others = ", ".join(str(camera.serial) for camera in same if camera is not device) or "no other"
-    return device.warned(
+    return (
         f"It shares bus {device.bus} {how} with {others}: {total:.1f} Mbit/s at {frame_rate:g} "
-        f"frames/s, of {most:.1f} Mbit/s at most. Use ports of two controllers, or "
+        f"frames/s, of {limit:.1f} Mbit/s at most. Use ports of two controllers, or "
         f"{SLOW:g} frames/s: {total * SLOW / frame_rate:.1f} Mbit/s."
     )
+
+
+def _denied_device(kind: Kind) -> str:
+    """Advice for a device that may not be opened on the bus."""
+    return f"No permission to open it. {_udev_advice(kind, 'usb')}"
+
+
+def _denied_nodes(kind: Kind, device: Device) -> list[str]:
+    """Advice for nodes that may not be read and written, once for each group or rule."""
+    families = {"video4linux": device.video_nodes, "tty": device.serial_nodes}
+    advice: dict[str, list[str]] = {}
+    for subsystem, nodes in families.items():
+        for node in (Path(node) for node in nodes):
+            if node.exists() and not os.access(node, os.R_OK | os.W_OK):
+                advice.setdefault(_node_advice(kind, subsystem, node), []).append(str(node))
+    return [f"No permission for {', '.join(names)}. {text}" for text, names in advice.items()]
+
+
+def _node_advice(kind: Kind, subsystem: str, node: Path) -> str:
+    """Group to join, where that helps, but never root; else the udev rule."""
+    status = _stat(node)
+    try:
+        group = node.group()
+    except KeyError:  # it has no name on this system
+        group = str(status.st_gid)
+    if status.st_mode & 0o060 != 0o060 or status.st_gid == 0:  # the group may not read and write
+        return _udev_advice(kind, subsystem)
+    if status.st_gid in os.getgroups():
+        return f"Its group '{group}' is yours, yet it is kept from you: are devices passed on here?"
+    return (
+        f"Must be in its group '{group}': run 'sudo usermod -aG {group} $USER', log in again, and "
+        "start the notebook server anew."
+    )
+
+
+def _stat(node: Path) -> os.stat_result:
+    return node.stat()
+
+
+def _udev_advice(kind: Kind, subsystem: str) -> str:
+    """Line to type: a rule that admits the user at the machine, and the group plugdev."""
+    matched = "ATTR" if subsystem == "usb" else "ATTRS"  # of itself, or of a parent device
+    rule = (
+        f'SUBSYSTEM=="{subsystem}", {matched}{{idVendor}}=="{kind.vendor:04x}", '
+        f'{matched}{{idProduct}}=="{kind.product:04x}", MODE="0660", GROUP="plugdev", '
+        'TAG+="uaccess"'
+    )
+    return (
+        f"Type this, and plug it in again: echo '{rule}' | sudo tee -a {RULES} "
+        "&& sudo udevadm control --reload"
+    )
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -18,7 +18,7 @@ from dbthermal.instruments.boson.commands import Ir16Mode, Setting, Switch, Tele
 from dbthermal.instruments.camera import FfcMode, FrameFlag, FrameSource, NoFrameError
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
-from dbthermal.instruments.recording.fetching import Reading
+from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 
@@ -135,7 +135,7 @@ class Devices:
 
     def readings(self) -> dict[str, Reading]:
         """
-        What is asked beside the frames, for `dbthermal.instruments.recording.record.record`.
+        What is asked beside the frames, for `dbthermal.instruments.recording.record`.
 
         Returns
         -------

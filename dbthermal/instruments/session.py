@@ -1,4 +1,4 @@
-"""A session: what is recorded, with which devices, described in one YAML file.
+"""A recording session: cameras, wheel, thermocouples and procedure, described in one YAML file.
 
 One key, ``simulated``, switches the whole rig; every device has an address for either case::
 
@@ -15,7 +15,7 @@ One key, ``simulated``, switches the whole rig; every device has an address for 
         control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
       "9.5":
         video: {simulated: "sim://camera/narrow", hardware: "v4l2:///dev/video2"}
-    devices:                   # whatever else there is
+    devices:                   # whatever else is connected
       filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
       thermocouples: {simulated: "sim://tc08", hardware: "tc08:"}
     filters: {1: "9.5", 2: "11"}
@@ -29,144 +29,139 @@ band is one of the filters is the one behind the wheel.
 """
 
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict, field
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Annotated, Any, Final, Literal, Self
 
-from dbthermal.instruments.entries import (
-    Blackbody,
-    Camera,
-    Device,
-    check_one_of,
-    check_positive,
-    check_unique,
-    known,
-    mapping,
-    read_yaml,
+import yaml
+from pydantic import (
+    ConfigDict,
+    Field,
+    StrictBool,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
 )
+from pydantic.dataclasses import dataclass
 
-__all__ = ["CHANNELS", "DEVICES", "PROTOCOLS", "SLOTS", "Blackbody", "Camera", "Device", "Session"]
+__all__ = ["Blackbody", "Camera", "Device", "Session"]
 
-PROTOCOLS: Final = ("gain_offset", "response", "emissivity_bench", "scene")
-"""What a session is for; all but `scene` go through the blackbody's temperatures."""
+_CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
-DEVICES: Final = ("filter_wheel", "thermocouples")
-"""What there may be beside the cameras."""
-
-CHANNELS: Final = range(1, 9)
-"""Channels of the thermocouple logger."""
-
-SLOTS: Final = range(1, 7)
-"""Slots of the filter wheel."""
-
-TELEMETRY_ROWS: Final = (0, 2)
-"""Rows of telemetry that a camera may give over USB."""
-
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(strict=True, gt=0)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+Slot = Annotated[int, Field(strict=True, ge=1, le=6)]
+Channel = Annotated[int, Field(strict=True, ge=1, le=8)]
+DeviceName = Literal["filter_wheel", "thermocouples"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=_CHECKED)
+class Device:
+    """Addresses of one device, such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``."""
+
+    simulated: str
+    hardware: str
+
+    @field_validator("simulated", "hardware")
+    @classmethod
+    def _check_kind(cls, address: str, info: ValidationInfo) -> str:
+        is_simulated = info.field_name == "simulated"
+        if address.startswith(("sim:", "pty:")) != is_simulated:
+            rule = "begin" if is_simulated else "not begin"
+            raise ValueError(f"Must {rule} with sim: or pty:")
+        return address
+
+
+@dataclass(frozen=True, config=_CHECKED)
+class Camera:
+    """Addresses of one camera's frames and of its command port, if it has one."""
+
+    video: Device
+    control: Device | None = None
+
+
+@dataclass(frozen=True, config=_CHECKED)
+class Blackbody:
+    """Temperatures of a calibration, and the rule by which each counts as reached."""
+
+    temperatures: Annotated[tuple[Positive, ...], Field(min_length=1)]  # in their order [K]
+    stability: Positive = 0.05  # largest range of the readings in the window [K]
+    window: Positive = 30.0  # how long the readings must stay within it [s]
+    # Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
+    # by half a kelvin or so each, and the recordings keep the reading.
+    tolerance: Positive = 1.5
+    timeout: Positive = 1800.0  # longest wait for it [s]
+
+
+@dataclass(frozen=True, config=_CHECKED)
 class Session:
     """
-    What is recorded, and with what.
+    Description of a recording: devices, procedure and duration; see the module.
 
-    Attributes
-    ----------
-    name : str
-        Of the session.
-    simulated : bool
-        Whether the rig is emulated: one switch for all devices.
-    protocol : str
-        One of `PROTOCOLS`.
-    duration : float
-        Of the recording, or of each of its steps [s].
-    cameras : mapping
-        Band to `Camera`; the order of the bands is that of the recording.
-    frame_rate : float
-        [Hz].
-    shape : tuple of int
-        Rows and columns [pixel].
-    telemetry_rows : int
-        Rows of telemetry besides.
-    devices : mapping
-        Name, of `DEVICES`, to `Device`.
-    filters : mapping
-        Slot of the wheel to band.
-    wheel : mapping
-        What differs from `dbthermal.instruments.filterwheel.Settings` in this wheel.
-    sweep : tuple of str
-        Filters that the wheel goes through at each temperature; see `swept`.
-    thermocouples : mapping
-        Channel to what it measures.
-    blackbody : Blackbody or None
-        Steps of a calibration.
+    All protocols but ``scene`` go through the blackbody's temperatures. Invalid values raise
+    pydantic's ValidationError, a ValueError.
+
+    Examples
+    --------
+    >>> video = Device("sim://camera/wide", "v4l2:///dev/video0")
+    >>> Session("pot", True, "scene", 60.0, {"8-14": Camera(video)}).bands
+    ('8-14',)
     """
 
-    name: str
-    simulated: bool
-    protocol: str
-    duration: float
-    cameras: Mapping[str, Camera]
-    frame_rate: float = 60.0
-    shape: tuple[int, int] = (512, 640)
-    telemetry_rows: int = 0
-    devices: Mapping[str, Device] = field(default_factory=dict)
-    filters: Mapping[int, str] = field(default_factory=dict)
-    wheel: Mapping[str, Any] = field(default_factory=dict)
-    sweep: tuple[str, ...] = ()
-    thermocouples: Mapping[int, str] = field(default_factory=dict)
+    name: Name  # of the recordings, too
+    simulated: StrictBool  # one switch for all devices
+    protocol: Literal["gain_offset", "response", "emissivity_bench", "scene"]
+    duration: Positive  # of the recording, or of each of its steps [s]
+    cameras: Annotated[dict[Name, Camera], Field(min_length=1)]  # by band, in recording order
+    frame_rate: Positive = 60.0  # [Hz]
+    shape: tuple[Count, Count] = (512, 640)  # rows, columns
+    telemetry_rows: Literal[0, 2] = 0
+    devices: dict[DeviceName, Device] = field(default_factory=dict)
+    filters: dict[Slot, Name] = field(default_factory=dict)  # slot of the wheel to band
+    wheel: dict[str, Any] = field(default_factory=dict)  # see `filterwheel.Settings`
+    sweep: tuple[Name, ...] = ()  # filters at each temperature; see `swept`
+    thermocouples: dict[Channel, str] = field(default_factory=dict)  # channel to measured object
     blackbody: Blackbody | None = None
 
-    def __post_init__(self) -> None:
-        if self.protocol not in PROTOCOLS:
-            raise ValueError(
-                f"Unknown protocol '{self.protocol}'. Must be one of {list(PROTOCOLS)}."
-            )
-        if not isinstance(self.simulated, bool):
-            raise TypeError(f"Invalid simulated {self.simulated!r}. Must be true or false.")
-        if not self.cameras:
-            raise ValueError(f"Invalid session '{self.name}' without cameras. Must have one.")
-        for name in (self.name, *self.bands, *self.filters.values()):
-            if not _NAME.fullmatch(name):
-                raise ValueError(
-                    f"Invalid name '{name}'. Must be fit for a file: '{_NAME.pattern}'."
-                )
-        check_positive("duration", self.duration)
-        check_positive("frame_rate", self.frame_rate)
+    @model_validator(mode="after")
+    def _check_protocol(self) -> Self:
         if (self.protocol == "scene") != (self.blackbody is None):
             rule = "no blackbody" if self.protocol == "scene" else "a blackbody"
-            raise ValueError(f"Invalid session of protocol '{self.protocol}'. Must have {rule}.")
+            raise ValueError(f"Invalid session of protocol '{self.protocol}'. Must have {rule}")
         if self.blackbody is not None and self.protocol != "emissivity_bench":
-            check_unique("temperature [K]", self.blackbody.temperatures)
-        check_one_of("telemetry_rows", [self.telemetry_rows], TELEMETRY_ROWS)
-        check_one_of("device", self.devices, DEVICES)
-        self._check_thermocouples()
-        self._check_wheel()
+            _check_unique("temperature [K]", self.blackbody.temperatures)
+        return self
 
-    def _check_thermocouples(self) -> None:
-        names = [*self.thermocouples.values(), *DEVICES]
-        check_one_of("channel of a thermocouple", self.thermocouples, CHANNELS)
+    @model_validator(mode="after")
+    def _check_thermocouples(self) -> Self:
+        # The readings of a recording have one name each: of the cameras and the wheel, too.
+        names = [*self.thermocouples.values(), "filter_wheel", "thermocouples"]
         for band in dict.fromkeys((*self.bands, *self.filters.values())):
-            names += [band, f"fpa {band}", f"ffc {band}"]  # what a recording knows besides
-        check_unique("thermocouple", names)
+            names += [band, f"fpa {band}", f"ffc {band}"]
+        _check_unique("thermocouple", names)
         self._require("thermocouples", self.thermocouples)
+        return self
 
-    def _check_wheel(self) -> None:
-        check_one_of("slot of a filter", self.filters, SLOTS)
-        check_unique("filter", self.filters.values())
+    @model_validator(mode="after")
+    def _check_wheel(self) -> Self:
+        _check_unique("filter", self.filters.values())
         self._require("filter_wheel", self.filters)
         behind = [band for band in self.bands if band in self.filters.values()]
         if self.filters and len(behind) != 1:
-            raise ValueError(f"Invalid cameras {behind} behind the wheel. Must be exactly one.")
+            raise ValueError(f"Invalid cameras {behind} behind the wheel. Must be exactly one")
         check_one_of("filter of the sweep", self.sweep, tuple(self.filters.values()))
-        check_unique("filter of the sweep", self.sweep)
+        _check_unique("filter of the sweep", self.sweep)
         if self.sweep and self.blackbody is None:
-            raise ValueError(f"Invalid sweep {list(self.sweep)}. Must have a blackbody.")
+            raise ValueError(f"Invalid sweep {list(self.sweep)}. Must have a blackbody")
+        return self
 
-    def _require(self, device: str, entries: Mapping[int, str]) -> None:
+    def _require(self, device: DeviceName, entries: Mapping[int, str]) -> None:
         if entries and device not in self.devices:
-            raise ValueError(f"Missing device '{device}' of {dict(entries)}. Must be given.")
+            raise ValueError(f"Missing device '{device}' of {dict(entries)}. Must be listed")
 
     @property
     def bands(self) -> tuple[str, ...]:
@@ -181,70 +176,32 @@ class Session:
 
     @property
     def swept(self) -> tuple[str, ...]:
-        """Filters that are recorded at each temperature: `sweep`, or the camera's own."""
+        """Filters that are recorded at each temperature: `sweep`, or the one of the camera."""
         return self.sweep or (() if self.filtered is None else (self.filtered,))
 
     def url(self, device: Device) -> str:
-        """
-        Address of a device in this session.
-
-        Parameters
-        ----------
-        device : Device
-            One of its devices.
-
-        Returns
-        -------
-        str
-            The simulated one, or the hardware's.
-        """
+        """Address of a device in this session: the simulated one, or the hardware's."""
         return device.simulated if self.simulated else device.hardware
 
     def content(self) -> dict[str, Any]:
-        """
-        What the session says, for the record of a recording.
-
-        Returns
-        -------
-        dict
-            JSON; keys that are numbers become text.
-        """
+        """Content of the session for the attributes of a recording, JSON."""
         return asdict(self)
 
     @classmethod
     def from_yaml(cls, text: str) -> Self:
-        """
-        Read a session.
-
-        Parameters
-        ----------
-        text : str
-            YAML; see the module.
-
-        Returns
-        -------
-        Session
-            Checked.
-
-        Raises
-        ------
-        ValueError
-            If it is no YAML, a key is missing or unknown, or a value is invalid.
-        TypeError
-            If a value is of another type.
-        """
-        return cls._of(read_yaml(text, "session"))
+        """Read a session from YAML, see the module; ValueError as from `load`."""
+        return cls._checked(_read_yaml(text, "session"), {}, "session")
 
     @classmethod
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
         """
-        Read a session from a file, and the file that it names as its ``rig``.
+        Read a session from a file, and from the file that it names as its ``rig``.
 
         Parameters
         ----------
         path : str or Path
-            YAML; see the module. What several sessions share, such as the addresses, may stand in a
-            file of its own, whose name is the key ``rig``, relative to this one.
+            YAML; see the module. Keys that several sessions share, such as the addresses, may stand
+            in a file of their own, whose name is the key ``rig``, relative to this one.
         changes : mapping, optional
             Values in place of those in the files, by key; of ``blackbody``, key by key.
 
@@ -256,51 +213,71 @@ class Session:
         Raises
         ------
         FileNotFoundError
-            If there is no such file.
-        TypeError, ValueError
-            As `from_yaml`, or if a key is in both files.
+            If a file does not exist.
+        ValueError
+            If it is not YAML, a key is missing, unknown or in both files, or a value is invalid:
+            the message has the file, the place in it, the value and the rule.
         """
-        own = read_yaml(Path(path).read_text(encoding="utf-8"), "session")
-        if "rig" in own:
-            place = Path(path).parent / str(own.pop("rig"))
-            shared = read_yaml(place.read_text(encoding="utf-8"), "rig")
-            check_unique("key of session and rig", [*map(str, own), *map(str, shared)])
-            own = {**shared, **own}
-        changed = {**own, **(changes or {})}
-        if changes and "blackbody" in changes and "blackbody" in own:
-            changed["blackbody"] = {**own["blackbody"], **changes["blackbody"]}
-        return cls._of(changed)
+        content = _read_yaml(Path(path).read_text(encoding="utf-8"), str(path))
+        files = {}
+        if "rig" in content:
+            rig = Path(path).parent / str(content.pop("rig"))
+            shared = _read_yaml(rig.read_text(encoding="utf-8"), str(rig))
+            _check_unique("key of session and rig", [*map(str, content), *map(str, shared)])
+            files = dict.fromkeys(shared, str(rig))
+            content = {**shared, **content}
+        changed = {**content, **(changes or {})}
+        if changes and "blackbody" in changes and "blackbody" in content:
+            changed["blackbody"] = {**content["blackbody"], **changes["blackbody"]}
+        return cls._checked(changed, files, str(path))
 
     @classmethod
-    def _of(cls, content: Mapping[Any, Any]) -> Self:
-        values = known(content, cls, "session")
-        values["cameras"] = {
-            str(band): _camera(camera, f"camera '{band}'")
-            for band, camera in mapping(values["cameras"], "cameras").items()
-        }
-        values["devices"] = {
-            str(name): Device(**known(device, Device, f"device '{name}'"))
-            for name, device in mapping(values.get("devices", {}), "devices").items()
-        }
-        if "shape" in values:
-            values["shape"] = tuple(values["shape"])
-        values["sweep"] = tuple(str(band) for band in values.get("sweep", ()))
-        for name in ("filters", "thermocouples"):
-            content = mapping(values.get(name, {}), name)
-            values[name] = {number: str(text) for number, text in content.items()}
-        if values.get("blackbody") is not None:
-            steps = known(values["blackbody"], Blackbody, "blackbody")
-            values["blackbody"] = Blackbody(
-                **{**steps, "temperatures": tuple(steps["temperatures"])}
-            )
-        return cls(**values)
+    def _checked(cls, content: Any, files: Mapping[str, str], path: str) -> Self:
+        """Session of a YAML content; `files` has the file of each key that is not from `path`."""
+        try:
+            session: Self = TypeAdapter(cls).validate_python(content)
+        except ValidationError as error:
+            told = [
+                f"{files.get(str(one['loc'][0]), path) if one['loc'] else path}: {_message(one)}"
+                for one in error.errors()
+            ]
+            raise ValueError("\n".join(told)) from None
+        return session
 
 
-def _camera(content: Any, what: str) -> Camera:
-    values = known(content, Camera, what)
-    return Camera(
-        **{
-            name: Device(**known(device, Device, f"{name} of {what}"))
-            for name, device in values.items()
-        }
-    )
+def check_one_of(name: str, values: Iterable[Any], allowed: Collection[Any]) -> None:
+    """Raise ValueError if one of the values is not allowed."""
+    for value in values:
+        if isinstance(value, bool) or value not in allowed:
+            raise ValueError(f"Invalid {name} {value!r}. Must be one of {list(allowed)}")
+
+
+def _check_unique(name: str, values: Iterable[Any]) -> None:
+    names = list(values)
+    for value in names:
+        if names.count(value) > 1:
+            raise ValueError(f"Repeated {name} '{value}'. Must be listed once")
+
+
+def _read_yaml(text: str, file: str) -> dict[Any, Any]:
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{file}: Must be YAML: {error}.") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{file}: Invalid content {content!r}. Must be a mapping.")
+    return content
+
+
+def _message(error: Any) -> str:
+    """One error of pydantic as a sentence: place, value and rule."""
+    place = ".".join(str(part) for part in error["loc"] if part != "[key]")
+    if error["type"] == "missing":
+        return f"Missing '{place}'. Must be given."
+    if error["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
+        return f"Unknown key '{place}'. Must be one of those in dbthermal.instruments.session."
+    rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"])
+    if not place:
+        return f"{rule}."
+    rule = rule if rule.startswith("Must ") else f"Must {rule}"
+    return f"Invalid {place} {error['input']!r}. {rule}."

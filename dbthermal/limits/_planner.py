@@ -1,9 +1,9 @@
-"""What accuracy to expect of a recording before it is made, and which filter to make it with."""
+"""Accuracy to expect of a capture before it is recorded, and the filter to record it with."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,18 +11,224 @@ import xarray as xr
 
 from dbthermal import mixing, planck, schema
 from dbthermal.bands import FILTERS, Band
-from dbthermal.limits._deviations import Truth, deviations, orders
-from dbthermal.limits._recording import Recording
-
-Array = npt.NDArray[np.float64]
+from dbthermal.limits._fisher import Array, Truth, deviations, smallest_order
 
 NO_FILTER: Final = "none"
-"""The best filter of a material whose temperature none of them tells."""
+"""Best filter of a material whose temperature no filter determines."""
+
+# Time constant of the object's warming, as a share of the capture.
+_TIME_CONSTANT: Final = 1.0 / 3.0
+
+
+@dataclass(frozen=True)
+class CaptureDesign:
+    r"""
+    Capture conditions: a warming object before a background of regular pulses.
+
+    The object warms exponentially, with a time constant of a third of the capture. The background
+    rests, then is warmer for the end of each period, as if someone stood there; the standard
+    deviation of its rapid change is :math:`A \sqrt{d (1 - d)}` with A the amplitude and
+    d = duration / period.
+
+    Attributes
+    ----------
+    seconds : float
+        Length [s].
+    rate : float
+        Frame rate [1/s].
+    start, span : float
+        First temperature of the object, and its rise until the last frame [K].
+    level : float
+        Temperature of the background at rest [K].
+    amplitude : float
+        Height of a pulse [K].
+    period, duration : float
+        From pulse to pulse, and of one pulse [s].
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, or not positive (all but `span` and `amplitude`), a pulse is
+        longer than the period, or there are fewer than two frames.
+    """
+
+    seconds: float = 35.0
+    rate: float = 10.0
+    start: float = 293.15
+    span: float = 25.0
+    level: float = 295.15
+    amplitude: float = 3.0
+    period: float = 5.0
+    duration: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse conditions that are no capture."""
+        for name in ("seconds", "rate", "start", "level", "period", "duration"):
+            planck.require_positive(name, getattr(self, name))
+        for name in ("span", "amplitude"):
+            if not np.isfinite(getattr(self, name)):
+                raise ValueError(f"Invalid {name} {getattr(self, name)} K. Must be finite.")
+        if self.duration > self.period:
+            raise ValueError(
+                f"Invalid duration {self.duration} s of a pulse. Must be at most the period, "
+                f"{self.period} s."
+            )
+        if round(self.seconds * self.rate) < 2:
+            raise ValueError(
+                f"Invalid capture of {self.seconds} s at {self.rate} 1/s. "
+                "Must have at least two frames."
+            )
+
+
+def plan(
+    table: xr.Dataset,
+    noise: xr.DataArray,
+    design: CaptureDesign | None = None,
+    *,
+    beside: str = "8-14",
+    together: int = 1,
+    filters: Mapping[str, Band] = FILTERS,
+    temperature: float = 300.0,
+) -> xr.Dataset:
+    r"""
+    Expected accuracy of one pixel for each material and filter, and the best filter.
+
+    The Cramer-Rao bound of `bounds` for the capture that a `CaptureDesign` describes, with the
+    response of Planck's law over each band: the smooth subspace and the frames at rest are known,
+    the emissivities, the level and everything else are not. Estimates of a pixel alone come close
+    to it; those of n pixels of one material share their ratios and emissivities, whose deviations
+    fall as :math:`1 / \sqrt{n}`.
+
+    Parameters
+    ----------
+    table : Dataset
+        Stage `emissivity_table`, of the camera's own band and the filters.
+    noise : DataArray
+        Noise (band) [K] of every band of the table, such as from `emissivity.filter_noise`.
+    design : CaptureDesign, optional
+        Capture conditions; 35 s of an object that warms by 25 K if not given.
+    beside : str
+        Name of the band that is always recorded.
+    together : int
+        Number of filters recorded beside it at once.
+    filters : mapping of str to Band
+        The bands of the table, by name.
+    temperature : float
+        Temperature [K] at which the noise is stated; in counts it is the same at all.
+
+    Returns
+    -------
+    Dataset
+        Over (material, filter), the filters of a combination joined by " + ":
+        `object_temperature_std` and `background_temperature_std` [K], root mean square over time;
+        `condition_number` [1], see `mixing.condition_number`. Over (material, filter, band):
+        `emissivity_std` [1], and `reflection_ratio_std` [1] of :math:`(1 - e_m) / (1 - e_1)` with
+        band 1 the one that is always recorded; NaN for a band outside the combination.
+        `best` (material): the filter of the smallest object deviation, "none" where each is above
+        that of a uniform number within the capture's range of temperatures.
+        `best_of_all` (): the filter whose median over the materials is smallest, "none" under the
+        same rule. `noise` (band) [K], and the design's numbers as attributes.
+
+    Raises
+    ------
+    KeyError
+        If a band of the table is not in the filters.
+    TypeError, ValueError
+        If the table is not as `schema` has it, an emissivity lies outside (0, 1), the band
+        `beside` or one of the noise is missing, the noise is not finite and positive or of
+        another unit, or there are fewer filters than are to be used together.
+
+    Examples
+    --------
+    >>> from dbthermal import emissivity, limits
+    >>> table = emissivity.embedded_table().sel(material=["plate window glass", "brass plate"])
+    >>> noise = emissivity.filter_noise(0.03, table["band"].values.tolist())
+    >>> limits.plan(table, noise)["best"].values.tolist()
+    ['9.5', 'none']
+    """
+    design = CaptureDesign() if design is None else design
+    emissivity = _emissivities(table)
+    names = [str(name) for name in table["band"].values]
+    sets = _combinations(names, beside, together)
+    std = _noise(noise, names)
+    bodies = [_TopHat(_band(filters, name), temperature) for name in names]
+    truths = [_truth(design, emissivity[chosen]) for chosen in sets]
+    parts = [
+        _expected(truth, [bodies[band] for band in chosen], std[chosen])
+        for truth, chosen in zip(truths, sets, strict=True)
+    ]
+    labels = [" + ".join(names[place] for place in chosen[1:]) for chosen in sets]
+    result = _dataset(table, labels, parts, sets)
+    temperatures = [truths[0].object_temperature, truths[0].background_temperature]
+    uniform = float(np.ptp(temperatures)) / np.sqrt(12.0)
+    object_std = result["object_temperature_std"]
+    best = _best(object_std, uniform)
+    of_all = _best(object_std.median("material").expand_dims("material"), uniform)[0]
+    return result.assign(
+        best=("material", best, {"long_name": "filter of the smallest object deviation"}),
+        best_of_all=((), of_all, {"long_name": "filter of its smallest median"}),
+        noise=("band", std, {"units": "K", "long_name": "noise-equivalent temperature difference"}),
+    ).assign_attrs(vars(design), beside=beside, origin="simulated")
+
+
+def plan_durations(
+    table: xr.Dataset,
+    noise: xr.DataArray,
+    seconds: Sequence[float],
+    design: CaptureDesign | None = None,
+    *,
+    beside: str = "8-14",
+    together: int = 1,
+    filters: Mapping[str, Band] = FILTERS,
+    temperature: float = 300.0,
+) -> xr.Dataset:
+    """
+    Expected accuracy of captures of several lengths.
+
+    Parameters
+    ----------
+    table, noise, beside, together, filters, temperature
+        See `plan`.
+    seconds : sequence of float
+        Lengths [s], strictly increasing. The object's rise and the pulses are the same in all.
+    design : CaptureDesign, optional
+        All conditions but the length.
+
+    Returns
+    -------
+    Dataset
+        That of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        As `plan`, or if the lengths do not increase.
+    """
+    design = CaptureDesign() if design is None else design
+    lengths = np.asarray(seconds, dtype=np.float64)
+    if lengths.size == 0 or np.any(np.diff(lengths) <= 0):
+        raise ValueError(f"Invalid seconds {lengths.tolist()}. Must increase strictly.")
+    plans = [
+        plan(
+            table,
+            noise,
+            replace(design, seconds=float(length)),
+            beside=beside,
+            together=together,
+            filters=filters,
+            temperature=temperature,
+        )
+        for length in lengths
+    ]
+    coordinate = xr.DataArray(lengths, dims="seconds", name="seconds", attrs={"units": "s"})
+    without_noise = [one.drop_vars("noise") for one in plans]
+    result = xr.concat(without_noise, dim=coordinate, combine_attrs="drop_conflicts")
+    return result.assign(noise=plans[0]["noise"])
 
 
 @dataclass(frozen=True)
 class _TopHat:
-    """Linearised signal of a band by Planck's law; see `information.Blackbody`."""
+    """Linearised signal of a band by Planck's law, relative to a temperature [K]."""
 
     band: Band
     reference: float
@@ -35,128 +241,21 @@ class _TopHat:
         return np.asarray(self.band.slope(temperature) / self.band.slope(self.reference))
 
 
-def plan(
-    table: xr.Dataset,
-    noise: xr.DataArray,
-    recording: Recording | None = None,
-    *,
-    beside: str = "8-14",
-    together: int = 1,
-    filters: Mapping[str, Band] = FILTERS,
-    temperature: float = 300.0,
-) -> xr.Dataset:
-    r"""
-    Accuracy to expect of one pixel for each material and filter, and the best filter.
-
-    The Cramer-Rao bound of `bounds` at the film that a `Recording` describes, its response
-    Planck's law over each band: the smooth subspace and the frames at rest are known, the
-    emissivities, the level and everything else are not. Estimates of a pixel alone come close to
-    it; those of n pixels of one material share their ratios and emissivities, whose deviations
-    fall as :math:`1 / \sqrt{n}`.
-
-    Parameters
-    ----------
-    table : Dataset
-        Stage `emissivity_table`, of the camera's own band and the filters.
-    noise : DataArray
-        Noise (band) [K] of every band of the table, such as from `emissivity.filter_noise`.
-    recording : Recording, optional
-        The film; 35 s of an object that warms by 25 K if not given.
-    beside : str
-        Name of the band that is always recorded.
-    together : int
-        Number of filters recorded beside it at once.
-    filters : mapping of str to Band
-        The bands of the table, by name.
-    temperature : float
-        Temperature [K] at which the noise is meant; in counts it is the same at all.
-
-    Returns
-    -------
-    Dataset
-        Over (material, filter), the filters of a combination joined by " + ":
-        `object_temperature_std` and `background_temperature_std` [K], root mean square over time;
-        `condition_number` [1], see `mixing.condition_number`. Over (material, filter, band):
-        `emissivity_std` [1], and `reflection_ratio_std` [1] of :math:`(1 - e_m) / (1 - e_1)` with
-        band 1 the one that is always recorded; NaN for a band that is not of the combination.
-        `best` (material): the filter of the smallest object deviation, "none" where each is above
-        that of a guess, a uniform number within the recording's range of temperatures.
-        `best_of_all` (): the filter whose median over the materials is smallest, "none" under the
-        same rule. `noise` (band) [K], and the recording's numbers as attributes.
-
-    Raises
-    ------
-    KeyError
-        If there is no band of a name in the filters.
-    TypeError, ValueError
-        If the table is not as `schema` has it, an emissivity lies outside (0, 1), the band
-        `beside` or one of the noise is missing, the noise is not finite and positive or of
-        another unit, or there are fewer filters than are to be used together.
-    """
-    recording = Recording() if recording is None else recording
-    emissivity = _emissivities(table)
-    names = [str(name) for name in table["band"].values]
-    sets = _combinations(names, beside, together)
-    std = _noise(noise, names)
-    bodies = [_TopHat(_band(filters, name), temperature) for name in names]
-    parts = [
-        _expected(recording.truth(emissivity[chosen]), [bodies[m] for m in chosen], std[chosen])
-        for chosen in sets
-    ]
-    labels = [" + ".join(names[place] for place in chosen[1:]) for chosen in sets]
-    result = _dataset(table, labels, parts, sets)
-    own = result["object_temperature_std"]
-    guess = recording.range / np.sqrt(12.0)
-    best = _best(own, guess)
-    of_all = _best(own.median("material").expand_dims("material"), guess)[0]
-    return result.assign(
-        best=("material", best, {"long_name": "filter of the smallest object deviation"}),
-        best_of_all=((), of_all, {"long_name": "filter of its smallest median"}),
-        noise=("band", std, {"units": "K", "long_name": "noise-equivalent temperature difference"}),
-    ).assign_attrs(vars(recording), beside=beside, origin="simulated")
-
-
-def plan_durations(
-    table: xr.Dataset,
-    noise: xr.DataArray,
-    seconds: Sequence[float],
-    recording: Recording | None = None,
-    **options: Any,
-) -> xr.Dataset:
-    """
-    Accuracy to expect of recordings of several lengths.
-
-    Parameters
-    ----------
-    table, noise
-        See `plan`.
-    seconds : sequence of float
-        Lengths [s], strictly increasing. The object's rise and the pulses are the same in all.
-    recording : Recording, optional
-        Everything but the length.
-    **options
-        Of `plan`.
-
-    Returns
-    -------
-    Dataset
-        That of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        As `plan`, or if the lengths do not increase.
-    """
-    recording = Recording() if recording is None else recording
-    lengths = np.asarray(seconds, dtype=np.float64)
-    if lengths.size == 0 or np.any(np.diff(lengths) <= 0):
-        raise ValueError(f"Invalid seconds {lengths.tolist()}. Must increase strictly.")
-    films = [replace(recording, seconds=float(length)) for length in lengths]
-    plans = [plan(table, noise, film, **options) for film in films]
-    coordinate = xr.DataArray(lengths, dims="seconds", name="seconds", attrs={"units": "s"})
-    of_films = [one.drop_vars("noise") for one in plans]
-    result = xr.concat(of_films, dim=coordinate, combine_attrs="drop_conflicts")
-    return result.assign(noise=plans[0]["noise"])
+def _truth(design: CaptureDesign, emissivity: Array) -> Truth:
+    """One pixel of each material (band, material); the background rests between the pulses."""
+    time = np.arange(round(design.seconds * design.rate)) / design.rate
+    rise = np.expm1(-time / (_TIME_CONSTANT * time[-1])) / np.expm1(-1.0 / _TIME_CONSTANT)
+    # Half a frame later than its stamp, so that rounding decides on no frame.
+    phase = np.mod(time + 0.5 / design.rate, design.period)
+    pulse = phase > design.period - design.duration
+    materials = np.ones(emissivity.shape[1])
+    return Truth(
+        time=time,
+        object_temperature=np.outer(design.start + design.span * rise, materials),
+        background_temperature=np.outer(design.level + design.amplitude * pulse, materials),
+        emissivity=emissivity,
+        resting=np.outer(~pulse, materials.astype(bool)),
+    )
 
 
 def _emissivities(table: xr.Dataset) -> Array:
@@ -193,7 +292,6 @@ def _noise(noise: xr.DataArray, names: list[str]) -> Array:
 
 
 def _band(filters: Mapping[str, Band], name: str) -> Band:
-    """Band of a name."""
     if name not in filters:
         raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
     return filters[name]
@@ -201,13 +299,12 @@ def _band(filters: Mapping[str, Band], name: str) -> Band:
 
 def _expected(truth: Truth, bodies: Sequence[_TopHat], noise: Array) -> dict[str, Array]:
     """Deviations of one combination: temperatures (material), the others (band, material)."""
-    order = orders(truth, truth.film(bodies, noise))
-    seen = truth.smooth(order).film(bodies, noise)
-    found = deviations(seen, truth.time, order, reference=0)
+    order = smallest_order(truth, truth.sensitivity(bodies, noise))
+    sensitivity = truth.smoothed(order).sensitivity(bodies, noise)
+    stds = deviations(sensitivity, truth.time, order, reference=0)
     for name in ("object_temperature", "background_temperature"):
-        found[name] = np.sqrt(np.mean(found[name] ** 2, axis=0))
-    found["condition_number"] = mixing.condition_number(truth.emissivity.T)
-    return found
+        stds[name] = np.sqrt(np.mean(stds[name] ** 2, axis=0))
+    return stds | {"condition_number": mixing.condition_number(truth.emissivity.T)}
 
 
 def _dataset(
@@ -232,9 +329,10 @@ def _dataset(
     return xr.Dataset(variables, coords)
 
 
-def _best(std: xr.DataArray, guess: float) -> list[str]:
-    """Filter of the smallest deviation for each material, if that is below a guess's."""
+def _best(std: xr.DataArray, uniform: float) -> list[str]:
+    """Filter of the smallest deviation for each material, if below that of a uniform number."""
     names = std["filter"].values
     return [
-        str(names[int(np.argmin(row))]) if np.min(row) < guess else NO_FILTER for row in std.values
+        str(names[int(np.argmin(row))]) if np.min(row) < uniform else NO_FILTER
+        for row in std.values
     ]

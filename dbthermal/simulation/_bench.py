@@ -18,8 +18,8 @@ import xarray as xr
 
 from dbthermal import calibration, mixing, planck, schema
 from dbthermal import response as responses
-from dbthermal.curves import Curve, require_range
 from dbthermal.emissivity import embedded_table
+from dbthermal.response import Curve, require_range
 
 Array = npt.NDArray[np.float64]
 

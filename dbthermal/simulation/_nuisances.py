@@ -8,6 +8,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
+from dbthermal.correction import lag_coefficients
 from dbthermal.simulation._rig import observe
 
 Array = npt.NDArray[np.float64]
@@ -346,20 +347,12 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
         a band has none.
     """
     counts = _floating(corrected).copy(deep=True)
-    names = [str(name) for name in counts["band"].values]
-    if isinstance(time_constant, xr.DataArray):
-        places = schema.band_positions(time_constant, names, "the time constants")
-        constants = time_constant.values[places]
-    else:
-        constants = np.full(len(names), time_constant, dtype=np.float64)
-    planck.require_positive("time_constant [s]", constants)
-    interval = np.diff(counts["time"].values.astype(np.float64))
-    for movie, constant in zip(counts.values, constants, strict=True):
-        fresh = -np.expm1(-interval / constant)  # 1 - a
+    _, new = lag_coefficients(time_constant, counts)
+    for movie, weight in zip(counts.values, new, strict=True):
         for frame in range(1, movie.shape[0]):
             # In place, each frame from the lagging one before.
             step = movie[frame] - movie[frame - 1]
-            movie[frame] = movie[frame - 1] + fresh[frame - 1] * step
+            movie[frame] = movie[frame - 1] + weight[frame - 1] * step
     return corrected.assign(counts=counts)
 
 

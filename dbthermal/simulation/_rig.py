@@ -8,7 +8,7 @@ import xarray as xr
 
 from dbthermal import bands, calibration, correction, mixing, planck, schema
 from dbthermal import response as responses
-from dbthermal.curves import require_range
+from dbthermal.response import require_range
 
 _CALIBRATION_POINTS: Final = 25
 _SLOPE_TEMPERATURE: Final = 300.0

@@ -169,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0 if all numbers agree, else 1.
     """
-    parser = argparse.ArgumentParser(prog="python -m dbthermal.verify", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m reproduction.verify", description=__doc__)
     parser.add_argument("--run", default="full", help="folder below results/")
     parser.add_argument("--record", action="store_true", help="keep the numbers as the reference")
     options = parser.parse_args(arguments)

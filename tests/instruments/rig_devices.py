@@ -4,11 +4,11 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+from faulty_apt import FaultyApt
 from faulty_tc08 import FaultyTC08
 
 from dbthermal.instruments import apt, fslp
 from dbthermal.instruments.boson import Boson
-from dbthermal.instruments.emulated.apt import EmulatedApt
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.boson_faults import Fault
 from dbthermal.instruments.emulated.port import Loop
@@ -17,6 +17,15 @@ from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 
 FILTERS = {1: "open", 3: "9.5", 5: "LW"}
+QUICK = Settings(
+    filters=FILTERS,
+    reply_timeout=5.0,
+    poll_interval=0.005,
+    velocity=50.0,
+    home_velocity=20.0,
+    acceleration=1e3,
+)
+"""A wheel that turns in no time."""
 
 
 class Clock:
@@ -75,7 +84,7 @@ class WheelBench:
     def __init__(self, model: str = "BSC201", slot_offset: float = 0.0, **options: object) -> None:
         self.clock = Clock(0.0)
         self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
-        self.device = EmulatedApt(self.world, model=model, slot_offset=slot_offset)
+        self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
         loop = Loop(self.device, clock=self.clock, sleep=self.clock.sleep)
         chosen = Settings(filters=FILTERS, **options)  # type: ignore[arg-type]
         self.wheel = FilterWheel(loop, chosen, clock=self.clock, sleep=self.clock.sleep)
@@ -85,6 +94,11 @@ class WheelBench:
         self.wheel.connect()
         self.wheel.home()
         return self.wheel
+
+    def move(self, position: int) -> None:
+        """Move the motor past the driver."""
+        data = apt.Position(1, position).pack()
+        self.device.receive(apt.command(apt.Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
 
     def sent(self, identifier: apt.Id) -> list[apt.Message]:
         """What the driver sent of one kind."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from rig_devices import FILTERS, BosonBench, Clock, LoggerBench, WheelBench
+from rig_devices import FILTERS, QUICK, BosonBench, Clock, LoggerBench, WheelBench
 from rig_stubs import StubCamera, StubController, StubLibrary
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
@@ -20,8 +20,6 @@ from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 from dbthermal.instruments.video import v4l2
-
-QUICK = Settings(filters=FILTERS, reply_timeout=5.0, poll_interval=0.005)
 
 
 def address(name: str) -> str:
@@ -79,9 +77,7 @@ def loop_wheel(_: ExitStack) -> Opened:
 
 def port_wheel(stack: ExitStack) -> Opened:
     """A wheel's driver on the emulator, on a pseudo-terminal, a hundred times as fast."""
-    port: Any = stack.enter_context(start_wheel({"model": "BSC101"}, None))
-    port.device.faults.slow = 0.01
-    url = f"pty://{port.path}"
+    url = f"pty://{stack.enter_context(start_wheel({'model': 'BSC101'}, None)).path}"
     return Opened(FilterWheel.from_url(url, QUICK), True, lambda: FilterWheel.from_url(url, QUICK))
 
 

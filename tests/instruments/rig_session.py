@@ -9,7 +9,7 @@ from dbthermal.instruments.camera import Counts
 from dbthermal.instruments.devices import Devices, emulated_world, open_devices
 from dbthermal.instruments.emulated.frames import Picture
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording.fetching import Limits
+from dbthermal.instruments.recording import Limits
 from dbthermal.instruments.session import Session
 
 SHAPE = (4, 80)

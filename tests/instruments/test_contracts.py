@@ -7,7 +7,6 @@ and run with -m hardware: the wheel turns, a shutter closes, nothing is saved.
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,6 @@ from dbthermal.instruments.camera import (
     SourceLostError,
     frames,
 )
-from dbthermal.instruments.emulated import usb
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.tc08 import TC08, Flag
 from dbthermal.instruments.transport import TransportError
@@ -224,16 +222,9 @@ def test_silence_is_no_loss(opened: Opened) -> None:
     source.close()
 
 
-@pytest.mark.parametrize(
-    "emulated", [True, pytest.param(False, marks=pytest.mark.hardware, id="hardware")]
-)
-def test_the_rig_is_found(emulated: bool, tmp_path: Path) -> None:
+@pytest.mark.hardware
+def test_the_rig_is_found() -> None:
     """With the rig plugged in all of it is found, and nothing stands in the way."""
-    if emulated:
-        backend = usb.EmulatedBackend(usb.boson(1), usb.boson(2, bus=2), usb.apt(), usb.tc08())
-        usb.write_sysfs(tmp_path, backend)
-        found = inventory.find(backend, sysfs=tmp_path, dev=tmp_path / "dev")
-    else:
-        found = inventory.find()
+    found = inventory.find()
     assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
     assert [device.warnings for device in found] == [()] * 4

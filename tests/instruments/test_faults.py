@@ -18,7 +18,6 @@ from rig_take import Read, Take, session
 
 from dbthermal import correction as frames
 from dbthermal import store
-from dbthermal.instruments import apt
 from dbthermal.instruments.boson import Boson, BosonReplyError, BosonStatusError, BosonTimeoutError
 from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.devices import Devices, Thermocouples
@@ -33,7 +32,7 @@ from dbthermal.instruments.filterwheel import (
     StalledWheelError,
     WheelError,
 )
-from dbthermal.instruments.recording.capture import open_capture
+from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.tc08 import TC08, TC08Error
 from dbthermal.instruments.transport import TransportError
 
@@ -167,7 +166,7 @@ def stopped_wheel() -> FilterWheel:
     """A wheel that was stopped on its way."""
     bench = WheelBench()
     wheel = bench.homed()
-    bench.device.receive(apt.move_absolute(1, 200_000, destination=apt.BAY_1))
+    bench.move(200_000)
     bench.clock.sleep(0.5)
     wheel.stop()
     return wheel

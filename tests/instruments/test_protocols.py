@@ -9,15 +9,13 @@ import xarray as xr
 from rig_session import LEVELS, QUICK, SHAPE, TEXT, bench, replaced, rig, scene_text
 
 from dbthermal import store
-from dbthermal.instruments import protocols
+from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.emulated.frames import Faults
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.protocols import Step
-from dbthermal.instruments.recording import sweep
-from dbthermal.instruments.recording.capture import notes, open_capture
-from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.recording import Preview, _sweep, notes, open_capture
 from dbthermal.instruments.session import Session
 
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"))
@@ -99,7 +97,7 @@ def test_each_temperature_and_filter_is_a_recording(recorded: tuple[Path, list[S
 
 def test_wheel_decides_what_is_seen(recorded: tuple[Path, list[Step]]) -> None:
     """Joined, all bands have the counts of their filter at the temperature that was read."""
-    movies = protocols.open_sweep(recorded[0], "plate", frames=8)
+    movies = recording.open_sweep(recorded[0], "plate", frames=8)
     assert movies["counts"].shape == (3, 3, 8, *SHAPE)
     assert list(movies["band"].values) == ["8-14", "9.5", "11"]
     np.testing.assert_allclose(movies["temperature"], [290.0, 300.0, 310.0], rtol=0, atol=1e-4)
@@ -124,7 +122,7 @@ def test_recording_says_what_it_was_made_with(recorded: tuple[Path, list[Step]])
 def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Step]]) -> None:
     """Counts are of region and good frames, corrected, and temperatures are those read."""
     region = {"plate": (slice(0, 2), slice(0, 10))}
-    series = protocols.bench_series(recorded[0], "plate", region)["plate"]
+    series = recording.bench_series(recorded[0], "plate", region)["plate"]
     seen = np.array([3000.5, 2900.5, 3100.5]) + np.array(list(LEVELS.values()))[:, None]
     np.testing.assert_allclose(series["counts"], seen, rtol=0, atol=1e-9)  # [count]
     np.testing.assert_allclose(series["object_temperature"], [330.0] * 3, rtol=0, atol=1e-4)
@@ -139,24 +137,24 @@ def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Step]]) 
         {"gain": (dims, 0.5 * ones), "offset": (dims, 7 * ones), "bad": (dims, bad)},
         coords={"band": list(LEVELS)},
     )
-    corrected = protocols.bench_series(recorded[0], "plate", region, correction)["plate"]
+    corrected = recording.bench_series(recorded[0], "plate", region, correction)["plate"]
     np.testing.assert_allclose(corrected["counts"], 0.5 * (seen - 0.5) + 7, rtol=0, atol=1e-2)
     with pytest.raises(ValueError, match="No frame or no pixel of band '8-14'"):
-        protocols.bench_series(recorded[0], "plate", {"plate": (slice(9, 9), slice(0, 2))})
+        recording.bench_series(recorded[0], "plate", {"plate": (slice(9, 9), slice(0, 2))})
     with pytest.raises(ValueError, match="No reading of 'wall' in the recording"):
-        protocols.bench_series(recorded[0], "plate", {"wall": (slice(0, 2), slice(0, 2))})
+        recording.bench_series(recorded[0], "plate", {"wall": (slice(0, 2), slice(0, 2))})
 
 
 def test_what_is_missing_is_named(recorded: tuple[Path, list[Step]], tmp_path: Path) -> None:
     """No sweep, too few frames, readings that differ, recordings that are not there."""
     folder, _ = recorded
     with pytest.raises(FileNotFoundError, match="No recording of a sweep 'dish'"):
-        protocols.open_sweep(folder, "dish", frames=8)
+        recording.open_sweep(folder, "dish", frames=8)
     with pytest.raises(ValueError, match=r"plate_00_9\.5\.zarr' with .* Must have 900\."):
-        protocols.open_sweep(folder, "plate", frames=900)
+        recording.open_sweep(folder, "plate", frames=900)
     (tmp_path / "plate_00_9.5.zarr").symlink_to(folder / "plate_00_9.5.zarr")
     with pytest.raises(ValueError, match=r"Missing recording '.*plate_00_11\.zarr' of the sweep"):
-        protocols.open_sweep(tmp_path, "plate", frames=8)
+        recording.open_sweep(tmp_path, "plate", frames=8)
 
 
 def test_recordings_of_a_step_must_agree(
@@ -164,9 +162,9 @@ def test_recordings_of_a_step_must_agree(
 ) -> None:
     """A blackbody that drifted between two filters has no one temperature."""
     values = iter([300.0, 300.2])
-    monkeypatch.setattr(sweep, "mean_reading", lambda *_: next(values))
+    monkeypatch.setattr(_sweep, "mean_reading", lambda *_: next(values))
     with pytest.raises(ValueError, match=r"Invalid readings \[300\.0, 300\.2\] K of 'blackbody'"):
-        protocols.open_sweep(recorded[0], "plate", frames=8)
+        recording.open_sweep(recorded[0], "plate", frames=8)
 
 
 def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
@@ -250,7 +248,7 @@ def test_sweep_without_a_wheel(tmp_path: Path) -> None:
         devices.prepare()
         steps = swept(devices, tmp_path)
     assert [(step.band, step.summary.path.name) for step in steps] == [(None, "plate_00.zarr")]
-    movies = protocols.open_sweep(tmp_path, "plate", frames=8)
+    movies = recording.open_sweep(tmp_path, "plate", frames=8)
     np.testing.assert_array_equal(movies["counts"][:, 0, 0, 0, 0], [4000, 23_000])
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from dbthermal.instruments.emulated.frames import EmulatedCamera, Movie
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording.record import record
+from dbthermal.instruments.recording import record
 from dbthermal.instruments.session import Camera, Device, Session
 
 SHAPE, RATE, MINUTE = (512, 640), 60.0, 60.0

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from dbthermal import _smooth as smooth
 from dbthermal import limits, mixing, simulation
 from dbthermal import response as responses
+from dbthermal.separation._baselines.calibrated import temperature_variance
 from dbthermal.simulation import Background, Rig
 
 RIG = Rig()
@@ -52,13 +53,15 @@ def test_ratio_without_rest_is_the_closed_form(background: dict[str, Any]) -> No
     scene = scene_of(0.86, 0.72, **background)
     found = limits.bounds(scene, RIG.response(), order=6, **NOTHING)["reflection_ratio_std"]
     cold = scene["background_temperature"].values[:, 0]
-    variance = limits.ratio_variance((0.86, 0.72), linear_noise(RIG), cold, smooth.basis(TIME, 6))
+    variance = limits.ratio_variance(
+        (0.86, 0.72), linear_noise(RIG), cold, smooth.polynomial_basis(TIME, 6)
+    )
     np.testing.assert_allclose(found[1, 0], np.sqrt(variance), rtol=1e-7)
     assert np.all(found[0] == 0)  # the quieter band over itself
 
 
 def test_known_emissivities_give_the_closed_form() -> None:
-    """One temperature a frame and known emissivities: the bound is `calibrated_variance`."""
+    """One temperature a frame and known emissivities: the bound is that of `calibrated`."""
     scene = scene_of(0.86, 0.72).isel(time=slice(0, 12))
     found = limits.bounds(scene, RIG.response(), order=12, resting=False, emissivity_std=0.0)
     curves = [responses.curve(RIG.response(), name) for name in RIG.bands]
@@ -73,7 +76,7 @@ def test_known_emissivities_give_the_closed_form() -> None:
     )
     noise = responses.noise(RIG.response(), list(RIG.bands))
     std = noise / [curve.reference_slope for curve in curves]
-    variance = limits.calibrated_variance(mixed, (std[0], std[1]), temperatures, np.zeros(2))
+    variance = temperature_variance(mixed, (std[0], std[1]), temperatures, np.zeros(2))
     for name, expected in zip(("object", "background"), np.sqrt(variance), strict=True):
         np.testing.assert_allclose(found[f"{name}_temperature_std"], expected, rtol=1e-9)
     assert not found["emissivity_std"].any()
@@ -126,7 +129,7 @@ def whole_fisher(scene: xr.Dataset, rig: Rig, functions: np.ndarray) -> dict[str
 def test_elimination_gives_the_whole_inverse(rig: Rig, values: tuple[float, ...]) -> None:
     """The background eliminated frame by frame, two bands or three, exact response, with rests."""
     scene = scene_of(*values, rig=rig, pixels=1).isel(time=slice(0, 350, 7))
-    functions = smooth.basis(scene["time"].values, 5)
+    functions = smooth.polynomial_basis(scene["time"].values, 5)
     projected = functions @ (functions.T @ scene["object_temperature"].values[:, 0, 0])
     scene["object_temperature"] = scene["object_temperature"].copy(data=projected[:, None, None])
     found = limits.bounds(scene, rig.response(), order=5)
@@ -202,7 +205,7 @@ def test_order_leaves_little() -> None:
     for pixel, order in enumerate(found["order"].values[0]):
         left = []
         for size in (order, order - 1):
-            functions = smooth.basis(TIME, int(size))
+            functions = smooth.polynomial_basis(TIME, int(size))
             warm = scene["object_temperature"].values[:, 0, pixel]
             left.append(np.sum((warm - functions @ (functions.T @ warm)) ** 2))
         # z2 - k2 z1 holds (1 - k2) x, and k2 = 2.

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import emissivity, limits, simulation
-from dbthermal.figures import _limits as drawn
+from dbthermal import emissivity, figures, limits, simulation
+from dbthermal.limits._planner import _truth
 from dbthermal.simulation import Rig
 
 
@@ -26,12 +26,15 @@ def test_plan_is_the_bound(materials: Materials) -> None:
     """The plan of glass is `bounds` of the same film with the rig's own response."""
     table, noise = materials
     row = table.sel(material=["plate window glass"])
-    truth = limits.Recording().truth(row["emissivity"].values.T)
+    truth = _truth(limits.CaptureDesign(), row["emissivity"].values.T)
     rig = Rig(bands=("8-14", "9.5"), noise=(1.0, 1.0))
     response = rig.response()
     of_glass = row["emissivity"].isel(material=0).sel(band=list(rig.bands))
     scene = simulation.scene(
-        truth.time, truth.warm[..., None], truth.cold[..., None], of_glass.drop_vars("material")
+        truth.time,
+        truth.object_temperature[..., None],
+        truth.background_temperature[..., None],
+        of_glass.drop_vars("material"),
     )
     response["noise"] = noise.sel(band=list(rig.bands)) * response["noise"].assign_attrs(
         units="count"
@@ -111,10 +114,10 @@ def test_bad_plan_is_a_clear_error(
 @pytest.mark.parametrize(
     "change", [{"seconds": 0.0}, {"rate": -1.0}, {"duration": 6.0}, {"seconds": 0.1}]
 )
-def test_bad_recording_is_a_clear_error(change: dict[str, float]) -> None:
-    """Numbers that are no film are refused."""
+def test_bad_design_is_a_clear_error(change: dict[str, float]) -> None:
+    """Conditions that are no capture are refused."""
     with pytest.raises(ValueError, match="Must"):
-        replace(limits.Recording(), **change)
+        replace(limits.CaptureDesign(), **change)
 
 
 def texts(figure: Any) -> set[str]:
@@ -128,7 +131,7 @@ def test_figure_of_the_plan(materials: Materials) -> None:
     table = table.sel(material=["plate window glass", "brass plate", "water"])
     expected = limits.plan(table, noise)
     durations = limits.plan_durations(table, noise, [20.0, 40.0])
-    figure = drawn.plan(expected, durations, ["plate window glass", "brass plate"])
+    figure = figures.plan(expected, durations, ["plate window glass", "brass plate"])
     figure.draw_without_rendering()
     framed = [text.get_text() for text in figure.axes[0].texts if text.get_bbox_patch()]
     assert framed == [f"{v:.2g}" for v in expected["object_temperature_std"].min("filter")[::2]]
@@ -137,26 +140,5 @@ def test_figure_of_the_plan(materials: Materials) -> None:
         "filter beside 8-14 [\N{MICRO SIGN}m]",
         "length of the film [s]",
         "expected std [K]",
-    }
-    assert "(simulated)" in figure.get_suptitle()
-
-
-def test_figure_of_the_limits() -> None:
-    """Errors are drawn as they are, and below in units of their bound."""
-    level = {"noise": [0.01, 0.03, 0.1]}
-    parts = {
-        f"{name}_{kind}": ("noise", scale * np.array([1.0, 2.0, 4.0]))
-        for name in ("reflection_ratio", "object_temperature")
-        for kind, scale in (("bound", 0.1), ("error", 0.12))
-    }
-    figure = drawn.error_over_bound(xr.Dataset(parts, level, {"origin": "simulated"}))
-    figure.draw_without_rendering()
-    ratio = np.asarray(figure.axes[2].lines[0].get_ydata())
-    np.testing.assert_allclose(ratio, 1.2, rtol=1e-12)
-    assert texts(figure) == {
-        "error of the reflection ratio [1]",
-        "error of the object temperature [K]",
-        "error / bound [1]",
-        "noise of the quieter band [K]",
     }
     assert "(simulated)" in figure.get_suptitle()

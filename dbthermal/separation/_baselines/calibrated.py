@@ -1,18 +1,20 @@
 r"""Separation with known emissivities: two equations in two temperatures, frame by frame.
 
-For each frame :math:`z_m = e_m u_m(x) + (1 - e_m) u_m(y)`, m = 1, 2, is solved for x and y by
-Newton's method from the linear closed form of Narayanan et al. (2026), equation 12,
-doi:10.48550/arXiv.2509.11334. No prior in time: each frame stands alone, so the noise is the
-price; see `limits.calibrated_variance`.
+.. math:: z_m = e_m u_m(x) + (1 - e_m) u_m(y), \quad m = 1, 2 \qquad (1)
+
+is solved for x and y by Newton's method from the linear closed form of Narayanan et al. (2026),
+equation 12, doi:10.48550/arXiv.2509.11334. No prior in time: each frame stands alone, so the noise
+is the price.
 """
 
 from typing import Final
 
 import numpy as np
 
-from dbthermal import limits
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Separated, flag
+from dbthermal import mixing
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._tiles import Array, Estimate, Method, Tile
 
 _STEPS: Final = 5
 # Largest last step of a sample that is solved [K].
@@ -22,82 +24,89 @@ _GRAY_SIGMAS: Final = 4.0
 _LEAST_DIFFERENCE: Final = 1e-6
 
 
-def separate(problem: Problem) -> Separated:
-    """
-    Separate one tile, given its emissivities.
-
-    Parameters
-    ----------
-    problem : Problem
-        Signals, and `emissivity` (2, pixel) in (0, 1), different in the two bands.
-
-    Returns
-    -------
-    Separated
-        Temperatures with their standard deviations; the emissivities as given.
-
-    Raises
-    ------
-    ValueError
-        If the problem has no emissivity.
-    """
-    if problem.emissivity is None:
+def separate(tile: Tile) -> Estimate:
+    """Temperatures with their standard deviations, at the known emissivities (2, pixel)."""
+    if tile.emissivity is None:
         raise ValueError("Missing emissivity. Method 'calibrated' must be given one.")
-    emissivity = problem.emissivity
+    emissivity = tile.emissivity
     emissivity_std = (
-        np.zeros_like(emissivity) if problem.emissivity_std is None else problem.emissivity_std
+        np.zeros_like(emissivity) if tile.emissivity_std is None else tile.emissivity_std
     )
-    noise = (problem.noise[0], problem.noise[1])
+    noise = (tile.noise[0], tile.noise[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        temperatures, last_step = _newton(problem, emissivity)
-        mixing = _mixing(problem, emissivity, temperatures)
-        variances = limits.calibrated_variance(mixing, noise, temperatures, emissivity_std)
-        stds = np.sqrt(variances)
-    apart = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * np.hypot(*emissivity_std))
-    gray = np.abs(emissivity[0] - emissivity[1]) <= apart
+        temperatures, last_step = _newton(tile, emissivity)
+        jacobian = _jacobian(tile, emissivity, temperatures)
+        stds = np.sqrt(temperature_variance(jacobian, noise, temperatures, emissivity_std))
+    least = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * np.hypot(*emissivity_std))
+    gray = np.abs(emissivity[0] - emissivity[1]) <= least
     solved = np.all(np.abs(last_step) < _CONVERGED, axis=(0, 1))
     solved &= np.all(np.isfinite(stds), axis=(0, 1))
     undefined = gray | ~solved
-    none = np.zeros_like(gray)
     return (
-        Separated(
+        Estimate(
             object_temperature=temperatures[0],
             object_temperature_std=stds[0],
             background_temperature=temperatures[1],
             background_temperature_std=stds[1],
             emissivity=emissivity,
             emissivity_std=emissivity_std,
-            status=flag({"gray": gray, "outside_response": ~solved & ~gray}),
+            status=status_bits({Status.GRAY: gray, Status.OUTSIDE_RESPONSE: ~solved & ~gray}),
         )
-        .without(undefined, none, undefined)
-        .ranged(problem.curves[0])
+        .undefine(undefined, np.zeros_like(gray), undefined)
+        .check_range(tile.curves[0])
     )
 
 
-def _newton(problem: Problem, emissivity: Array) -> tuple[Array, Array]:
-    """Object and background temperature, (2, time, pixel), and the last change of both."""
-    weights = np.stack([emissivity, 1.0 - emissivity], axis=1)[:, :, np.newaxis]
-    temperatures = _invert(weights, problem.signals) + problem.reference
+def temperature_variance(
+    jacobian: Array, noise: tuple[float, float], temperatures: Array, emissivity_std: Array
+) -> Array:
+    r"""
+    Variance (2, ...) of object and background [K^2] of a single frame; the Cramer-Rao bound.
+
+    From the derivatives (band, 2, ...) of the signals with the two temperatures (2, ...) [K], the
+    noise of the signals [K] and the deviation (2, ...) of the emissivities [1]. For slopes 1
+
+    .. math:: \mathrm{var}(x) = [(1-e_2)^2 s_1^2 + (1-e_1)^2 s_2^2] / (e_1-e_2)^2, \quad
+              \mathrm{var}(y) = [e_2^2 s_1^2 + e_1^2 s_2^2] / (e_1-e_2)^2 \qquad (2)
+    """
+    # An uncertain emissivity is a noise of dz/de = u(x) - u(y): s_m^2 + (x - y)^2 var(e_m).
+    contrast = temperatures[0] - temperatures[1]
+    first, second = (
+        std**2 + (contrast * deviation) ** 2
+        for std, deviation in zip(noise, emissivity_std, strict=True)
+    )
+    # var = J^-1 diag(first, second) J^-T, with J^-1 = ((d, -b), (-c, a)) / det J.
+    ((a, b), (c, d)) = jacobian
+    determinant = a * d - b * c
+    energy = np.stack([d**2 * first + b**2 * second, c**2 * first + a**2 * second])
+    return np.asarray(energy / determinant**2)
+
+
+def _newton(tile: Tile, emissivity: Array) -> tuple[Array, Array]:
+    """Object and background temperature (2, time, pixel) [K], and the last change of both."""
+    temperatures = _invert(_weights(emissivity), tile.signals) + tile.reference
     step = np.zeros_like(temperatures)
     for _ in range(_STEPS):
-        residual = problem.signals - np.stack(
-            [(weights[m] * problem.blackbody(m, temperatures)).sum(axis=0) for m in (0, 1)]
-        )
-        step = _invert(_mixing(problem, emissivity, temperatures), residual)
+        residual = tile.signals - tile.mixed(emissivity, temperatures)
+        step = _invert(_jacobian(tile, emissivity, temperatures), residual)
         temperatures = temperatures + step
     return np.asarray(temperatures), step
 
 
-def _mixing(problem: Problem, emissivity: Array, temperatures: Array) -> Array:
-    """Derivative of the signals with the two temperatures, (band, 2, time, pixel)."""
-    weights = np.stack([emissivity, 1.0 - emissivity], axis=1)[:, :, np.newaxis]
-    slopes = np.stack([curve.slope(temperatures) for curve in problem.curves])
-    return np.asarray(weights * slopes)
+def _weights(emissivity: Array) -> Array:
+    """Mixing matrix (band, 2, 1, pixel): weights of object and background."""
+    return np.moveaxis(mixing.matrix(emissivity), -1, 1)[:, :, np.newaxis]
 
 
-def _invert(mixing: Array, signals: Array) -> Array:
+def _jacobian(tile: Tile, emissivity: Array, temperatures: Array) -> Array:
+    """Derivative (band, 2, time, pixel) of equation (1) with the two temperatures [1]."""
+    slopes = np.stack([curve.slope(temperatures) for curve in tile.curves])
+    return np.asarray(_weights(emissivity) * slopes)
+
+
+def _invert(matrix: Array, signals: Array) -> Array:
     """Solve the two-by-two system of every sample."""
-    ((a, b), (c, d)) = mixing
+    ((a, b), (c, d)) = matrix
     determinant = a * d - b * c
     first, second = signals
     return np.asarray(np.stack([d * first - b * second, a * second - c * first]) / determinant)

@@ -6,9 +6,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.separation._problem import Shared
-from dbthermal.separation._separated import Array, Mask, Survey
 from dbthermal.separation._subspace import reflection_ratio as direction
+from dbthermal.separation._tiles import Array, Mask, Material, Survey
 
 Labels = npt.NDArray[np.intp]
 
@@ -31,20 +30,20 @@ class Materials:
         Material of each pixel; -1 for those that share nothing.
     ratio : ndarray, shape (band, material)
         Reflection ratios [1].
-    spread : ndarray, shape (material,)
+    inverse_energy : ndarray, shape (material,)
         Their variance, see `direction.Direction` [1/K^2].
-    emissivity, own_variance, common_variance : ndarray, shape (material,)
-        Emissivity of the first band and its variances, see `Shared` [1].
+    emissivity, noise_variance, drift_variance : ndarray, shape (material,)
+        Emissivity of the first band and its variances, see `Material` [1].
     """
 
     label: Labels
     ratio: Array
-    spread: Array
+    inverse_energy: Array
     emissivity: Array
-    own_variance: Array
-    common_variance: Array
+    noise_variance: Array
+    drift_variance: Array
 
-    def shared(self, pixels: Labels) -> Shared:
+    def shared(self, pixels: Labels) -> Material:
         """
         Spread the materials over some pixels.
 
@@ -55,12 +54,18 @@ class Materials:
 
         Returns
         -------
-        Shared
+        Material
             NaN for those that share nothing.
         """
         label = self.label[pixels]
-        parts = (self.ratio, self.spread, self.emissivity, self.own_variance, self.common_variance)
-        return Shared(*(np.where(label >= 0, part[..., label], np.nan) for part in parts))
+        parts = (
+            self.ratio,
+            self.inverse_energy,
+            self.emissivity,
+            self.noise_variance,
+            self.drift_variance,
+        )
+        return Material(*(np.where(label >= 0, part[..., label], np.nan) for part in parts))
 
 
 def asked(labels: Labels) -> Mask:
@@ -152,11 +157,11 @@ def _directions(label: Labels, count: int, survey: Survey, noise: Array) -> tupl
     scatter = np.array([[_sum(label, survey.scatter[i, j], count) for j in bands] for i in bands])
     told = np.einsum("bbm->m", scatter) > 0
     scatter = np.where(told, scatter, np.eye(len(noise))[..., np.newaxis])
-    ratio = direction.axis_of(np.moveaxis(scatter, -1, 0), noise)
+    ratio = direction.principal_ratio(np.moveaxis(scatter, -1, 0), noise)
     whitened = ratio / noise[:, np.newaxis]
     length = (whitened**2).sum(axis=0)
     energy = np.einsum("bm,bcm,cm->m", whitened, scatter, whitened) / length**2
-    spread = direction.estimated_spread(energy, length, _sum(label, survey.frames, count))
+    spread = direction.inverse_energy(energy, length, _sum(label, survey.frames, count))
     return np.where(told, ratio, np.nan), np.where(told, spread, np.nan)
 
 
@@ -165,7 +170,7 @@ def _strange(label: Labels, ratio: Array, survey: Survey, noise: Array) -> Array
     whitened = survey.ratio / noise[:, np.newaxis]
     length = (whitened**2).sum(axis=0)
     energy = np.einsum("bp,bcp,cp->p", whitened, survey.scatter, whitened) / length**2
-    spread = direction.estimated_spread(energy, length, survey.frames)
+    spread = direction.inverse_energy(energy, length, survey.frames)
     deviation = np.sqrt(spread * (noise[1:, np.newaxis] ** 2 + (survey.ratio[1:] * noise[0]) ** 2))
     apart = np.abs(survey.ratio[1:] - ratio[1:, label]) > _OUTLIER_SIGMAS * deviation
     return np.asarray(np.any(apart, axis=0) & (survey.frames > 0) & (label >= 0))
@@ -174,18 +179,18 @@ def _strange(label: Labels, ratio: Array, survey: Survey, noise: Array) -> Array
 def _emissivities(
     label: Labels, count: int, survey: Survey, ratio: Array
 ) -> tuple[Array, Array, Array]:
-    off = (survey.weights * ratio[:, label]).sum(axis=0)
+    off = (survey.null_weights * ratio[:, label]).sum(axis=0)
     value = survey.emissivity * (1.0 - (1.0 - survey.emissivity) * off)
     known = (label >= 0) & np.isfinite(value)
     where = np.where(known, label, -1)
-    typical = np.median(survey.own_variance[known]) if np.any(known) else np.nan
-    weight = np.where(known, 1.0 / (survey.own_variance + typical), 0.0)
-    value, common = (np.where(known, part, 0.0) for part in (value, survey.common_variance))
+    typical = np.median(survey.noise_variance[known]) if np.any(known) else np.nan
+    weight = np.where(known, 1.0 / (survey.noise_variance + typical), 0.0)
+    value, common = (np.where(known, part, 0.0) for part in (value, survey.drift_variance))
     total = _sum(where, weight, count)
     mean = _sum(where, weight * value, count) / total
     residual = np.where(known, (value - mean[where]) ** 2, 0.0)
     pixels = _sum(where, np.ones_like(value), count)
     scatter = _sum(where, weight**2 * residual, count) / total**2
     scatter *= pixels / np.maximum(pixels - 1, 1)
-    stated = _sum(where, weight**2 * np.where(known, survey.own_variance, 0.0), count) / total**2
+    stated = _sum(where, weight**2 * np.where(known, survey.noise_variance, 0.0), count) / total**2
     return mean, np.maximum(scatter, stated), _sum(where, weight * common, count) / total

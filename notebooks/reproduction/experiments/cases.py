@@ -142,7 +142,7 @@ def efficiency(
     """
     emissivity = truth["emissivity"].values[:, 0, 0]
     background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
-    functions = smooth.basis(truth["time"].values, order)
+    functions = smooth.polynomial_basis(truth["time"].values, order)
     pair = (float(emissivity[0]), float(emissivity[1]))
     bound = np.sqrt(limits.ratio_variance(pair, noise, background, functions))
     found = limits.reflection_ratio(result["emissivity"].values.reshape(2, -1))

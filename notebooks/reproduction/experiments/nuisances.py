@@ -1,6 +1,5 @@
 """What the nuisances of a real rig cost, and what is left of it when they are undone."""
 
-import importlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -215,7 +214,7 @@ def parallax(
     Returns
     -------
     Dataset
-        `misregistered` [pixel], distance of the transform that `registration.register` finds from
+        `misregistered` [pixel], distance of the transform that `alignment.register` finds from
         the true one; and over `treatment`, one of `VIEWS`, the variables of `cost`.
 
     Raises
@@ -232,13 +231,12 @@ def parallax(
             f"Invalid shift {list(shift)} and parallax {distance} pixels. Must be multiples of "
             f"1/{COLUMNS} along x and of 1 along y, within {_MARGIN} together."
         )
-    registration = importlib.import_module("dbthermal.alignment._registration")
     wide, known = _plate(shape, clock, np.random.default_rng(seed)), Rig().response()
     capture, single = (
         _two_views(wide, moved, more, known, np.random.default_rng(seed + 1))
         for moved, more in ((shift, distance), ((0.0, 0.0), 0.0))
     )
-    found = registration.register(capture, model="translation")
+    found = alignment.register(capture, model="translation")
     true = found.copy(data=np.stack([np.eye(3), np.eye(3)]))
     true[1, :2, 2] = -np.array(shift)
     captures = [alignment.align(capture, offset=0.0, transform=matrix) for matrix in (found, true)]

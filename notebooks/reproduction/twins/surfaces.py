@@ -64,10 +64,8 @@ def plate(width: float, height: float, spacing: float) -> trimesh.Trimesh:
 def ellipsoid(semi_axes: Sequence[float], middle: npt.ArrayLike, spacing: float) -> trimesh.Trimesh:
     """Stretched geodesic sphere about a point; along its longest axis `spacing` is the largest."""
     edge = np.arctan(2.0) * max(semi_axes) / require_positive("spacing [m]", spacing)
-    mesh: trimesh.Trimesh = trimesh.creation.icosphere(max(0, int(np.ceil(np.log2(edge)))))
-    mesh.apply_scale(semi_axes)
-    mesh.apply_translation(middle)
-    return mesh
+    ball = trimesh.creation.icosphere(max(0, int(np.ceil(np.log2(edge)))))
+    return trimesh.Trimesh(ball.vertices * semi_axes + middle, ball.faces, process=False)
 
 
 def capsule(

@@ -1,0 +1,292 @@
+r"""Cramer-Rao bounds of a scene: the exact response, any number of bands, every quantity.
+
+The image formation is that of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import mixing, schema
+from dbthermal import response as responses
+from dbthermal.limits._fisher import QUANTITIES, Array, Mask, Truth, deviations, smallest_order
+from dbthermal.response import Curve, require_range
+
+# Difference [K] below which two background temperatures are one level.
+_LEVEL: Final = 1e-6
+_UNIFORM: Final = 1.0 / np.sqrt(12.0)
+"""Standard deviation of a uniform number, over the width of its interval."""
+
+
+def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
+    r"""
+    Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` of the reflections in the two bands.
+
+    Parameters
+    ----------
+    emissivity : array_like, shape (2, ...)
+        Emissivities [1].
+
+    Returns
+    -------
+    ndarray
+        Ratio [1].
+    """
+    first, second = np.asarray(emissivity, dtype=np.float64)
+    return np.asarray((1.0 - second) / (1.0 - first))
+
+
+def ratio_variance(
+    emissivity: tuple[float, float],
+    noise: tuple[float, float],
+    background: Array,
+    functions: Array,
+) -> Array:
+    r"""
+    Cramer-Rao bound of the reflection ratio of two linear bands.
+
+    .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
+              {\sum_t [(1 - e_1) P y(t)]^2}
+
+    with P the projection orthogonal to the smooth subspace, in which the object may do anything.
+
+    Parameters
+    ----------
+    emissivity : tuple of float
+        Emissivities of the two bands [1].
+    noise : tuple of float
+        Standard deviations of the noise [K].
+    background : ndarray, shape (time, ...)
+        Background temperature [K].
+    functions : ndarray, shape (time, order)
+        Orthonormal functions that span the smooth subspace.
+
+    Returns
+    -------
+    ndarray
+        Smallest variance [1] of an unbiased estimate.
+    """
+    ratio = float(reflection_ratio(emissivity))
+    rapid = background - np.tensordot(functions, functions.T @ background, axes=1)
+    energy = (1.0 - emissivity[0]) ** 2 * np.sum(rapid**2, axis=0)
+    return np.asarray((noise[1] ** 2 + (ratio * noise[0]) ** 2) / energy)
+
+
+def bounds(
+    scene: xr.Dataset,
+    response: xr.Dataset,
+    *,
+    order: int | None = None,
+    resting: npt.ArrayLike | None = None,
+    emissivity_std: float = np.inf,
+    response_kind: str = "exact",
+) -> xr.Dataset:
+    r"""
+    Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
+
+    Of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` + white noise :math:`s_m` the unknowns
+    are
+
+    - every :math:`e_m`, from this pixel alone (pixels that share a material do better);
+    - x, in a known smooth subspace of polynomials of time;
+    - y, one number a frame; in the frames at rest, one number for all of them. Which frames rest
+      is assumed to be known, the level is not. ``resting=False`` assumes nothing about y.
+
+    Response and noise are known, nothing has a prior. The bound is the inverse Fisher information
+    [1]_ at the truth; y is eliminated frame by frame by a Schur complement, as an estimate by
+    variable projection [2]_ does.
+
+    Parameters
+    ----------
+    scene : Dataset
+        Truth: `object_temperature`, `background_temperature` (time, y, x) [K], `emissivity`
+        (band, y, x) [1].
+    response : Dataset
+        Stage `response` with `noise`, of every band of the scene.
+    order : int, optional
+        Size of the smooth subspace. If not given, for each pixel the smallest that leaves at most
+        0.1 of the noise's variance.
+    resting : array_like of bool, optional
+        Frames at rest, (time) or (time, y, x), or one for all. If not given, those in which a
+        pixel's background has its most frequent temperature, where two or more share it.
+    emissivity_std : float
+        Prior standard deviation [1] of each emissivity: 0 if it is known, infinite for no prior. A
+        finite one gives the Bayesian bound of van Trees.
+    response_kind : {"exact", "linear"}
+        See `response.curve`.
+
+    Returns
+    -------
+    Dataset
+        `object_temperature_std`, `background_temperature_std` (time, y, x) [K];
+        `emissivity_std` (band, y, x) [1]; `reflection_ratio_std` (band, y, x) [1], of
+        :math:`(1 - e_m) / (1 - e_r)` with r the quieter band, the attribute `reference_band`;
+        infinite without information. `identifiable` (quantity, y, x): True if the deviation, root
+        mean square over time and largest of the bands, is below that of a uniform number between
+        the limits, which are 0 and 1 for an emissivity and the calibrated range for a temperature,
+        and for a ratio below the ratio itself.
+        `condition_number`, `order` (y, x) [1]; `resting` (time, y, x).
+
+    Raises
+    ------
+    ValueError
+        If a variable is missing or its dims or unit are others, there is one band only, an
+        emissivity lies outside (0, 1), a temperature outside the response's range, the response
+        lacks a band or the noise, the background differs between frames at rest, or no smooth
+        subspace holds the object.
+
+    Notes
+    -----
+    For the linear response and two bands, ``resting=False`` gives the reflection ratio the bound
+    of `ratio_variance`, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down alike
+    changes no sample. Frames at rest determine the emissivities, and sharpen the ratio, too. The
+    exact response determines the emissivities without them, by its curvature, but hardly; and as
+    nothing then keeps y near the truth, where the bands' slopes have another ratio, the bound of
+    the reflection ratio is loose. An `emissivity_std` of 0.29, that of a uniform number in (0, 1),
+    tightens it.
+
+    References
+    ----------
+    .. [1] Kay (1993), Fundamentals of Statistical Signal Processing: Estimation Theory, chapter 3
+    .. [2] Golub, Pereyra (2003), Inverse Problems 19, R1, doi:10.1088/0266-5611/19/2/201
+
+    Examples
+    --------
+    Glass that warms by 20 K while someone walks by:
+
+    >>> import numpy as np, xarray as xr
+    >>> from dbthermal import limits, simulation
+    >>> rig, time = simulation.Rig(), np.arange(100) / 10.0
+    >>> glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    >>> scene = simulation.independent_pixels(
+    ...     time, glass, simulation.Background(), 1, np.random.default_rng(0),
+    ...     start=293.15, stop=313.15,
+    ... )
+    >>> bound = limits.bounds(scene, rig.response())
+    >>> bool(bound["identifiable"].sel(quantity="object_temperature").all())
+    True
+    """
+    if not emissivity_std >= 0:
+        raise ValueError(f"Invalid emissivity_std {emissivity_std}. Must not be negative.")
+    truth = _truth(scene, resting)
+    names = [str(name) for name in scene["band"].values]
+    curves = [responses.curve(response, name, response_kind) for name in names]
+    for name in ("object_temperature", "background_temperature"):
+        for curve in curves:
+            require_range(getattr(truth, name), curve, name)
+    noise = responses.noise(response, names) / [curve.reference_slope for curve in curves]
+    reference = int(np.argmin(noise))
+    if order is None:
+        orders = smallest_order(truth, truth.sensitivity(curves, noise))
+    else:
+        orders = np.full(truth.object_temperature.shape[1], order)
+    sensitivity = truth.smoothed(orders).sensitivity(curves, noise)
+    stds = deviations(sensitivity, truth.time, orders, reference, emissivity_std=emissivity_std)
+    maps = {
+        "condition_number": mixing.condition_number(truth.emissivity.T),
+        "order": orders,
+        "resting": truth.resting,
+        "identifiable": _identifiable(stds, truth.emissivity, reference, curves[0]),
+    }
+    result = _dataset(scene, stds, maps)
+    return result.assign_attrs(reference_band=names[reference], response_kind=response_kind)
+
+
+def _truth(scene: xr.Dataset, resting: npt.ArrayLike | None) -> Truth:
+    """Checked truth of a scene."""
+    stage = schema.STAGES["separated"]
+    names = ("object_temperature", "background_temperature", "emissivity")
+    for name in names:
+        if name not in scene:
+            raise ValueError(f"Missing variable '{name}' in the scene.")
+        schema.check_variable(scene[name], stage[name], f"'{name}' of the scene")
+    temperature, background, emissivity = (
+        scene[name].values.astype(np.float64).reshape(scene[name].shape[0], -1) for name in names
+    )
+    if len(emissivity) < 2:
+        raise ValueError("Invalid scene of one band. Must have at least two.")
+    bad = ~((emissivity > 0) & (emissivity < 1))
+    if np.any(bad):
+        band = scene["band"].values[np.argmax(bad.any(axis=1))]
+        raise ValueError(
+            f"Invalid emissivity {emissivity[bad][0]} in band '{band}' of the scene. "
+            "Must lie in (0, 1)."
+        )
+    if resting is None:
+        rest = _most_frequent(background)
+    else:
+        rest = _checked_rest(resting, background, scene["object_temperature"].shape)
+    time = scene["time"].values.astype(np.float64)
+    return Truth(time, temperature, background, emissivity, rest)
+
+
+def _most_frequent(background: Array) -> Mask:
+    """
+    Frames (time, pixel) in which a pixel's background has its most frequent temperature.
+
+    No frame where no two share a temperature; the lowest of several that are as frequent.
+    """
+    ordered = np.sort(background, axis=0)
+    place = np.arange(len(ordered))[:, np.newaxis]
+    new = np.diff(ordered, axis=0, prepend=-np.inf) > 0
+    length = place - np.maximum.accumulate(np.where(new, place, 0), axis=0)
+    longest = np.argmax(length, axis=0)[np.newaxis]
+    level = np.take_along_axis(ordered, longest, axis=0)
+    return np.asarray((background == level) & (length.max(axis=0) > 0))
+
+
+def _checked_rest(resting: npt.ArrayLike, background: Array, shape: tuple[int, ...]) -> Mask:
+    """Frames at rest (time, pixel), in all of which the background has one level."""
+    rest = np.asarray(resting)
+    if rest.dtype != bool or rest.shape not in {(), shape[:1], shape}:
+        raise ValueError(
+            f"Invalid resting {rest.shape} of {rest.dtype}. Must be bool, one for all or "
+            f"{shape[:1]} or {shape}."
+        )
+    mask = np.broadcast_to(rest.reshape(*rest.shape, *(1,) * (3 - rest.ndim)), shape)
+    mask = mask.reshape(background.shape)
+    least = np.min(background, axis=0, where=mask, initial=np.inf)
+    most = np.max(background, axis=0, where=mask, initial=-np.inf)
+    if np.any(most - least > _LEVEL):
+        raise ValueError(
+            f"Invalid resting: the background differs by {np.max(most - least)} K between frames "
+            "that are said to rest. Must be one level."
+        )
+    return mask
+
+
+def _identifiable(stds: dict[str, Array], emissivity: Array, reference: int, curve: Curve) -> Mask:
+    """Quantities (quantity, pixel) that the capture determines better than their limits do."""
+    scales = {
+        "emissivity": np.full_like(emissivity, _UNIFORM),
+        "reflection_ratio": (1.0 - emissivity) / (1.0 - emissivity[reference]),
+    }
+    limit = _UNIFORM * (curve.highest - curve.lowest)
+    return np.stack(
+        [
+            np.all(stds[name] < scales[name], axis=0)
+            if name in scales
+            else np.sqrt(np.mean(stds[name] ** 2, axis=0)) < limit
+            for name in QUANTITIES
+        ]
+    )
+
+
+def _dataset(scene: xr.Dataset, stds: dict[str, Array], maps: dict[str, Any]) -> xr.Dataset:
+    """Bounds and maps on the grid of their scene."""
+    image = scene["object_temperature"].shape[1:]
+    stage = schema.STAGES["separated"]
+    variables: dict[str, Any] = {}
+    for name, values in stds.items():
+        attrs = {"units": stage[name].units, "long_name": f"bound of {stage[name].long_name}"}
+        rows = "time" if "temperature" in name else "band"
+        variables[f"{name}_std"] = ((rows, "y", "x"), values.reshape(-1, *image), attrs)
+    leading = {"resting": ("time",), "identifiable": ("quantity",)}
+    for name, part in maps.items():
+        dims = (*leading.get(name, ()), "y", "x")
+        variables[name] = (dims, part.reshape(*part.shape[:-1], *image), {"units": "1"})
+    coords = {name: scene[name] for name in ("band", "time", "y", "x") if name in scene.coords}
+    origin = {name: scene.attrs[name] for name in ("origin",) if name in scene.attrs}
+    return xr.Dataset(variables, {**coords, "quantity": list(QUANTITIES)}, origin)

@@ -1,0 +1,291 @@
+r"""Fisher information of one pixel's capture, the background eliminated frame by frame.
+
+.. math:: z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t)) + s_m n_m(t), \quad x = \Phi c \qquad (1)
+
+with n white noise of variance 1 and :math:`\Phi` a smooth subspace of time. All derivatives are
+divided by the noise :math:`s_m`, so that the information is a sum of their products.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal import _smooth as smooth
+from dbthermal import mixing
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Indices = npt.NDArray[np.intp]
+
+QUANTITIES: Final = (
+    "object_temperature",
+    "background_temperature",
+    "emissivity",
+    "reflection_ratio",
+)
+"""Quantities that have a bound."""
+
+# Energy of the object outside its smooth subspace that is negligible, in units of the noise's
+# variance, and the largest subspace that is tried.
+_NEGLIGIBLE: Final = 0.1
+_HIGHEST_ORDER: Final = 30
+# Information in a direction, relative to that on its parameters were each the only unknown, below
+# which it is rounding: a deviation a million times larger tells nothing of any quantity here.
+_ROUNDING: Final = 1e-12
+# Squared share of a quantity's gradient along such directions, above which it depends on them.
+_DEPENDENT: Final = 1e-8
+# Pixels at once: their working memory, some 200 kB each at 350 frames, stays below 100 MB.
+_PIXELS: Final = 512
+
+
+class Blackbody(Protocol):
+    """Linearised signal u(T) [K] of a blackbody in one band, and its slope u'(T) [1]."""
+
+    def signal(self, temperature: npt.ArrayLike) -> Array:
+        """Signal [K] at temperatures [K]."""
+
+    def slope(self, temperature: npt.ArrayLike) -> Array:
+        """Derivative [1] of the signal at temperatures [K]."""
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Derivatives of every sample with the unknowns, divided by the noise, at the truth."""
+
+    emissivity: Array  # (band, pixel) [1]
+    contrast: Array  # with the band's emissivity (band, time, pixel) [1]
+    emission: Array  # with the object temperature (band, time, pixel) [1/K]
+    reflection: Array  # with the background temperature (band, time, pixel) [1/K]
+    resting: Mask  # frames with the background at its resting level (time, pixel)
+
+    def select(self, pixels: Indices) -> "Sensitivity":
+        """The same for some of the pixels."""
+        return Sensitivity(*(getattr(self, field.name)[..., pixels] for field in fields(self)))
+
+    def projection(self) -> Array:
+        r"""
+        Projection (band, band, time, pixel) that eliminates the free background of a frame.
+
+        .. math:: W = 1 - v v^T / v^T v \qquad (2)
+
+        with v the reflection, over the bands; the unit matrix in a frame at rest.
+        """
+        free = ~self.resting / np.sum(self.reflection**2, axis=0)
+        outer = self.reflection[:, np.newaxis] * self.reflection * free
+        unit = np.eye(len(self.reflection))[..., np.newaxis, np.newaxis]
+        return np.asarray(unit - outer)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True state of the pixels of a capture, at which its information is computed."""
+
+    time: Array  # (time,) [s]
+    object_temperature: Array  # (time, pixel) [K]
+    background_temperature: Array  # (time, pixel) [K]
+    emissivity: Array  # (band, pixel) [1]
+    resting: Mask  # frames with the background at its resting level (time, pixel)
+
+    def sensitivity(self, blackbodies: Sequence[Blackbody], noise: Array) -> Sensitivity:
+        """Derivatives of equation (1) for the bands' blackbodies and noise (band) [K]."""
+        x, y = self.object_temperature, self.background_temperature
+        bands = list(zip(blackbodies, noise, mixing.matrix(self.emissivity), strict=True))
+        return Sensitivity(
+            emissivity=self.emissivity,
+            # dz/de = u(x) - u(y),  dz/dx = e u'(x),  dz/dy = (1 - e) u'(y)
+            contrast=np.stack([(u.signal(x) - u.signal(y)) / s for u, s, _ in bands]),
+            emission=np.stack([weight[:, 0] * u.slope(x) / s for u, s, weight in bands]),
+            reflection=np.stack([weight[:, 1] * u.slope(y) / s for u, s, weight in bands]),
+            resting=self.resting,
+        )
+
+    def smoothed(self, order: Indices) -> "Truth":
+        """The same with the object projected onto each pixel's smooth subspace."""
+        smoothed = self.object_temperature.copy()
+        for count in np.unique(order):
+            functions = smooth.polynomial_basis(self.time, int(count))
+            smoothed[:, order == count] = functions @ (functions.T @ smoothed[:, order == count])
+        return replace(self, object_temperature=smoothed)
+
+
+def smallest_order(truth: Truth, sensitivity: Sensitivity) -> Indices:
+    r"""
+    Order (pixel) of the smallest smooth subspace that holds the object within the noise.
+
+    A subspace leaves :math:`r = x - \Phi \Phi^T x`, whose energy must satisfy
+
+    .. math:: \sum_t r(t)^2 \, p(t)^T W(t) \, p(t) \le 0.1 \qquad (3)
+
+    with p the emission. It shifts no quantity by more than the root, 0.32, of that quantity's own
+    bound (Cauchy and Schwarz). Without rest and with two bands this is the energy of
+    :math:`z_2 - k_2 z_1`, which holds no background, over the variance of its noise.
+    """
+    highest = min(_HIGHEST_ORDER, truth.time.size)
+    functions = smooth.polynomial_basis(truth.time, highest)
+    order = np.full(truth.object_temperature.shape[1], highest + 1, dtype=np.intp)
+    for pixels in _blocks(np.arange(order.size)):
+        part = sensitivity.select(pixels)
+        weight = np.einsum("itp,ijtp,jtp->tp", part.emission, part.projection(), part.emission)
+        residual = truth.object_temperature[:, pixels]
+        for count, function in enumerate(functions.T, start=1):
+            residual = residual - np.outer(function, function @ residual)
+            enough = np.sum(weight * residual**2, axis=0) <= _NEGLIGIBLE
+            order[pixels[enough & (order[pixels] > count)]] = count
+    if np.any(order > highest):
+        raise ValueError(
+            f"Invalid object_temperature of pixel {int(np.argmax(order > highest))}: {highest} "
+            f"smooth functions leave more than {_NEGLIGIBLE} of the noise's variance. "
+            "Must be smooth; or give the order."
+        )
+    return order
+
+
+def deviations(
+    sensitivity: Sensitivity,
+    time: Array,
+    order: Indices,
+    reference: int,
+    *,
+    emissivity_std: float = np.inf,
+) -> dict[str, Array]:
+    """
+    Smallest standard deviations of `QUANTITIES`, with ratios over the reference band.
+
+    Temperatures (time, pixel) [K], emissivity and ratios (band, pixel) [1]; infinite where the
+    capture holds no information. A prior deviation of 0 means known emissivities.
+    """
+    frames, pixels = sensitivity.resting.shape
+    bands = len(sensitivity.emissivity)
+    known = emissivity_std == 0
+    if known:
+        sensitivity = replace(sensitivity, contrast=np.zeros_like(sensitivity.contrast))
+    prior = 1.0 if known else 1.0 / emissivity_std**2
+    rows = {name: frames if "temperature" in name else bands for name in QUANTITIES}
+    result = {name: np.zeros((size, pixels)) for name, size in rows.items()}
+    for count in np.unique(order):
+        functions = smooth.polynomial_basis(time, int(count))
+        for block in _blocks(np.flatnonzero(order == count)):
+            part = _deviations(sensitivity.select(block), functions, reference, prior)
+            for name, values in part.items():
+                if "temperature" in name or not known:
+                    result[name][:, block] = values
+    return result
+
+
+def _blocks(pixels: Indices) -> list[Indices]:
+    """Pixels in blocks, for the memory that each takes."""
+    return np.split(pixels, range(_PIXELS, pixels.size, _PIXELS))
+
+
+def _deviations(
+    sensitivity: Sensitivity, functions: Array, reference: int, prior: float
+) -> dict[str, Array]:
+    """Deviations of pixels of one order."""
+    emissivity = sensitivity.emissivity
+    bands, (frames, order) = len(emissivity), functions.shape
+    inverse = fisher_inverse(sensitivity, functions, prior)
+    # Gradients (pixel or 1, quantity, unknown) of the quantities; x(t) = Phi(t) c.
+    of_emissivity = np.eye(bands, bands + order + 1)[np.newaxis]
+    of_object = np.zeros((1, frames, bands + order + 1))
+    of_object[0, :, bands:-1] = functions
+    of_background, free_variance = _background(sensitivity, functions)
+    of_ratio = _ratio_gradient(1.0 - emissivity, reference) @ -of_emissivity
+    variances = {
+        "object_temperature": inverse.variance(of_object),
+        "background_temperature": inverse.variance(of_background) + free_variance,
+        "emissivity": inverse.variance(of_emissivity),
+        "reflection_ratio": inverse.variance(of_ratio),
+    }
+    return {name: np.sqrt(variance.T) for name, variance in variances.items()}
+
+
+def _background(sensitivity: Sensitivity, functions: Array) -> tuple[Array, Array]:
+    r"""
+    Gradient (pixel, time, unknown) of each frame's background, and its variance given them.
+
+    In a free frame y follows the other unknowns: :math:`dy = -v^T (g\,de + p\,dx) / v^T v`, with
+    the variance :math:`1 / v^T v` of its own; at rest it is the level.
+    """
+    energy = np.sum(sensitivity.reflection**2, axis=0)
+    along = sensitivity.reflection * ~sensitivity.resting / energy
+    of_object = np.sum(along * sensitivity.emission, axis=0)
+    parts = [
+        -np.moveaxis(along * sensitivity.contrast, 0, -1),
+        -of_object[..., np.newaxis] * functions[:, np.newaxis],
+        sensitivity.resting[..., np.newaxis],
+    ]
+    gradient = np.concatenate(parts, axis=-1)
+    return np.swapaxes(gradient, 0, 1), (~sensitivity.resting / energy).T
+
+
+def _ratio_gradient(part: Array, reference: int) -> Array:
+    """Derivative (pixel, band, band) of each band's part over the reference's, with all parts."""
+    # d(a_m / a_r) = da_m / a_r - a_m da_r / a_r^2
+    below = part[reference]
+    result = np.eye(len(part)) / below[:, np.newaxis, np.newaxis]
+    result[:, :, reference] -= (part / below**2).T
+    result[:, reference] = 0.0  # 1 by definition, not but for rounding
+    return np.asarray(result)
+
+
+@dataclass(frozen=True)
+class FisherInverse:
+    """Inverse of Fisher informations, which may be singular, in factors."""
+
+    scale: Array  # deviation of each unknown, were it the only one (pixel, unknown)
+    directions: Array  # principal directions in units of `scale` (pixel, unknown, direction)
+    information: Array  # along them (pixel, direction) [1]
+
+    def variance(self, gradient: Array) -> Array:
+        """
+        Smallest variance (pixel, quantity) for gradients (pixel or 1, quantity, unknown).
+
+        Infinite where a quantity depends on a direction without information.
+        """
+        along = ((gradient * self.scale[:, np.newaxis]) @ self.directions) ** 2
+        blind = self.information <= _ROUNDING
+        dependent = along @ blind[..., np.newaxis] > _DEPENDENT * along.sum(axis=-1, keepdims=True)
+        # var(q) = h^T F^-1 h = sum_i (h . d_i)^2 / lambda_i
+        inverse = np.divide(1.0, self.information, out=np.zeros_like(blind, float), where=~blind)
+        return np.where(dependent, np.inf, along @ inverse[..., np.newaxis])[..., 0]
+
+
+def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.0) -> FisherInverse:
+    """
+    Inverse information about emissivities (band), object (order) [K] and resting level [K].
+
+    The functions (time, order) are the object's smooth subspace; the prior is the information about
+    each emissivity from elsewhere, one over its variance [1].
+    """
+    # Over the samples, g = dz/de, p = dz/dx, v = dz/dy and w = v in the frames at rest, else 0.
+    g, p = sensitivity.contrast, sensitivity.emission
+    w = sensitivity.reflection * sensitivity.resting
+    projection = sensitivity.projection()
+    projected = np.einsum("ijtp,jtp->itp", projection, p)
+    products = functions[:, :, np.newaxis] * functions[:, np.newaxis]
+    # F_ee = sum_t g^T W g + prior,  F_ec = sum_t g^T W p Phi^T,  F_cc = sum_t p^T W p Phi Phi^T
+    ee = np.einsum("itp,ijtp,jtp->pij", g, projection, g) + prior * np.eye(len(g))
+    ec = np.einsum("itp,tk->pik", g * projected, functions)
+    cc = np.einsum("tp,tkl->pkl", np.sum(p * projected, axis=0), products)
+    # F_el = sum_t g^T w,  F_cl = sum_t p^T w Phi,  F_ll = sum_t w^T w
+    el = np.einsum("itp,itp->pi", g, w)[..., np.newaxis]
+    cl = np.einsum("tp,tk->pk", np.sum(p * w, axis=0), functions)[..., np.newaxis]
+    ll = np.sum(w**2, axis=(0, 1))[:, np.newaxis, np.newaxis]
+    ce, le, lc = (np.swapaxes(block, 1, 2) for block in (ec, el, cl))
+    information = np.block([[ee, ec, el], [ce, cc, cl], [le, lc, ll]])
+    # Information about each unknown, were it the only one: no background to eliminate.
+    alone = np.concatenate(
+        [
+            np.sum(g**2, axis=1).T + prior,
+            np.sum(p**2, axis=0).T @ functions**2,
+            ll[..., 0],
+        ],
+        axis=1,
+    )
+    scale = np.sqrt(np.divide(1.0, alone, out=np.ones_like(alone), where=alone > 0))
+    scaled = information * scale[:, np.newaxis] * scale[..., np.newaxis]
+    eigenvalues, directions = np.linalg.eigh(scaled)
+    return FisherInverse(scale, directions, eigenvalues)
