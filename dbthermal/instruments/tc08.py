@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import Closing
 
 if TYPE_CHECKING:
     from dbthermal.instruments.emulated.world import World

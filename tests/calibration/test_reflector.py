@@ -245,7 +245,7 @@ def test_deviations_grow_with_the_correction(known: xr.Dataset) -> None:
 
 def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit that is stopped before it stands still names its band."""
-    monkeypatch.setattr("dbthermal.calibration._contact._ITERATIONS", 1)
+    monkeypatch.setattr("dbthermal.calibration._emissivity._ITERATIONS", 1)
     rng = np.random.default_rng(0)
     series = bench_series(known, OBJECTS[0], Bench(), rng)
     with pytest.raises(ArithmeticError, match=r"No convergence in band '8-14': emissivity 0\."):

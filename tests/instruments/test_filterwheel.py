@@ -2,12 +2,12 @@
 
 import pytest
 from dialogue import Dialogue
+from loop import Loop
 from rig_devices import FILTERS, QUICK, WheelBench
 from test_filterwheel_dialogue import _greeting
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.emulated.apt import EmulatedApt, start
-from dbthermal.instruments.emulated.port import Loop
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import (
     FilterWheel,

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Self
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.filterwheel._controller import (
     Controller,
     NotHomedError,
@@ -21,7 +20,7 @@ from dbthermal.instruments.filterwheel._controller import (
     WheelTimeoutError,
 )
 from dbthermal.instruments.filterwheel._settings import FAULTS, Settings
-from dbthermal.instruments.transport import SerialTransport, Transport, open_serial
+from dbthermal.instruments.transport import Closing, SerialTransport, Transport, open_serial
 
 if TYPE_CHECKING:
     from dbthermal.instruments.emulated.world import World
