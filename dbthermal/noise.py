@@ -101,7 +101,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
             f"Invalid capture of {frames} frames and {pixels} usable pixels to estimate a noise "
             f"from. Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise."
         )
-    functions = smooth.basis(time, min(_ORDER, frames // 4))
+    functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]
     # The projection on K functions of N frames leaves 1 - K / N of the noise's variance.
     remaining = 1.0 - functions.shape[1] / frames

@@ -210,7 +210,7 @@ def _smooth_change(level: xr.DataArray, segment: npt.NDArray[np.generic], order:
     for part in np.unique(segment):
         here = (segment == part) & np.isfinite(values)
         if here.any():
-            functions = smooth.basis(time[here], min(order, int(here.sum())))
+            functions = smooth.polynomial_basis(time[here], min(order, int(here.sum())))
             fitted = functions @ (functions.T @ values[here])
             curve[here] = fitted - fitted[0]
     return curve

@@ -113,7 +113,7 @@ def uncalibrated_reflection(
     inside = _check(signal, mask, correlated)
     frames, image = signal.sizes["time"], signal.shape[2:]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
-    functions = smooth.basis(signal["time"].values, order)
+    functions = smooth.polynomial_basis(signal["time"].values, order)
     rapid = np.stack([part - functions @ (functions.T @ part) for part in values])
     quiet = inside & (np.abs(_correlation(rapid)) < _UNCORRELATED)
     _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")

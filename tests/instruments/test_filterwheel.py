@@ -1,11 +1,11 @@
 """The filter wheel: its places, its settings, and the emulated wheel in memory and on a line."""
 
 import pytest
+from loop import Loop
 from rig_devices import FILTERS, QUICK, WheelBench
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.emulated.apt import EmulatedApt, start
-from dbthermal.instruments.emulated.port import Loop
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import (
     FilterWheel,

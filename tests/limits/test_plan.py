@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import emissivity, limits, simulation
-from dbthermal.figures import _limits as drawn
+from dbthermal import emissivity, figures, limits, simulation
 from dbthermal.limits._planner import _truth
 from dbthermal.simulation import Rig
 
@@ -132,7 +131,7 @@ def test_figure_of_the_plan(materials: Materials) -> None:
     table = table.sel(material=["plate window glass", "brass plate", "water"])
     expected = limits.plan(table, noise)
     durations = limits.plan_durations(table, noise, [20.0, 40.0])
-    figure = drawn.plan(expected, durations, ["plate window glass", "brass plate"])
+    figure = figures.plan(expected, durations, ["plate window glass", "brass plate"])
     figure.draw_without_rendering()
     framed = [text.get_text() for text in figure.axes[0].texts if text.get_bbox_patch()]
     assert framed == [f"{v:.2g}" for v in expected["object_temperature_std"].min("filter")[::2]]
@@ -141,26 +140,5 @@ def test_figure_of_the_plan(materials: Materials) -> None:
         "filter beside 8-14 [\N{MICRO SIGN}m]",
         "length of the film [s]",
         "expected std [K]",
-    }
-    assert "(simulated)" in figure.get_suptitle()
-
-
-def test_figure_of_the_limits() -> None:
-    """Errors are drawn as they are, and below in units of their bound."""
-    level = {"noise": [0.01, 0.03, 0.1]}
-    parts = {
-        f"{name}_{kind}": ("noise", scale * np.array([1.0, 2.0, 4.0]))
-        for name in ("reflection_ratio", "object_temperature")
-        for kind, scale in (("bound", 0.1), ("error", 0.12))
-    }
-    figure = drawn.error_over_bound(xr.Dataset(parts, level, {"origin": "simulated"}))
-    figure.draw_without_rendering()
-    ratio = np.asarray(figure.axes[2].lines[0].get_ydata())
-    np.testing.assert_allclose(ratio, 1.2, rtol=1e-12)
-    assert texts(figure) == {
-        "error of the reflection ratio [1]",
-        "error of the object temperature [K]",
-        "error / bound [1]",
-        "noise of the quieter band [K]",
     }
     assert "(simulated)" in figure.get_suptitle()

@@ -55,7 +55,7 @@ def ratio_of(scene: xr.Dataset) -> tuple[Array, Array]:
     """True ratio of the second band, and its deviation from the energy of the reflection."""
     first, second = 1.0 - scene["emissivity"].values
     moved = (first * scene["background_temperature"].values).reshape(scene.sizes["time"], -1)
-    functions = smooth.basis(scene["time"].values, 6)
+    functions = smooth.polynomial_basis(scene["time"].values, 6)
     energy = np.sum((moved - functions @ (functions.T @ moved)) ** 2, axis=0).reshape(first.shape)
     ratio = second / first
     energy = np.where(energy > 60 * NOISE[0] ** 2, energy, np.nan)

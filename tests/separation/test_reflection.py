@@ -92,7 +92,7 @@ def test_emission_and_reflection_are_the_first_band(
 
 def test_reflection_is_the_true_one(found: xr.Dataset) -> None:
     """It is off by what the noise of the best linear estimate leaves, the scaling taken out."""
-    functions = smooth.basis(TIME, found.attrs["order"])
+    functions = smooth.polynomial_basis(TIME, found.attrs["order"])
     true = pulses().reshape(FRAMES, -1)
     true -= functions @ (functions.T @ true)
     error = found["reflection"].values.reshape(FRAMES, -1) - true

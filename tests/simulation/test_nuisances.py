@@ -247,7 +247,7 @@ def test_separation_stands_a_shutter_and_lost_frames(
 @pytest.mark.parametrize(("times", "factor"), [((17.5,), 1.90), ((11.0, 24.0), 2.71)])
 def test_a_step_costs_accuracy(times: tuple[float, ...], factor: float) -> None:
     """The smooth part's deviation rises as stated, steps being fitted beside five functions."""
-    functions = smooth.basis(TIME, 5)
+    functions = smooth.polynomial_basis(TIME, 5)
     steps = (TIME[:, np.newaxis] > np.array(times)).astype(float)
     both = np.hstack([functions, steps])
     covariance = np.linalg.inv(both.T @ both)[:5, :5]

@@ -114,7 +114,7 @@ def _radiances(tile: Tile, settings: RatioSettings) -> Array:
     )
     if settings.order is None:
         return radiances
-    functions = smooth.basis(tile.time, settings.order)
+    functions = smooth.polynomial_basis(tile.time, settings.order)
     return np.asarray(functions @ (functions.T @ radiances))
 
 

@@ -157,11 +157,11 @@ def _directions(label: Labels, count: int, survey: Survey, noise: Array) -> tupl
     scatter = np.array([[_sum(label, survey.scatter[i, j], count) for j in bands] for i in bands])
     told = np.einsum("bbm->m", scatter) > 0
     scatter = np.where(told, scatter, np.eye(len(noise))[..., np.newaxis])
-    ratio = direction.axis_of(np.moveaxis(scatter, -1, 0), noise)
+    ratio = direction.principal_ratio(np.moveaxis(scatter, -1, 0), noise)
     whitened = ratio / noise[:, np.newaxis]
     length = (whitened**2).sum(axis=0)
     energy = np.einsum("bm,bcm,cm->m", whitened, scatter, whitened) / length**2
-    spread = direction.estimated_spread(energy, length, _sum(label, survey.frames, count))
+    spread = direction.inverse_energy(energy, length, _sum(label, survey.frames, count))
     return np.where(told, ratio, np.nan), np.where(told, spread, np.nan)
 
 
@@ -170,7 +170,7 @@ def _strange(label: Labels, ratio: Array, survey: Survey, noise: Array) -> Array
     whitened = survey.ratio / noise[:, np.newaxis]
     length = (whitened**2).sum(axis=0)
     energy = np.einsum("bp,bcp,cp->p", whitened, survey.scatter, whitened) / length**2
-    spread = direction.estimated_spread(energy, length, survey.frames)
+    spread = direction.inverse_energy(energy, length, survey.frames)
     deviation = np.sqrt(spread * (noise[1:, np.newaxis] ** 2 + (survey.ratio[1:] * noise[0]) ** 2))
     apart = np.abs(survey.ratio[1:] - ratio[1:, label]) > _OUTLIER_SIGMAS * deviation
     return np.asarray(np.any(apart, axis=0) & (survey.frames > 0) & (label >= 0))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal import schema, separation, simulation
-from dbthermal.separation._subspace import change_points as jumps
+from dbthermal.separation._subspace import residuals
 from dbthermal.simulation import Rig
 from reproduction import experiments
 
@@ -104,14 +104,14 @@ def test_a_jump_needs_no_least_length(frames: int, rate: float, seed: int) -> No
 def test_candidates_leave_room() -> None:
     """There are enough frames on both sides, not counting those next to the jump."""
     time = np.arange(120) / 20.0
-    inside = jumps.candidates(time)
+    inside = residuals.candidates(time)
     assert inside.size > 0
     for jump in (inside[0], inside[-1]):
-        kept = jumps.outside(time, int(jump))
+        kept = residuals.beside_jump(time, int(jump))
         assert min(kept[:jump].sum(), kept[jump:].sum()) == 24
         between = time[jump] - 0.5 / 20.0
-        assert np.abs(time[kept] - between).min() > jumps.AROUND
-    assert jumps.candidates(time[:60]).size == 0
+        assert np.abs(time[kept] - between).min() > residuals.AROUND
+    assert residuals.candidates(time[:60]).size == 0
 
 
 @pytest.mark.parametrize("height", [0, 30])

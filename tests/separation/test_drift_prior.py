@@ -8,8 +8,7 @@ import xarray as xr
 
 from dbthermal import _smooth as smooth
 from dbthermal import separation
-from dbthermal.separation._subspace import drift_prior as slow
-from dbthermal.separation._subspace import regression as robust
+from dbthermal.separation._subspace import emission, residuals
 from dbthermal.simulation import Rig
 from reproduction import experiments
 
@@ -94,8 +93,8 @@ def test_a_random_walk_is_extrapolated(walk: float) -> None:
     own = np.repeat(20.0 * (1 - np.exp(-TIME / 12.0))[:, np.newaxis], 2000, axis=1)
     steps = walk * rng.standard_normal(own.shape) / np.sqrt(350)
     ordinate = 0.8 * own + np.cumsum(steps, axis=0) + 0.03 * rng.standard_normal(own.shape)
-    line = robust.regress(own, ordinate, 0.03)
-    found = slow.variance(line, own, np.full(2000, 0.2), functions, 0.03, slow.Prior(0.0))
+    line = residuals.regress(own, ordinate, 0.03)
+    found = emission.drift_variance(line, own, np.full(2000, 0.2), functions, 0.03, 0.0)
     true, stated = float(np.std(line.slope)), np.sqrt(found)
     share = float(
         np.mean(np.abs(line.slope - 0.8) < 1.96 * np.hypot(stated, np.sqrt(line.variance)))
