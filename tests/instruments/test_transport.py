@@ -261,3 +261,11 @@ def test_every_module_is_on_the_map() -> None:
     names = {module.name for module in pkgutil.iter_modules(instruments.__path__)}
     names -= {module.rpartition(".")[2] for module in KINDS.values()}
     assert {name for name in names if f"`{name}`" not in (instruments.__doc__ or "")} == set()
+
+
+def test_completion_shows_the_rooms() -> None:
+    """Completion of the package offers its modules, each of which is imported when it is used."""
+    assert dir(instruments) == sorted(instruments.__all__)
+    assert instruments.thermocouple.emf(273.15) == 0.0
+    with pytest.raises(AttributeError, match="Unknown module 'dialogue'"):
+        _ = instruments.dialogue
