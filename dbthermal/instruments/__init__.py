@@ -1,17 +1,43 @@
-"""The rig: cameras, filter wheel, thermocouples, and the recording of a capture.
+"""Recording with the rig: two cameras, a filter wheel and thermocouples, real or emulated.
 
-A device has one name like an address, ``serial:///dev/ttyACM0`` or ``sim://boson``, and a driver
-that speaks its protocol. Messages are made from bytes, and back, without any input or output, and
-below the real drivers `emulated` answers in place of the hardware, and says so:
+Begin with a `session`, a YAML file of the recording and its devices' addresses; `devices` opens
+them, `protocols` records a scene or a blackbody sweep, `live` shows it meanwhile, and `recording`
+opens it again. `inventory` lists what is on the USB bus. Below are the drivers: `boson` over `fslp`
+and its `telemetry`, with frames by `v4l2` (`camera` is the interface of any camera), `filterwheel`
+over `apt`, and `tc08`; `transport` opens their lines. `thermocouple` converts type T.
 
-- `camera`: the interface of any camera, and the state of its shutter; `boson` over `fslp` and its
-  `telemetry`, on the frames of `v4l2`;
-- `filterwheel` over `apt`; `tc08`, with `thermocouple` for type T; byte streams by `transport`;
-- `inventory`: the devices that are plugged in, and missing permissions;
-- `session`: the description of a recording; `devices` opens its devices, `protocols` use them;
-- `recording`: writes it, and opens it again; `live` shows it meanwhile.
-
+`emulated` devices stand behind ``sim://`` addresses, below the same drivers, and say what they are.
 The drivers were written from public descriptions of the protocols and tested against public byte
-vectors and emulators, never against hardware. The modules that talk to a device need the optional
-packages of ``dbthermal[instruments]``; importing this package loads none of them.
+vectors and emulators, never against hardware. Those that talk to a device need the optional
+packages of ``dbthermal[instruments]``; a module is imported when it is first used.
 """
+
+import importlib
+from types import ModuleType
+
+__all__ = [
+    "apt",
+    "boson",
+    "camera",
+    "devices",
+    "filterwheel",
+    "fslp",
+    "inventory",
+    "live",
+    "protocols",
+    "recording",
+    "session",
+    "tc08",
+    "thermocouple",
+]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import the module `name` of this package when it is first used (PEP 562)."""
+    if name in __all__:
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"Unknown module {name!r} in {__name__}. Must be one of {__all__}.")
+
+
+def __dir__() -> list[str]:
+    return __all__
