@@ -10,6 +10,7 @@ and says so in its flags: to hide or mend it is not the driver's task.
 import importlib
 import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from types import MappingProxyType
@@ -59,6 +60,7 @@ FEWEST_COPIES: Final = 3
 KINDS: Final = MappingProxyType(
     {
         "boson": "dbthermal.instruments.boson",
+        "y16": "dbthermal.instruments.y16",
     }
 )
 """Module of each kind of camera; its ``KIND`` is a `CameraKind`."""
@@ -314,8 +316,10 @@ class CameraKind:
         Numbers of telemetry rows that it can give.
     """
 
-    open_frames: Callable[[str, Stream], FrameSource]
-    open_control: Callable[[str, object | None], CameraControl] | None = None
+    open_frames: Callable[[str, Stream], AbstractContextManager[FrameSource]]
+    open_control: Callable[[str, object | None], AbstractContextManager[CameraControl]] | None = (
+        None
+    )
     telemetry_rows: tuple[int, ...] = (0,)
 
 
