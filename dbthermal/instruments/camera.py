@@ -10,6 +10,7 @@ and says so in its flags: to hide or mend it is not the driver's task.
 import importlib
 import math
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 from types import MappingProxyType
@@ -314,8 +315,10 @@ class CameraKind:
         Numbers of telemetry rows that it can give.
     """
 
-    open_frames: Callable[[str, Stream], FrameSource]
-    open_control: Callable[[str, object | None], CameraControl] | None = None
+    open_frames: Callable[[str, Stream], AbstractContextManager[FrameSource]]
+    open_control: Callable[[str, object | None], AbstractContextManager[CameraControl]] | None = (
+        None
+    )
     telemetry_rows: tuple[int, ...] = (0,)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from dbthermal import store
 from dbthermal.instruments.camera import SourceLostError
+from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import (
     Limits,
     Preview,
@@ -33,7 +34,6 @@ from dbthermal.instruments.recording._sweep import (
     require_filter,
     step_path,
 )
-from dbthermal.instruments.rig import Devices
 from dbthermal.instruments.session import Session
 
 __all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]

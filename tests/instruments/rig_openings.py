@@ -11,15 +11,15 @@ from rig_devices import FILTERS, QUICK, BosonBench, Clock, LoggerBench, WheelBen
 from rig_stubs import StubCamera, StubController, StubLibrary
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
+from dbthermal.instruments import v4l2
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import Stream
 from dbthermal.instruments.emulated.apt import start as start_wheel
 from dbthermal.instruments.emulated.boson import start as start_camera
-from dbthermal.instruments.emulated.frames import EmulatedCamera
+from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
-from dbthermal.instruments.video import v4l2
 
 
 def address(name: str) -> str:

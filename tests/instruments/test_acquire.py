@@ -12,7 +12,7 @@ from dbthermal import acquire
 from dbthermal.instruments import inventory, protocols, recording
 from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated.frames import Picture
+from dbthermal.instruments.emulated.camera import Picture
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording import Preview, open_capture

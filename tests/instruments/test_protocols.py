@@ -1,19 +1,20 @@
 """The rig waits for the blackbody, sweeps it through all filters, and what it recorded opens."""
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from rig_session import LEVELS, QUICK, SHAPE, TEXT, bench, replaced, rig, scene_text
+from faulty_camera import Faults, FaultyCamera
+from rig_session import LEVELS, QUICK, SHAPE, TEXT, bench, pictures, replaced, rig, scene_text
 
 from dbthermal import store
 from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated.frames import Faults
-from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.protocols import Step
 from dbthermal.instruments.recording import Preview, _sweep, notes, open_capture
 from dbthermal.instruments.session import Session
@@ -211,7 +212,7 @@ def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
         def read() -> float:
             if next(calls, 9) == 5:  # four readings are waited for
                 wheel.move_to(2)
-            return world.blackbody_temperature
+            return float(world.blackbody_temperature)
 
         for _ in range(2):
             with pytest.raises(ValueError, match=r"Invalid slots .* of filter '9\.5' throughout"):
@@ -223,7 +224,11 @@ def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
     with rig(Session.from_yaml(ONE)) as devices:
         devices.prepare()
         assert devices.world is not None
-        devices.sources["8-14"].faults = Faults(unplugged=3)  # type: ignore[attr-defined]
+        world, form = devices.world, (devices.session.shape, 100.0, 2)
+        faulty = FaultyCamera(
+            world, "wide", pictures(world), "8-14", *form, faults=Faults(unplugged=3)
+        )
+        devices = replace(devices, sources={**devices.sources, "8-14": faulty})  # noqa: PLW2901
         with pytest.raises(SourceLostError, match=r"plate_00_9\.5\.zarr' ended: source lost"):
             swept(devices, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["plate_00_9.5.zarr"]
@@ -310,12 +315,11 @@ def test_no_rest_is_an_error(readings: list[float]) -> None:
 def test_blackbody_takes_its_time() -> None:
     """The emulated blackbody is waited for until it is near, and no longer."""
     clock = Clock()
-    world = World(clock=clock, blackbody_temperature=290.0, time_constant=2.0)
-    world.blackbody_temperature = 300.0
+    start = clock()
     found = protocols.wait_stable(
         Session.from_yaml(TEXT),
         300.0,
-        lambda: world.blackbody_temperature,
+        lambda: 300.0 - 10.0 * math.exp((start - clock()) / 2.0),
         clock=clock,
         sleep=clock.sleep,
     )

@@ -259,3 +259,11 @@ def test_every_module_is_on_the_map() -> None:
     """The package says what each of its modules is for."""
     names = {module.name for module in pkgutil.iter_modules(instruments.__path__)}
     assert {name for name in names if f"`{name}`" not in (instruments.__doc__ or "")} == set()
+
+
+def test_completion_shows_the_rooms() -> None:
+    """Completion of the package offers its modules, each of which is imported when it is used."""
+    assert dir(instruments) == sorted(instruments.__all__)
+    assert instruments.thermocouple.emf(273.15) == 0.0
+    with pytest.raises(AttributeError, match="Unknown module 'dialogue'"):
+        _ = instruments.dialogue
