@@ -60,6 +60,7 @@ FEWEST_COPIES: Final = 3
 KINDS: Final = MappingProxyType(
     {
         "boson": "dbthermal.instruments.boson",
+        "y16": "dbthermal.instruments.y16",
     }
 )
 """Module of each kind of camera; its ``KIND`` is a `CameraKind`."""
