@@ -21,7 +21,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.devices import Devices, open_devices
-from dbthermal.instruments.emulated.frames import Picture
+from dbthermal.instruments.emulated.camera import Picture
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording import Preview, Summary

@@ -12,7 +12,7 @@ import xarray as xr
 
 from dbthermal import store
 from dbthermal.instruments.camera import Counts, Frame
-from dbthermal.instruments.emulated.frames import EmulatedCamera
+from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import (
     Limits,
