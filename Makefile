@@ -6,9 +6,11 @@ python := .venv/bin/python
 stems := $(basename $(notdir $(sort $(wildcard notebooks/*.ipynb))))
 full := $(stems:%=results/full/%.ipynb)
 recorded := $(basename $(notdir $(sort $(wildcard params/recorded/*.yaml))))
-smoke := $(stems:%=results/smoke/%.ipynb)
-sources := $(shell find dbthermal -type f -not -path '*/__pycache__/*') $(wildcard data_manifest.yaml)
-papermill := $(python) -m papermill --kernel python3 --no-progress-bar --log-level WARNING
+smoke := $(stems:%=results/smoke/%.passed)
+sources := $(shell find dbthermal notebooks/reproduction -type f -not -path '*/__pycache__/*') $(wildcard data_manifest.yaml)
+papermill := $(python) -m papermill --kernel python3 --no-progress-bar --log-level WARNING --cwd notebooks
+JOBS ?= 2
+parallel := $(MAKE) --no-print-directory --jobs=$(JOBS) --output-sync=target
 
 # A mirror of the outside files is named from here, but read from the notebooks' folder too.
 ifneq ($(strip $(DBTHERMAL_DATA)),)
@@ -31,15 +33,15 @@ export JUPYTER_CONFIG_DIR := $(CURDIR)/.venv/etc/jupyter
 export JUPYTER_DATA_DIR := $(CURDIR)/.venv/share/jupyter
 export MPLCONFIGDIR := $(CURDIR)/.venv/share/matplotlib
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
-unexport JUPYTER_PATH MPLBACKEND PYTHONHOME PYTHONPATH
+unexport JUPYTER_PATH MPLBACKEND PYTHONHOME
+export PYTHONPATH := $(CURDIR)/notebooks
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.NOTPARALLEL:
-.PHONY: help install format check types pytest nbval chain interop test smoke reproduce verify record data bench lock clean FORCE
+.PHONY: help install format check types pytest smoke chain interop test test-slow reproduce full verify record data bench lock clean FORCE
 
 help: ## list the tasks
-	@awk 'BEGIN { FS = ":.*## " } /^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
 
 install: .venv/installed ## set up the environment in .venv
 
@@ -55,10 +57,9 @@ types: .venv/installed ## check the types
 	$(python) -m mypy
 
 pytest: .venv/installed ## run the tests alone
-	$(python) -m pytest
+	$(python) -m pytest --numprocesses=$(JOBS)
 
-nbval: .venv/installed ## run every notebook with its own small values, as a test
-	$(if $(stems),$(python) -m pytest --nbval-lax $(stems:%=notebooks/%.ipynb),@echo "no notebooks")
+smoke: $(smoke) ## run every notebook with its own small values, as a test
 
 chain: $(recorded:%=results/chain/%.ipynb) ## from the bytes of the emulated rig to its separated video, with small values
 
@@ -69,21 +70,29 @@ interop: ## compare emulators and codecs with independent software, in an enviro
 	.venv/interop/bin/python -c "import flirpy, thermocouple_its90, thorlabs_apt_protocol"
 	.venv/interop/bin/python -m pytest tests/instruments/test_interop.py
 
-test: check types pytest nbval chain ## check everything: lint, types, tests, notebooks, and the chain of them
+test: .venv/installed ## check lint, types, the quick tests, and every notebook with small values
+	$(parallel) check types
+	$(MAKE) pytest
+	$(parallel) smoke
 
-smoke: $(smoke) ## run the notebooks with their own small values into results/smoke
+test-slow: .venv/installed ## run the long tests, and the notebooks on the recordings of the emulated rig
+	$(python) -m pytest --numprocesses=$(JOBS) -m slow
+	$(parallel) chain
 
-reproduce: $(full) $(recorded:%=results/rig/%.ipynb) ## run the notebooks in order, with the values in params/, into results/full
+reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full, two at a time
+	$(parallel) full
+
+full: $(full) $(recorded:%=results/rig/%.ipynb)
 
 verify: .venv/installed ## compare results/full with the stored reference numbers
-	$(python) -m dbthermal.verify
+	$(python) -m reproduction.verify
 
 record: .venv/installed ## keep the numbers of results/full as the reference, and its scene as the picture in the README
-	$(python) -m dbthermal.verify --record
+	$(python) -m reproduction.verify --record
 	cp results/full/04_separation_twin.png notebooks/separated_scene.png
 
 data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
-	$(python) -m dbthermal.manifest
+	$(python) -m reproduction.manifest
 
 bench: .venv/installed ## measure time and memory
 	$(python) -m pytest -m bench --capture=no
@@ -126,18 +135,24 @@ endef
 results/full/%.ipynb: notebooks/%.ipynb params/%.yaml $(sources) results/inputs.txt .venv/installed
 	$(call execute,--parameters_file params/$*.yaml)
 
-results/smoke/%.ipynb: notebooks/%.ipynb $(sources) results/inputs.txt .venv/installed
-	$(call execute)
+results/smoke/%.passed: notebooks/%.ipynb $(sources) results/inputs.txt .venv/installed
+	@echo "$<"
+	@mkdir -p $(@D) && rm -rf $(@D)/$** && $(python) -m pytest --quiet -p no:cacheprovider --nbval-lax $< && touch $@
 
 # The same notebooks on what the emulated rig recorded: full values in results/rig, small ones in results/chain.
 results/rig/%.ipynb: notebooks/%.ipynb params/%.yaml params/recorded/%.yaml results/full/00_acquisition.ipynb
 	$(call execute,--parameters_file params/$*.yaml --parameters_file params/recorded/$*.yaml \
-	    -p run rig -p recorded results/full/00_acquisition)
+	    -p results rig -p recorded results/full/00_acquisition)
 
-results/chain/%.ipynb: notebooks/%.ipynb params/recorded/%.yaml results/smoke/00_acquisition.ipynb
-	$(call execute,--parameters_file params/recorded/$*.yaml -p run chain -p recorded results/smoke/00_acquisition)
+results/chain/%.ipynb: notebooks/%.ipynb params/recorded/%.yaml results/smoke/00_acquisition.passed
+	$(call execute,--parameters_file params/recorded/$*.yaml -p results chain -p recorded results/smoke/00_acquisition)
 
-# A notebook may open what an earlier one saved.
-follow = $(if $(previous),$(eval results/$(1)/$(stem).ipynb: results/$(1)/$(previous).ipynb))
-$(foreach stem,$(stems),$(call follow,full)$(call follow,smoke)$(eval previous := $(stem)))
-$(eval previous :=)$(foreach stem,$(recorded),$(call follow,rig)$(call follow,chain)$(eval previous := $(stem)))
+# The notebooks that open what another one saved; the last of them reads the numbers of all.
+calibrated := 02_emissivity 04_separation 08_twins
+paper := 09_paper
+$(calibrated:%=results/full/%.ipynb): results/full/01_calibration.ipynb
+$(calibrated:%=results/smoke/%.passed): results/smoke/01_calibration.passed
+$(paper:%=results/full/%.ipynb): $(filter-out $(paper:%=results/full/%.ipynb),$(full))
+$(paper:%=results/smoke/%.passed): $(filter-out $(paper:%=results/smoke/%.passed),$(smoke))
+results/rig/02_emissivity.ipynb results/rig/04_separation.ipynb: results/rig/01_calibration.ipynb
+results/chain/02_emissivity.ipynb results/chain/04_separation.ipynb: results/chain/01_calibration.ipynb

@@ -1,4 +1,4 @@
-"""The smooth subspace of time: what a slowly changing object temperature can do.
+"""The smooth subspace of time: every curve that a slowly changing object temperature can take.
 
 An orthonormal basis of polynomials over the capture's own time stamps. The bases are nested, so
 the fit of every order follows from one set of coefficients.
@@ -14,22 +14,11 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Subspace:
-    """
-    Functions of time that are projected out of a signal, nested by order.
+    """Functions of time that are projected out of a signal, nested by order."""
 
-    Attributes
-    ----------
-    functions : ndarray, shape (time, steps + order)
-        Orthonormal columns: the constant, then the steps, then polynomials of rising degree.
-    own : ndarray, shape (time, steps + order)
-        The object's part of each column: the column itself, less the camera's steps in it.
-    steps : int
-        Columns that are there at every order, beside the constant.
-    """
-
-    functions: Array
-    own: Array
-    steps: int
+    functions: Array  # (time, steps + order), orthonormal: constant, steps, rising polynomials
+    object_part: Array  # the same columns less the steps of the camera in them
+    steps: int  # columns of every order, beside the constant
 
     @property
     def orders(self) -> int:
@@ -37,31 +26,11 @@ class Subspace:
         return int(self.functions.shape[1]) - self.steps
 
     def leverage(self) -> Array:
-        r"""
-        Variance factor of the object's part of a fit at each time, for every order at once.
-
-        Returns
-        -------
-        ndarray, shape (time, order)
-            Column j holds :math:`\sum_i \Phi_i(t)^2` over the columns of order j + 1: the
-            variance of a fit to white noise of variance 1.
-        """
-        return np.asarray(np.cumsum(self.own**2, axis=1)[:, self.steps :])
+        r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
+        return np.asarray(np.cumsum(self.object_part**2, axis=1)[:, self.steps :])
 
     def columns(self, order: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
-        """
-        Which columns each order uses.
-
-        Parameters
-        ----------
-        order : ndarray of int, shape (pixel,)
-            Orders, 1 for the constant.
-
-        Returns
-        -------
-        ndarray of bool, shape (steps + order, pixel)
-            True for the columns in use.
-        """
+        """Columns in use (column, pixel) at each pixel's order, 1 for the constant alone."""
         places = np.arange(self.functions.shape[1])[:, np.newaxis]
         return np.asarray(places < order + self.steps)
 
@@ -96,9 +65,9 @@ def subspace(
     Raises
     ------
     ValueError
-        As `basis`, or if there are more functions than times.
+        As `polynomial_basis`, or if there are more functions than times.
     """
-    plain = basis(time, order)
+    plain = polynomial_basis(time, order)
     steps = []
     if segment is not None:
         steps += [np.where(segment >= one, 1.0, 0.0) for one in np.unique(segment)[1:]]
@@ -115,14 +84,16 @@ def subspace(
             f"Invalid order {order} with {len(steps)} steps over {len(plain)} frames. "
             "Must not be more functions than frames."
         )
+    # QR makes the columns orthonormal, F = Q R; the object's part of Q is F R^-1 with the camera's
+    # columns of F set to zero.
     together = np.column_stack([plain[:, 0], *steps, plain[:, 1:]])
     functions, triangle = np.linalg.qr(together)
     together[:, 1 : 1 + of_camera] = 0.0
-    own = np.linalg.solve(triangle.T, together.T).T
-    return Subspace(functions, own, len(steps))
+    object_part = np.linalg.solve(triangle.T, together.T).T
+    return Subspace(functions, object_part, len(steps))
 
 
-def basis(time: npt.ArrayLike, order: int) -> Array:
+def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
     r"""
     Orthonormal polynomials over given times, the discrete Legendre polynomials.
 

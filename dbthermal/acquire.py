@@ -1,18 +1,18 @@
 """Record a session from the command line: ``python -m dbthermal.acquire session.yaml folder``.
 
 The devices are opened, named and prepared, and the session's protocol is run: a scene becomes
-``<name>.zarr`` in the folder, a sweep of the blackbody a recording for each temperature and filter,
-and where it was interrupted it goes on. The blackbody is set by the one who sits at it. With
+``<name>.zarr`` in the folder, a sweep of the blackbody a recording for each temperature and filter.
+An interrupted sweep goes on where it was. The user sets the blackbody when asked. With
 ``--simulate`` the same drivers talk to emulated devices, whose cameras see a blackbody.
 
-Exit status: 0 if all was recorded, 1 if a device or a recording failed, 2 if the session is none,
-130 if it was interrupted; what was recorded is kept. Nothing here was ever run on hardware.
+Exit status: 0 if all was recorded, 1 if a device or a recording failed, 2 if the session is
+invalid, 130 if it was interrupted; what was recorded is kept. Never tried on hardware.
 """
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -20,69 +20,34 @@ from typing import Final
 from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import inventory, protocols
-from dbthermal.instruments.devices import Devices, emulated_world, open_devices
-from dbthermal.instruments.emulated import blackbody
-from dbthermal.instruments.emulated.frames import Picture
-from dbthermal.instruments.emulated.world import ROOM, World
+from dbthermal.instruments.devices import Devices, open_devices
+from dbthermal.instruments.emulated.camera import Picture
+from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.live import Watch
-from dbthermal.instruments.recording.record import Preview, Summary
+from dbthermal.instruments.recording import Preview, Summary
 from dbthermal.instruments.session import Session
 
-FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)
-"""What devices and recordings raise: the drivers' own errors are of these kinds."""
-
-Pictures = Callable[[Session, World], Mapping[str, Picture]]
+__all__ = ["ask_for_blackbody", "main", "plugged_in"]
 
 
-@dataclass
-class Progress:
-    """
-    One line that says how a recording goes, written again and again.
+def __dir__() -> list[str]:
+    return __all__
 
-    Attributes
-    ----------
-    write : callable
-        Takes the line.
-    """
 
-    write: Callable[[str], object]
-    _watch: Watch = field(default_factory=Watch)
-
-    def __call__(self, preview: Preview) -> None:
-        """
-        Write the line.
-
-        Parameters
-        ----------
-        preview : Preview
-            Of the recording.
-        """
-        self._watch.note(preview)
-        bands = "; ".join(
-            f"{band}: " + ", ".join([*status.text.splitlines(), *status.warning.splitlines()])
-            for band, status in self._watch.status().items()
-        )
-        self.write(f"\r{preview.time:6.1f} s  {bands}")
+_FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)
+"""Errors of devices and recordings: the drivers' own ones are of these kinds."""
 
 
 def ask_for_blackbody(name: str, temperature: float) -> None:
     """
-    Ask who sits at the blackbody to set it, and wait for Enter.
+    Ask the user to set the blackbody to a temperature [K], and wait for Enter.
 
-    Parameters
-    ----------
-    name : str
-        Of the session.
-    temperature : float
-        What it is to be set to [K].
-
-    Raises
-    ------
-    RuntimeError
-        If there is no keyboard, as under papermill.
+    RuntimeError if there is no keyboard, as under papermill.
     """
     celsius = f"{temperature - zero_Celsius:.2f} degC"
-    question = f"\n{name}: set the blackbody to {celsius} and press Enter; its rest is awaited. "
+    question = (
+        f"\n{name}: set the blackbody to {celsius} and press Enter; then its rest is awaited. "
+    )
     try:
         input(question)
     except (EOFError, NotImplementedError) as error:
@@ -93,20 +58,7 @@ def ask_for_blackbody(name: str, temperature: float) -> None:
 
 
 def plugged_in(session: Session) -> str:
-    """
-    Report of the USB bus; the devices may open even where it cannot be listed.
-
-    Parameters
-    ----------
-    session : Session
-        Its frame rate determines the bandwidth that is needed.
-
-    Returns
-    -------
-    str
-        See `dbthermal.instruments.inventory.describe`; for an emulated session, or without
-        libusb, that the bus was not looked at.
-    """
+    """Report of the USB bus, which an emulated session does not need; see `inventory.describe`."""
     if session.simulated:
         return f"Session '{session.name}' is emulated: the USB bus was not looked at."
     try:
@@ -118,7 +70,7 @@ def plugged_in(session: Session) -> str:
 def main(
     arguments: Sequence[str] | None = None,
     world: World | None = None,
-    pictures: Pictures = blackbody.pictures,
+    pictures: Mapping[str, Picture] | None = None,
 ) -> int:
     """
     Record a session.
@@ -127,10 +79,9 @@ def main(
     ----------
     arguments : sequence of str, optional
         Command line: session, folder, ``--simulate``, ``--dry-run``.
-    world : World, optional
-        The emulated bench of an emulated session; by default one that is made for it.
-    pictures : callable
-        Gives what the emulated cameras see, of session and world.
+    world, pictures : optional
+        Emulated bench of an emulated session, and frames of its cameras, as for
+        `dbthermal.instruments.devices.open_devices`.
 
     Returns
     -------
@@ -149,7 +100,7 @@ def main(
     except KeyboardInterrupt:
         print("\nInterrupted: what was recorded is kept.", file=sys.stderr)
         return 130
-    except FAILURES as error:
+    except _FAILURES as error:
         print(f"\nFailed: {error}", file=sys.stderr)
         return 1
 
@@ -168,17 +119,19 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(
-    session: Session, folder: Path, world: World | None, pictures: Pictures, *, dry: bool
+    session: Session,
+    folder: Path,
+    world: World | None,
+    pictures: Mapping[str, Picture] | None,
+    *,
+    dry: bool,
 ) -> int:
-    """Open the devices, say what they are, and record."""
-    seen: Mapping[str, Picture] = {}
+    """Open the devices, print their identities, and record; returns the exit status."""
     if session.simulated:
         print(f"Session '{session.name}': every device is emulated, nothing is measured.")
-        world = _world(session) if world is None else world
-        seen = pictures(session, world)
     else:
         print(plugged_in(session))
-    with open_devices(session, world, seen) as devices:
+    with open_devices(session, world, pictures) as devices:
         for name, identity in devices.identities().items():
             print(f"{name}: " + ", ".join(f"{key} {value}" for key, value in identity.items()))
         if dry:
@@ -193,36 +146,40 @@ def _run(
 
 def _record(devices: Devices, folder: Path) -> list[Summary]:
     """Run the session's protocol."""
-    progress = Progress(lambda line: print(line, end="", flush=True))
-    name = devices.session.name
+    watch, name = Watch(), devices.session.name
+
+    def show(preview: Preview) -> None:
+        print(_progress(watch, preview), end="", flush=True)
+
     if devices.session.blackbody is None:
-        found = [protocols.record_scene(devices, folder / f"{name}.zarr", preview=progress)]
+        summaries = [protocols.record_scene(devices, folder / f"{name}.zarr", preview=show)]
     else:
+        set_temperature = partial(_set_blackbody, devices)
         steps = protocols.record_sweep(
-            devices, folder, set_temperature=_setter(devices), preview=progress
+            devices, folder, set_temperature=set_temperature, preview=show
         )
-        found = [step.summary for step in steps]
+        summaries = [step.summary for step in steps]
     print()
-    return found
+    return summaries
 
 
-def _setter(devices: Devices) -> Callable[[float], None]:
-    """What sets the blackbody: the emulated one by itself, the real one by who sits at it."""
-    world = devices.world
-    if world is None:
-        return partial(ask_for_blackbody, devices.session.name)
-
-    def set_temperature(temperature: float) -> None:
-        print(f"\nSetting the emulated blackbody to {temperature - zero_Celsius:.2f} degC.")
-        world.blackbody_temperature = temperature
-
-    return set_temperature
+def _progress(watch: Watch, preview: Preview) -> str:
+    """Progress of a recording in one line, written over the one before."""
+    watch.note(preview)
+    bands = "; ".join(
+        f"{band}: " + ", ".join([*status.text.splitlines(), *status.warning.splitlines()])
+        for band, status in watch.status().items()
+    )
+    return f"\r{preview.time:6.1f} s  {bands}"
 
 
-def _world(session: Session) -> World:
-    """Bench on which all but the blackbody is as warm as the room."""
-    places = dict.fromkeys(session.thermocouples.values(), ROOM)
-    return emulated_world(session, scene=lambda _: places, waits=True)
+def _set_blackbody(devices: Devices, temperature: float) -> None:
+    """Set the emulated blackbody, or ask the user to set the real one."""
+    if devices.world is None:
+        ask_for_blackbody(devices.session.name, temperature)
+        return
+    print(f"\nSetting the emulated blackbody to {temperature - zero_Celsius:.2f} degC.")
+    devices.world.blackbody_temperature = temperature
 
 
 if __name__ == "__main__":

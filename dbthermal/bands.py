@@ -15,6 +15,8 @@ import numpy.typing as npt
 
 from dbthermal import planck
 
+__all__ = ["FILTERS", "TEMPERATURE_RANGE", "Band", "get"]
+
 Array = npt.NDArray[np.float64]
 
 TEMPERATURE_RANGE: Final = (100.0, 2000.0)
@@ -22,6 +24,10 @@ TEMPERATURE_RANGE: Final = (100.0, 2000.0)
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 _NEWTON_STEPS = 50
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,7 @@ class Band:
     Attributes
     ----------
     name : str
-        Label used on the `band` dimension.
+        Label on the dimension `band`.
     lower, upper : float
         Edges [m].
     """
@@ -42,7 +48,7 @@ class Band:
     upper: float
 
     def __post_init__(self) -> None:
-        """Refuse edges that are not a band."""
+        """Check the edges."""
         if not 0 < self.lower < self.upper < np.inf:
             raise ValueError(
                 f"Invalid edges {self.lower} m, {self.upper} m of band '{self.name}'. "
@@ -120,7 +126,7 @@ class Band:
 
     def temperature(self, radiance: npt.ArrayLike) -> Array:
         r"""
-        Temperature of the blackbody with a given in-band radiance: the inverse of `radiance`.
+        Temperature of the blackbody of an in-band radiance, the inverse of `radiance`.
 
         Newton's method on :math:`\ln B` as a function of :math:`1/T`, nearly a straight line,
         run until the temperature no longer changes.
@@ -202,7 +208,7 @@ doi:10.48550/arXiv.2509.11334): centre and full width at half maximum, as top ha
 
 def get(name: str) -> Band:
     """
-    Return one of `FILTERS` by its name.
+    Band of `FILTERS` by its name.
 
     Parameters
     ----------
@@ -217,7 +223,16 @@ def get(name: str) -> Band:
     Raises
     ------
     KeyError
-        If there is no such band; the error lists those that exist.
+        If the name is unknown; the error lists the known ones.
+
+    Examples
+    --------
+    >>> sorted(FILTERS)
+    ['10.6', '12.1', '8-14', '8.5', '9.5']
+    >>> band = get("9.5")
+    >>> radiance = band.radiance(300.0)
+    >>> round(float(radiance), 4), round(float(band.temperature(radiance)), 6)
+    (4.97, 300.0)
     """
     if name not in FILTERS:
         raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(FILTERS)}.")

@@ -15,6 +15,8 @@ from scipy.stats import chi2
 
 from dbthermal import _smooth as smooth
 
+__all__ = ["MINIMUM_FRAMES", "estimate", "of_bands", "second_difference"]
+
 Array = npt.NDArray[np.float64]
 
 MINIMUM_FRAMES: Final = 16
@@ -31,6 +33,10 @@ _TRIMMED_VARIANCE = float(chi2.cdf(_TRIM, 4) / chi2.cdf(_TRIM, 2))
 # Standard deviation of a correlation of second differences, times sqrt(frames): their
 # autocorrelation is 1, -2/3, 1/6, so sqrt(1 + 2 (4/9 + 1/36)).
 _CORRELATION_STD = np.sqrt(35.0 / 18.0)
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
@@ -95,20 +101,20 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
             f"Invalid capture of {frames} frames and {pixels} usable pixels to estimate a noise "
             f"from. Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise."
         )
-    functions = smooth.basis(time, min(_ORDER, frames // 4))
+    functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]
-    # What the smooth functions took of the noise.
-    kept = 1.0 - functions.shape[1] / frames
-    covariance = [
-        part / kept
-        for part in _trimmed_covariance(*(second_difference(part, time) for part in rapid))
-    ]
+    # The projection on K functions of N frames leaves 1 - K / N of the noise's variance.
+    remaining = 1.0 - functions.shape[1] / frames
+    differences = [second_difference(part, time) for part in rapid]
+    auto_first, cross, auto_second = (
+        part / remaining for part in _trimmed_covariance(*differences)
+    )
     ratio = _lagged_ratio(*rapid)
-    auto_first, cross, auto_second = covariance
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = np.abs(cross) / np.sqrt(auto_first * auto_second)
         shared = correlation > _SIGNIFICANCE * _CORRELATION_STD / np.sqrt(frames)
         shared &= ratio * cross > 0
+        # With y2 = ratio y1: var_1 = s_1^2 + v, var_2 = s_2^2 + ratio^2 v, cov = ratio v.
         variances = (
             np.where(shared, auto_first - cross / ratio, auto_first),
             np.where(shared, auto_second - ratio * cross, auto_second),
@@ -165,20 +171,21 @@ def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Arra
     Variances and covariance (pixel) over the frames in which the bands do not step.
 
     The frames are cut by an ellipse of the shape of the covariance, which scales all of it by one
-    factor: a cut of each band alone would take more of the covariance than of the variances, and
-    what is wanted is a small difference of the two.
+    factor: a cut of each band alone would reduce the covariance more than the variances, whose
+    small difference is the noise.
     """
-    spread = [_MAD * np.median(np.abs(part), axis=0) for part in (first, second)]
+    scales = [_MAD * np.median(np.abs(part), axis=0) for part in (first, second)]
     one, other = (
         np.divide(part, std, out=np.zeros_like(part), where=std > 0)
-        for part, std in zip((first, second), spread, strict=True)
+        for part, std in zip((first, second), scales, strict=True)
     )
     # Robust correlation (Gnanadesikan, Kettenring 1972, doi:10.2307/2528963).
-    along, across = (np.median(np.abs(part), axis=0) ** 2 for part in (one + other, one - other))
+    plus, minus = (np.median(np.abs(part), axis=0) ** 2 for part in (one + other, one - other))
     correlation = np.divide(
-        along - across, along + across, out=np.zeros_like(along), where=along + across > 0
+        plus - minus, plus + minus, out=np.zeros_like(plus), where=plus + minus > 0
     )
     distance = one**2 - 2.0 * correlation * one * other + other**2
+    # Squared Mahalanobis distance: (a^2 - 2 r a b + b^2) / (1 - r^2).
     keep = distance <= _TRIM * (1.0 - correlation**2)
     count = keep.sum(axis=0) * _TRIMMED_VARIANCE
     products = (first * first, first * second, second * second)

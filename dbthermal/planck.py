@@ -10,6 +10,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy import constants
 
+__all__ = [
+    "FIRST_RADIATION_CONSTANT",
+    "SECOND_RADIATION_CONSTANT",
+    "brightness_temperature",
+    "require_positive",
+    "spectral_radiance",
+    "spectral_radiance_slope",
+]
+
 FIRST_RADIATION_CONSTANT: float = 2.0 * constants.h * constants.c**2
 """2 h c^2, first radiation constant for radiance [W m^2 sr^-1]."""
 
@@ -20,14 +29,18 @@ Array = npt.NDArray[np.float64]
 Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 def require_positive(name: str, value: npt.ArrayLike) -> Array:
     """
-    Return a float array of which every element is finite and positive.
+    Check that every element of a value is finite and positive.
 
     Parameters
     ----------
     name : str
-        What the value is, for the error.
+        Name of the value, for the error.
     value : array_like
         The value, in any unit.
 
@@ -78,6 +91,14 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
     ----------
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        arXiv, doi:10.48550/arXiv.2509.11334
+
+    Examples
+    --------
+    >>> radiance = spectral_radiance(10e-6, 300.0)
+    >>> round(float(radiance) * 1e-6, 3)  # [W m^-2 sr^-1 um^-1]
+    9.924
+    >>> round(float(brightness_temperature(10e-6, radiance)), 6)
+    300.0
     """
     wavelength = require_positive("wavelength [m]", wavelength)
     temperature = require_positive("temperature [K]", temperature)
@@ -119,7 +140,7 @@ def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLik
 
 def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -> Array:
     r"""
-    Temperature of the blackbody with a given spectral radiance: the exact inverse.
+    Temperature of the blackbody of a spectral radiance, the exact inverse of Planck's law.
 
     .. math:: T = \frac{c_2}{\lambda \ln(1 + 2 h c^2 / \lambda^5 L)}
 

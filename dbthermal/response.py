@@ -1,8 +1,13 @@
-"""The camera's response, a Dataset per band (see `schema`), made by `calibration.fit_response`.
+r"""Response of a camera: counts of a blackbody as a function of its temperature, per band.
 
-`curve` makes a `curves.Curve` of one band of it, in which everything downstream computes.
+A response is a Dataset of the stage `response` of `schema`, made by `calibration.fit_response`;
+`curve` makes the `Curve` of one of its bands, in which everything downstream computes: with the
+linearised signal :math:`z = T_r + (I - U(T_r)) / a`, in kelvin, and the blackbody's own signal
+:math:`u(T)`, with :math:`u(T_r) = T_r` and slope 1 there.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -10,17 +15,185 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
-from dbthermal.curves import Curve, Line, require_range
+
+__all__ = [
+    "COEFFICIENTS",
+    "KINDS",
+    "Curve",
+    "LinearCurve",
+    "apparent_temperature",
+    "counts",
+    "curve",
+    "noise",
+    "require_range",
+]
 
 Array = npt.NDArray[np.float64]
 
 KINDS: Final = ("exact", "linear")
 """Kinds of response: the Sakuma-Hattori curve, and the paper's linear approximation."""
 
-_SLOPE_POINTS: Final = 16
-
 COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", "offset")
 """Variables of a response that hold the Sakuma-Hattori curve."""
+
+# Temperatures at which the slope of a curve is checked.
+_SLOPE_POINTS: Final = 16
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+@dataclass(frozen=True)
+class Curve:
+    r"""
+    Sakuma-Hattori response of one band.
+
+    .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O
+
+    Attributes
+    ----------
+    band : str
+        Name of the band.
+    amplitude : float
+        C [count].
+    wavelength : float
+        A, effective wavelength [m].
+    shift : float
+        B [m K].
+    offset : float
+        O [count].
+    reference : float
+        Reference temperature :math:`T_r` [K].
+    lowest, highest : float
+        Calibrated range [K].
+
+    References
+    ----------
+    .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
+       Industry 5, 421-427
+    .. [2] Saunders, White (2003), Metrologia 40, 195, doi:10.1088/0026-1394/40/4/309
+    """
+
+    band: str
+    amplitude: float
+    wavelength: float
+    shift: float
+    offset: float
+    reference: float
+    lowest: float
+    highest: float
+
+    def counts(self, temperature: npt.ArrayLike) -> Array:
+        """Counts of a blackbody at a temperature [K] that fills the pixel, extrapolated [count]."""
+        exponent = planck.SECOND_RADIATION_CONSTANT / self._scale(temperature)
+        return np.asarray(self.amplitude / np.expm1(exponent) + self.offset)
+
+    def count_slope(self, temperature: npt.ArrayLike) -> Array:
+        """Derivative of `counts` with the temperature [count/K]."""
+        scale = self._scale(temperature)
+        exponent = planck.SECOND_RADIATION_CONSTANT / scale
+        excess = np.expm1(exponent)
+        growth = self.amplitude / excess * (1.0 + 1.0 / excess)
+        return np.asarray(growth * exponent * self.wavelength / scale)
+
+    def inverse(self, counts: npt.ArrayLike) -> Array:
+        """Temperature [K] of a blackbody of given counts; NaN at and below the offset."""
+        excess = np.asarray(counts, dtype=np.float64) - self.offset
+        ratio = np.full_like(excess, np.nan)
+        np.divide(self.amplitude, excess, out=ratio, where=excess > 0)
+        scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(ratio)
+        return np.asarray((scale - self.shift) / self.wavelength)
+
+    @cached_property
+    def reference_counts(self) -> float:
+        """Counts at the reference temperature [count]."""
+        return float(self.counts(self.reference))
+
+    @cached_property
+    def reference_slope(self) -> float:
+        """Slope a at the reference temperature [count/K]."""
+        return float(self.count_slope(self.reference))
+
+    def linearise(self, counts: npt.ArrayLike) -> Array:
+        """Linearised signal z of counts [K]."""
+        excess = np.asarray(counts, dtype=np.float64) - self.reference_counts
+        return self.reference + excess / self.reference_slope
+
+    def signal(self, temperature: npt.ArrayLike) -> Array:
+        """Linearised signal u(T) of a blackbody at a temperature [K]."""
+        return self.linearise(self.counts(temperature))
+
+    def slope(self, temperature: npt.ArrayLike) -> Array:
+        """Derivative of `signal` with the temperature [1]."""
+        return self.count_slope(temperature) / self.reference_slope
+
+    def temperature(self, signal: npt.ArrayLike) -> Array:
+        """Temperature [K] of the blackbody with a linearised signal [K]; NaN where undefined."""
+        excess = np.asarray(signal, dtype=np.float64) - self.reference
+        return self.inverse(self.reference_counts + self.reference_slope * excess)
+
+    def _scale(self, temperature: npt.ArrayLike) -> Array:
+        return self.wavelength * np.asarray(temperature, dtype=np.float64) + self.shift
+
+
+@dataclass(frozen=True)
+class LinearCurve(Curve):
+    """
+    The paper's linear response, counts = slope * T + intercept, with the methods of `Curve`.
+
+    Attributes
+    ----------
+    amplitude : float
+        Slope [count/K].
+    offset : float
+        Intercept [count]; `wavelength` and `shift` are not used.
+    """
+
+    def counts(self, temperature: npt.ArrayLike) -> Array:
+        """Counts at a temperature [K]."""
+        return self.amplitude * np.asarray(temperature, dtype=np.float64) + self.offset
+
+    def count_slope(self, temperature: npt.ArrayLike) -> Array:
+        """Slope, the same at each temperature [count/K]."""
+        return np.full_like(np.asarray(temperature, dtype=np.float64), self.amplitude)
+
+    def inverse(self, counts: npt.ArrayLike) -> Array:
+        """Temperature of counts [K]."""
+        return (np.asarray(counts, dtype=np.float64) - self.offset) / self.amplitude
+
+
+def require_range(temperature: npt.ArrayLike, of: Curve, name: str) -> Array:
+    """
+    Temperatures as float64, all of which must lie in the calibrated range of a curve.
+
+    Parameters
+    ----------
+    temperature : array_like
+        Temperatures [K].
+    of : Curve
+        The curve.
+    name : str
+        Name of the quantity, for the error.
+
+    Returns
+    -------
+    ndarray
+        The temperatures [K].
+
+    Raises
+    ------
+    ValueError
+        If one lies outside the range or is NaN; the error names the first.
+    """
+    values = np.asarray(temperature, dtype=np.float64)
+    bad = ~((values >= of.lowest) & (values <= of.highest))
+    if np.any(bad):
+        raise ValueError(
+            f"Invalid {name} {values[bad].flat[0]} K in band '{of.band}'. Must lie in the "
+            f"response's range [{of.lowest}, {of.highest}] K."
+        )
+    return values
 
 
 def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
@@ -59,7 +232,7 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     common = (number["reference_temperature"], number["temperature_min"], number["temperature_max"])
     if kind == "linear":
         slope, intercept = number["linear_slope"], number["linear_intercept"]
-        result: Curve = Line(band, slope, 0.0, 0.0, intercept, *common)
+        result: Curve = LinearCurve(band, slope, 0.0, 0.0, intercept, *common)
     else:
         shape = (number["effective_wavelength"], number["wavelength_shift"], number["offset"])
         result = Curve(band, number["amplitude"], *shape, *common)
@@ -157,6 +330,15 @@ def apparent_temperature(
     ------
     ValueError
         If a band is missing in the response.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from dbthermal import simulation
+    >>> response = simulation.Rig(bands=("8-14", "9.5")).response()
+    >>> blackbody = counts(response, xr.DataArray([293.15, 313.15], dims="time"))
+    >>> apparent_temperature(response, blackbody).sel(band="9.5").values.round(2)
+    array([293.15, 313.15])
     """
     names = [str(name) for name in counts["band"].values]
     values = [

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal import planck, response, schema
-from dbthermal.curves import Curve, Line, require_range
+from dbthermal.response import Curve, LinearCurve, require_range
 
 TEMPERATURES = st.floats(250.0, 400.0)
 # Published constants of a laboratory's FLIR Boson: R / (exp(B / T) - F) + O with F = 1.
 BOSON = Curve(
     "8-14", 1.08e6, planck.SECOND_RADIATION_CONSTANT / 1524.0, 0.0, 15500.0, 300.0, 250.0, 400.0
 )
-LINE = Line("8-14", 115.0, 0.0, 0.0, -12000.0, 300.0, 250.0, 400.0)
+LINE = LinearCurve("8-14", 115.0, 0.0, 0.0, -12000.0, 300.0, 250.0, 400.0)
 CURVES = st.builds(
     Curve,
     band=st.just("9.5"),
@@ -122,7 +122,7 @@ def test_curve_of_a_response(two_bands: xr.Dataset) -> None:
     """The coefficients of the asked band and kind arrive in the curve."""
     exact, linear = (response.curve(two_bands, "9.5", kind) for kind in response.KINDS)
     assert exact == Curve("9.5", 1.5e5, 9.5e-6, 0.0, 17000.0, 298.15, 280.0, 340.0)
-    assert isinstance(linear, Line)
+    assert isinstance(linear, LinearCurve)
     assert float(linear.counts(300.0)) == pytest.approx(11.0 * 300.0 + 14000.0, abs=1e-9)
 
 

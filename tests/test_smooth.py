@@ -16,7 +16,7 @@ ORDERS = st.integers(1, 6)
 @given(TIMES, ORDERS)
 def test_basis_is_orthonormal(time: smooth.Array, order: int) -> None:
     """The functions are orthonormal over the capture's own times, evenly spaced or not."""
-    functions = smooth.basis(time, order)
+    functions = smooth.polynomial_basis(time, order)
     np.testing.assert_allclose(functions.T @ functions, np.eye(order), rtol=0, atol=1e-12)
 
 
@@ -25,14 +25,14 @@ def test_basis_spans_the_polynomials(time: smooth.Array, order: int, seed: int) 
     """A polynomial of a degree below the order is its own projection."""
     coefficients = np.random.default_rng(seed).standard_normal(order)
     signal = np.polynomial.Polynomial(coefficients, domain=[time[0], time[-1]])(time)
-    functions = smooth.basis(time, order)
+    functions = smooth.polynomial_basis(time, order)
     np.testing.assert_allclose(functions @ (functions.T @ signal), signal, rtol=0, atol=1e-10)
 
 
 def test_bases_are_nested() -> None:
     """A higher order keeps the functions of the lower one, up to their sign."""
     time = np.arange(30.0)
-    small, large = smooth.basis(time, 3), smooth.basis(time, 7)
+    small, large = smooth.polynomial_basis(time, 3), smooth.polynomial_basis(time, 7)
     np.testing.assert_allclose(np.abs(large[:, :3]), np.abs(small), rtol=0, atol=1e-12)
 
 
@@ -40,20 +40,22 @@ def test_bases_are_nested() -> None:
 def test_basis_ignores_unit_and_start_of_time(scale: float, start: float) -> None:
     """Seconds or minutes, from whenever: the functions are the same."""
     time = np.arange(20.0) ** 1.2
-    functions = smooth.basis(start + scale * time, 5)
-    np.testing.assert_allclose(np.abs(functions), np.abs(smooth.basis(time, 5)), rtol=0, atol=1e-6)
+    functions = smooth.polynomial_basis(start + scale * time, 5)
+    np.testing.assert_allclose(
+        np.abs(functions), np.abs(smooth.polynomial_basis(time, 5)), rtol=0, atol=1e-6
+    )
 
 
 def test_single_frame() -> None:
     """One frame has the constant alone."""
-    np.testing.assert_allclose(np.abs(smooth.basis([3.0], 1)), [[1.0]], rtol=0, atol=0)
+    np.testing.assert_allclose(np.abs(smooth.polynomial_basis([3.0], 1)), [[1.0]], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("order", [0, -1, 6])
 def test_bad_order(order: int) -> None:
     """An order of nothing, or of more functions than frames, is refused."""
     with pytest.raises(ValueError, match=re.escape(f"Invalid order {order} of the smooth")):
-        smooth.basis(np.arange(5.0), order)
+        smooth.polynomial_basis(np.arange(5.0), order)
 
 
 def test_leverage_is_the_hat_matrix() -> None:
@@ -101,7 +103,7 @@ def test_own_part_is_without_the_steps_of_the_camera(height: float, events: list
     curve = 0.01 * (time - 20.0) ** 2
     signal = curve + height * segmented(60, *events)
     functions = smooth.subspace(time, 4, segment=segmented(60, *events))
-    own = functions.own @ (functions.functions.T @ signal)
+    own = functions.object_part @ (functions.functions.T @ signal)
     np.testing.assert_allclose(own, curve, rtol=0, atol=1e-9)
 
 
@@ -110,7 +112,7 @@ def test_own_part_keeps_a_jump() -> None:
     time = np.arange(60.0)
     jump, shutter = 5.0 * (time >= 40), 3.0 * (time >= 15)
     functions = smooth.subspace(time, 3, segment=segmented(60, 15), jump=40)
-    own = functions.own @ (functions.functions.T @ (0.1 * time + jump + shutter))
+    own = functions.object_part @ (functions.functions.T @ (0.1 * time + jump + shutter))
     np.testing.assert_allclose(own, 0.1 * time + jump, rtol=0, atol=1e-9)
 
 
@@ -122,7 +124,7 @@ def test_leverage_with_steps_is_the_variance_of_the_own_part() -> None:
     for order in (1, 3, 5):
         used = functions.columns(np.array([order]))[:, 0]
         assert used.sum() == order + 3
-        own = functions.own[:, used] @ (functions.functions[:, used].T @ noise)
+        own = functions.object_part[:, used] @ (functions.functions[:, used].T @ noise)
         np.testing.assert_allclose(
             own.var(axis=1), functions.leverage()[:, order - 1], rtol=0.15, atol=0
         )
@@ -133,8 +135,8 @@ def test_without_steps_the_subspace_is_the_basis() -> None:
     time = np.arange(30.0)
     for segment in (None, np.zeros(30, int), np.full(30, 7)):
         found = smooth.subspace(time, 5, segment=segment)
-        np.testing.assert_array_equal(found.functions, smooth.basis(time, 5))
-        np.testing.assert_array_equal(found.own, found.functions)
+        np.testing.assert_array_equal(found.functions, smooth.polynomial_basis(time, 5))
+        np.testing.assert_array_equal(found.object_part, found.functions)
         assert found.steps == 0
 
 
@@ -149,5 +151,5 @@ def test_jump_in_slope_over_uneven_times() -> None:
     time = np.concatenate([np.arange(150), np.arange(250, 350)]) / 10.0
     bent = np.maximum(time - time[80], 0.0) + 5.0 * (time >= time[80])
     functions = smooth.subspace(time, 4, jump=80)
-    own = functions.own @ (functions.functions.T @ bent)
+    own = functions.object_part @ (functions.functions.T @ bent)
     np.testing.assert_allclose(own, bent, rtol=0, atol=1e-9)

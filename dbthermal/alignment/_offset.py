@@ -251,7 +251,7 @@ def _rapid(movie: Array, times: Array, here: Mask, segment: clocks.Indices) -> A
             f"Must be at least {_MINIMUM_FRAMES} for a time offset."
         )
     steps = segment[here][:, np.newaxis] == np.unique(segment[here])[1:]
-    functions, _ = np.linalg.qr(np.hstack([smooth.basis(times[here], _ORDER), steps]))
+    functions, _ = np.linalg.qr(np.hstack([smooth.polynomial_basis(times[here], _ORDER), steps]))
     residual = np.zeros_like(movie)
     residual[here] = movie[here] - functions @ (functions.T @ movie[here])
     return residual

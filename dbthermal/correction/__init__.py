@@ -1,41 +1,41 @@
-"""Correction of one camera's frames: what its detector does to the counts, found and undone.
+"""Correction of a camera's raw counts: what the detector adds to the signal is undone or marked.
 
-In the order of use: `fit_correction` and `correct` (gain and offset of each pixel, from a
-blackbody; `correct_drifting` between two corrections), `mark_shutter` (frozen and repeated frames),
-`mark_bad` (pixels that turn bad in the capture), `undo_lag` (thermal lag of the pixels) and
-`undo_drift` (drift that all pixels share). Then `alignment.registration.register` and
-`alignment.align` bring two cameras together, and `separation.solve` follows. A sample that is no
-measurement becomes NaN or is flagged, never filled.
+Begin with `fit_correction` (gain, offset and bad pixels from a blackbody, whose movies
+`blackbody_statistics` reduces); then `correct_capture` does all of it in one documented order. Its
+steps are functions of their own, for a capture that was corrected in part elsewhere. A sample that
+is no measurement becomes NaN or is flagged, never filled. `alignment.register` and
+`alignment.align` follow, then `separation.solve`.
 """
 
-from dbthermal.correction._drift import correct_drifting, renew_offset, undo_drift
-from dbthermal.correction._lag import noise_amplification, undo_lag
+from dbthermal.correction._capture import correct_capture
 from dbthermal.correction._nonuniformity import (
     DETECTOR_MAXIMUM,
     OUTLIER,
-    Array,
-    Mask,
     blackbody_statistics,
     correct,
     fit_correction,
+    renew_offset,
 )
 from dbthermal.correction._pixels import mark_bad
 from dbthermal.correction._shutter import find_shutter, mark_shutter
+from dbthermal.correction._temporal import lag_coefficients, undo_drift, undo_lag
 
 __all__ = [
     "DETECTOR_MAXIMUM",
     "OUTLIER",
-    "Array",
-    "Mask",
     "blackbody_statistics",
     "correct",
-    "correct_drifting",
+    "correct_capture",
     "find_shutter",
     "fit_correction",
+    "lag_coefficients",
     "mark_bad",
     "mark_shutter",
-    "noise_amplification",
     "renew_offset",
     "undo_drift",
     "undo_lag",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,10 +1,9 @@
-"""Correction of the camera's frames: a gain and an offset for each pixel, and its bad pixels.
+"""Non-uniformity correction (NUC): a gain and an offset for each pixel, and its bad pixels.
 
 The correction follows the supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334: a
 blackbody fills the view at several temperatures, and each pixel is brought to the frame's mean by
-least squares. `blackbody_statistics` reduces the movies of the blackbody, `fit_correction` fits,
-`correct` applies. A bad pixel is marked, never filled from its neighbours: a filled pixel looks
-like a measurement and is none.
+least squares. A bad pixel is marked, never filled from its neighbours: a filled pixel looks like a
+measurement and is none.
 """
 
 from typing import Final
@@ -15,7 +14,8 @@ import xarray as xr
 from scipy.special import ndtri
 from scipy.stats import chi2
 
-from dbthermal import schema
+from dbthermal import planck, schema
+from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -26,11 +26,11 @@ DETECTOR_MAXIMUM: Final = 65535
 OUTLIER: Final = 6.0
 """Robust z-score beyond which a pixel is bad [1]: 1 of 5e8 normal pixels."""
 
-_PARAMETERS = ("blackbody_temperatures", "threshold", "detector_maximum")
+_PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "offset_renewed"}
 _PASSES = 2
 # Median absolute deviation -> standard deviation of a normal distribution.
 _MAD = 1.0 / float(ndtri(0.75))
-# Below this a spread between pixels is rounding, and no pixel is an outlier [count].
+# Below this a difference between pixels is rounding, and no pixel is an outlier [count].
 _ROUNDING = 0.01
 
 
@@ -102,7 +102,7 @@ def fit_correction(
     finite or at the detector's limits at a temperature, whose counts do not rise with the mean, or
     whose gain, or RMS of residuals, lies more than `threshold` robust standard deviations
     (1.48 times the median absolute deviation) off the median of the others. Mean, fit and outliers
-    are found twice, then the fit is made with the pixels that are left.
+    are determined twice, then the fit is made with the remaining pixels.
 
     Parameters
     ----------
@@ -119,8 +119,8 @@ def fit_correction(
     Dataset
         Stage `correction`: `gain` (band, y, x) [1] and `offset` (band, y, x) [count]; `bad`
         (band, y, x), bool; `residual` (band) [count], RMS over good pixels and temperatures;
-        `level` (band, temperature) [count], the means that the pixels are brought to, which is
-        what `calibration.fit_response` takes. Bad pixels have gain 1 and offset 0: their counts
+        `level` (band, temperature) [count], the means that the pixels are brought to, for
+        `calibration.fit_response`. Bad pixels have gain 1 and offset 0: their counts
         pass unchanged.
 
     Raises
@@ -137,26 +137,19 @@ def fit_correction(
         raise ValueError(f"Invalid threshold {threshold} of bad pixels. Must be positive.")
     image = (counts.sizes["y"], counts.sizes["x"])
     parts = []
-    for here in counts:
-        frames = here.values.astype(np.float64).reshape(-1, image[0] * image[1])
-        parts.append(_fit_band(frames, str(here["band"].item()), threshold, maximum))
+    for band in counts:
+        frames = band.values.astype(np.float64).reshape(-1, image[0] * image[1])
+        parts.append(_fit_band(frames, str(band["band"].item()), threshold, maximum))
     gain, offset, bad, residual, level = (np.stack(part) for part in zip(*parts, strict=True))
-    stage, pixels = schema.STAGES["correction"], (-1, *image)
-    maps = {
-        "gain": (gain.reshape(pixels), stage["gain"].attrs),
-        "offset": (offset.reshape(pixels), stage["offset"].attrs),
-        "bad": (bad.reshape(pixels), {"units": "1", "long_name": "bad pixel"}),
+    values = {
+        **{name: part.reshape(-1, *image) for name, part in (("gain", gain), ("offset", offset))},
+        "bad": bad.reshape(-1, *image),
+        "residual": residual,
+        "level": level,
     }
+    stage = {**schema.STAGES["correction"], **schema.OPTIONAL["correction"]}
     return xr.Dataset(
-        {
-            **{name: (("band", "y", "x"), *values) for name, values in maps.items()},
-            "residual": ("band", residual, {"units": "count", "long_name": "RMS residual"}),
-            "level": (
-                ("band", "temperature"),
-                level,
-                {"units": "count", "long_name": "mean over the good pixels"},
-            ),
-        },
+        {name: (stage[name].dims, part, stage[name].attrs) for name, part in values.items()},
         coords={name: counts.coords[name] for name in counts.dims if name in counts.coords},
         attrs={
             "blackbody_temperatures": counts["temperature"].values.tolist(),
@@ -166,11 +159,72 @@ def fit_correction(
     )
 
 
-def correct(
-    capture: xr.Dataset, correction: xr.Dataset, *, maximum: int = DETECTOR_MAXIMUM
-) -> xr.Dataset:
+def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
+    r"""
+    One-point correction: new offsets from one image of a uniform view, the gains kept.
+
+    .. math:: f' = f - [(g F + f) - \overline{g F + f}]
+
+    with F the image and the mean over the good pixels, so that the band's level stays: a single
+    image of unknown temperature says nothing of it (`undo_drift` does).
+
+    Parameters
+    ----------
+    correction : Dataset
+        From `fit_correction`.
+    flat : DataArray
+        Mean of raw frames of a uniform view, (band, y, x) [count], such as a lens cap or the
+        camera's shutter, of the bands of the correction.
+
+    Returns
+    -------
+    Dataset
+        The correction with other `offset` [count], bad pixels unchanged, and the attribute
+        ``offset_renewed`` = 1.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the correction is not as `schema` has it or has no `bad`, a band is missing, the
+        pixels are not the same, or a good pixel of the image is not finite.
     """
+    schema.check(correction, "correction")
+    if "bad" not in correction:
+        raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
+    names = [str(name) for name in correction["band"].values]
+    flat = flat.isel(band=schema.band_positions(flat, names, "the flat image"))
+    if flat.dims != ("band", "y", "x") or flat.shape != correction["gain"].shape:
+        raise ValueError(
+            f"Invalid flat image of sizes {dict(flat.sizes)}. Must be those of the correction, "
+            f"{dict(correction['gain'].sizes)}."
+        )
+    good = ~correction["bad"].values
+    if not np.all(np.isfinite(flat.values[good])):
+        raise ValueError("Invalid flat image: a good pixel is not finite. Must be finite.")
+    seen = correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
+    level = np.mean(seen, axis=(1, 2), where=good, keepdims=True)
+    offset = np.where(good, correction["offset"].values - (seen - level), 0.0)
+    variable = correction["offset"].copy(data=offset)
+    return correction.assign(offset=variable).assign_attrs(offset_renewed=1)
+
+
+def correct(
+    capture: xr.Dataset,
+    correction: xr.Dataset,
+    *,
+    after: xr.Dataset | None = None,
+    times: tuple[float, float] | None = None,
+    maximum: int = DETECTOR_MAXIMUM,
+) -> xr.Dataset:
+    r"""
     Apply gain and offset to a capture, and mark its bad and saturated pixels.
+
+    With a second correction gain and offset go from the first to it in proportion to time,
+
+    .. math:: I' = (1 - w) (g_0 I + f_0) + w (g_1 I + f_1), \quad w = \frac{t - t_0}{t_1 - t_0}
+
+    which is right for a pattern that drifts so, and wrong across a shutter event, where a camera
+    renews its offsets.
 
     Parameters
     ----------
@@ -179,6 +233,11 @@ def correct(
         are handed on.
     correction : Dataset
         From `fit_correction`, of the same pixels; it may hold more bands.
+    after : Dataset, optional
+        Correction that holds after the capture, e.g. from `renew_offset`.
+    times : tuple of float, optional
+        When the two corrections hold [s], on the capture's clock; by default its first and its last
+        frame. The capture lies between them: nothing is extrapolated.
     maximum : int
         Largest count of the detector [count].
 
@@ -186,52 +245,74 @@ def correct(
     -------
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), uint32,
-        with the bits of `schema.FLAGS` "dead_pixel" (bad in a band) and "saturated" (a sample of a
-        band at `maximum` or above, or at 0). The counts of these pixels are kept. Attributes say
+        with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample of a band at `maximum` or
+        above, or at 0) of `schema.Status`. The counts of these pixels are kept. Attributes say
         that gain and offset were corrected (``gain_offset_corrected`` = 1), with which parameters
-        they were fitted (``gain_offset_...``), and how many pixels are marked. The capture is not
-        changed.
+        they were fitted (``gain_offset_...``), between which times they were interpolated
+        (``correction_times`` [s]), and how many pixels are marked.
 
     Raises
     ------
     TypeError, ValueError
         If capture or correction is not as `schema` has it, the capture is not uint16 or was
-        corrected before, a band is missing in the correction, a gain or offset is not finite, or
-        the pixels are not the same.
+        corrected before, a band is missing in the correction, a gain or offset is not finite, the
+        pixels are not the same, or the times do not rise or do not enclose the capture.
     """
     counts = _require_raw(capture)
-    _require_same_pixels(counts, schema.check(correction, "correction"))
     names = [str(name) for name in counts["band"].values]
-    chosen = _select(correction, names)
+    maps = _maps(correction, counts, names)
+    time = counts["time"].values.astype(np.float64)
+    times = (float(time[0]), float(time[-1])) if times is None else times
+    if after is not None:
+        last, weight = _maps(after, counts, names), _weight(time, times)
+        change = last[["gain", "offset"]] - maps
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
-    for index, name in enumerate(names):
+    for band in range(len(names)):
         # One band at a time, written where it stays: no second movie in memory.
-        raw, here = counts.isel(band=index).values, chosen.sel(band=name)
-        np.multiply(raw, here["gain"].values.astype(np.float32), out=corrected[index])
-        corrected[index] += here["offset"].values.astype(np.float32)
+        raw = counts.isel(band=band).values
+        gain, offset = maps["gain"].values[band], maps["offset"].values[band]
+        np.multiply(raw, gain.astype(np.float32), out=corrected[band])
+        corrected[band] += offset.astype(np.float32)
+        if after is not None:
+            gain, offset = change["gain"].values[band], change["offset"].values[band]
+            for frame, share in enumerate(weight):
+                corrected[band, frame] += share * (gain * raw[frame] + offset)
         saturated |= (raw.max(axis=0) >= maximum) | (raw.min(axis=0) <= 0)
-    bad = chosen["bad"].values.any(axis=0)
-    status = bad * schema.FLAGS["dead_pixel"] + saturated * schema.FLAGS["saturated"]
-    attrs = schema.STAGES["corrected"]["counts"].attrs
+    bad = maps["bad"].values.any(axis=0)
+    if after is not None:
+        bad |= last["bad"].values.any(axis=0)
+    status = bad * np.uint32(Status.DEAD_PIXEL) | saturated * np.uint32(Status.SATURATED)
     result = capture.drop_vars("counts").assign(
-        counts=(counts.dims, corrected, attrs),
-        status=(("y", "x"), status.astype(np.uint32), schema.status_attrs()),
+        counts=(counts.dims, corrected, schema.STAGES["corrected"]["counts"].attrs),
+        status=(("y", "x"), status, schema.status_attrs()),
     )
+    done = {
+        f"gain_offset_{key}": correction.attrs[key] for key in _PARAMETERS & correction.attrs.keys()
+    }
     return schema.check(
         result.assign_attrs(
             gain_offset_corrected=1,
-            **{
-                f"gain_offset_{name}": correction.attrs[name]
-                for name in _PARAMETERS
-                if name in correction.attrs
-            },
+            **done,
+            **({} if after is None else {"correction_times": list(times)}),
             detector_maximum=maximum,
             dead_pixels=int(bad.sum()),
             saturated_pixels=int(saturated.sum()),
         ),
         "corrected",
     )
+
+
+def _weight(time: Array, times: tuple[float, float]) -> Array:
+    """Weight of the later correction at each time [1]."""
+    start, stop = times
+    planck.require_positive("time between the corrections [s]", stop - start)
+    if not (start <= time[0] and time[-1] <= stop):
+        raise ValueError(
+            f"Invalid times {start} s and {stop} s of the corrections. Must enclose the capture, "
+            f"{time[0]} s to {time[-1]} s."
+        )
+    return np.asarray((time - start) / (stop - start))
 
 
 def _difference_variance(counts: xr.DataArray) -> Array:
@@ -252,15 +333,16 @@ def _fit_band(
 ) -> tuple[Array, Array, Mask, float, Array]:
     """Gain, offset, bad, residual and level of one band, from frames (temperature, pixel)."""
     good = np.all((frames > 0) & (frames < maximum), axis=0)  # false for NaN
-    frames = np.where(good, frames, 0.0)  # these take part in nothing
+    frames = np.where(good, frames, 0.0)  # bad pixels enter neither mean nor fit
     good &= np.ptp(frames, axis=0) > 0
     for _ in range(_PASSES):
         level = _level(frames, good, band)
         gain, offset, rising = _least_squares(frames, level)
         residual = np.sqrt(np.mean((gain * frames + offset - level[:, np.newaxis]) ** 2, axis=0))
         good &= rising
-        spread = float(np.std(level))
-        good &= _inliers(gain * spread, good, threshold) & _inliers(residual, good, threshold)
+        # A gain that is off by dg is off by dg std(level) in counts, as the residuals are.
+        scale = float(np.std(level))
+        good &= _inliers(gain * scale, good, threshold) & _inliers(residual, good, threshold)
     level = _level(frames, good, band)
     gain, offset, _ = _least_squares(frames, level)
     error = (gain * frames + offset - level[:, np.newaxis])[:, good]
@@ -312,27 +394,23 @@ def _require_raw(capture: xr.Dataset) -> xr.DataArray:
     return counts
 
 
-def _require_same_pixels(counts: xr.DataArray, correction: xr.Dataset) -> None:
-    """Refuse a correction of another window of the detector."""
+def _maps(correction: xr.Dataset, counts: xr.DataArray, names: list[str]) -> xr.Dataset:
+    """Finite `gain`, `offset` and `bad` (band, y, x) of the bands and pixels of a capture."""
+    schema.check(correction, "correction")
     for dim in ("y", "x"):
-        sizes = counts.sizes[dim], correction.sizes[dim]
-        if sizes[0] != sizes[1]:
+        if counts.sizes[dim] != correction.sizes[dim]:
             raise ValueError(
-                f"Invalid size {sizes[0]} of '{dim}' of the capture. Must be that of the "
-                f"correction, {sizes[1]}."
+                f"Invalid size {counts.sizes[dim]} of '{dim}' of the capture. Must be that of the "
+                f"correction, {correction.sizes[dim]}."
             )
         both = dim in counts.coords and dim in correction.coords
         if both and not np.array_equal(counts[dim], correction[dim]):
             raise ValueError(f"Invalid '{dim}' of the capture. Must be those of the correction.")
-
-
-def _select(correction: xr.Dataset, names: list[str]) -> xr.Dataset:
-    """Bands of a correction by name, with finite coefficients."""
     places = schema.band_positions(correction, names, "the correction")
     if "bad" not in correction or correction["bad"].dims != ("band", "y", "x"):
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
-    chosen = correction.isel(band=places).assign_coords(band=names)
+    maps = correction[["gain", "offset", "bad"]].isel(band=places)
     for name in ("gain", "offset"):
-        if not np.all(np.isfinite(chosen[name])):
+        if not np.all(np.isfinite(maps[name])):
             raise ValueError(f"Invalid {name} of the correction: not finite. Must be finite.")
-    return chosen
+    return maps.drop_vars(["y", "x"], errors="ignore")

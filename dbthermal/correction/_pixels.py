@@ -14,14 +14,14 @@ from scipy.special import ndtri
 
 from dbthermal import schema
 from dbthermal.correction._nonuniformity import OUTLIER
+from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-MINIMUM_FRAMES: Final = 16
-"""Fewest frames from which a pixel is judged."""
-
+# Fewest frames from which a pixel is judged.
+_MINIMUM_FRAMES: Final = 16
 # Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
 _QUIET = 0.8
 # Mean magnitude of that share of a standard normal distribution, and the median's scale.
@@ -35,7 +35,7 @@ _NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
 _SHARED = 0.3
 _REACH_SECONDS = 0.2
 _REACH_FRAMES = 5
-# Spread of the logarithm of the noise that is rounding [1].
+# Differences of the logarithm of the noise that are rounding [1].
 _ROUNDING = 0.01
 # Samples of a block of rows.
 _BLOCK = 8_000_000
@@ -76,15 +76,15 @@ def mark_bad(
     Returns
     -------
     Dataset
-        The dataset with the bit "dead_pixel" of `schema.FLAGS` set in `status` (y, x), other bits
-        as they were, the counts unchanged; and the attributes ``noisy_pixels`` and
+        The dataset with the bit `Status.DEAD_PIXEL` set in `status` (y, x), other bits as they
+        were, the counts unchanged; and the attributes ``noisy_pixels`` and
         ``jumping_pixels``, their numbers, ``bad_threshold`` and ``bad_jump``.
 
     Raises
     ------
     TypeError, ValueError
         If the dataset is not as `schema` has it, a limit is not positive, or a band has fewer than
-        `MINIMUM_FRAMES` frames that are not NaN, or than 0.5 s have.
+        16 frames that are not NaN, or than 0.5 s have.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     for name, value in (("threshold", threshold), ("jump", jump)):
@@ -96,15 +96,15 @@ def mark_bad(
     reach = _reach(counts["time"].values.astype(np.float64))
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
-        frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
-        here = np.zeros(frames.size) if segment is None else segment[frames]
-        movie, apart = movie.isel(time=frames), np.diff(here) != 0
+        frames = _frames(movie, max(_MINIMUM_FRAMES, 2 * reach + 3))
+        part = np.zeros(frames.size) if segment is None else segment[frames]
+        movie, stepped = movie.isel(time=frames), np.diff(part) != 0
         level = _noise(movie)
         usual = median_filter(level, size=_WINDOW, mode="mirror")
         noisy |= _outliers(level, usual, threshold)
-        jumping |= _jumps(movie, jump * np.sqrt(2.0) * usual, apart, reach)
+        jumping |= _jumps(movie, jump * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
-    status = before | np.where(noisy | jumping, schema.FLAGS["dead_pixel"], 0).astype(np.uint32)
+    status = before | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
     return corrected.assign(status=(("y", "x"), status, schema.status_attrs())).assign_attrs(
         noisy_pixels=int(noisy.sum()),
         jumping_pixels=int(jumping.sum()),
@@ -114,8 +114,8 @@ def mark_bad(
 
 
 def _reach(time: Array) -> int:
-    """Frames by which neighbours may see something earlier or later."""
-    if time.size < MINIMUM_FRAMES:
+    """Frames by which neighbours may show a change earlier or later."""
+    if time.size < _MINIMUM_FRAMES:
         return _REACH_FRAMES
     return max(_REACH_FRAMES, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
 
@@ -164,23 +164,23 @@ def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
     return np.asarray((np.abs(apart - centre) > threshold * scale) | (level == 0))
 
 
-def _jumps(movie: xr.DataArray, limit: Array, apart: Mask, reach: int) -> Mask:
-    """Where a pixel (y, x) changes by more than its limit [count] and no neighbour does."""
-    found = np.zeros(limit.shape, dtype=bool)
+def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
+    """Pixels (y, x) that change by more than their limit [count] while no neighbour does."""
+    jumping = np.zeros(limit.shape, dtype=bool)
     for rows in _blocks(movie):
         # A row more on each side: the neighbours.
         top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
         change = np.diff(movie.isel(y=slice(top, bottom)).values.astype(np.float32), axis=0)
-        change[apart] = 0.0  # the detector's own steps
+        change[stepped] = 0.0  # new offsets after a shutter event
         change[~np.isfinite(change)] = 0.0
         here = slice(rows.start - top, rows.stop - top)
         for signed in (change, -change):
-            found[rows] |= _alone(signed, limit[top:bottom], reach)[here]
-    return found
+            jumping[rows] |= _alone(signed, limit[top:bottom], reach)[here]
+    return jumping
 
 
 def _alone(change: Single, limit: Array, reach: int) -> Mask:
-    """Where a pixel (y, x) rises by more than its limit in a frame and no neighbour near it."""
+    """Pixels (y, x) that rise by more than their limit in a frame, and no neighbour about then."""
     shape = limit.shape
     nearby = maximum_filter1d(change, 2 * reach + 1, axis=0, mode="constant")
     nearby = np.pad(nearby, ((0, 0), (1, 1), (1, 1)))

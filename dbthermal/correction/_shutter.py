@@ -1,4 +1,4 @@
-"""Shutter events and repeated frames: a camera that delivers an image it did not take.
+"""Shutter events and repeated frames: a camera delivers an image that it did not take.
 
 Every few minutes a microbolometer closes a shutter and renews its offsets (flat-field correction,
 FFC). Its driver repeats the last image meanwhile; afterwards each pixel of the band has an offset
@@ -19,9 +19,8 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
-MINIMUM_PIXELS: Final = 16
-"""Fewest pixels that must change for an unchanged image to say something."""
-
+# Fewest pixels that must change in a capture for an unchanged image to be a copy.
+_MINIMUM_PIXELS: Final = 16
 # About as many pixels, evenly spread, are compared first.
 _SAMPLE = 4096
 # Median absolute deviation -> standard deviation of a normal distribution.
@@ -42,7 +41,7 @@ def find_shutter(
     Find the runs of frames in which a band repeats its image.
 
     A frame is a copy if no pixel differs from the frame before. Some thousands of pixels are
-    compared first, then the whole of the frames that are left, in blocks of rows, so that a lazy
+    compared first, then the whole of the remaining frames, in blocks of rows, so that a lazy
     dataset is never read at once. The search is exact only before anything is interpolated in
     time: call it before `alignment.align`.
 
@@ -53,15 +52,15 @@ def find_shutter(
     closed : DataArray, optional
         True in frames in which the shutter is known to be closed, (time) or (band, time), bool:
         from the camera's telemetry, or because they show the shutter itself. A run of copies that
-        holds or touches one is part of its event.
+        includes or touches one is part of its event.
     stillness : float
         Largest RMS change of a copy, relative to the noise of a change (robust, over the frames
         that change at all) [1]. With 0 a copy is exact; 0.2 takes in images that were rescaled or
         compressed after they were frozen.
     fewest : int
         Copies from which a run is taken for the shutter's; shorter ones are lost frames. A
-        shutter that is not counted biases the separation, a lost pair of frames that is counted
-        costs it one degree of freedom a band: hence two.
+        shutter event that is missed biases the separation, a lost pair of frames that is counted
+        as one costs it one degree of freedom a band.
 
     Returns
     -------
@@ -75,15 +74,15 @@ def find_shutter(
     ------
     TypeError, ValueError
         If the dataset is not as `schema` has it, `closed` is no boolean of its frames, `stillness`
-        does not lie in [0, 1), `fewest` is below 1, or in a band fewer than `MINIMUM_PIXELS` of
-        the pixels looked at ever change.
+        does not lie in [0, 1), `fewest` is below 1, or in a band fewer than 16 of the pixels
+        compared ever change.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not 0 <= stillness < 1:
         raise ValueError(f"Invalid stillness {stillness} of a copy. Must lie in [0, 1).")
     if fewest < 1:
         raise ValueError(f"Invalid fewest {fewest} copies of a shutter event. Must be 1 or more.")
-    known = _known(counts, closed)
+    known = _closed_frames(counts, closed)
     runs = []
     for index, name in enumerate(counts["band"].values):
         marked = known[index] | _copies(counts.isel(band=index), stillness)
@@ -95,7 +94,7 @@ def find_shutter(
 
 def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.Dataset:
     """
-    Take out the samples that a closed shutter or a lost frame repeats, and count the events.
+    Replace samples that a closed shutter or a lost frame repeats by NaN, and count the events.
 
     After an event every pixel of the band has an offset step of its own, of tens of counts, which
     no camera reports. It is left in the counts: `separation.solve` keeps it out of the object, by a
@@ -104,8 +103,7 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     lost frames, its slots lie at other times than the other band's, and one event of both may count
     as two: the frames between are then lost in `align`. Events of two bands that
     overlap, or follow without a frame between, are counted as one, so that cameras that fire
-    together cost one step. An event before the first or after the last frame that is left makes
-    none.
+    together cost one step. An event before the first or after the last valid frame makes none.
 
     Undone or not, an event costs accuracy: nothing ties the level after it to the one before but
     the object's smoothness. Beside five functions over 35 s, one step in the middle raises the
@@ -117,7 +115,7 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     corrected : Dataset
         Stage `corrected` of `schema`, not yet marked. `counts` may be lazy.
     events : Dataset, optional
-        From `find_shutter`, or rows of it; by default `find_shutter` is called with its defaults.
+        From `find_shutter`, or rows of it; by default `find_shutter(corrected)`.
 
     Returns
     -------
@@ -152,7 +150,7 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     kept = xr.DataArray(~marked, dims=("band", "time"), coords={"band": counts["band"]})
     return corrected.assign(
         counts=counts.where(kept).assign_attrs(counts.attrs),
-        segment=("time", segment, {"units": "1", "long_name": "shutter events before the frame"}),
+        segment=("time", segment, schema.SEGMENT.attrs),
     ).assign_attrs(
         shutter_events=int(renewed.sum()),
         repeated_frames=int((~renewed).sum()),
@@ -160,8 +158,8 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     )
 
 
-def _known(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
-    """Frames (band, time) that are known to be closed."""
+def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
+    """Frames (band, time) in which the shutter is known to be closed."""
     shape = counts.sizes["band"], counts.sizes["time"]
     if closed is None:
         return np.zeros(shape, dtype=bool)
@@ -186,23 +184,23 @@ def _copies(counts: xr.DataArray, stillness: float) -> Mask:
     change = _change(sample[:-1], sample[1:])
     squares, number = _energy(change)
     moving = (np.abs(change) > 0).any(axis=0)  # false for NaN
-    if moving.sum() < MINIMUM_PIXELS:
+    if moving.sum() < _MINIMUM_PIXELS:
         raise ValueError(
             f"Invalid counts of band '{counts['band'].item()}': {moving.sum()} of the "
-            f"{moving.size} pixels looked at change. Must be at least {MINIMUM_PIXELS}."
+            f"{moving.size} pixels looked at change. Must be at least {_MINIMUM_PIXELS}."
         )
     # Pixel by pixel over time: where someone walks by, most pixels are quiet in most frames.
     usual = _MAD * np.nanmedian(np.abs(change[squares > 0][:, moving]), axis=0)
     limit = stillness**2 * float(np.mean(usual**2))
-    found = np.zeros(counts.sizes["time"], dtype=bool)
+    copies = np.zeros(counts.sizes["time"], dtype=bool)
     candidates = 1 + np.flatnonzero((number > 0) & (squares <= limit * number))
     if candidates.size:
-        found[candidates] = _whole_copies(counts, candidates, limit)
-    return found
+        copies[candidates] = _whole_copies(counts, candidates, limit)
+    return copies
 
 
 def _whole_copies(counts: xr.DataArray, candidates: Integers, limit: float) -> Mask:
-    """Which candidates repeat the frame before in all of the image, read in blocks of rows."""
+    """Candidates that repeat the frame before in all of the image, read in blocks of rows."""
     needed = np.union1d(candidates, candidates - 1)
     here, before = (np.searchsorted(needed, part) for part in (candidates, candidates - 1))
     rows = max(1, _BLOCK // (needed.size * counts.sizes["x"]))
@@ -215,7 +213,7 @@ def _whole_copies(counts: xr.DataArray, candidates: Integers, limit: float) -> M
 
 
 def _change(before: npt.NDArray[np.generic], after: npt.NDArray[np.generic]) -> Array:
-    """Changes [count], NaN where a sample is."""
+    """Changes [count], NaN where a sample is NaN."""
     # Signed before the difference: unsigned counts wrap around.
     return after.astype(np.float64) - before.astype(np.float64)
 

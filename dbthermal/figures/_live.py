@@ -1,7 +1,7 @@
-"""The figure of a recording that goes on: a picture of each band, drawn anew many times.
+"""Figure of a recording while it goes on: one picture of each band, updated in place.
 
-The artists are made once. An update hands them other pictures and texts, and the layout is
-computed again only where these take other room, so that an update is cheap.
+The artists are made once. An update gives them new pictures and texts, and the layout is computed
+again only where these need other room, so that an update is cheap.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from dbthermal.figures._canvas import band_label, canvas, draw_image
+from dbthermal.figures.drawing import band_label, canvas, draw_image
 
 _WIDTH: Final = 4.8  # of a band [inch]
 _TEXT_HEIGHT: Final = 1.15  # of title, lines and foot [inch]
@@ -32,30 +32,17 @@ _ALARM: Final = "#b3001b"
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """
-    What is shown of one band.
+    """Picture and texts of one band; the text stands below the picture, the warning across it."""
 
-    Attributes
-    ----------
-    image : ndarray, shape (y, x), or None
-        Raw signal [count]; None as long as there is no frame.
-    limits : tuple of float
-        Counts that are black and white [count].
-    text : str
-        Lines below the picture.
-    warning : str
-        Lines across the picture, none if empty.
-    """
-
-    image: npt.NDArray[Any] | None
-    limits: tuple[float, float]
+    image: npt.NDArray[Any] | None  # raw signal (y, x) [count]; None before the first frame
+    limits: tuple[float, float]  # counts that are black and white [count]
     text: str
     warning: str = ""
 
 
 @dataclass(frozen=True)
 class _Artists:
-    """What is drawn anew of one band."""
+    """Updated parts of one band."""
 
     image: AxesImage
     text: Text
@@ -64,7 +51,7 @@ class _Artists:
 
 class LiveFigure:
     """
-    A figure whose pictures and texts are replaced while it stays the same.
+    Figure whose pictures and texts are replaced while it stays the same.
 
     Parameters
     ----------
@@ -76,11 +63,14 @@ class LiveFigure:
     Attributes
     ----------
     figure : Figure
-        What is drawn on.
-    bands : tuple of str
-        Their names.
-    shape : tuple of int
-        Rows and columns [pixel].
+        Of matplotlib.
+
+    Examples
+    --------
+    >>> live = LiveFigure(["9.5"], (24, 32))
+    >>> live.update({"9.5": Panel(None, (0, 1), "no frame yet")}, title="pot")
+    >>> live.pixels().shape[-1]
+    4
     """
 
     def __init__(self, bands: Sequence[str], shape: tuple[int, int]) -> None:
@@ -99,23 +89,7 @@ class LiveFigure:
         }
 
     def update(self, panels: Mapping[str, Panel], *, title: str, foot: str = "") -> None:
-        """
-        Show other pictures and texts.
-
-        Parameters
-        ----------
-        panels : mapping
-            Each band to what is shown of it.
-        title : str
-            What is recorded, and whether it is emulated.
-        foot : str
-            What belongs to no band; it is broken into lines.
-
-        Raises
-        ------
-        KeyError
-            If a band is missing.
-        """
+        """Show each band's `Panel`, a title, and a foot that belongs to no band."""
         for band, artists in self._artists.items():
             panel = panels[band]
             image = self._empty if panel.image is None else panel.image
@@ -127,14 +101,7 @@ class LiveFigure:
         self._lay_out([len(f"{limit:.0f}") for panel in panels.values() for limit in panel.limits])
 
     def pixels(self) -> npt.NDArray[np.uint8]:
-        """
-        Draw the figure.
-
-        Returns
-        -------
-        ndarray of uint8, shape (rows, columns, 4)
-            Red, green, blue and opacity.
-        """
+        """Drawn figure: red, green, blue and opacity, uint8 (rows, columns, 4)."""
         drawing: Any = FigureCanvasAgg(self.figure)  # its methods have no types
         drawing.draw()
         return np.asarray(drawing.buffer_rgba())
@@ -149,7 +116,7 @@ class LiveFigure:
 
 
 def _artists(figure: Figure, axis: Axes, band: str, shape: tuple[int, int]) -> _Artists:
-    """Make the artists of a band, which has no picture yet."""
+    """Artists of a band before its first picture."""
     empty = xr.DataArray(np.full(shape, np.nan), dims=("y", "x"))
     draw_image(figure, axis, empty, band_label(band), "raw signal [count]", cmap="gray")
     image = axis.images[0]

@@ -5,8 +5,8 @@ nothing is reset, claimed or detached from its kernel driver, for the devices ma
 camera's video nodes are those below its USB device in Linux's sysfs, so that two equal cameras are
 distinguished by the ports they are plugged into.
 
-Whether a Boson's USB serial number is always the camera's own is not certain: ask the camera
-itself. Tested against an emulated backend and a written sysfs tree, not against hardware.
+A Boson's USB serial number may not always be the camera's own: ask the camera itself. Tested
+against an emulated backend and a written sysfs tree, not against hardware.
 """
 
 import errno
@@ -54,14 +54,9 @@ HIGH_SPEED_PAYLOAD: Final = 13 * 512 * 8 * 8000
 Universal Serial Bus Specification 2.0, table 5-10.
 """
 
-PIXELS: Final = 640 * 512
-"""Pixels of a frame of 16 bits."""
-
-SLOW: Final = 30.0
-"""Lower of the two frame rates that a Boson offers over USB [Hz]."""
-
-RULES: Final = "/etc/udev/rules.d/70-dbthermal.rules"
-"""File of the udev rules; its number is below 73, or ``uaccess`` comes too late."""
+PIXELS: Final = 640 * 512  # of a frame, 16 bits each
+SLOW: Final = 30.0  # [Hz] lower of the two frame rates that a Boson offers over USB
+RULES: Final = "/etc/udev/rules.d/70-dbthermal.rules"  # below 73, or ``uaccess`` comes too late
 
 
 class LibusbMissingError(RuntimeError):

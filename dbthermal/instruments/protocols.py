@@ -1,10 +1,10 @@
-"""What is done with the rig: wait for the blackbody, sweep it, record a scene.
+"""Procedures of the rig: wait for the blackbody, record a blackbody sweep, record a scene.
 
 Gain, offset and response are calibrated before a blackbody that goes through several temperatures;
 the emissivity bench goes through them with samples. At each temperature the wheel goes through its
-filters, and each of these is a recording of its own, begun only when the temperature rests. What
-was recorded is opened by `open_sweep` and `bench_series`, a scene by
-`dbthermal.instruments.recording.capture.open_capture`.
+filters, and each of these is a recording of its own, begun only when the temperature is stable.
+`dbthermal.instruments.recording` opens the recordings: `open_sweep`, `bench_series`,
+`open_capture`.
 """
 
 import threading
@@ -19,21 +19,29 @@ import numpy as np
 
 from dbthermal import store
 from dbthermal.instruments.camera import SourceLostError
-from dbthermal.instruments.recording.capture import mean_reading
-from dbthermal.instruments.recording.fetching import Limits, Reading
-from dbthermal.instruments.recording.record import Preview, Summary, record
-from dbthermal.instruments.recording.sweep import (
+from dbthermal.instruments.devices import Devices
+from dbthermal.instruments.recording import (
+    Limits,
+    Preview,
+    Reading,
+    Summary,
+    mean_reading,
+    record,
+)
+from dbthermal.instruments.recording._sweep import (
     BLACKBODY,
-    bench_series,
     is_complete,
-    open_sweep,
     require_filter,
     step_path,
 )
-from dbthermal.instruments.rig import Devices
 from dbthermal.instruments.session import Session
 
-__all__ = ["Step", "bench_series", "open_sweep", "record_scene", "record_sweep", "wait_stable"]
+__all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 STABILITY_PERIOD: Final = 1.0
 """Time from reading to reading while a temperature is awaited [s]."""
@@ -41,26 +49,11 @@ STABILITY_PERIOD: Final = 1.0
 
 @dataclass(frozen=True)
 class Step:
-    """
-    One recording of a sweep.
+    """One recording of a sweep, through the filter of `band` (None without a wheel)."""
 
-    Attributes
-    ----------
-    number : int
-        Of the temperature, from 0.
-    temperature : float
-        What the blackbody was set to [K].
-    blackbody : float
-        Mean of what was read of it during the recording [K].
-    band : str or None
-        Of the filter in the beam; None without a wheel.
-    summary : Summary
-        How the recording went.
-    """
-
-    number: int
-    temperature: float
-    blackbody: float
+    number: int  # of the temperature, from 0
+    temperature: float  # set point of the blackbody [K]
+    blackbody: float  # mean of its readings during the recording [K]
     band: str | None
     summary: Summary
 
@@ -74,31 +67,11 @@ def wait_stable(
     sleep: Callable[[float], None] = system_time.sleep,
 ) -> float:
     """
-    Wait until a temperature rests where it was set.
+    Wait until a temperature is stable near its set point [K], and return its mean [K].
 
-    Parameters
-    ----------
-    session : Session
-        With a blackbody: its `stability` and `tolerance` [K], `window` and `timeout` [s].
-    temperature : float
-        Where it was set [K].
-    read : callable
-        Reads it [K].
-    clock, sleep : callable
-        Time [s].
-
-    Returns
-    -------
-    float
-        Mean of the readings in the window [K].
-
-    Raises
-    ------
-    TimeoutError
-        If within `timeout` the readings of no window lay within `stability` of one another and
-        their mean within `tolerance` of `temperature`.
-    ValueError
-        If the session has no blackbody.
+    Within the session's `window` the readings must lie within its `stability` of one another, and
+    their mean within its `tolerance` of the set point. TimeoutError after its `timeout`, ValueError
+    if the session has no blackbody.
     """
     if session.blackbody is None:
         raise ValueError(f"Invalid session '{session.name}'. Must have a blackbody.")
@@ -115,8 +88,8 @@ def wait_stable(
             readings.popleft()
         sleep(STABILITY_PERIOD)
     raise TimeoutError(
-        f"No rest at {temperature} K within {steps.timeout} s: last {values[-1]} K. Must stay "
-        f"within {steps.stability} K for {steps.window} s, and within {steps.tolerance} K of it."
+        f"No rest at {temperature} K within {steps.timeout:g} s: last {values[-1]} K. Must stay "
+        f"within {steps.stability} K for {steps.window:g} s, and within {steps.tolerance} K of it."
     )
 
 
@@ -132,7 +105,7 @@ def record_sweep(
     sleep: Callable[[float], None] = system_time.sleep,
 ) -> list[Step]:
     """
-    Record at each temperature of the blackbody, as soon as it rests there, through each filter.
+    Record a blackbody at each of its temperatures, once it is stable, through each filter.
 
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep,
     and a scene too is recorded after a correction. Recordings of this sweep that are in the folder
@@ -146,36 +119,34 @@ def record_sweep(
     folder : str or Path
         Where the recordings go: ``<name>_<step>_<band>.zarr``.
     set_temperature : callable
-        Sets the blackbody [K], or asks the user to.
+        Sets the blackbody [K], or asks the user to set it.
     read_blackbody : callable, optional
         Reads it [K]; by default the thermocouple named ``"blackbody"`` does.
     limits, preview : optional
-        As for `instruments.recording.record.record`. The camera behind the wheel is called by
-        the band of the filter in the beam.
+        As for `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of
+        the filter in the beam.
     clock, sleep : callable
         Time [s], for the wait.
 
     Returns
     -------
     list of Step
-        In the order of the session, those that were kept too.
+        In the order of the session, with those that were recorded before.
 
     Raises
     ------
     ValueError
-        If there is no blackbody in the session or the readings; or a recording is there that is
-        incomplete, or of another temperature, or during which the wheel turned.
+        If the session has no blackbody, or none is read; or a recording exists that is incomplete,
+        of another temperature, or during which the wheel turned.
     TimeoutError
-        As `wait_stable`; the steps before are kept.
+        As `wait_stable`; the recordings before are kept.
     SourceLostError
         If a camera is lost on the way.
-    BosonError, WheelError, ReadingError, OSError
-        As `Devices.correct_offsets`, `Devices.select`, `Devices.readings` and `record`.
     """
     session = devices.session
     extra = {} if read_blackbody is None else {BLACKBODY: Reading(read_blackbody)}
-    known = {**devices.readings(), **extra}
-    if session.blackbody is None or BLACKBODY not in known:
+    readings = {**devices.readings(), **extra}
+    if session.blackbody is None or BLACKBODY not in readings:
         raise ValueError(f"Invalid session '{session.name}'. Must have and read a blackbody.")
     plan = _plan(session, folder)
     kept = [_kept(number, temperature, band, path) for number, temperature, band, path in plan]
@@ -184,7 +155,7 @@ def record_sweep(
     for (number, temperature, band, path), was in zip(plan, kept, strict=True):
         if was is None and resting != number:
             set_temperature(temperature)
-            wait_stable(session, temperature, known[BLACKBODY].read, clock=clock, sleep=sleep)
+            wait_stable(session, temperature, readings[BLACKBODY].read, clock=clock, sleep=sleep)
             devices.correct_offsets()
             resting = number
         summary = was or _record_step(devices, band, path, extra, limits, preview)
@@ -203,30 +174,23 @@ def record_scene(
     """
     Record a scene with all devices; an emulated scene begins with the recording.
 
-    Call `Devices.prepare` before.
-
     Parameters
     ----------
     devices : Devices
-        Of any session.
+        Of any session; call `Devices.prepare` before.
     path : str or Path
-        Store to make, ``*.zarr``.
+        Folder ``*.zarr`` to make.
     limits, preview, stop : optional
-        As for `dbthermal.instruments.recording.record.record`.
+        As for `dbthermal.instruments.recording.record`, whose errors it raises.
 
     Returns
     -------
     Summary
-        How it went.
-
-    Raises
-    ------
-    FileExistsError, OSError, ValueError
-        As `record`.
+        How it ended, and numbers of frames.
     """
-    identities, own = devices.identities(), devices.session.filtered
-    if devices.wheel is not None and devices.wheel.band() != own:
-        raise ValueError(f"Invalid filter in the beam. Must be '{own}': prepare the devices.")
+    identities, expected = devices.identities(), devices.session.filtered
+    if devices.wheel is not None and devices.wheel.band() != expected:
+        raise ValueError(f"Invalid filter in the beam. Must be '{expected}': prepare the devices.")
     devices.flush()
     if devices.world is not None:
         devices.world.begin()
@@ -243,7 +207,7 @@ def record_scene(
 
 
 def _plan(session: Session, folder: str | Path) -> list[tuple[int, float, str | None, Path]]:
-    """Step, temperature [K], band behind the wheel and recording, in their order."""
+    """Number, temperature [K], band behind the wheel and path of each recording, in order."""
     assert session.blackbody is not None
     return [
         (number, temperature, band, step_path(folder, session.name, number, band))
@@ -253,7 +217,7 @@ def _plan(session: Session, folder: str | Path) -> list[tuple[int, float, str | 
 
 
 def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
-    """How a recording of the sweep went that is there already; None if there is none."""
+    """Summary of a recording of the sweep that exists already; None if it does not."""
     if not path.exists():
         return None
     if not is_complete(path):
@@ -278,14 +242,14 @@ def _record_step(
     preview: Callable[[Preview], None] | None,
 ) -> Summary:
     """Turn the filter into the beam, and record to the end."""
-    here = devices if band is None else devices.select(band)
-    identities = here.identities()
-    here.flush()
+    selected = devices if band is None else devices.select(band)
+    identities = selected.identities()
+    selected.flush()
     summary = record(
-        here.session,
-        here.sources,
+        selected.session,
+        selected.sources,
         path,
-        readings={**here.readings(), **extra},
+        readings={**selected.readings(), **extra},
         identities=identities,
         limits=limits,
         preview=preview,

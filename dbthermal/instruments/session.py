@@ -14,6 +14,7 @@ One key, ``simulated``, switches the whole rig; every device has an address for 
         video: {simulated: "sim://camera/wide", hardware: "v4l2:///dev/video0"}
         control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
       "9.5":
+        kind: boson            # of dbthermal.instruments.camera.KINDS; boson by default
         video: {simulated: "sim://camera/narrow", hardware: "v4l2:///dev/video2"}
     devices:                   # whatever else is connected
       filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
@@ -47,6 +48,8 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
+from dbthermal.instruments.camera import KINDS
+
 __all__ = ["Blackbody", "Camera", "Device", "Session"]
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
@@ -78,77 +81,49 @@ class Device:
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
-    """Addresses of one camera's frames and of its command port, if it has one."""
+    """
+    One camera: addresses of its frames and of its command port, if it has one.
+
+    Attributes
+    ----------
+    video, control : Device
+        Addresses.
+    kind : str
+        One of `dbthermal.instruments.camera.KINDS`.
+    """
 
     video: Device
     control: Device | None = None
+    kind: str = "boson"
+
+    @field_validator("kind")
+    @classmethod
+    def _check_kind(cls, kind: str) -> str:
+        if kind not in KINDS:
+            raise ValueError(f"Must be one of {sorted(KINDS)}")
+        return kind
 
 
 @dataclass(frozen=True, config=_CHECKED)
 class Blackbody:
-    """
-    Temperatures of a calibration, and the rule by which each is reached.
+    """Temperatures of a calibration, and the rule by which each counts as reached."""
 
-    Attributes
-    ----------
-    temperatures : tuple of float
-        In the order of the session [K].
-    stability : float
-        Largest range of the readings in the window [K].
-    window : float
-        How long the readings must stay within it [s].
-    tolerance : float
-        Largest distance of their mean from the set temperature [K]; a thermocouple and its logger
-        are off by half a kelvin or so each, and the recordings keep the reading.
-    timeout : float
-        How long to wait for it [s].
-    """
-
-    temperatures: Annotated[tuple[Positive, ...], Field(min_length=1)]
-    stability: Positive = 0.05
-    window: Positive = 30.0
+    temperatures: Annotated[tuple[Positive, ...], Field(min_length=1)]  # in their order [K]
+    stability: Positive = 0.05  # largest range of the readings in the window [K]
+    window: Positive = 30.0  # how long the readings must stay within it [s]
+    # Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
+    # by half a kelvin or so each, and the recordings keep the reading.
     tolerance: Positive = 1.5
-    timeout: Positive = 1800.0
+    timeout: Positive = 1800.0  # longest wait for it [s]
 
 
 @dataclass(frozen=True, config=_CHECKED)
 class Session:
     """
-    Description of a recording: devices, procedure and duration.
+    Description of a recording: devices, procedure and duration; see the module.
 
-    ValueError (of pydantic) if a value is invalid.
-
-    Attributes
-    ----------
-    name : str
-        Of the session; recordings are named after it.
-    simulated : bool
-        Whether the rig is emulated: one switch for all devices.
-    protocol : str
-        ``gain_offset``, ``response`` and ``emissivity_bench`` go through the blackbody's
-        temperatures, ``scene`` does not.
-    duration : float
-        Of the recording, or of each of its steps [s].
-    cameras : mapping
-        Band to `Camera`; the order of the bands is that of the recording.
-    frame_rate : float
-        [Hz].
-    shape : tuple of int
-        Rows and columns [pixel].
-    telemetry_rows : int
-        Rows of telemetry below the image: 0 or 2.
-    devices : mapping
-        ``filter_wheel`` and ``thermocouples`` to `Device`.
-    filters : mapping
-        Slot of the wheel, 1 to 6, to band.
-    wheel : mapping
-        Settings in which this wheel differs from `dbthermal.instruments.filterwheel.Settings`.
-    sweep : tuple of str
-        Filters that the wheel goes through at each temperature; see `swept`.
-    thermocouples : mapping
-        Channel of the logger, 1 to 8, to the name of the measured object.
-    blackbody : Blackbody or None
-        Steps of a calibration.
+    All protocols but ``scene`` go through the blackbody's temperatures. Invalid values raise
+    pydantic's ValidationError, a ValueError.
 
     Examples
     --------
@@ -157,19 +132,19 @@ class Session:
     ('8-14',)
     """
 
-    name: Name
-    simulated: StrictBool
+    name: Name  # of the recordings, too
+    simulated: StrictBool  # one switch for all devices
     protocol: Literal["gain_offset", "response", "emissivity_bench", "scene"]
-    duration: Positive
-    cameras: Annotated[dict[Name, Camera], Field(min_length=1)]
-    frame_rate: Positive = 60.0
-    shape: tuple[Count, Count] = (512, 640)
+    duration: Positive  # of the recording, or of each of its steps [s]
+    cameras: Annotated[dict[Name, Camera], Field(min_length=1)]  # by band, in recording order
+    frame_rate: Positive = 60.0  # [Hz]
+    shape: tuple[Count, Count] = (512, 640)  # rows, columns
     telemetry_rows: Literal[0, 2] = 0
     devices: dict[DeviceName, Device] = field(default_factory=dict)
-    filters: dict[Slot, Name] = field(default_factory=dict)
-    wheel: dict[str, Any] = field(default_factory=dict)
-    sweep: tuple[Name, ...] = ()
-    thermocouples: dict[Channel, str] = field(default_factory=dict)
+    filters: dict[Slot, Name] = field(default_factory=dict)  # slot of the wheel to band
+    wheel: dict[str, Any] = field(default_factory=dict)  # see `filterwheel.Settings`
+    sweep: tuple[Name, ...] = ()  # filters at each temperature; see `swept`
+    thermocouples: dict[Channel, str] = field(default_factory=dict)  # channel to measured object
     blackbody: Blackbody | None = None
 
     @model_validator(mode="after")

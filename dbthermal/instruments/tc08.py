@@ -22,15 +22,12 @@ from ctypes import POINTER, c_char, c_float, c_int8, c_int16
 from dataclasses import dataclass
 from enum import IntFlag
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments.closing import Closing
-
-if TYPE_CHECKING:
-    from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.transport import Closing
 
 __all__ = ["ERRORS", "TC08", "Flag", "Identity", "Scan", "TC08Error", "load"]
 
@@ -40,22 +37,12 @@ Library = Any
 Where C takes a pointer to one value, an array of length one is passed, which both accept.
 """
 
-ENVIRONMENT: Final = "DBTHERMAL_USBTC08"
-"""Environment variable with the path of the library."""
-
-CHANNELS: Final = 9
-"""Channels of a unit: 0 is the cold junction, 1 to 8 are the sockets."""
-
-KINDS: Final = "BEJKNRST"
-"""Letters of the thermocouple types that the library converts."""
-
-KELVIN: Final = 2
-"""The library's number of the unit kelvin; 0 is °C, 1 °F, 3 °R."""
-
-OPEN_TIMEOUT: Final = 30.0
-"""Longest time that opening a unit may take [s]; the library downloads the firmware first."""
-
-_POLL = 0.05  # [s] between two progress requests
+ENVIRONMENT: Final = "DBTHERMAL_USBTC08"  # variable with the path of the library
+CHANNELS: Final = 9  # 0 is the cold junction, 1 to 8 are the sockets
+KINDS: Final = "BEJKNRST"  # types of thermocouples that the library converts
+KELVIN: Final = 2  # the library's number of the unit; 0 is °C, 1 °F, 3 °R
+OPEN_TIMEOUT: Final = 30.0  # [s] the library downloads the firmware first
+POLL: Final = 0.05  # [s] between two progress requests
 
 ERRORS: Final[Mapping[int, str]] = MappingProxyType(
     {
@@ -91,10 +78,10 @@ class TC08Error(RuntimeError):
 
 
 class UnitInfo(ctypes.Structure):
-    """Identity of a unit as the library writes it: 40 bytes, packed or not."""
+    """Identity of a unit as the library writes it: 40 bytes, whose number the caller sets."""
 
     _fields_ = (
-        ("size", c_int16),  # of this structure [byte], set by the caller
+        ("size", c_int16),
         ("driver", c_char * 12),
         ("kernel_driver", c_int16),
         ("hardware", c_int16),
@@ -122,12 +109,9 @@ class Flag(IntFlag):
     """Reason why a reading is not a temperature; 0 if it is one."""
 
     GOOD = 0
-    OVERFLOW = 1
-    """The voltage was beyond the converter's range."""
-    MISSING = 2
-    """The library returned NaN: open thermocouple, or channel off."""
-    OUT_OF_RANGE = 4
-    """The temperature is not positive."""
+    OVERFLOW = 1  # the voltage was beyond the converter's range
+    MISSING = 2  # the library returned NaN: open thermocouple, or channel off
+    OUT_OF_RANGE = 4  # the temperature is not positive
 
 
 @dataclass(frozen=True)
@@ -187,7 +171,7 @@ class TC08(Closing):
         self._has_channels = False
 
     @classmethod
-    def from_url(cls, url: str = "tc08:", *, world: "World | None" = None) -> Self:
+    def from_url(cls, url: str = "tc08:", *, world: object | None = None) -> Self:
         """
         Load the library and open the first free unit.
 
@@ -196,7 +180,7 @@ class TC08(Closing):
         url : str
             ``tc08:``, the library being found as by `load`, ``tc08:///path/of/library.so``, or
             ``sim://tc08`` for an emulated unit.
-        world : World, optional
+        world : object, optional
             Emulated bench, needed for ``sim://tc08`` alone.
 
         Raises
@@ -205,6 +189,16 @@ class TC08(Closing):
             If the URL is another one, or the world is missing, or given to a real unit.
         OSError, TC08Error, TimeoutError
             As `load` and `open`.
+
+        Examples
+        --------
+        >>> from dbthermal.instruments.emulated.world import World
+        >>> bench = World(blackbody_temperature=310.0)
+        >>> bench.thermocouples[1] = "blackbody"
+        >>> with TC08.from_url("sim://tc08", world=bench) as logger:
+        ...     logger.set_channels({1: "T"})
+        ...     print(f"{logger.single().temperature[1]:.2f} K")
+        310.00 K
         """
         if (url == "sim://tc08") != (world is not None):
             raise ValueError(
@@ -228,14 +222,10 @@ class TC08(Closing):
 
         Raises
         ------
-        RuntimeError
-            If it is open already.
-        ConnectionError
-            If there is no free unit.
-        TC08Error
-            If the library says why it failed.
-        TimeoutError
-            If the firmware is not downloaded in time.
+        RuntimeError, ConnectionError
+            If it is open already, or no unit is free.
+        TC08Error, TimeoutError
+            If the library reports an error, or the firmware is not downloaded in time.
         """
         if self._handle:
             raise RuntimeError("The TC-08 is open already. Must be closed first.")
@@ -249,7 +239,7 @@ class TC08(Closing):
                     f"The TC-08 is not open after {timeout} s, at {percent[0]} %. Must have its "
                     "firmware by then: pull it out and plug it in again."
                 )
-            self._sleep(_POLL)
+            self._sleep(POLL)
         if progress < 0:
             raise self._error("be opened")
         if not handle[0]:
@@ -263,10 +253,7 @@ class TC08(Closing):
         """
         Close the unit; a second call does nothing.
 
-        Raises
-        ------
-        TC08Error
-            If the library could not, as after unplugging; the unit counts as closed.
+        TC08Error if the library could not, as after unplugging; the unit counts as closed.
         """
         handle, self._handle = self._handle, 0
         self._has_channels = False
@@ -324,11 +311,6 @@ class TC08(Closing):
     def single(self) -> Scan:
         """
         Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
-
-        Returns
-        -------
-        Scan
-            Temperatures and flags of the nine channels.
 
         Raises
         ------

@@ -30,8 +30,7 @@ EMF: Final = (-5.603, 20.872)
 """Range of `temperature` [mV], against a cold junction at 0 °C: -200 to 400 °C."""
 
 # Coefficients c_i of E = sum c_i t^i [mV °C^-i] below and above 0 °C, and of the approximate
-# inverses t = sum d_i E^i [°C mV^-i]: type T of NIST Standard Reference Database 60,
-# doi:10.18434/T4S888; Burns et al. (1993), NIST Monograph 175, doi:10.6028/NIST.MONO.175.
+# inverses t = sum d_i E^i [°C mV^-i]; see the references of `emf`.
 _FORWARD_BELOW = (
     *(0.0, 0.387481063640e-01, 0.441944343470e-04, 0.118443231050e-06, 0.200329735540e-07),
     *(0.901380195590e-09, 0.226511565930e-10, 0.360711542050e-12, 0.384939398830e-14),

@@ -106,7 +106,7 @@ class Truth:
         """The same with the object projected onto each pixel's smooth subspace."""
         smoothed = self.object_temperature.copy()
         for count in np.unique(order):
-            functions = smooth.basis(self.time, int(count))
+            functions = smooth.polynomial_basis(self.time, int(count))
             smoothed[:, order == count] = functions @ (functions.T @ smoothed[:, order == count])
         return replace(self, object_temperature=smoothed)
 
@@ -124,7 +124,7 @@ def smallest_order(truth: Truth, sensitivity: Sensitivity) -> Indices:
     :math:`z_2 - k_2 z_1`, which holds no background, over the variance of its noise.
     """
     highest = min(_HIGHEST_ORDER, truth.time.size)
-    functions = smooth.basis(truth.time, highest)
+    functions = smooth.polynomial_basis(truth.time, highest)
     order = np.full(truth.object_temperature.shape[1], highest + 1, dtype=np.intp)
     for pixels in _blocks(np.arange(order.size)):
         part = sensitivity.select(pixels)
@@ -166,7 +166,7 @@ def deviations(
     rows = {name: frames if "temperature" in name else bands for name in QUANTITIES}
     result = {name: np.zeros((size, pixels)) for name, size in rows.items()}
     for count in np.unique(order):
-        functions = smooth.basis(time, int(count))
+        functions = smooth.polynomial_basis(time, int(count))
         for block in _blocks(np.flatnonzero(order == count)):
             part = _deviations(sensitivity.select(block), functions, reference, prior)
             for name, values in part.items():

@@ -7,17 +7,15 @@ options takes them as its frozen record, such as `SubspaceSettings`.
 import importlib
 from typing import TYPE_CHECKING, Any, Final
 
-from dbthermal.separation._methods import METHODS, get_method
 from dbthermal.separation._pooling.materials import materials
-from dbthermal.separation._reflected import reflected_change
-from dbthermal.separation._solve import solve
-from dbthermal.separation._uncalibrated import reflections
+from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection
+from dbthermal.separation._solve import METHODS, get_method, solve
 
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
-    from dbthermal.separation._baselines.ratio import RatioSettings
-    from dbthermal.separation._dbvt.method import DbvtSettings
+    from dbthermal.separation._baselines.pyrometry import RatioSettings
+    from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 __all__ = [
@@ -30,16 +28,16 @@ __all__ = [
     "get_method",
     "materials",
     "reflected_change",
-    "reflections",
     "solve",
+    "uncalibrated_reflection",
 ]
 
 # The settings are imported with their method when they are first asked for: one needs torch.
 _SETTINGS: Final = {
     "BcpSettings": "_baselines.bcp",
-    "DbvtSettings": "_dbvt.method",
+    "DbvtSettings": "_dbvt",
     "NaiveSettings": "_baselines.naive",
-    "RatioSettings": "_baselines.ratio",
+    "RatioSettings": "_baselines.pyrometry",
     "SubspaceSettings": "_subspace.method",
 }
 

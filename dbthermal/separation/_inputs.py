@@ -1,67 +1,141 @@
-"""Checks of what a user gives beside the capture: emissivities, mask, materials."""
+"""Inputs of a separation: a capture and all that is known of it, checked, as arrays."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import noise as noises
+from dbthermal import response as responses
 from dbthermal import schema
-from dbthermal.separation._problem import Problem
-from dbthermal.separation._separated import Array
-from dbthermal.separation._tiles import Tile
+from dbthermal.response import Curve
+from dbthermal.separation import _quality as quality
+from dbthermal.separation._tiles import Method
+
+Array = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.intp]
+
+# Pixels from which the noise is estimated where the response has none.
+_NOISE_PIXELS = 4096
+_READ = ("counts", "status", "segment")
+_MASK_DIMS = (("time",), ("y", "x"), ("time", "y", "x"))
 
 
 @dataclass(frozen=True)
-class Given:
-    """Known emissivities and their standard deviations (band, y, x) [1] of the whole image."""
+class Inputs:
+    """Capture, responses, noise and known quantities of an image, in the capture's band order."""
 
-    emissivity: Array | None = None
-    emissivity_std: Array | None = None
+    capture: xr.Dataset  # counts, where present status and segment, and `mask`; may be lazy
+    curves: list[Curve]
+    noise: Array  # standard deviation of the linearised signals (band) [K]
+    emissivity: Array | None  # known beforehand (band, y, x) [1]
+    emissivity_std: Array | None
+    labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
 
-    def put_into(self, problem: Problem, tile: Tile, bands: list[int]) -> Problem:
-        """Add the emissivities of a tile, at rows and columns of the image, to its problem."""
-        if self.emissivity is None or self.emissivity_std is None:
-            return problem
-        value, std = (
-            array[(slice(None), *tile)].reshape(len(bands), -1)[bands]
-            for array in (self.emissivity, self.emissivity_std)
+    @property
+    def bands(self) -> list[int]:
+        """Places of the bands in the order of their noise."""
+        return [int(band) for band in np.argsort(self.noise, kind="stable")]
+
+
+def check(  # noqa: PLR0913 - all that the user gives, by name
+    corrected: xr.Dataset,
+    response: xr.Dataset,
+    method: Method,
+    name: str,
+    *,
+    emissivity: xr.DataArray | None,
+    emissivity_std: xr.DataArray | None,
+    mask: xr.DataArray | None,
+    pool: xr.DataArray | None,
+    response_kind: str,
+) -> Inputs:
+    """Check all that the user gives, see `solve`, against the capture and the method's demands."""
+    schema.check(corrected, "corrected")
+    quality.check_status(corrected)
+    bands = [str(band) for band in corrected["band"].values]
+    _check_demands(method, name, bands, corrected.sizes["time"])
+    if emissivity is not None and not method.knows_emissivity:
+        raise ValueError(f"Invalid emissivity for method '{name}', which estimates it. Omit it.")
+    if emissivity is None and method.knows_emissivity:
+        raise ValueError(f"Missing emissivity. Method '{name}' must be given one.")
+    curves = [responses.curve(response, band, response_kind) for band in bands]
+    if pool is not None and method.survey is None:
+        raise ValueError(f"Invalid pool for method '{name}', which does not pool.")
+    capture = corrected[[variable for variable in _READ if variable in corrected]]
+    _check_segment(capture)
+    if mask is not None:
+        capture = capture.assign(mask=_checked_mask(capture, mask))
+    noise = _noise(capture, response, curves)
+    value, std = _known_emissivity(corrected, emissivity, emissivity_std)
+    return Inputs(capture, curves, noise, value, std, _labels(corrected, pool))
+
+
+def _check_demands(method: Method, name: str, bands: list[str], frames: int) -> None:
+    if len(bands) < 2 or (len(bands) > 2 and not method.any_bands):
+        rule = "two or more" if method.any_bands else "exactly two"
+        raise ValueError(f"Invalid bands {bands} for method '{name}'. Must be {rule}.")
+    if frames < method.minimum_frames:
+        raise ValueError(
+            f"Invalid capture of {frames} frames for method '{name}'. "
+            f"Must have at least {method.minimum_frames}."
         )
-        return replace(problem, emissivity=value, emissivity_std=std)
 
 
-def known_emissivity(
+def _check_segment(capture: xr.Dataset) -> None:
+    """Check the number of shutter events before each frame, `segment` (time)."""
+    if "segment" not in capture:
+        return
+    segment = capture["segment"]
+    falling = segment.dtype.kind in "iu" and np.any(np.diff(segment.values.astype(int)) < 0)
+    if segment.dims != ("time",) or segment.dtype.kind not in "iu" or falling:
+        raise ValueError(
+            f"Invalid segment {segment.dims} of {segment.dtype}. Must be ('time',) of whole "
+            "numbers that do not fall."
+        )
+    events, frames = len(np.unique(segment)) - 1, segment.size
+    if events > frames // 4:
+        raise ValueError(
+            f"Invalid segment: {events} shutter events in {frames} frames. "
+            "Must be at most one in four."
+        )
+
+
+def _checked_mask(capture: xr.Dataset, mask: xr.DataArray) -> xr.DataArray:
+    """Return the samples to use without coordinates: (time), (y, x) or (time, y, x), boolean."""
+    if not isinstance(mask, xr.DataArray):
+        raise TypeError(f"Invalid mask of type {type(mask).__name__}. Must be a DataArray.")
+    if mask.dtype != bool:
+        raise TypeError(f"Invalid dtype {mask.dtype} of the mask. Must be bool.")
+    sizes = {str(dim): capture.sizes.get(str(dim), 0) for dim in mask.dims}
+    if mask.dims not in _MASK_DIMS or dict(mask.sizes) != sizes:
+        raise ValueError(
+            f"Invalid mask {dict(mask.sizes)}. Must have dims of {_MASK_DIMS} and the capture's "
+            "sizes."
+        )
+    return mask.drop_vars(list(mask.coords))
+
+
+def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Array:
+    """Noise (band) [K] of the linearised signals, from the response or else from the capture."""
+    if "noise" in response:
+        slopes = np.array([curve.reference_slope for curve in curves])
+        return np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
+    counts, frames = quality.sample(capture, _NOISE_PIXELS)
+    signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
+    return noises.of_bands(signals, capture["time"].values[frames])
+
+
+def _known_emissivity(
     corrected: xr.Dataset, emissivity: xr.DataArray | None, std: xr.DataArray | None
-) -> tuple[Array, Array] | None:
-    """
-    Check known emissivities and spread them over the image.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture.
-    emissivity, std : DataArray, optional
-        Emissivity and its standard deviation, (band) or (band, y, x) [1]; without a coordinate
-        `band`, in the capture's order.
-
-    Returns
-    -------
-    tuple of ndarray or None
-        Both as (band, y, x), in the capture's order of bands; None where none is given.
-
-    Raises
-    ------
-    TypeError
-        If one is not a DataArray.
-    ValueError
-        If a band is missing, dims differ, a value is not in (0, 1), a deviation is negative, or
-        the bands have the same emissivity everywhere.
-    """
+) -> tuple[Array, Array] | tuple[None, None]:
+    """Emissivity and standard deviation (band, y, x) [1], from (band) or (band, y, x)."""
     if emissivity is None:
         if std is not None:
             raise ValueError("Invalid emissivity_std without an emissivity. Give both.")
-        return None
-    values = _spread(corrected, emissivity, "emissivity")
+        return None, None
+    values = _over_image(corrected, emissivity, "emissivity")
     bad = ~((values > 0) & (values < 1))
     if np.any(bad):
         band, y, x = np.argwhere(bad)[0]
@@ -74,56 +148,38 @@ def known_emissivity(
             f"Invalid emissivities {values[:, 0, 0]}: the same in both bands. Must differ; "
             "a gray body cannot be separated."
         )
-    deviations = np.zeros_like(values) if std is None else _spread(corrected, std, "emissivity_std")
+    if std is None:
+        return values, np.zeros_like(values)
+    deviations = _over_image(corrected, std, "emissivity_std")
     if not np.all(deviations >= 0):
         raise ValueError("Invalid emissivity_std. Must be zero or positive, not NaN.")
     return values, deviations
 
 
-def _spread(corrected: xr.Dataset, array: xr.DataArray, what: str) -> Array:
+def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str) -> Array:
+    """Values (band, y, x) of an array (band) or (band, y, x), in the capture's order of bands."""
     if not isinstance(array, xr.DataArray):
-        raise TypeError(f"Invalid {what} of type {type(array).__name__}. Must be a DataArray.")
+        raise TypeError(f"Invalid {name} of type {type(array).__name__}. Must be a DataArray.")
     if array.dims not in (("band",), ("band", "y", "x")):
         raise ValueError(
-            f"Invalid dims {array.dims} of {what}. Must be ('band',) or ('band', 'y', 'x')."
+            f"Invalid dims {array.dims} of {name}. Must be ('band',) or ('band', 'y', 'x')."
         )
     if array.attrs.get("units", "1") != "1":
-        raise ValueError(f"Invalid units '{array.attrs['units']}' of {what}. Must be '1'.")
-    wanted = [str(name) for name in corrected["band"].values]
-    if "band" not in array.coords and array.sizes["band"] == len(wanted):
-        places = list(range(len(wanted)))  # unlabelled dimensions align by position, as in xarray
+        raise ValueError(f"Invalid units '{array.attrs['units']}' of {name}. Must be '1'.")
+    bands = [str(band) for band in corrected["band"].values]
+    if "band" not in array.coords and array.sizes["band"] == len(bands):
+        places = list(range(len(bands)))  # unlabelled dimensions align by position, as in xarray
     else:
-        places = schema.band_positions(array, wanted, what)
+        places = schema.band_positions(array, bands, name)
     values = array.values[places].astype(np.float64)
-    shape = (len(wanted), corrected.sizes["y"], corrected.sizes["x"])
+    shape = (len(bands), corrected.sizes["y"], corrected.sizes["x"])
     if values.ndim == 3 and values.shape != shape:
-        raise ValueError(f"Invalid shape {values.shape} of {what}. Must be {shape}.")
-    return np.broadcast_to(values.reshape(2, *values.shape[1:] or (1, 1)), shape)
+        raise ValueError(f"Invalid shape {values.shape} of {name}. Must be {shape}.")
+    return np.broadcast_to(values.reshape(len(bands), *values.shape[1:] or (1, 1)), shape)
 
 
-def labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> npt.NDArray[np.intp] | None:
-    """
-    Check labels of materials.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture.
-    pool : DataArray, optional
-        (y, x), integer; negative for pixels that share nothing.
-
-    Returns
-    -------
-    ndarray of int or None
-        Labels (pixel), numbered from 0 without gaps, -1 for none.
-
-    Raises
-    ------
-    TypeError
-        If they are not a DataArray of integers.
-    ValueError
-        If their dims or sizes are not the capture's.
-    """
+def _labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:
+    """Labels (pixel) of materials, numbered from 0 without gaps, -1 for pixels of none."""
     if pool is None:
         return None
     if not isinstance(pool, xr.DataArray):
@@ -136,55 +192,3 @@ def labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> npt.NDArray[np.i
     flat = pool.values.ravel()
     names = np.unique(flat[flat >= 0])
     return np.where(flat >= 0, np.searchsorted(names, flat), -1).astype(np.intp)
-
-
-def with_mask(corrected: xr.Dataset, mask: xr.DataArray | None) -> xr.Dataset:
-    """
-    Check which samples to use, and the shutter's segments, beside the capture.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture; a `segment` (time) counts the shutter events before each frame.
-    mask : DataArray, optional
-        (time), (y, x) or (time, y, x), true for the samples to use.
-
-    Returns
-    -------
-    Dataset
-        The capture with the variable `mask`, where one is given.
-
-    Raises
-    ------
-    TypeError
-        If the mask is not a DataArray of booleans.
-    ValueError
-        If its dims or sizes are others, or a segment is no count of events.
-    """
-    if "segment" in corrected:
-        segment = corrected["segment"]
-        falling = segment.dtype.kind in "iu" and np.any(np.diff(segment.values.astype(int)) < 0)
-        if segment.dims != ("time",) or segment.dtype.kind not in "iu" or falling:
-            raise ValueError(
-                f"Invalid segment {segment.dims} of {segment.dtype}. Must be ('time',) of whole "
-                "numbers that do not fall."
-            )
-        events, frames = len(np.unique(segment)) - 1, segment.size
-        if events > frames // 4:
-            raise ValueError(
-                f"Invalid segment: {events} shutter events in {frames} frames. "
-                "Must be at most one in four."
-            )
-    if mask is None:
-        return corrected.drop_vars("mask", errors="ignore")
-    if not isinstance(mask, xr.DataArray):
-        raise TypeError(f"Invalid mask of type {type(mask).__name__}. Must be a DataArray.")
-    if mask.dtype != bool:
-        raise TypeError(f"Invalid dtype {mask.dtype} of the mask. Must be bool.")
-    sizes = {str(dim): corrected.sizes.get(str(dim), 0) for dim in mask.dims}
-    allowed = (("time",), ("y", "x"), ("time", "y", "x"))
-    if mask.dims not in allowed or dict(mask.sizes) != sizes:
-        raise ValueError(
-            f"Invalid mask {dict(mask.sizes)}. Must have dims of {allowed} and the capture's sizes."
-        )
-    return corrected.assign(mask=(mask.dims, mask.values))

@@ -1,41 +1,57 @@
-"""The one entrance to all methods: checks, noise, tiles, threads."""
+"""The one entrance to all methods: the inputs are checked, and separated tile by tile."""
 
+import importlib
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from dbthermal import noise as noise_of
-from dbthermal import response as responses
-from dbthermal import schema
-from dbthermal.curves import Curve
-from dbthermal.separation import (
-    _inputs as given,
+from dbthermal.schema import Status
+from dbthermal.separation import _inputs as inputs
+from dbthermal.separation import _quality as quality
+from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._inputs import Inputs, Labels
+from dbthermal.separation._pooling import pool as pooling
+from dbthermal.separation._tiles import (
+    PIXELS,
+    Array,
+    Bits,
+    Estimate,
+    Mask,
+    Material,
+    Method,
+    Parts,
+    Survey,
+    Tile,
+    Window,
 )
-from dbthermal.separation import (
-    _methods as methods,
-)
-from dbthermal.separation import (
-    _quality as samples,
-)
-from dbthermal.separation import (
-    _tiles as tiles,
-)
-from dbthermal.separation._pooling import pool as pool_of
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Flags, Mask, Separated, Survey
 
-Places = npt.NDArray[np.intp]
+if TYPE_CHECKING:
+    from dbthermal.separation._baselines.bcp import BcpSettings
+    from dbthermal.separation._baselines.naive import NaiveSettings
+    from dbthermal.separation._baselines.pyrometry import RatioSettings
+    from dbthermal.separation._dbvt import DbvtSettings
+    from dbthermal.separation._subspace.method import SubspaceSettings
 
-_NOISE_PIXELS: Final = 4096
-_READ: Final = ("counts", "status", "segment", "mask")
+    Settings = SubspaceSettings | DbvtSettings | NaiveSettings | RatioSettings | BcpSettings
+
+_MODULES: Final = {
+    "subspace": ("_subspace.method", "METHOD"),
+    "calibrated": ("_baselines.calibrated", "METHOD"),
+    "dbvt": ("_dbvt.method", "METHOD"),
+    "naive": ("_baselines.naive", "METHOD"),
+    "ratio": ("_baselines.pyrometry", "RATIO"),
+    "bcp": ("_baselines.bcp", "METHOD"),
+    "apparent": ("_baselines.pyrometry", "APPARENT"),
+}
+METHODS: Final = tuple(_MODULES)
+"""Names of the methods; the module of each is imported when it is first used."""
 
 
 def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by name
@@ -43,7 +59,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     response: xr.Dataset,
     method: str = "subspace",
     *,
-    settings: Any = None,
+    settings: "Settings | None" = None,
     emissivity: xr.DataArray | None = None,
     emissivity_std: xr.DataArray | None = None,
     mask: xr.DataArray | None = None,
@@ -129,212 +145,213 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        doi:10.48550/arXiv.2509.11334
     """
-    module = methods.get_method(method)
-    settings = methods.checked(method, settings)
-    _check(corrected, method, module, (workers, seed), has_emissivity=emissivity is not None)
-    names = [str(name) for name in corrected["band"].values]
-    curves = [responses.curve(response, name, response_kind) for name in names]
-    if pool is not None and module.survey is None:
-        raise ValueError(f"Invalid pool for method '{method}', which does not pool.")
-    corrected = given.with_mask(corrected, mask)
-    deviations = _noise(corrected, response, curves)
-    task = _Task(
-        needed=corrected[[name for name in _READ if name in corrected]],
-        curves=curves,
-        noise=deviations,
-        # The quieter band comes first: the regression for the emissivity needs a quiet ordinate.
-        bands=[int(band) for band in np.argsort(deviations, kind="stable")],
-        known=given.Given(*given.known_emissivity(corrected, emissivity, emissivity_std) or ()),
-        method=module,
-        settings=settings,
-        seed=seed,
+    module = get_method(method)
+    settings = _checked_settings(module, method, settings)
+    if operator.index(workers) < 1:
+        raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")
+    if operator.index(seed) < 0:
+        raise ValueError(f"Invalid seed {seed}. Must be zero or positive.")
+    checked = inputs.check(
+        corrected,
+        response,
+        module,
+        method,
+        emissivity=emissivity,
+        emissivity_std=emissivity_std,
+        mask=mask,
+        pool=pool,
+        response_kind=response_kind,
     )
-    labels = given.labels(corrected, pool)
+    run = _Run(checked, module, settings, seed)
     result = tiles.allocate(corrected)
+    height, pixels = corrected.sizes["y"], corrected.sizes["y"] * corrected.sizes["x"]
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
         tqdm(
-            total=corrected.sizes["y"] * corrected.sizes["x"] * (1 if labels is None else 2),
+            total=pixels if checked.labels is None else 2 * pixels,
             unit="pixel",
             desc=method,
             disable=not progress,
         ) as bar,
     ):
-        blocks = list(tiles.blocks(corrected, whole_image=module.whole_image))
-        if labels is not None:
-            asked = pool_of.asked(labels)
-            found = threads.map(lambda rows: task.survey(rows, asked, bar), blocks)
-            task = task.pooled(labels, [part for block in found for part in block])
-        for _ in threads.map(lambda rows: task.separate(rows, result.isel(y=rows), bar), blocks):
+        blocks = list(tiles.blocks(height, whole_image=module.whole_image))
+        if checked.labels is not None:
+            selected = pooling.select(checked.labels)
+            run = run.pooled(threads.map(lambda rows: run.survey(rows, selected, bar), blocks))
+        for _ in threads.map(lambda rows: run.separate(rows, result.isel(y=rows), bar), blocks):
             pass
-    counts_per_kelvin = np.array([curve.reference_slope for curve in curves])
+    counts_per_kelvin = np.array([curve.reference_slope for curve in checked.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
-    result["noise"] = xr.DataArray(deviations * counts_per_kelvin, dims="band", attrs=attrs)
+    result["noise"] = xr.DataArray(checked.noise * counts_per_kelvin, dims="band", attrs=attrs)
+    ratios = () if module.survey else ("reflection_ratio", "reflection_ratio_std")
     return result.assign_attrs(
         method=method,
         response_kind=response_kind,
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
-        not_estimated=" ".join(_not_estimated(module)),
-        reference_band=names[int(np.argmin(deviations))],
+        not_estimated=" ".join(module.not_estimated + ratios),
+        reference_band=str(corrected["band"].values[checked.bands[0]]),
         **({} if settings is None else {"settings": repr(settings)}),
     )
 
 
-@dataclass(frozen=True)
-class _Task:
-    """What every tile needs."""
+def get_method(name: str) -> Method:
+    """
+    Record of a method: its functions, its settings, and its demands on the capture.
 
-    needed: xr.Dataset
-    curves: list[Curve]
-    noise: Array
-    bands: list[int]
-    known: given.Given
+    Parameters
+    ----------
+    name : str
+        One of `METHODS`.
+
+    Returns
+    -------
+    Method
+        Among its fields `settings`, the type of its options or None, and `knows_emissivity`.
+
+    Raises
+    ------
+    ValueError
+        If there is no such method.
+    """
+    if name not in METHODS:
+        raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}.")
+    module, record = _MODULES[name]
+    method: Method = getattr(importlib.import_module(f"dbthermal.separation.{module}"), record)
+    return method
+
+
+def _checked_settings(method: Method, name: str, settings: Any) -> Any:
+    """Return the settings of a method, its defaults for None; None for a method without any."""
+    kind = method.settings
+    if settings is None:
+        return None if kind is None else kind()
+    if kind is None or type(settings) is not kind:
+        rule = "be omitted: it has no settings" if kind is None else f"be {kind.__name__}"
+        raise TypeError(
+            f"Invalid settings of type {type(settings).__name__} for method '{name}'. Must {rule}."
+        )
+    for field in fields(kind):
+        value = getattr(settings, field.name)
+        if type(field.default) is int and type(value) is not int:
+            raise TypeError(
+                f"Invalid {field.name} {value!r} of method '{name}'. Must be a whole number."
+            )
+    return settings
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One run of a method over a capture, a block of rows at a time."""
+
+    inputs: Inputs
     method: Method
     settings: Any
     seed: int
-    materials: pool_of.Materials | None = None
+    materials: Material | None = None
 
     def separate(self, rows: slice, result: xr.Dataset, bar: "tqdm[Any]") -> None:
         """Separate a block of rows into its place in the result."""
-        for tile, status, there, problems in self._problems(rows):
-            parts = []
-            for frames, pixels, problem in problems:
-                found: Separated = self._call(self.method.separate, problem)
-                whole = found.status.size == pixels.size
-                parts.append((frames, pixels, found.of(pixels) if whole else found))
-            tiles.write(result, tile, self.bands, status, there, parts)
+        for window, status, valid, parts in self._tiles(rows):
+            estimates = []
+            for frames, pixels, tile in parts:
+                estimate: Estimate = self._call(self.method.separate, tile)
+                whole = estimate.status.size == pixels.size
+                estimate = estimate.select_pixels(pixels) if whole else estimate
+                estimates.append((frames, pixels, estimate))
+            tiles.write(result, window, self.inputs.bands, status, valid, estimates)
             bar.update(status.size)
 
-    def survey(self, rows: slice, asked: Mask, bar: "tqdm[Any]") -> list[tuple[Places, Survey]]:
-        """What a block's pixels tell of their materials, and which pixels of the image they are."""
-        found = []
-        for tile, status, _, problems in self._problems(rows):
-            place = self._places(tile, rows)
-            for _, pixels, problem in problems:
-                chosen = asked[place[pixels]]
-                if np.any(chosen):
-                    part = problem if np.all(chosen) else problem.of(chosen)
-                    tells = self._call(self.method.survey, part)
-                    found.append((place[pixels][chosen], tells))
+    def survey(self, rows: slice, selected: Mask, bar: "tqdm[Any]") -> list[tuple[Labels, Survey]]:
+        """Survey the selected pixels of a block; with their numbers in the image."""
+        surveys = []
+        for window, status, _, parts in self._tiles(rows):
+            numbers = self._numbers(window, rows)
+            for _, pixels, tile in parts:
+                wanted = selected[numbers[pixels]]
+                if np.any(wanted):
+                    part = tile if np.all(wanted) else tile.select_pixels(wanted)
+                    survey: Survey = self._call(self.method.survey, part)
+                    surveys.append((numbers[pixels][wanted], survey))
             bar.update(status.size)
-        return found
+        return surveys
 
-    def pooled(self, labels: Places, found: list[tuple[Places, Survey]]) -> "_Task":
-        """The same task with the pixels of one material sharing what they tell."""
-        if not found:
+    def pooled(self, blocks: Iterable[list[tuple[Labels, Survey]]]) -> "_Run":
+        """Return the run in which the pixels of one material share their ratios and emissivity."""
+        labels = self.inputs.labels
+        surveys = [part for block in blocks for part in block]
+        if not surveys or labels is None:
             return self
-        places = np.concatenate([place for place, _ in found])
-        survey = pool_of.joined([part for _, part in found])
-        count = int(labels.max()) + 1
-        materials = pool_of.combine(labels[places], count, survey, self.noise[self.bands])
-        return replace(self, materials=replace(materials, label=labels))
+        numbers = np.concatenate([number for number, _ in surveys])
+        survey = pooling.join([part for _, part in surveys])
+        noise = self.inputs.noise[self.inputs.bands]
+        materials = pooling.estimate(labels[numbers], int(labels.max()) + 1, survey, noise)
+        return replace(self, materials=materials)
 
-    def _call(self, function: Callable[..., Any] | None, problem: Problem) -> Any:
+    def _call(self, function: Callable[..., Any] | None, tile: Tile) -> Any:
         assert function is not None
-        return function(problem) if self.settings is None else function(problem, self.settings)
+        return function(tile) if self.settings is None else function(tile, self.settings)
 
-    def _places(self, tile: tiles.Tile, rows: slice) -> Places:
-        """Numbers of a tile's pixels in the image."""
-        down, along = tiles.moved(tile, rows.start)
-        width = self.needed.sizes["x"]
-        lines = np.arange(down.start, down.stop)[:, np.newaxis] * width
-        return (lines + np.arange(along.start, along.stop)).ravel()
+    def _numbers(self, window: Window, rows: slice) -> Labels:
+        """Numbers (pixel) of a window's pixels in the image."""
+        lines = np.arange(window[0].start, window[0].stop)[:, np.newaxis] + rows.start
+        columns = np.arange(window[1].start, window[1].stop)
+        return np.asarray((lines * self.inputs.capture.sizes["x"] + columns).ravel())
 
-    def _problems(
-        self, rows: slice
-    ) -> Iterator[tuple[tiles.Tile, Flags, Mask, list[tuple[Mask, Mask, Problem]]]]:
-        """Tiles of a block, status and samples of their pixels, problems by set of frames."""
-        part = self.needed.isel(y=rows).load()
-        whole = part.sizes["y"] * part.sizes["x"]
-        size = whole if self.method.whole_image else getattr(self.settings, "batch", tiles.PIXELS)
-        for tile in tiles.cover(part, size):
-            counts, there, status = samples.read(part, tile, self.method.minimum_frames)
-            bad, own = samples.unusable(status), there
-            counts, there = samples.bridged(counts, there, part["time"].values)
-            if self.method.whole_image or self.method.every_frame:
-                frames, lacking = samples.common(there, bad, self.method.minimum_frames)
-                status[lacking] |= np.uint32(schema.FLAGS["invalid_samples"])
+    def _tiles(self, rows: slice) -> Iterator[tuple[Window, Bits, Mask, Parts[Tile]]]:
+        """Yield the windows of a block, status and valid samples, and a tile by set of frames."""
+        block = self.inputs.capture.isel(y=rows).load()
+        height, width, time = block.sizes["y"], block.sizes["x"], block["time"].values
+        method = self.method
+        size = height * width if method.whole_image else getattr(self.settings, "batch", PIXELS)
+        for window in tiles.windows(height, width, size):
+            part = block.isel(y=window[0], x=window[1])
+            counts, valid, status = quality.read(part, method.minimum_frames)
+            excluded, used = quality.unusable(status), valid
+            counts, valid = quality.bridge(counts, valid, time)
+            if method.whole_image or method.every_frame:
+                fewest = method.minimum_frames
+                frames, lacking = quality.common_frames(valid, excluded, fewest)
+                status[lacking] |= np.uint32(Status.INVALID_SAMPLES)
                 counts[:, :, lacking] = 0.0
-                usable = ~bad & ~lacking
+                usable = ~excluded & ~lacking
                 sets = [(frames, usable)] if np.any(usable) else []
             else:
-                sets = list(samples.patterns(there, bad))
-            problem = self._problem(part, counts, tile, rows)
-            problems = []
+                sets = list(quality.frame_sets(valid, excluded))
+            tile = self._tile(part, counts, window, rows)
+            parts = []
             for frames, pixels in sets:
-                one = problem if np.all(frames) else problem.at(frames)
-                alone = not (self.method.whole_image or np.all(pixels))
-                problems.append((frames, pixels, one.of(pixels) if alone else one))
-            yield tile, status, own, problems
+                one = tile if np.all(frames) else tile.select_frames(frames)
+                alone = not (method.whole_image or np.all(pixels))
+                parts.append((frames, pixels, one.select_pixels(pixels) if alone else one))
+            yield window, status, used, parts
 
-    def _problem(self, part: xr.Dataset, counts: Array, tile: tiles.Tile, rows: slice) -> Problem:
-        """All pixels and frames of a tile."""
-        place = tiles.moved(tile, rows.start)
-        curves = [self.curves[band] for band in self.bands]
+    def _tile(self, part: xr.Dataset, counts: Array, window: Window, rows: slice) -> Tile:
+        """Make the tile of all pixels and frames of a window."""
+        known, bands = self.inputs, self.inputs.bands
+        place = (slice(window[0].start + rows.start, window[0].stop + rows.start), window[1])
+        curves = tuple(known.curves[band] for band in bands)
         signals = [
             curve.linearise(counts[band]) - curve.reference
-            for band, curve in zip(self.bands, curves, strict=True)
+            for band, curve in zip(bands, curves, strict=True)
         ]
-        shared = None
-        if self.materials is not None:
-            shared = self.materials.shared(self._places(tile, rows))
-        problem = Problem(
+        emissivity, std = (
+            None if array is None else array[(slice(None), *place)].reshape(len(bands), -1)[bands]
+            for array in (known.emissivity, known.emissivity_std)
+        )
+        material = None
+        if self.materials is not None and known.labels is not None:
+            material = pooling.expand(self.materials, known.labels[self._numbers(window, rows)])
+        return Tile(
             signals=np.stack(signals),
             time=part["time"].values.astype(np.float64),
-            curves=tuple(curves),
-            noise=tuple(float(self.noise[band]) for band in self.bands),
-            shape=tiles.shape_of(tile),
+            curves=curves,
+            noise=tuple(float(known.noise[band]) for band in bands),
+            shape=(part.sizes["y"], part.sizes["x"]),
             rng=tiles.generator(self.seed, place),
             segment=part["segment"].values.astype(np.intp) if "segment" in part else None,
-            shared=shared,
+            material=material,
+            emissivity=emissivity,
+            emissivity_std=std,
         )
-        return self.known.put_into(problem, place, self.bands)
-
-
-def _not_estimated(method: Method) -> tuple[str, ...]:
-    """Variables of the result that a method leaves NaN everywhere."""
-    ratios = ("reflection_ratio", "reflection_ratio_std")
-    return method.not_estimated + (() if method.survey else ratios)
-
-
-def _check(
-    corrected: xr.Dataset,
-    name: str,
-    method: Method,
-    whole: tuple[int, int],
-    *,
-    has_emissivity: bool,
-) -> None:
-    workers, seed = whole
-    schema.check(corrected, "corrected")
-    samples.check_status(corrected)
-    if operator.index(workers) < 1:
-        raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")
-    if operator.index(seed) < 0:
-        raise ValueError(f"Invalid seed {seed}. Must be zero or positive.")
-    number, names = corrected.sizes["band"], [str(name) for name in corrected["band"].values]
-    if number < 2 or (number > 2 and not method.any_bands):
-        rule = "two or more" if method.any_bands else "exactly two"
-        raise ValueError(f"Invalid bands {names} for method '{name}'. Must be {rule}.")
-    frames = corrected.sizes["time"]
-    if frames < method.minimum_frames:
-        raise ValueError(
-            f"Invalid capture of {frames} frames for method '{name}'. "
-            f"Must have at least {method.minimum_frames}."
-        )
-    if has_emissivity and not method.knows_emissivity:
-        raise ValueError(f"Invalid emissivity for method '{name}', which estimates it. Omit it.")
-    if not has_emissivity and method.knows_emissivity:
-        raise ValueError(f"Missing emissivity. Method '{name}' must be given one.")
-
-
-def _noise(corrected: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Array:
-    """Standard deviation of the linearised signals (band) [K]: calibrated, or from the capture."""
-    if "noise" in response:
-        slopes = np.array([curve.reference_slope for curve in curves])
-        return np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
-    counts, frames = samples.sample(corrected, _NOISE_PIXELS)
-    signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
-    return noise_of.of_bands(signals, corrected["time"].values[frames])

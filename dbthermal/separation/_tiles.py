@@ -1,67 +1,236 @@
-"""Tiles: a capture is read in blocks of rows, and separated a few hundred pixels at a time.
+"""Records of a tile: its inputs, the method that is applied to it, and the estimate it yields.
 
-So the memory beyond the result stays small, a lazy capture is never read whole, and every tile
-fits in the processor's cache.
+A capture is read in blocks of rows and separated a few hundred pixels at a time: the memory beyond
+the result stays small, a lazy capture is never read whole, and a tile fits in the processor's
+cache. A tile's bands are in the order of their noise, the quietest first: the regression for the
+emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Iterator
-from typing import Final
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import schema
-from dbthermal.separation._separated import Array, Flags, Mask, Separated
+from dbthermal import mixing, schema
+from dbthermal.response import Curve
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
 
-Tile = tuple[slice, slice]
+Array = npt.NDArray[np.float64]
+Whole = npt.NDArray[np.intp]
+Bits = npt.NDArray[np.uint32]
+Mask = npt.NDArray[np.bool_]
+Window = tuple[slice, slice]
 """Rows and columns of a tile."""
 
 PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
 _BLOCK_ROWS: Final = 32
+# A temperature leaves the calibrated range if it is so many standard deviations outside.
+_RANGE_SIGMAS: Final = 5.0
+# A temperature [K], emissivity [1] or deviation beyond is no result.
+_USELESS: Final = 1e6
+_KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 
 
-def blocks(corrected: xr.Dataset, *, whole_image: bool = False) -> Iterator[slice]:
-    """
-    Blocks of rows, each read at once: a lazy capture is then decoded about once.
+@dataclass(frozen=True)
+class _Pixels:
+    """A record of arrays, optional ones among them, whose last axis is the pixel."""
 
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture.
-    whole_image : bool
-        All rows in one block.
+    def select_pixels(self, selected: Mask) -> Self:
+        """Return the record of the selected pixels alone."""
+        values = ((field.name, getattr(self, field.name)) for field in fields(self))
+        parts: dict[str, Any] = {name: v if v is None else v[..., selected] for name, v in values}
+        return replace(self, **parts)
 
-    Yields
-    ------
-    slice
-        Rows.
-    """
-    height = corrected.sizes["y"]
+    def replace_pixels(self, selected: Mask, part: Self) -> Self:
+        """Return the record with the selected pixels replaced by those of a part, in order."""
+        parts: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None:
+                parts[field.name] = value.copy()
+                parts[field.name][..., selected] = getattr(part, field.name)
+        return replace(self, **parts)
+
+
+@dataclass(frozen=True)
+class Material(_Pixels):
+    """Reflection ratios and emissivity that the pixels of one material share; NaN for others."""
+
+    ratio: Array  # reflection ratios (band, pixel) [1]
+    inverse_energy: Array  # their variance, see `ReflectionRatio` (pixel) [1/K^2]
+    emissivity: Array  # of the first band (pixel) [1]
+    noise_variance: Array  # its variance from the noise (pixel) [1]
+    drift_variance: Array  # its variance from the background's slow part (pixel) [1]
+
+
+@dataclass(frozen=True)
+class Survey(_Pixels):
+    """Contribution of each pixel to the estimate for its material."""
+
+    scatter: Array  # noise-whitened scatter of rapid changes less noise (band, band, pixel) [1]
+    frames: Array  # its degrees of freedom (pixel)
+    ratio: Array  # reflection ratios of the pixel alone (band, pixel) [1]
+    null_weights: Array  # see `ReflectionRatio` (band, pixel) [1]
+    emissivity: Array  # of the first band, of the pixel alone (pixel) [1]; NaN where undefined
+    noise_variance: Array  # its variance from the noise, independent of other pixels' (pixel) [1]
+    drift_variance: Array  # its variance from the background, common to all pixels (pixel) [1]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Inputs of one tile: linearised signals, responses, noise, and quantities known beforehand."""
+
+    signals: Array  # less the reference temperature (band, time, pixel) [K], finite
+    time: Array  # (time,) [s]
+    curves: tuple[Curve, ...]  # response of each band, of one reference temperature
+    noise: tuple[float, ...]  # standard deviation of each band's signal at the reference [K]
+    shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
+    rng: np.random.Generator  # the tile's own source of random starts
+    segment: Whole | None = None  # number of shutter events before each frame (time,)
+    material: Material | None = None
+    emissivity: Array | None = None  # known beforehand (band, pixel) [1]
+    emissivity_std: Array | None = None  # its standard deviation (band, pixel) [1]
+
+    @property
+    def reference(self) -> float:
+        """Reference temperature [K] that the signals are relative to."""
+        return self.curves[0].reference
+
+    def blackbody(self, band: int, temperature: Array) -> Array:
+        """Signal of a blackbody at a temperature [K] in a band, relative to the reference [K]."""
+        return self.curves[band].signal(temperature) - self.reference
+
+    def temperature(self, band: int, signal: Array) -> Array:
+        """Temperature [K] of the blackbody with a signal [K]; NaN where there is none."""
+        return self.curves[band].temperature(signal + self.reference)
+
+    def mixed(self, emissivity: Array, temperatures: Array) -> Array:
+        """Signals (band, time, pixel) [K] of object and background (2, time, pixel) [K]."""
+        x, y = temperatures
+        return np.stack(
+            [
+                mixing.mixed(share, self.blackbody(band, x), self.blackbody(band, y))
+                for band, share in enumerate(emissivity)
+            ]
+        )
+
+    def select_frames(self, selected: Mask) -> "Tile":
+        """Return the tile with the selected frames (time) alone."""
+        segment = None if self.segment is None else self.segment[selected]
+        signals, time = self.signals[:, selected], self.time[selected]
+        return replace(self, signals=signals, time=time, segment=segment)
+
+    def select_pixels(self, selected: Mask) -> "Tile":
+        """Return the tile of the selected pixels (pixel) alone, as one row."""
+        known: dict[str, Any] = {
+            name: None if getattr(self, name) is None else getattr(self, name)[..., selected]
+            for name in ("emissivity", "emissivity_std")
+        }
+        material = None if self.material is None else self.material.select_pixels(selected)
+        signals = self.signals[..., selected]
+        shape = (1, signals.shape[2])
+        return replace(self, signals=signals, shape=shape, material=material, **known)
+
+
+@dataclass(frozen=True)
+class Estimate(_Pixels):
+    """Estimate of one tile; NaN where a quantity is undefined, with a status bit that says so."""
+
+    object_temperature: Array  # (time, pixel) [K]
+    object_temperature_std: Array
+    background_temperature: Array  # (time, pixel) [K]
+    background_temperature_std: Array
+    emissivity: Array  # (band, pixel) [1]
+    emissivity_std: Array
+    status: Bits  # `schema.Status` (pixel)
+    reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
+    reflection_ratio_std: Array | None = None
+
+    def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
+        """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""
+        undefined = {
+            "object_temperature": no_object,
+            "emissivity": no_emissivity,
+            "background_temperature": no_background,
+        }
+        return replace(
+            self,
+            **{
+                name + ending: np.where(where, np.nan, getattr(self, name + ending))
+                for name, where in undefined.items()
+                for ending in ("", "_std")
+            },
+        )
+
+    def expand_frames(self, used: Mask) -> "Estimate":
+        """Return the estimate at all frames; the temperatures are NaN at those not used (time)."""
+        values = {}
+        for name in ("object_temperature", "background_temperature"):
+            for which in (name, f"{name}_std"):
+                part = getattr(self, which)
+                values[which] = np.full((used.size, part.shape[1]), np.nan)
+                values[which][used] = part
+        return replace(self, **values)
+
+    def check_range(self, curve: Curve, *, deviations: bool = True) -> "Estimate":
+        """
+        Flag temperatures outside the calibrated range of a response, and values without a number.
+
+        Samples without a temperature, or with a useless standard deviation where the method has
+        `deviations`, become NaN. A quantity that is NaN in all samples of a pixel with another
+        status bit needs no further bit.
+        """
+        values: dict[str, Array] = {}
+        beyond = np.zeros(self.status.shape, dtype=bool)
+        for field in fields(self):
+            name = field.name
+            if name == "status" or name.endswith("_std") or getattr(self, name) is None:
+                continue
+            value, std = getattr(self, name), getattr(self, f"{name}_std")
+            lost = ~((np.abs(value) < _USELESS) & ((std < _USELESS) | (not deviations)))
+            explained = np.all(np.isnan(value), axis=0) & (self.status != 0)
+            beyond |= np.any(lost, axis=0) & ~explained
+            values[name], values[f"{name}_std"] = (
+                np.where(lost, np.nan, part) for part in (value, std)
+            )
+            if name.endswith("temperature"):
+                margin = _RANGE_SIGMAS * np.where(np.isnan(std), 0.0, std)
+                cold, hot = value < curve.lowest - margin, value > curve.highest + margin
+                beyond |= np.any(cold | hot, axis=0)
+        status = self.status | status_bits({Status.OUTSIDE_RESPONSE: beyond})
+        return replace(self, **values, status=status)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A separation method: its functions of a tile, and its demands on the capture."""
+
+    separate: Callable[..., Estimate]  # of a `Tile`, and of the settings where there are any
+    settings: type[Any] | None = None  # frozen dataclass; a field `batch` is a tile's pixels
+    minimum_frames: int = 1
+    knows_emissivity: bool = False  # is given the emissivities, and does not estimate them
+    whole_image: bool = False  # looks at a pixel's neighbours: a tile is the whole image
+    every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
+    survey: Callable[..., Survey] | None = None  # of the same arguments, to pool the pixels
+    any_bands: bool = False  # takes more than two bands
+    not_estimated: tuple[str, ...] = ()  # variables of the result that are NaN everywhere
+
+
+def blocks(height: int, *, whole_image: bool = False) -> Iterator[slice]:
+    """Yield blocks of rows, each read at once: a lazy capture is then decoded about once."""
     rows = height if whole_image else _BLOCK_ROWS
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
 
 
-def cover(corrected: xr.Dataset, pixels: int = PIXELS) -> Iterator[Tile]:
-    """
-    Tiles that cover the image, along rows.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture.
-    pixels : int
-        Pixels in a tile, at most.
-
-    Yields
-    ------
-    tuple of slice
-        Rows and columns.
-    """
-    height, width = corrected.sizes["y"], corrected.sizes["x"]
+def windows(height: int, width: int, pixels: int = PIXELS) -> Iterator[Window]:
+    """Yield windows of at most so many pixels that cover an image, along its rows."""
     columns = min(width, pixels)
     rows = max(1, pixels // columns)
     for top in range(0, height, rows):
@@ -69,131 +238,56 @@ def cover(corrected: xr.Dataset, pixels: int = PIXELS) -> Iterator[Tile]:
             yield slice(top, min(top + rows, height)), slice(left, min(left + columns, width))
 
 
-def moved(tile: Tile, top: int) -> Tile:
-    """
-    Place of a block's tile in the whole image.
-
-    Parameters
-    ----------
-    tile : tuple of slice
-        Rows and columns in the block.
-    top : int
-        First row of the block.
-
-    Returns
-    -------
-    tuple of slice
-        Rows and columns in the image.
-    """
-    return slice(tile[0].start + top, tile[0].stop + top), tile[1]
-
-
-def generator(seed: int, tile: Tile) -> np.random.Generator:
-    """
-    A tile's own source of randomness, independent of all others of this seed.
-
-    Parameters
-    ----------
-    seed : int
-        Seed.
-    tile : tuple of slice
-        Rows and columns in the image.
-
-    Returns
-    -------
-    Generator
-        The same for the same seed and place, and not that of the seed itself.
-    """
-    key = (tile[0].start, tile[1].start)
+def generator(seed: int, window: Window) -> np.random.Generator:
+    """Make the random generator of a tile, independent of all others of this seed."""
+    key = (window[0].start, window[1].start)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
-def shape_of(tile: Tile) -> tuple[int, int]:
-    """
-    Size of a tile.
-
-    Parameters
-    ----------
-    tile : tuple of slice
-        Rows and columns.
-
-    Returns
-    -------
-    tuple of int
-        Number of rows and of columns.
-    """
-    return tile[0].stop - tile[0].start, tile[1].stop - tile[1].start
-
-
 def allocate(corrected: xr.Dataset) -> xr.Dataset:
-    """
-    Make an empty result of the stage `separated`.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        The capture.
-
-    Returns
-    -------
-    Dataset
-        Variables of `schema.STAGES["separated"]`, not yet filled; coordinates of the capture.
-    """
-    coordinates = {
-        name: corrected[name] for name in ("band", "time", "y", "x") if name in corrected.coords
-    }
-    kept = {
-        name: value
-        for name, value in corrected.attrs.items()
-        if name in ("origin", "radiometric", "source", "twin")
-    }
+    """Make an empty result of the stage `separated` with the coordinates of a capture."""
+    dims = ("band", "time", "y", "x")
+    kept = {name: value for name, value in corrected.attrs.items() if name in _KEPT_ATTRS}
     arrays = {}
     for name, variable in schema.STAGES["separated"].items():
         shape = tuple(corrected.sizes[dim] for dim in variable.dims)
         attrs = schema.status_attrs() if name == "status" else variable.attrs
-        attrs = {**attrs, **kept}
         empty = np.empty(shape, dtype=variable.dtype)
-        arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs=attrs)
+        arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs={**attrs, **kept})
+    coordinates = {name: corrected[name] for name in dims if name in corrected.coords}
     return xr.Dataset(arrays, coords=coordinates, attrs=kept)
+
+
+Part = TypeVar("Part")
+Parts = list[tuple[Mask, Mask, Part]]
+"""Frames (time) and pixels (pixel) of a window, and the tile or the estimate of these."""
 
 
 def write(
     result: xr.Dataset,
-    tile: Tile,
+    window: Window,
     bands: list[int],
-    status: Flags,
-    there: Mask,
-    parts: list[tuple[Mask, Mask, Separated]],
+    status: Bits,
+    valid: Mask,
+    parts: Parts[Estimate],
 ) -> None:
     """
-    Put a tile's result in its place.
+    Write the estimates of a window's parts into the result.
 
-    Parameters
-    ----------
-    result : Dataset
-        From `allocate`; filled in place.
-    tile : tuple of slice
-        Rows and columns.
-    bands : list of int
-        Order of the problem's bands in the capture.
-    status : ndarray of uint32, shape (pixel,)
-        From `read`; pixels of no part become NaN and keep only these bits.
-    there : ndarray of bool, shape (time, pixel)
-        Frames that the capture has; the temperatures of others are NaN.
-    parts : list of tuple
-        Frames (time), pixels (pixel), and what the method found there; NaN in other frames.
+    `bands` are the places of the tile's bands in the capture. A pixel of no part becomes NaN and
+    keeps its `status` (pixel); so do temperatures at frames of no part and at samples that are not
+    `valid` (time, pixel).
     """
-    rows, columns = tile
-    shape = shape_of(tile)
     complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in parts)
     for name, variable in schema.STAGES["separated"].items():
-        target = result[name].values[..., rows, columns]
+        target = result[name].values[..., window[0], window[1]]
+        shape = target.shape[-2:]
         if name == "status":
             target[...] = status.reshape(shape)
-        elif not complete or any(getattr(found, name) is None for _, _, found in parts):
+        elif not complete or any(getattr(estimate, name) is None for _, _, estimate in parts):
             target[...] = np.nan
-        for frames, pixels, found in parts:
-            values = getattr(found, name)
+        for frames, pixels, estimate in parts:
+            values = getattr(estimate, name)
             if values is None:
                 continue
             where = pixels.reshape(shape)
@@ -203,15 +297,15 @@ def write(
                 for index, band in enumerate(bands):
                     target[band][where] = values[index]
             else:
-                _put(target, frames, where, values)
-        if "time" in variable.dims and not np.all(there):
-            target[~there.reshape(-1, *shape)] = np.nan
+                _write_film(target, frames, where, values)
+        if "time" in variable.dims and not np.all(valid):
+            target[~valid.reshape(-1, *shape)] = np.nan
 
 
-def _put(target: npt.NDArray[np.floating], frames: Mask, where: Mask, values: Array) -> None:
-    """Put values (time, pixel) at some frames and pixels of (time, y, x), in place."""
+def _write_film(target: npt.NDArray[np.floating], frames: Mask, where: Mask, values: Array) -> None:
+    """Write values (time, pixel) at some frames and pixels of (time, y, x), in place."""
     if np.all(frames) and np.all(where):
         target[...] = values.reshape(target.shape)
-        return
-    rows, columns = np.nonzero(where)
-    target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values
+    else:
+        rows, columns = np.nonzero(where)
+        target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values

@@ -97,8 +97,8 @@ def agreement(reflection: xr.DataArray, theirs: xr.Dataset, strongest: int) -> x
     Parameters
     ----------
     reflection : DataArray
-        (time, y, x), from `separation.reflections`; its magnitude is compared, smoothed by
-        `SMOOTHING`.
+        (time, y, x), from `separation.uncalibrated_reflection`; its magnitude is compared,
+        smoothed by `SMOOTHING`.
     theirs : Dataset
         From `authors_reflection`, with as many frames.
     strongest : int

@@ -1,5 +1,6 @@
 """An emulated TC-08 in which things go wrong: each attribute of `faults` is one of them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -44,8 +45,9 @@ class Faults:
 class FaultyTC08(EmulatedTC08):
     """The emulated library with faults."""
 
-    def __init__(self, *arguments: Any, **settings: Any) -> None:
+    def __init__(self, *arguments: Any, clock: Callable[[], float], **settings: Any) -> None:
         super().__init__(*arguments, **settings)
+        self._clock = clock
         self.faults = Faults()
         self._opening = 0.0
 

@@ -4,19 +4,27 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+from faulty_apt import FaultyApt
+from faulty_boson import Fault, FaultyBoson
 from faulty_tc08 import FaultyTC08
+from loop import Loop
 
 from dbthermal.instruments import apt, fslp
 from dbthermal.instruments.boson import Boson
-from dbthermal.instruments.emulated.apt import EmulatedApt
-from dbthermal.instruments.emulated.boson import EmulatedBoson
-from dbthermal.instruments.emulated.boson_faults import Fault
-from dbthermal.instruments.emulated.port import Loop
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 
 FILTERS = {1: "open", 3: "9.5", 5: "LW"}
+QUICK = Settings(
+    filters=FILTERS,
+    reply_timeout=5.0,
+    poll_interval=0.005,
+    velocity=50.0,
+    home_velocity=20.0,
+    acceleration=1e3,
+)
+"""A wheel that turns in no time."""
 
 
 class Clock:
@@ -55,7 +63,7 @@ class BosonBench:
         self.clock = Clock()
         self.world = World(clock=self.clock)
         self.state = self.world.add_camera("boson", serial_number)
-        self.device = EmulatedBoson(self.world, "boson")
+        self.device = FaultyBoson(self.world, "boson")
         self.loop = Loop(self.device, clock=self.clock, sleep=self.clock.sleep)
         self.camera = Boson(self.loop, first_sequence=1, clock=self.clock, sleep=self.clock.sleep)
 
@@ -75,7 +83,7 @@ class WheelBench:
     def __init__(self, model: str = "BSC201", slot_offset: float = 0.0, **options: object) -> None:
         self.clock = Clock(0.0)
         self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
-        self.device = EmulatedApt(self.world, model=model, slot_offset=slot_offset)
+        self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
         loop = Loop(self.device, clock=self.clock, sleep=self.clock.sleep)
         chosen = Settings(filters=FILTERS, **options)  # type: ignore[arg-type]
         self.wheel = FilterWheel(loop, chosen, clock=self.clock, sleep=self.clock.sleep)
@@ -85,6 +93,11 @@ class WheelBench:
         self.wheel.connect()
         self.wheel.home()
         return self.wheel
+
+    def move(self, position: int) -> None:
+        """Move the motor past the driver."""
+        data = apt.Position(1, position).pack()
+        self.device.receive(apt.command(apt.Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
 
     def sent(self, identifier: apt.Id) -> list[apt.Message]:
         """What the driver sent of one kind."""

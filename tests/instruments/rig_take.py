@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from faulty_camera import Faults, FaultyCamera
 
 from dbthermal import store
 from dbthermal.instruments.camera import (
@@ -18,11 +19,8 @@ from dbthermal.instruments.camera import (
     FrameFlag,
     FrameSource,
 )
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording import record
-from dbthermal.instruments.recording.capture import notes
-from dbthermal.instruments.recording.fetching import Limits, Reading
+from dbthermal.instruments.recording import Limits, Reading, notes, record
 from dbthermal.instruments.session import Camera, Device, Session
 
 BANDS, SHAPE, RATE, MILLI = ("8-14", "9.5"), (16, 24), 100.0, 1e-3
@@ -44,7 +42,7 @@ def session(duration: float = 1.0) -> Session:
     return Session("faults", True, "scene", duration, dict.fromkeys(BANDS, camera), RATE, SHAPE)
 
 
-class Witness(EmulatedCamera):
+class Witness(FaultyCamera):
     """An emulated camera that keeps what it gave."""
 
     def __post_init__(self) -> None:
@@ -80,9 +78,7 @@ class Take:
         """Record so long [s], and hold it against what came."""
         asked = {name: Reading(read) for name, read in (readings or {}).items()}
         sources: dict[str, FrameSource] = dict(self.cameras)
-        self.summary = record.record(
-            session(duration), sources, self.path, readings=asked, limits=LIMITS
-        )
+        self.summary = record(session(duration), sources, self.path, readings=asked, limits=LIMITS)
         self.log = [note[1:] for note in notes(self.path)]
         for band in BANDS:
             self.check(band)

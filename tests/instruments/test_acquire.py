@@ -9,17 +9,20 @@ import pytest
 from rig_session import LEVELS, TEXT, bench, pictures, replaced, scene_text
 
 from dbthermal import acquire
-from dbthermal.instruments import inventory, protocols
+from dbthermal.instruments import inventory, protocols, recording
 from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated.frames import Picture
+from dbthermal.instruments.emulated.camera import Picture
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording.capture import open_capture
-from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.live import Watch
+from dbthermal.instruments.recording import Preview, open_capture
 from dbthermal.instruments.session import Session
 
-TWO = replaced(
-    ("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("window: 3", "window: 0.1"), ("0.15", "0.5")
+ONE = replaced(
+    ("[300.0, 290.0, 310.0]", "[290.0]"),
+    ("sweep: [9.5, 11]", "sweep: [11]"),
+    ("window: 3", "window: 0.1"),
+    ("0.15", "0.4"),
 )
 
 
@@ -29,9 +32,10 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(protocols, "STABILITY_PERIOD", 0.05)
 
 
-def levels(_: Session, world: World) -> Mapping[str, Picture]:
-    """Pictures that tell band and temperature."""
-    return pictures(world)
+def emulated(text: str) -> tuple[World, Mapping[str, Picture]]:
+    """Bench of a session, and pictures that tell band and temperature."""
+    world = bench(Session.from_yaml(text))
+    return world, pictures(world)
 
 
 def written(path: Path, text: str) -> str:
@@ -42,18 +46,18 @@ def written(path: Path, text: str) -> str:
 
 def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every device is named as emulated, the progress is told, and the movies are of the sweep."""
-    file, folder = written(tmp_path / "a.yaml", TWO), tmp_path / "recorded"
-    assert acquire.main([file, str(folder)], pictures=levels) == 0
+    file, folder = written(tmp_path / "a.yaml", ONE), tmp_path / "recorded"
+    assert acquire.main([file, str(folder)], *emulated(ONE)) == 0
     said = capsys.readouterr().out
     assert said.startswith("Session 'plate': every device is emulated, nothing is measured.")
     assert "filter_wheel: model BSC201" in said
     assert "Setting the emulated blackbody to 16.85 degC." in said
     assert "11: " in said
     assert "FPA 35.0 \N{DEGREE SIGN}C, FFC complete" in said
-    assert f"{folder / 'plate_01_11.zarr'}: duration" in said
-    movies = protocols.open_sweep(folder, "plate", frames=8)
-    exact = np.add.outer(list(LEVELS.values()), [2900, 3000])
-    np.testing.assert_array_equal(movies["counts"][:, :, 0, 0, 0], exact)
+    assert f"{folder / 'plate_00_11.zarr'}: duration" in said
+    movies = recording.open_sweep(folder, "plate", frames=8)
+    levels = [LEVELS["8-14"] + 2900, LEVELS["11"] + 2900]
+    np.testing.assert_array_equal(movies["counts"][:, 0, 0, 0, 0], levels)
 
 
 def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
@@ -68,9 +72,9 @@ def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
 
 def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The devices are opened and named, and no more."""
-    world = bench(Session.from_yaml(TEXT))
+    world, shown = emulated(TEXT)
     arguments = [written(tmp_path / "a.yaml", TEXT), str(tmp_path / "b"), "--dry-run"]
-    assert acquire.main(arguments, world, levels) == 0
+    assert acquire.main(arguments, world, shown) == 0
     assert "9.5: device sim://camera/narrow" in capsys.readouterr().out
     assert world.camera("wide").ffc_count == 0
     assert not (tmp_path / "b").exists()
@@ -88,7 +92,7 @@ def test_failures_have_a_status(
 ) -> None:
     """What is wrong is said, and other programs are told."""
     file = written(tmp_path / "a.yaml", text)
-    assert acquire.main([file, str(tmp_path)], pictures=levels) == status
+    assert acquire.main([file, str(tmp_path)]) == status
     assert message in capsys.readouterr().err
 
 
@@ -103,12 +107,12 @@ def test_interrupted(
 ) -> None:
     """Who interrupts it is told that nothing is lost."""
 
-    def interrupt(_: acquire.Progress, __: Preview) -> None:
+    def interrupt(*_: object) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(acquire.Progress, "__call__", interrupt)
+    monkeypatch.setattr(acquire, "_progress", interrupt)
     file = written(tmp_path / "a.yaml", scene_text())
-    assert acquire.main([file, str(tmp_path)], pictures=levels) == 130
+    assert acquire.main([file, str(tmp_path)], *emulated(scene_text())) == 130
     assert "Interrupted: what was recorded is kept." in capsys.readouterr().err
     assert (tmp_path / "plate.zarr").is_dir()
 
@@ -130,9 +134,9 @@ def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     monkeypatch.setattr("builtins.input", asked.append)
     devices = Devices(Session.from_yaml(TEXT), {})
-    acquire._setter(devices)(300.0)
+    acquire._set_blackbody(devices, 300.0)
     assert asked == [
-        "\nplate: set the blackbody to 26.85 degC and press Enter; its rest is awaited. "
+        "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
     ]
 
 
@@ -163,13 +167,10 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_progress_is_a_line() -> None:
     """One line tells the losses, the temperatures and the shutter of each band."""
-    lines: list[str] = []
-    progress = acquire.Progress(lines.append)
     totals = {"9.5": {"frames": 10, "lost": 3, "refused": 0, "damaged": 0}}
     readings = {"fpa 9.5": 308.15, "ffc 9.5": float(FfcStatus.IN_PROGRESS)}
-    progress(Preview(1.0, {}, totals, readings))
-    assert len(lines) == 1
-    assert lines[0].startswith("\r   1.0 s  9.5: ")
+    line = acquire._progress(Watch(), Preview(1.0, {}, totals, readings))
+    assert line.startswith("\r   1.0 s  9.5: ")
     for part in ("3 lost", "0 refused", "FPA 35.0 \N{DEGREE SIGN}C", "FFC in progress"):
-        assert part in lines[0]
-    assert "\n" not in lines[0]
+        assert part in line
+    assert "\n" not in line

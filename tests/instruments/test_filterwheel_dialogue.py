@@ -7,17 +7,18 @@ from hypothesis import strategies as st
 from rig_devices import FILTERS, Clock
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.filterwheel import FilterWheel, Settings, WheelError
+from dbthermal.instruments.apt import Id, command
+from dbthermal.instruments.filterwheel import FilterWheel, Settings, WheelError, WrongDeviceError
 
 SETTINGS = Settings(filters=FILTERS)
 
 
 def _greeting(unit: int) -> bytes:
-    start_ = apt.no_flash_programming(destination=unit) + apt.stop_updates(destination=unit)
-    return start_ + apt.request_info(destination=unit)
+    greeting = (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS, Id.HW_REQ_INFO)
+    return b"".join(command(identifier, destination=unit) for identifier in greeting)
 
 
-def _reply(identifier: apt.Id, data: bytes, *, source: int = apt.BAY_1) -> bytes:
+def _reply(identifier: Id, data: bytes, *, source: int = apt.BAY_1) -> bytes:
     return apt.encode(apt.Message(identifier, 0, 0, apt.HOST, source, data))
 
 
@@ -28,20 +29,20 @@ def _connection() -> list[Pair]:
     before, home = apt.HomeParameters(1, 2, 1, 0, 0), apt.HomeParameters(1, 2, 1, 4_397_466, 0)
     return [
         (_greeting(apt.UNIT), None),
-        (_greeting(apt.RACK), _reply(apt.Id.HW_GET_INFO, info.pack(), source=apt.RACK)),
+        (_greeting(apt.RACK), _reply(Id.HW_GET_INFO, info.pack(), source=apt.RACK)),
         (
-            apt.set_velocity_parameters(speeds, destination=to)
-            + apt.request_velocity_parameters(1, destination=to),
-            _reply(apt.Id.MOT_GET_VELPARAMS, speeds.pack()),
+            command(Id.MOT_SET_VELPARAMS, data=speeds.pack(), destination=to)
+            + command(Id.MOT_REQ_VELPARAMS, 1, destination=to),
+            _reply(Id.MOT_GET_VELPARAMS, speeds.pack()),
         ),
         (
-            apt.request_home_parameters(1, destination=to),
-            _reply(apt.Id.MOT_GET_HOMEPARAMS, before.pack()),
+            command(Id.MOT_REQ_HOMEPARAMS, 1, destination=to),
+            _reply(Id.MOT_GET_HOMEPARAMS, before.pack()),
         ),
         (
-            apt.set_home_parameters(home, destination=to)
-            + apt.request_home_parameters(1, destination=to),
-            _reply(apt.Id.MOT_GET_HOMEPARAMS, home.pack()),
+            command(Id.MOT_SET_HOMEPARAMS, data=home.pack(), destination=to)
+            + command(Id.MOT_REQ_HOMEPARAMS, 1, destination=to),
+            _reply(Id.MOT_GET_HOMEPARAMS, home.pack()),
         ),
         (bytes.fromhex("10 02 01 01 21 01 11 02 01 00 21 01"), bytes.fromhex("12 02 01 01 01 21")),
     ]
@@ -49,7 +50,7 @@ def _connection() -> list[Pair]:
 
 def _status(position: int, bits: int) -> bytes:
     packed = apt.Status(1, position, 0, apt.StatusBits(bits)).pack()
-    return _reply(apt.Id.MOT_GET_STATUSUPDATE, packed)
+    return _reply(Id.MOT_GET_STATUSUPDATE, packed)
 
 
 def test_dialogue_of_a_move() -> None:
@@ -77,10 +78,12 @@ def test_answers_of_others() -> None:
     ask, answer = bytes.fromhex("80 04 01 00 21 01"), _status(3, 0)
     old, other_bay = _status(1, 0), _status(2, 0)[:5] + b"\x22" + _status(2, 0)[6:]
     other_channel = answer[:6] + b"\x02" + answer[7:10] + b"\x01" + answer[11:]
-    later = [old, b"", other_bay + other_channel, answer]
-    settings_ = Settings(addresses=((apt.RACK, apt.BAY_1),))
-    with Dialogue([(None, later[:2]), (ask, later[2:])]) as dialogue:
-        assert FilterWheel(dialogue, settings_).status().position == 3
+    greeted = _connection()[-1]
+    pairs = [*_connection()[:-1], (greeted[0], [bytes.fromhex("12 02 01 01 01 21"), old])]
+    with Dialogue([*pairs, (ask, [other_bay + other_channel, answer])]) as dialogue:
+        wheel = FilterWheel(dialogue, SETTINGS)
+        wheel.connect()
+        assert wheel.status().position == 3
 
 
 @settings(max_examples=60, deadline=None)
@@ -106,3 +109,14 @@ def test_neither_enabled_nor_not(bits: bytes) -> None:
     dialogue = Dialogue([*_connection()[:-1], (_connection()[-1][0], bits)])
     with dialogue, pytest.raises(WheelError, match="does not say what the motor does"):
         FilterWheel(dialogue, SETTINGS).connect()
+
+
+def test_another_language() -> None:
+    """A device that answers in text, such as an FW102C, is refused."""
+    banner = b"Command error CMD_NOT_DEFINED\r\n> "
+    chosen = Settings(addresses=((apt.UNIT, apt.UNIT),))
+    with (
+        Dialogue([(_greeting(apt.UNIT), banner)]) as device,
+        pytest.raises(WrongDeviceError, match="33 bytes came that are no APT messages"),
+    ):
+        FilterWheel(device, chosen).connect()

@@ -1,43 +1,25 @@
 """What goes wrong with a filter wheel: which faults are overcome, and what the others look like."""
 
+import logging
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rig_devices import WheelBench
+from rig_devices import Clock, WheelBench
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.filterwheel import (
-    ControllerError,
+    FilterWheel,
     NoReplyError,
     NotHomedError,
+    Settings,
     StalledWheelError,
     WheelError,
     WheelTimeoutError,
+    WrongDeviceError,
 )
-from dbthermal.instruments.transport import TransportError
-
-
-def test_no_raw_move_without_current() -> None:
-    """The emulated motor runs away if it is moved before it is enabled, as users report."""
-    bench = WheelBench()
-    parameters = apt.VelocityParameters(1, 0, 4506, 21_987_328)
-    bench.device.receive(apt.set_velocity_parameters(parameters, destination=apt.BAY_1))
-    bench.device.receive(apt.move_absolute(1, 100, destination=apt.BAY_1))
-    bench.clock.sleep(100.0)
-    bench.device.poll()
-    assert bench.device.motor.position > 10_000_000
-
-
-def test_started_updates_end_in_silence() -> None:
-    """The emulated controller stops answering 5 s after its updates were started."""
-    bench = WheelBench()
-    bench.wheel.connect()
-    bench.device.receive(apt.start_updates(destination=apt.RACK))
-    for _ in range(60):
-        bench.clock.sleep(0.1)
-        bench.device.poll()
-    with pytest.raises(NoReplyError, match="No answer MOT_GET_STATUSUPDATE from address 0x21"):
-        bench.wheel.status()
+from dbthermal.instruments.filterwheel._controller import MAXIMUM_UNSOLICITED
+from dbthermal.instruments.transport import Closing, TransportError
 
 
 def test_unset_speeds_make_homing_do_nothing() -> None:
@@ -58,7 +40,7 @@ def test_an_earlier_search_for_home_does_not_count() -> None:
     """Neither the bit nor the report of an earlier search for home ends the next one."""
     bench = WheelBench()
     wheel = bench.homed()
-    bench.device.receive(apt.home(1, destination=apt.BAY_1))
+    bench.device.receive(apt.command(apt.Id.MOT_MOVE_HOME, 1, destination=apt.BAY_1))
     bench.clock.sleep(10.0)
     wheel.status()
     bench.device.faults.deaf_to = {apt.Id.MOT_MOVE_HOME}
@@ -186,12 +168,12 @@ def test_errors_of_the_controller() -> None:
     bench = WheelBench()
     wheel = bench.homed()
     bench.device.faults.notice = "motor hot"
-    with pytest.raises(ControllerError, match="It reported error 1 of message 0x0480: motor hot"):
+    with pytest.raises(WheelError, match="It reported error 1 of message 0x0480: motor hot"):
         wheel.move_to(3)
     assert not bench.sent(apt.Id.MOT_MOVE_ABSOLUTE)
     wheel.move_to(3)
     bench.device.faults.notice = "motor cold"
-    with pytest.raises(ControllerError, match="motor cold"):
+    with pytest.raises(WheelError, match="motor cold"):
         wheel.home()
 
 
@@ -269,3 +251,122 @@ def test_noise_on_the_line(noise: bytes, drop: int) -> None:
         assert bench.clock.now < 200.0
     else:
         assert bench.world.wheel_position == 2
+
+
+class Endless(Closing):
+    """A device that talks without end."""
+
+    is_simulated = True
+
+    def __init__(self, limit: int) -> None:
+        self.left = limit
+
+    def write(self, data: bytes) -> None:
+        """Take anything."""
+
+    def read(self, size: int, timeout: float) -> bytes:  # noqa: ARG002 - it never waits
+        """Talk; far beyond what the driver should listen to, the test fails."""
+        self.left -= size
+        if self.left < 0:
+            pytest.fail("The driver listens without end.")
+        return bytes(size)
+
+    def close(self) -> None:
+        """End."""
+
+
+def test_a_device_that_never_ends_is_another_one() -> None:
+    """Where more comes unasked than a controller says in its life, the wait ends and says why."""
+    clock = Clock()
+    line = Endless(2 * MAXIMUM_UNSOLICITED)
+    wheel = FilterWheel(line, Settings(), clock=clock, sleep=clock.sleep)
+    with pytest.raises(WrongDeviceError, match="More than 65536 bytes came unasked"):
+        wheel.connect()
+
+
+class Unplugged(Closing):
+    """A line that is gone after a number of reads and writes."""
+
+    is_simulated = True
+
+    def __init__(self, line: Closing, steps: int) -> None:
+        self.line, self.steps = line, steps
+
+    def _step(self, name: str, *arguments: object) -> bytes:
+        self.steps -= 1
+        if self.steps < 0:
+            raise TransportError("unplugged")
+        found: bytes = getattr(self.line, name)(*arguments)
+        return found
+
+    def write(self, data: bytes) -> None:
+        """Send."""
+        self._step("write", data)
+
+    def read(self, size: int, timeout: float) -> bytes:
+        """Receive."""
+        return self._step("read", size, timeout)
+
+    def close(self) -> None:
+        """End."""
+        self.line.close()
+
+
+@pytest.mark.parametrize("steps", [*range(0, 90, 3)])
+def test_unplugging_at_any_step(steps: int) -> None:
+    """Wherever the cable is pulled out, the error is the documented one, and closing works."""
+    bench = WheelBench()
+    line = Unplugged(bench.wheel._transport, steps)  # type: ignore[arg-type]
+    wheel = FilterWheel(line, bench.wheel.settings, clock=bench.clock, sleep=bench.clock.sleep)
+
+    def use() -> None:
+        wheel.connect()
+        wheel.home()
+        wheel.select("9.5")
+
+    with pytest.raises(TransportError, match="unplugged"):
+        use()
+    for _ in range(2):
+        wheel.close()
+
+
+def test_a_lost_position_stays_lost() -> None:
+    """Though the controller still says that it was homed, the driver does not believe it."""
+    bench = WheelBench()
+    wheel = bench.homed()
+    bench.device.faults.deaf_to = {apt.Id.MOT_MOVE_HOME}
+    with pytest.raises(StalledWheelError):
+        wheel.home()
+    bench.device.faults.deaf_to = set()
+    wheel.stop()
+    assert wheel.status().bits & apt.StatusBits.HOMED
+    with pytest.raises(NotHomedError, match="Must be homed"):
+        wheel.position()
+
+
+def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptureFixture) -> None:
+    """A controller need not know all that it is greeted with; what it says is in the log."""
+    bench = WheelBench()
+    bench.device.faults.notice = "unknown message"
+    with caplog.at_level(logging.WARNING):
+        bench.wheel.connect()
+    assert "unknown message" in caplog.text
+
+
+def test_a_speed_that_is_a_little_off_is_refused() -> None:
+    """A controller that takes 2 % less than it was told is not the one that was described."""
+    bench = WheelBench()
+    bench.device.faults.weak = 0.98
+    with pytest.raises(WheelError, match=r"The controller has velocity \d+\. Must be 21987328"):
+        bench.wheel.connect()
+
+
+def test_passing_a_target_is_no_arrival() -> None:
+    """A wheel that still moves is not there, however near to its target it is seen twice."""
+    bench = WheelBench(stall_timeout=1.0)
+    bench.homed()
+    bench.device.faults.stands_after = 60.05
+    bench.device.faults.unreported = True
+    with pytest.raises(StalledWheelError, match=r"stood at 60\.05 deg for 1\.0 s"):
+        bench.wheel.move_to(3)
+    assert bench.sent(apt.Id.MOT_MOVE_STOP)

@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose
 from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import apt, thermocouple
+from dbthermal.instruments.apt import Id, command
 from dbthermal.instruments.emulated.boson import EmulatedBoson
 from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.emulated.world import World
@@ -19,35 +20,27 @@ from dbthermal.instruments.emulated.world import World
 TO = apt.BAY_1
 SPEEDS = apt.VelocityParameters(1, minimum=0, acceleration=0x35B0, maximum=0x00CCCCCD)
 HOME = apt.HomeParameters(1, 2, 1, 4_397_466, -50)
+TARGET = apt.Position(1, 68_267)
 # By the function of thorlabs-apt-protocol, in its spelling: what is built here, and its arguments.
 REQUESTS: dict[str, tuple[bytes, dict[str, int]]] = {
-    "hw_disconnect": (apt.disconnect(destination=TO), {}),
-    "hw_no_flash_programming": (apt.no_flash_programming(destination=TO), {}),
-    "hw_req_info": (apt.request_info(destination=TO), {}),
-    "hw_start_updatemsgs": (apt.start_updates(destination=TO), {}),
-    "hw_stop_updatemsgs": (apt.stop_updates(destination=TO), {}),
-    "rack_req_bayused": (apt.request_bay_used(3, destination=TO), {"bay_ident": 3}),
-    "mod_identify": (apt.identify(1, destination=TO), {"chan_ident": 1}),
+    "hw_no_flash_programming": (command(Id.HW_NO_FLASH_PROGRAMMING, destination=TO), {}),
+    "hw_req_info": (command(Id.HW_REQ_INFO, destination=TO), {}),
+    "hw_stop_updatemsgs": (command(Id.HW_STOP_UPDATEMSGS, destination=TO), {}),
     "mod_set_chanenablestate": (
-        apt.set_channel_enabled(1, enabled=True, destination=TO),
+        command(Id.MOD_SET_CHANENABLESTATE, 1, apt.YES, destination=TO),
         {"chan_ident": 1, "enable_state": 1},
     ),
     "mod_req_chanenablestate": (
-        apt.request_channel_enabled(1, destination=TO),
+        command(Id.MOD_REQ_CHANENABLESTATE, 1, destination=TO),
         {"chan_ident": 1},
     ),
-    "mot_set_poscounter": (
-        apt.set_position(1, -7, destination=TO),
-        {"chan_ident": 1, "position": -7},
-    ),
-    "mot_req_poscounter": (apt.request_position(1, destination=TO), {"chan_ident": 1}),
     "mot_set_velparams": (
-        apt.set_velocity_parameters(SPEEDS, destination=TO),
+        command(Id.MOT_SET_VELPARAMS, data=SPEEDS.pack(), destination=TO),
         {"chan_ident": 1, "min_velocity": 0, "acceleration": 0x35B0, "max_velocity": 0x00CCCCCD},
     ),
-    "mot_req_velparams": (apt.request_velocity_parameters(1, destination=TO), {"chan_ident": 1}),
+    "mot_req_velparams": (command(Id.MOT_REQ_VELPARAMS, 1, destination=TO), {"chan_ident": 1}),
     "mot_set_homeparams": (
-        apt.set_home_parameters(HOME, destination=TO),
+        command(Id.MOT_SET_HOMEPARAMS, data=HOME.pack(), destination=TO),
         {
             "chan_ident": 1,
             "home_dir": 2,
@@ -56,22 +49,20 @@ REQUESTS: dict[str, tuple[bytes, dict[str, int]]] = {
             "offset_distance": -50,
         },
     ),
-    "mot_req_homeparams": (apt.request_home_parameters(1, destination=TO), {"chan_ident": 1}),
-    "mot_move_home": (apt.home(1, destination=TO), {"chan_ident": 1}),
+    "mot_req_homeparams": (command(Id.MOT_REQ_HOMEPARAMS, 1, destination=TO), {"chan_ident": 1}),
+    "mot_move_home": (command(Id.MOT_MOVE_HOME, 1, destination=TO), {"chan_ident": 1}),
     "mot_move_absolute": (
-        apt.move_absolute(1, 68_267, destination=TO),
+        command(Id.MOT_MOVE_ABSOLUTE, data=TARGET.pack(), destination=TO),
         {"chan_ident": 1, "position": 68_267},
     ),
-    "mot_move_relative": (
-        apt.move_relative(1, -9, destination=TO),
-        {"chan_ident": 1, "distance": -9},
+    "mot_move_stop": (
+        command(Id.MOT_MOVE_STOP, 1, apt.NO, destination=TO),
+        {"chan_ident": 1, "stop_mode": 2},
     ),
-    "mot_move_stop": (apt.stop(1, destination=TO), {"chan_ident": 1, "stop_mode": 2}),
-    "mot_req_statusupdate": (apt.request_status(1, destination=TO), {"chan_ident": 1}),
-    "mot_req_dcstatusupdate": (apt.request_dc_status(1, destination=TO), {"chan_ident": 1}),
-    "mot_ack_dcstatusupdate": (apt.acknowledge_status(destination=TO), {}),
-    "mot_suspend_endofmovemsges": (apt.suspend_end_of_move(destination=TO), {}),
-    "mot_resume_endofmovemsges": (apt.resume_end_of_move(destination=TO), {}),
+    "mot_req_statusupdate": (
+        command(Id.MOT_REQ_STATUSUPDATE, 1, destination=TO),
+        {"chan_ident": 1},
+    ),
 }
 
 
@@ -96,17 +87,15 @@ def test_replies_agree(protocol: ModuleType) -> None:
     unpacker = protocol.Unpacker()
     status = apt.Status(1, -68_267, 0, apt.StatusBits.REVERSE_LIMIT | apt.StatusBits.HOMED)
     answers = [
-        (apt.Id.MOT_GET_STATUSUPDATE, status.pack()),
-        (apt.Id.MOT_GET_POSCOUNTER, apt.Position(1, 200_000).pack()),
-        (apt.Id.HW_GET_INFO, apt.Info(94_000_009, "BSC201", 45, "57.1.2", 1, 3, 1).pack()),
-        (apt.Id.MOT_GET_HOMEPARAMS, HOME.pack()),
-        (apt.Id.MOT_GET_VELPARAMS, SPEEDS.pack()),
+        (Id.MOT_GET_STATUSUPDATE, status.pack()),
+        (Id.HW_GET_INFO, apt.Info(94_000_009, "BSC201", 45, "57.1.2", 1, 3, 1).pack()),
+        (Id.MOT_GET_HOMEPARAMS, HOME.pack()),
+        (Id.MOT_GET_VELPARAMS, SPEEDS.pack()),
     ]
     for identifier, data in answers:
         unpacker.feed(apt.encode(apt.Message(identifier, 0, 0, apt.HOST, TO, data)))
-    where, counter, info, homes, speeds = list(unpacker)
+    where, info, homes, speeds = list(unpacker)
     assert (where.position, where.reverse_limit_switch, where.homed) == (-68_267, True, True)
-    assert counter.position == 200_000
     assert (info.serial_number, info.nchs, list(info.firmware_version)) == (
         *(94_000_009, 1),
         [57, 1, 2],

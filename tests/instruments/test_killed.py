@@ -12,12 +12,16 @@ import xarray as xr
 
 from dbthermal import store
 from dbthermal.instruments.camera import Counts, Frame
-from dbthermal.instruments.emulated.frames import EmulatedCamera
+from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording import record, tape
-from dbthermal.instruments.recording.capture import notes, open_capture
-from dbthermal.instruments.recording.contents import Note
-from dbthermal.instruments.recording.fetching import Limits, Reading
+from dbthermal.instruments.recording import (
+    Limits,
+    Reading,
+    notes,
+    open_capture,
+    record,
+)
+from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 from dbthermal.instruments.session import Camera, Device, Session
 from dbthermal.store import _durable as durable
 
@@ -42,7 +46,7 @@ def record_until_killed(path: Path, duration: float, pipe: Connection) -> None:
     session = Session("killed", True, "scene", duration, cameras, RATE, SHAPE)
     limits = Limits(chunk=CHUNK, reserve=0, preview_period=0.0, reading_period=0.02)
     readings = {"plate": Reading(lambda: 300.0)}
-    record.record(
+    record(
         session,
         dict(sources),
         path,
@@ -55,9 +59,7 @@ def record_until_killed(path: Path, duration: float, pipe: Connection) -> None:
 def killed(path: Path, delay: float, duration: float = 60.0) -> list[int]:
     """Kill a recording some time after its first frame; frames that it had taken by then."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(
-        [__name__, "dbthermal.store", "dbthermal.instruments.recording.record"]
-    )
+    context.set_forkserver_preload([__name__, "dbthermal.store", "dbthermal.instruments.recording"])
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=record_until_killed, args=(path, duration, theirs))
     process.start()
@@ -104,20 +106,6 @@ def test_kill_costs_the_last_chunk(tmp_path: Path, kills: int) -> None:
         assert all(note[1:] == ("reading", "plate", 300.0) for note in notes(path))
 
 
-def test_recovered(tmp_path: Path) -> None:
-    """Recovered, a recording that was killed has all frames that any band has, and says so."""
-    path = tmp_path / "a.zarr"
-    killed(path, 0.3)
-    written = store.open_dataset(path).attrs["frames_written"]
-    store.recover(path)
-    opened = store.open_dataset(path)
-    assert (opened.attrs["complete"], opened.attrs["closed"]) == (False, True)
-    assert opened.sizes["time"] == max(written.values())
-    check(opened, list(written.values()))
-    with pytest.raises(ValueError, match="Must be one that was cut short"):
-        store.recover(path)
-
-
 @pytest.mark.parametrize("kills", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_kill_while_it_is_closed(tmp_path: Path, kills: int) -> None:
     """Killed about its end, a recording opens, too, and is complete only if it says so."""
@@ -130,9 +118,6 @@ def test_kill_while_it_is_closed(tmp_path: Path, kills: int) -> None:
         assert opened.attrs["complete"] is closed
         assert opened.sizes["time"] == (max(written) if closed else min(written))
         check(opened, written if closed else 2 * [min(written)])
-        if not closed:
-            store.recover(path)
-            check(store.open_dataset(path), written)
 
 
 class Disk:
@@ -183,13 +168,13 @@ def frame(number: int) -> Frame:
     return Frame(picture(time), time, time, number)
 
 
-def two_bands(path: Path) -> tape.Tape:
-    """A tape of two bands, in chunks of three frames, which is handed frames by hand."""
+def two_bands(path: Path) -> CaptureFile:
+    """A capture file of two bands, in chunks of three frames, which is handed frames by hand."""
     world, sources = World(), {}
     for number, band in enumerate(BANDS):
         world.add_camera(band, number)
         sources[band] = EmulatedCamera(world, band, {band: picture}, band, SHAPE, RATE)
-    return tape.Tape(path, sources, readings={"plate": "K"}, origin=0.0, attrs={}, chunk=3)
+    return CaptureFile(path, sources, readings={"plate": "K"}, origin=0.0, attrs={}, chunk=3)
 
 
 def check_left(left: Path, committed: list[int]) -> None:
@@ -227,7 +212,7 @@ def test_power_loss_costs_the_last_chunk(
             lose()
         disk.sync(path)
 
-    recorded: tape.Tape | None = None
+    recorded: CaptureFile | None = None
     monkeypatch.setattr(durable, "_THREADS", 1)
     monkeypatch.setattr(durable, "_to_disk", sync)
     recorded = two_bands(tmp_path / "disk" / "a.zarr")

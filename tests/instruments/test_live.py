@@ -11,16 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from faulty_camera import Faults, FaultyCamera, Movie
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
 from dbthermal.figures import LiveFigure, Panel
 from dbthermal.instruments import live, telemetry
-from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
+from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag, Metadata
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording.fetching import Limits, Reading
-from dbthermal.instruments.recording.record import Preview, Summary, record
+from dbthermal.instruments.recording import Limits, Preview, Reading, Summary, record
 from dbthermal.instruments.session import Camera, Device, Session
 
 BANDS = ("8-14", "9.5")
@@ -28,15 +27,11 @@ DEGREE = "\N{DEGREE SIGN}C"
 RAMP = (5000 + np.arange(384, dtype=np.uint16)).reshape(16, 24)
 
 
-def frame(counts: Counts = RAMP, flags: FrameFlag = GOOD, rows: Counts | None = None) -> Frame:
+def frame(
+    counts: Counts = RAMP, flags: FrameFlag = GOOD, metadata: Metadata | None = None
+) -> Frame:
     """A frame whose clocks do not matter."""
-    return Frame(counts, 0.0, 0.0, 0, flags, rows)
-
-
-def rows(fpa_temperature: float, last_ffc_frame: int = 0) -> Counts:
-    """Telemetry of a frame."""
-    fields = telemetry.Telemetry(fpa_temperature=fpa_temperature, last_ffc_frame=last_ffc_frame)
-    return telemetry.encode(fields, 640)
+    return Frame(counts, 0.0, 0.0, 0, flags, metadata=metadata)
 
 
 def preview(at: float = 0.0, shown: Frame | None = None, **readings: float) -> Preview:
@@ -84,8 +79,8 @@ def recording(path: Path, view: live.View) -> Summary:
     movie, faults = Movie(wide[None], 60.0, endless=True), Faults(ffc=frozenset(range(1, 6000)))
     for number, band in enumerate(BANDS):
         world.add_camera(band, number)
-        sources[band] = EmulatedCamera(
-            world, band, {band: movie}, band, wide.shape, 100.0, telemetry.ROWS, faults
+        sources[band] = FaultyCamera(
+            world, band, {band: movie}, band, wide.shape, 100.0, telemetry.ROWS, faults=faults
         )
 
     def show(shown: Preview) -> None:
@@ -108,7 +103,7 @@ def test_numbers_of_a_preview() -> None:
     found = status(preview())
     assert (found.frames, found.lost, found.refused, found.damaged) == (1, 2, 3, 4)
     assert (found.lowest, found.highest, found.dead, found.saturated) == (5000, 5383, 0, 0)
-    expected = np.percentile(RAMP[::4, ::4], live._watch.PERCENTILES)
+    expected = np.percentile(RAMP[::4, ::4], live._PERCENTILES)
     np.testing.assert_allclose(found.limits, expected, rtol=0, atol=1e-9)
     assert math.isnan(found.frame_rate)
 
@@ -170,7 +165,7 @@ def test_time_since_the_last_correction() -> None:
     assert math.isnan(status(asked[0]).ffc_age)
     assert status(*asked).ffc_age == 3.5
     told = [
-        preview(at, frame(rows=rows(300.0, number)))
+        preview(at, frame(metadata=Metadata(last_ffc_frame=number)))
         for at, number in ((1.0, 10), (2.0, 10), (3.0, 130), (7.0, 130))
     ]
     assert math.isnan(status(*told[:2]).ffc_age)
@@ -179,11 +174,11 @@ def test_time_since_the_last_correction() -> None:
 
 def test_camera_temperature() -> None:
     """The reading counts, without an answer the telemetry, but not that of a damaged frame."""
-    told = frame(rows=rows(311.2))
+    told = frame(metadata=Metadata(fpa_temperature=311.2))
     assert status(ffc(shown=told, ffc=3.0, fpa=308.15)).fpa_temperature == 308.15
     silent = status(ffc(shown=told, ffc=3.0, fpa=math.nan))
     np.testing.assert_allclose(silent.fpa_temperature, 311.2, rtol=0, atol=1e-9)
-    damaged = frame(flags=FrameFlag.WRONG_SIZE, rows=rows(0.0))
+    damaged = frame(flags=FrameFlag.WRONG_SIZE)
     assert math.isnan(status(preview(shown=damaged)).fpa_temperature)
 
 
@@ -325,7 +320,8 @@ def test_recording_without_a_notebook(tmp_path: Path) -> None:
 
 def test_import_is_light() -> None:
     """Neither the package nor the watch loads matplotlib or IPython: the first picture does."""
-    code = "import sys, dbthermal.live; print({'matplotlib', 'IPython', 'torch'} & {*sys.modules})"
+    heavy = "{'matplotlib', 'IPython', 'torch'}"
+    code = f"import sys, dbthermal.instruments.live; print({heavy} & {{*sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

@@ -8,16 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from faulty_camera import Faults, FaultyCamera
 
 from dbthermal import alignment, store
 from dbthermal import correction as frames
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.recording import record, tape, writing
-from dbthermal.instruments.recording.capture import notes, open_capture
-from dbthermal.instruments.recording.fetching import Limits, Reading
-from dbthermal.instruments.recording.record import Preview
+from dbthermal.instruments.recording import (
+    Limits,
+    Preview,
+    Reading,
+    _recorder,
+    notes,
+    open_capture,
+    record,
+)
+from dbthermal.instruments.recording._capture_file import CaptureFile
 from dbthermal.instruments.session import Camera, Device, Session
 
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
@@ -45,7 +51,7 @@ def bench(
     world, sources = World(), {}
     for number, (band, faults) in enumerate(zip(BANDS, (first, second), strict=True)):
         world.add_camera(band, 100 + number)
-        sources[band] = EmulatedCamera(
+        sources[band] = FaultyCamera(
             world,
             band,
             dict.fromkeys(BANDS, picture),
@@ -53,15 +59,15 @@ def bench(
             SHAPE,
             RATE,
             telemetry_rows,
-            faults or Faults(),
+            faults=faults or Faults(),
         )
     return dict(sources)
 
 
-def short_tape(path: Path) -> tape.Tape:
-    """A tape of one camera, which is handed frames by hand."""
+def short_file(path: Path) -> CaptureFile:
+    """A capture file of one camera, which is handed frames by hand."""
     source = {BANDS[0]: bench()[BANDS[0]]}
-    return tape.Tape(path, source, readings={"plate": "K"}, origin=0.0, attrs={}, chunk=CHUNK)
+    return CaptureFile(path, source, readings={"plate": "K"}, origin=0.0, attrs={}, chunk=CHUNK)
 
 
 def shot(number: int, *, at: float | None = None, flags: int = 0) -> Frame:
@@ -73,7 +79,7 @@ def shot(number: int, *, at: float | None = None, flags: int = 0) -> Frame:
 def test_recording_is_a_capture(tmp_path: Path) -> None:
     """Each frame is what was to be seen when it was exposed, on one clock for both bands."""
     sources = bench()
-    summary = record.record(session(), sources, tmp_path / "a.zarr", limits=SMALL)
+    summary = record(session(), sources, tmp_path / "a.zarr", limits=SMALL)
     opened = open_capture(tmp_path / "a.zarr")
     steps = opened["exposure_time"].diff("time").values
     np.testing.assert_allclose(steps[np.isfinite(steps)], 1 / RATE, rtol=0, atol=1e-6)
@@ -88,7 +94,7 @@ def test_recording_is_a_capture(tmp_path: Path) -> None:
 
 def test_recording_says_what_made_it(tmp_path: Path) -> None:
     """Identities, the switch, the session and the versions are in the store."""
-    record.record(session(), bench(telemetry_rows=12), tmp_path / "a.zarr", limits=SMALL)
+    record(session(), bench(telemetry_rows=12), tmp_path / "a.zarr", limits=SMALL)
     opened = open_capture(tmp_path / "a.zarr")
     assert opened.attrs["is_simulated"] is True
     assert opened.attrs["identities"]["9.5"]["model"] == "emulated Boson"
@@ -102,7 +108,7 @@ def test_identities_beside_those_of_the_sources(tmp_path: Path) -> None:
     camera: dict[str, str | bool] = {"software_revision": "1.2.3", "is_simulated": True}
     known: dict[str, dict[str, str | bool]] = {"9.5": camera, "wheel": {"model": "a"}}
     path = tmp_path / "a.zarr"
-    record.record(session(), bench(), path, identities=known, limits=SMALL)
+    record(session(), bench(), path, identities=known, limits=SMALL)
     found = open_capture(path).attrs["identities"]
     assert found["9.5"] == {
         "device": "sim://camera/9.5",
@@ -119,7 +125,7 @@ def test_frames_from_before_are_not_taken(tmp_path: Path) -> None:
     for source in sources.values():
         source.read()
     time.sleep(0.05)
-    summary = record.record(session(), sources, tmp_path / "a.zarr", limits=SMALL)
+    summary = record(session(), sources, tmp_path / "a.zarr", limits=SMALL)
     opened = open_capture(tmp_path / "a.zarr")
     assert float(opened["exposure_time"].min()) >= 0
     assert int(opened["sequence"][:, 0].min()) > 4
@@ -130,7 +136,7 @@ def test_recording_goes_on_to_alignment(tmp_path: Path) -> None:
     """A recording with losses and a shutter event goes through correction, marking, alignment."""
     first = Faults(dropped=frozenset({7, 8}), corrupt=frozenset({20}))
     second = Faults(ffc=frozenset({10}), offset_step=20.0)
-    record.record(session(0.9), bench(first, second), tmp_path / "a.zarr", limits=SMALL)
+    record(session(0.9), bench(first, second), tmp_path / "a.zarr", limits=SMALL)
     capture = open_capture(tmp_path / "a.zarr")
     ones = np.ones((2, *SHAPE))
     gain, offset, bad = (("band", "y", "x"), ones), (("band", "y", "x"), 0 * ones), ones > 1
@@ -160,7 +166,7 @@ def test_recording_goes_on_to_alignment(tmp_path: Path) -> None:
 )
 def test_faults_are_noted(faults: Faults, kind: str, value: int, tmp_path: Path) -> None:
     """What goes wrong is in the log, of the camera it happened to, and of no other."""
-    record.record(session(), bench(None, faults), tmp_path / "a.zarr", limits=SMALL)
+    record(session(), bench(None, faults), tmp_path / "a.zarr", limits=SMALL)
     found = [note[1:] for note in notes(tmp_path / "a.zarr")]
     assert found == [(kind, "9.5", value)]
 
@@ -168,7 +174,7 @@ def test_faults_are_noted(faults: Faults, kind: str, value: int, tmp_path: Path)
 def test_damaged_frames_are_kept_without_time(tmp_path: Path) -> None:
     """A corrupt frame is in the store, with its flag, and has no exposure time."""
     faults = Faults(corrupt=frozenset({7}))
-    record.record(session(), bench(faults), tmp_path / "a.zarr", limits=SMALL)
+    record(session(), bench(faults), tmp_path / "a.zarr", limits=SMALL)
     frame = open_capture(tmp_path / "a.zarr").isel(band=0, time=7)
     assert (int(frame["sequence"]), int(frame["frame_flags"])) == (7, FrameFlag.DRIVER_ERROR)
     assert np.isnan(frame["exposure_time"])
@@ -178,7 +184,7 @@ def test_damaged_frames_are_kept_without_time(tmp_path: Path) -> None:
 def test_unplugged_camera_leaves_the_other(tmp_path: Path) -> None:
     """One camera is pulled out: the other is recorded to the end, and the store says it."""
     sources = bench(None, Faults(unplugged=12))
-    summary = record.record(session(), sources, tmp_path / "a.zarr", limits=SMALL)
+    summary = record(session(), sources, tmp_path / "a.zarr", limits=SMALL)
     assert (summary.ended, summary.totals["9.5"]["frames"]) == ("source lost", 12)
     assert summary.totals["8-14"]["frames"] > 20
     opened = open_capture(tmp_path / "a.zarr")
@@ -193,7 +199,7 @@ def test_last_source_lost_ends_it(tmp_path: Path) -> None:
     """Without a camera there is nothing to wait for."""
     gone = Faults(unplugged=6)
     start = time.monotonic()
-    summary = record.record(session(60.0), bench(gone, gone), tmp_path / "a.zarr", limits=SMALL)
+    summary = record(session(60.0), bench(gone, gone), tmp_path / "a.zarr", limits=SMALL)
     assert time.monotonic() - start < 10
     assert summary.ended == "source lost"
 
@@ -201,7 +207,7 @@ def test_last_source_lost_ends_it(tmp_path: Path) -> None:
 def test_clock_of_its_own_is_fitted(tmp_path: Path) -> None:
     """Stamps of a drifting clock are no exposure times until they are put on the host's."""
     sources = bench(None, Faults(clock_rate=1.05))
-    record.record(session(0.6), sources, tmp_path / "a.zarr", limits=SMALL)
+    record(session(0.6), sources, tmp_path / "a.zarr", limits=SMALL)
     with pytest.raises(ValueError, match=r"Invalid exposure times of band '9\.5': 0 stamps"):
         open_capture(tmp_path / "a.zarr")
     fitted = open_capture(tmp_path / "a.zarr", fitted=True)
@@ -210,7 +216,7 @@ def test_clock_of_its_own_is_fitted(tmp_path: Path) -> None:
 
 def test_numbers_that_stand_are_flagged(tmp_path: Path) -> None:
     """A repeated number or time makes no exposure time; a restart of the numbers goes on."""
-    short = short_tape(tmp_path / "a.zarr")
+    short = short_file(tmp_path / "a.zarr")
     for frame in (shot(0), shot(1), shot(1), shot(2, at=0.005), shot(3), shot(0, at=0.04)):
         short.frame("8-14", frame)
     short.frame("8-14", shot(1, at=0.05))
@@ -233,7 +239,7 @@ def test_readings_come_beside_the_frames(tmp_path: Path) -> None:
         return value
 
     readings = {"plate": Reading(read)}
-    record.record(session(), bench(), tmp_path / "a.zarr", readings=readings, limits=SMALL)
+    record(session(), bench(), tmp_path / "a.zarr", readings=readings, limits=SMALL)
     found = [note[1:] for note in notes(tmp_path / "a.zarr")]
     assert found[:2] == [("reading", "plate", 300.0), ("reading", "plate", 301.0)]
     assert {kind for kind, _, _ in found[2:]} == {"reading_failed"}
@@ -247,13 +253,13 @@ def test_errors_end_it_and_keep_what_came(tmp_path: Path) -> None:
         raise KeyError("plate")
 
     with pytest.raises(KeyError, match="plate"):
-        record.record(session(9.0), bench(), tmp_path / "a.zarr", readings={"a": Reading(wrong)})
+        record(session(9.0), bench(), tmp_path / "a.zarr", readings={"a": Reading(wrong)})
 
     def show(_: Preview) -> None:
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        record.record(session(9.0), bench(), tmp_path / "b.zarr", limits=SMALL, preview=show)
+        record(session(9.0), bench(), tmp_path / "b.zarr", limits=SMALL, preview=show)
     for name, ended in (("a.zarr", "error"), ("b.zarr", "interrupted")):
         opened = store.open_dataset(tmp_path / name)
         assert (opened.attrs["complete"], opened.attrs["ended"]) == (False, ended)
@@ -264,7 +270,7 @@ def test_stopped_by_the_user(tmp_path: Path) -> None:
     """A stop is an end as good as any."""
     stop = threading.Event()
     limits = Limits(chunk=CHUNK, reserve=0, preview_period=0.2)
-    summary = record.record(
+    summary = record(
         session(60.0),
         bench(),
         tmp_path / "a.zarr",
@@ -280,30 +286,30 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     """What is there stays, whatever it is."""
     (tmp_path / "a.zarr").mkdir()
     with pytest.raises(FileExistsError, match="Must be a new recording"):
-        record.record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)
+        record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)
 
 
 def test_wrong_sources_are_refused(tmp_path: Path) -> None:
     """Emulated frames are never recorded as a camera's, nor one band as another."""
     hardware = Session("test", False, "scene", 1.0, session().cameras, RATE, SHAPE)
     with pytest.raises(ValueError, match=r"is_simulated is True\. Must be False, as the session"):
-        record.record(hardware, bench(), tmp_path / "a.zarr")
+        record(hardware, bench(), tmp_path / "a.zarr")
     swapped = dict(reversed(bench().items()))
     with pytest.raises(ValueError, match=r"Invalid sources \['9\.5', '8-14'\]"):
-        record.record(session(), swapped, tmp_path / "a.zarr")
+        record(session(), swapped, tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr").exists()
 
 
 def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Too little space is an error before it begins, and ends it on the way with all it has."""
     limits = Limits(chunk=CHUNK, reserve=1000)
-    monkeypatch.setattr(writing, "free", lambda _: 5000)
+    monkeypatch.setattr(_recorder, "_free", lambda _: 5000)
     with pytest.raises(OSError, match=r"Too little space: 5000 bytes are free\. Must be 47080"):
-        record.record(session(), bench(), tmp_path / "a.zarr", limits=limits)
+        record(session(), bench(), tmp_path / "a.zarr", limits=limits)
     answers = iter([10**9, 10**9, 999])
-    monkeypatch.setattr(writing, "free", lambda _: next(answers))
+    monkeypatch.setattr(_recorder, "_free", lambda _: next(answers))
     with pytest.raises(OSError, match="Too little space: 999 bytes") as raised:
-        record.record(session(), bench(), tmp_path / "a.zarr", limits=limits)
+        record(session(), bench(), tmp_path / "a.zarr", limits=limits)
     assert raised.value.errno == errno.ENOSPC
     opened = store.open_dataset(tmp_path / "a.zarr")
     assert (opened.attrs["ended"], opened.attrs["complete"]) == ("no space", False)
@@ -316,7 +322,7 @@ def test_device_that_hangs(tmp_path: Path) -> None:
     free = threading.Event()
     readings = {"plate": Reading(lambda: float(free.wait(20)))}
     with pytest.raises(TimeoutError, match="No answer of the device of 'readings' within 0"):
-        record.record(session(), bench(), tmp_path / "a.zarr", readings=readings, limits=limits)
+        record(session(), bench(), tmp_path / "a.zarr", readings=readings, limits=limits)
     free.set()
     assert store.open_dataset(tmp_path / "a.zarr").attrs["frames_written"]["9.5"] > 20
 
@@ -324,7 +330,7 @@ def test_device_that_hangs(tmp_path: Path) -> None:
 def test_no_frames_at_all(tmp_path: Path) -> None:
     """A recording without a frame is closed, opens, and is no capture."""
     gone = Faults(unplugged=0)
-    record.record(session(), bench(gone, gone), tmp_path / "a.zarr", limits=SMALL)
+    record(session(), bench(gone, gone), tmp_path / "a.zarr", limits=SMALL)
     assert store.open_dataset(tmp_path / "a.zarr").sizes["time"] == 0
     with pytest.raises(ValueError, match="Empty 'exposure_time'"):
         open_capture(tmp_path / "a.zarr")

@@ -60,7 +60,9 @@ def test_slope_is_the_closed_form() -> None:
     truth, _, _ = cases.simulate(case, Rig(noise=noise), time, size, 4)
     cold = truth["background_temperature"].values[:, 0]
     orders = [
-        np.sqrt(bounds.ratio_variance((0.86, 0.72), noise, cold, smooth.basis(time, order)))
+        np.sqrt(
+            bounds.ratio_variance((0.86, 0.72), noise, cold, smooth.polynomial_basis(time, order))
+        )
         for order in range(3, 13)
     ]
     apart = np.abs(np.array(orders) / found["reflection_ratio_bound"].values[1] - 1).min(axis=0)

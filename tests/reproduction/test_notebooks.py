@@ -1,6 +1,7 @@
 """The rules of the notebooks that running them does not show."""
 
 import ast
+import re
 from pathlib import Path
 
 import nbformat
@@ -11,6 +12,8 @@ from nbformat import NotebookNode
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LONGEST_CELL = 12  # lines
+BOOKKEEPING = re.compile(r"\b(run|paths|store|manifest)\.|\bRun\(|\brecord\b|\bsave\b")
+LARGEST_SHARE = 0.15  # of bookkeeping in the code lines [1]
 
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -80,3 +83,24 @@ def test_kernel_is_set(path: Path) -> None:
     """Papermill takes the kernel and the language from the notebook."""
     kernel = read(path).metadata.kernelspec
     assert (kernel.name, kernel.language) == ("python3", "python")
+
+
+def code_lines(path: Path) -> list[str]:
+    """Lines of code without those of the parameters, imports, comments and blanks."""
+    tagged = [
+        cell for cell in cells(path, "code") if "parameters" not in cell.metadata.get("tags", ())
+    ]
+    lines = [line.strip() for cell in tagged for line in cell.source.splitlines()]
+    return [line for line in lines if line and not line.startswith(("#", "import ", "from "))]
+
+
+def test_bookkeeping_is_a_small_share(capsys: pytest.CaptureFixture[str]) -> None:
+    """Few of all code lines say where an input or a result lies; printed for each notebook."""
+    counts = {}
+    for path in NOTEBOOKS:
+        lines = code_lines(path)
+        counts[path.stem] = sum(bool(BOOKKEEPING.search(line)) for line in lines), len(lines)
+    with capsys.disabled():
+        print("".join(f"\n{stem}: {kept} of {count}" for stem, (kept, count) in counts.items()))
+    kept, count = (sum(part) for part in zip(*counts.values(), strict=True))
+    assert kept / count <= LARGEST_SHARE, f"{kept} of {count} lines"

@@ -39,12 +39,12 @@ def test_missing_root_names_both_starts(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_one_stem_names_all(project: Path) -> None:
-    """Notebook, parameters and results share their stem."""
-    assert paths.notebook("03_simulation") == project / "notebooks" / "03_simulation.ipynb"
+    """Parameters, results and cached experiments share their stem."""
     assert paths.params("03_simulation") == project / "params" / "03_simulation.yaml"
     assert paths.result("full", "03_simulation", "_scene.png") == (
         project / "results" / "full" / "03_simulation_scene.png"
     )
+    assert paths.cells("03_simulation") == project / "results" / "cells" / "03_simulation"
 
 
 def test_fixed_places(project: Path) -> None:

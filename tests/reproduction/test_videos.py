@@ -107,7 +107,7 @@ def test_coffee_pot(mirror: Path) -> None:
     movie = published.inputs(files, "coffeepot", 0, 350)
     assert movie.shape == (2, 350, 240, 262)
     assert movie.attrs["radiometric"] == 0
-    found = separation.reflections(movie)
+    found = separation.uncalibrated_reflection(movie)
     assert 1.9 <= found.attrs["pooled_ratio"] <= 2.4
     assert found.attrs["radiometric"] == 0
     theirs = published.authors_reflection(files, "coffeepot", "uncalib", 262)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from dbthermal import bands, planck, schema, separation, simulation
 from dbthermal import response as responses
-from dbthermal.separation._baselines import bcp, naive, ratio
-from dbthermal.separation._problem import Problem
+from dbthermal.separation._baselines import bcp, naive, pyrometry
+from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Background, Rig
 
 Floats = NDArray[np.float64]
@@ -19,20 +19,20 @@ TIME = np.arange(120) / 4.0
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
 
 
-def problem_of(
+def tile_of(
     signals: Floats, shape: tuple[int, int], names: tuple[str, str] = ("8-14", "9.5")
-) -> Problem:
-    """Problem with given signals (2, time, pixel)."""
+) -> Tile:
+    """Tile with given signals (2, time, pixel)."""
     response = Rig(bands=names).response()
     first, second = (responses.curve(response, name) for name in names)
     time = np.arange(signals.shape[1]) / 4.0
     rng = np.random.default_rng(5)
-    return Problem(signals, time, (first, second), RIG.noise[:2], shape, rng)
+    return Tile(signals, time, (first, second), RIG.noise[:2], shape, rng)
 
 
-def seen(warm: Floats, cold: Floats, emissivity: tuple[float, float]) -> Problem:
-    """Problem without noise of an object before a background, both (time, pixel) [K]."""
-    empty = problem_of(np.zeros((2, *warm.shape)), (1, warm.shape[1]))
+def seen(warm: Floats, cold: Floats, emissivity: tuple[float, float]) -> Tile:
+    """Tile without noise of an object before a background, both (time, pixel) [K]."""
+    empty = tile_of(np.zeros((2, *warm.shape)), (1, warm.shape[1]))
     signals = [
         share * empty.blackbody(band, warm) + (1 - share) * empty.blackbody(band, cold)
         for band, share in enumerate(emissivity)
@@ -55,14 +55,14 @@ def temperatures() -> tuple[Floats, Floats]:
 
 
 @pytest.fixture(scope="module")
-def glass(temperatures: tuple[Floats, Floats]) -> Problem:
+def glass(temperatures: tuple[Floats, Floats]) -> Tile:
     """Thirty pixels of glass, without noise."""
     return seen(*temperatures, (0.86, 0.72))
 
 
-def fresh(problem: Problem) -> Problem:
+def fresh(tile: Tile) -> Tile:
     """The same with its random numbers at their start."""
-    return replace(problem, rng=np.random.default_rng(5))
+    return replace(tile, rng=np.random.default_rng(5))
 
 
 def error(truth: Floats, estimate: Floats) -> Floats:
@@ -71,7 +71,7 @@ def error(truth: Floats, estimate: Floats) -> Floats:
 
 
 def test_naive_meets_the_images_and_is_wrong(
-    glass: Problem, temperatures: tuple[Floats, Floats]
+    glass: Tile, temperatures: tuple[Floats, Floats]
 ) -> None:
     """Without noise the image error is zero in every pixel, and the answer kelvins off."""
     found = naive.separate(fresh(glass), naive.NaiveSettings())
@@ -90,7 +90,7 @@ def test_naive_meets_the_images_and_is_wrong(
     assert of_emissivity.max() > 0.1
 
 
-def test_naive_oracle_is_never_worse(glass: Problem, temperatures: tuple[Floats, Floats]) -> None:
+def test_naive_oracle_is_never_worse(glass: Tile, temperatures: tuple[Floats, Floats]) -> None:
     """Of the same starts the oracle keeps the one nearest to the truth, in every pixel."""
     settings, truth = naive.NaiveSettings(), temperatures[0]
     plain = error(truth, naive.separate(fresh(glass), settings).object_temperature)
@@ -99,7 +99,7 @@ def test_naive_oracle_is_never_worse(glass: Problem, temperatures: tuple[Floats,
     assert np.median(best) < 0.5 * np.median(plain)
 
 
-def test_naive_follows_its_random_numbers(glass: Problem) -> None:
+def test_naive_follows_its_random_numbers(glass: Tile) -> None:
     """The same seed gives the same result, another seed another."""
     first, second = (naive.separate(fresh(glass), naive.NaiveSettings()) for _ in range(2))
     other = naive.separate(replace(glass, rng=np.random.default_rng(6)), naive.NaiveSettings())
@@ -107,7 +107,7 @@ def test_naive_follows_its_random_numbers(glass: Problem) -> None:
     assert np.all(first.emissivity != other.emissivity)
 
 
-def test_naive_says_when_it_stopped_early(glass: Problem) -> None:
+def test_naive_says_when_it_stopped_early(glass: Tile) -> None:
     """After a single step a start is not done; after a hundred all are."""
     bit = schema.FLAGS["not_converged"]
     early = naive.separate(fresh(glass), naive.NaiveSettings(iterations=1))
@@ -121,7 +121,7 @@ def test_naive_says_when_it_stopped_early(glass: Problem) -> None:
     [
         ({"starts": 0}, "Invalid starts 0 of method 'naive'. Must be at least 1."),
         ({"iterations": 0}, "Invalid iterations 0 of method 'naive'"),
-        ({"spread": -1.0}, r"Invalid spread \[K\] of method 'naive' -1.0"),
+        ({"shift_std": -1.0}, r"Invalid shift_std \[K\] of method 'naive' -1.0"),
         ({"tolerance": 0.0}, "Invalid tolerance of method 'naive' 0.0"),
     ],
 )
@@ -134,16 +134,16 @@ def test_naive_refuses_what_is_no_search(options: dict[str, float], message: str
 WARM = np.linspace(290.0, 340.0, 24)[:, np.newaxis]
 
 
-@pytest.mark.parametrize("kind", ratio.KINDS)
+@pytest.mark.parametrize("kind", pyrometry.KINDS)
 def test_ratio_of_a_blackbody(kind: str) -> None:
     """A blackbody's temperature is exact within 0.01 mK, in either kind of radiance."""
-    found = ratio.separate(seen(WARM, WARM, (1.0, 1.0)), ratio.RatioSettings(kind, order=None))
+    found = pyrometry.ratio(seen(WARM, WARM, (1.0, 1.0)), pyrometry.RatioSettings(kind, order=None))
     np.testing.assert_allclose(found.object_temperature, WARM, rtol=0, atol=1e-5)  # K
     np.testing.assert_allclose(found.emissivity, 1.0, rtol=0, atol=1e-6)
     assert np.all(np.isnan(found.background_temperature))
 
 
-def gray_body(kind: str, share: float) -> Problem:
+def gray_body(kind: str, share: float) -> Tile:
     """A gray body in a room that emits nothing, as either kind of radiance has it."""
     apparent = []
     for name in ("8-14", "9.5"):
@@ -153,16 +153,16 @@ def gray_body(kind: str, share: float) -> Problem:
         else:
             radiance = share * planck.spectral_radiance(band.centre, WARM)
             apparent.append(planck.brightness_temperature(band.centre, radiance))
-    empty = problem_of(np.zeros((2, *WARM.shape)), (1, 1))
+    empty = tile_of(np.zeros((2, *WARM.shape)), (1, 1))
     signals = [empty.blackbody(band, level) for band, level in enumerate(apparent)]
     return replace(empty, signals=np.stack(signals))
 
 
-@pytest.mark.parametrize("kind", ratio.KINDS)
+@pytest.mark.parametrize("kind", pyrometry.KINDS)
 @pytest.mark.parametrize("share", [0.95, 0.6])
 def test_ratio_of_a_gray_body(kind: str, share: float) -> None:
     """Without a background a gray body's temperature and emissivity are exact."""
-    found = ratio.separate(gray_body(kind, share), ratio.RatioSettings(kind, order=None))
+    found = pyrometry.ratio(gray_body(kind, share), pyrometry.RatioSettings(kind, order=None))
     np.testing.assert_allclose(found.object_temperature, WARM, rtol=0, atol=1e-5)  # K
     np.testing.assert_allclose(found.emissivity, share, rtol=0, atol=1e-6)
     assert np.all(found.status == 0)
@@ -174,7 +174,7 @@ def test_ratio_against_wien() -> None:
     radiances = [planck.spectral_radiance(centre, WARM) for centre in (first, second)]
     excess = np.log(radiances[0] / radiances[1]) - 5 * np.log(second / first)
     wien = planck.SECOND_RADIATION_CONSTANT * (1 / second - 1 / first) / excess
-    found = ratio.separate(gray_body("narrow", 0.8), ratio.RatioSettings("narrow", order=None))
+    found = pyrometry.ratio(gray_body("narrow", 0.8), pyrometry.RatioSettings("narrow", order=None))
     difference = wien - found.object_temperature
     print("Wien less Planck", difference.min(), difference.max())
     assert 2.0 < np.abs(difference).min() < np.abs(difference).max() < 6.0  # K
@@ -183,27 +183,27 @@ def test_ratio_against_wien() -> None:
 def test_ratio_smooths_before_it_divides() -> None:
     """Five polynomials in 120 frames: the noise falls by about the square root of 24."""
     warm = np.repeat(np.linspace(300.0, 325.0, 120)[:, np.newaxis], 40, axis=1)
-    problem = seen(warm, warm, (1.0, 1.0))
-    noise = np.random.default_rng(1).standard_normal(problem.signals.shape)
-    noisy = replace(problem, signals=problem.signals + noise * [[[0.03]], [[0.35]]])
+    tile = seen(warm, warm, (1.0, 1.0))
+    noise = np.random.default_rng(1).standard_normal(tile.signals.shape)
+    noisy = replace(tile, signals=tile.signals + noise * [[[0.03]], [[0.35]]])
     plain, smooth = (
-        np.sqrt(np.nanmean((ratio.separate(noisy, setting).object_temperature - warm) ** 2))
-        for setting in (ratio.RatioSettings(order=None), ratio.RatioSettings())
+        np.sqrt(np.nanmean((pyrometry.ratio(noisy, setting).object_temperature - warm) ** 2))
+        for setting in (pyrometry.RatioSettings(order=None), pyrometry.RatioSettings())
     )
     assert plain / smooth == pytest.approx(24**0.5, rel=0.2)
 
 
 def test_ratio_refuses_a_stationary_pair() -> None:
     """10.6 against 8-14 um turns near 33 C: no temperature follows from its ratio."""
-    problem = problem_of(np.zeros((2, 8, 1)), (1, 1), ("8-14", "10.6"))
+    tile = tile_of(np.zeros((2, 8, 1)), (1, 1), ("8-14", "10.6"))
     with pytest.raises(ValueError, match=r"'8-14', '10.6' .* stationary near 30\d\.\d K"):
-        ratio.separate(problem, ratio.RatioSettings())
+        pyrometry.ratio(tile, pyrometry.RatioSettings())
 
 
 def test_ratio_out_of_range_is_undefined() -> None:
     """Where emissivities differ strongly no temperature has the ratio: NaN, and a flag."""
-    problem = seen(WARM + 20.0, np.full_like(WARM, 290.0), (0.9, 0.4))
-    found = ratio.separate(problem, ratio.RatioSettings(order=None))
+    tile = seen(WARM + 20.0, np.full_like(WARM, 290.0), (0.9, 0.4))
+    found = pyrometry.ratio(tile, pyrometry.RatioSettings(order=None))
     assert np.isnan(found.object_temperature).any()
     assert np.all(found.status & schema.FLAGS["outside_response"])
 
@@ -218,7 +218,7 @@ def test_ratio_out_of_range_is_undefined() -> None:
 def test_ratio_refuses_other_settings(options: dict[str, object], message: str) -> None:
     """Kinds that do not exist, smoothing by no function."""
     with pytest.raises(ValueError, match=message):
-        ratio.RatioSettings(**options)  # type: ignore[arg-type]
+        pyrometry.RatioSettings(**options)  # type: ignore[arg-type]
 
 
 HOT, ROOM = 320.0, 295.0
@@ -227,10 +227,10 @@ EXACT = bcp.BcpSettings(
 )  # a window of one pixel smooths nothing
 
 
-def half_black() -> Problem:
+def half_black() -> Tile:
     """An image of 20 x 40 at 320 K in a room of 295 K: black left of the middle, else 0.5."""
     share = np.where(np.arange(40) < 20, 1.0, 0.5)
-    empty = problem_of(np.zeros((2, 3, 800)), (20, 40))
+    empty = tile_of(np.zeros((2, 3, 800)), (20, 40))
     hot, room = (
         np.array([float(empty.blackbody(band, np.array(level))) for band in (0, 1)])
         for level in (HOT, ROOM)
@@ -242,11 +242,11 @@ def half_black() -> Problem:
 
 def test_bcp_by_hand() -> None:
     """Seven columns beside the blackbody take its temperature and t = 0.5; beyond, t = 1."""
-    problem = half_black()
-    found = bcp.separate(problem, EXACT)
+    tile = half_black()
+    found = bcp.separate(tile, EXACT)
     warm = found.object_temperature.reshape(3, 20, 40)
     share = found.emissivity.reshape(2, 20, 40)
-    apparent = problem.temperature(0, problem.signals[0]).reshape(3, 20, 40)
+    apparent = tile.temperature(0, tile.signals[0]).reshape(3, 20, 40)
     np.testing.assert_allclose(warm[..., :27], HOT, rtol=0, atol=1e-9)  # K
     np.testing.assert_allclose(warm[..., 27:], apparent[..., 27:], rtol=0, atol=1e-9)  # K
     np.testing.assert_allclose(share[..., :20], 1.0, rtol=0, atol=1e-12)
@@ -264,20 +264,20 @@ def test_bcp_of_one_value() -> None:
 
 def test_bcp_divides_by_no_less_than_its_limit() -> None:
     """With a limit of 0.8 a pixel of t = 0.5 is divided by 0.8."""
-    problem = half_black()
-    found = bcp.separate(problem, replace(EXACT, least_transmission=0.8))
-    room = float(problem.blackbody(0, np.array(ROOM)))
-    signal = problem.signals[0, 0, 20]
-    expected = problem.temperature(0, np.array((signal - room) / 0.8 + room))
+    tile = half_black()
+    found = bcp.separate(tile, replace(EXACT, least_transmission=0.8))
+    room = float(tile.blackbody(0, np.array(ROOM)))
+    signal = tile.signals[0, 0, 20]
+    expected = tile.temperature(0, np.array((signal - room) / 0.8 + room))
     assert found.object_temperature[0, 20] == pytest.approx(float(expected), abs=1e-9)  # K
 
 
 def test_bcp_passes_over_dead_pixels() -> None:
     """A pixel without counts has no temperature, and its neighbours keep theirs."""
-    problem = half_black()
-    signals = problem.signals.copy()
+    tile = half_black()
+    signals = tile.signals.copy()
     signals[:, :, 400 + 10] = -1e6
-    found = bcp.separate(replace(problem, signals=signals), EXACT)
+    found = bcp.separate(replace(tile, signals=signals), EXACT)
     assert np.all(np.isnan(found.object_temperature[:, 410]))
     others = np.delete(found.object_temperature.reshape(3, 20, 40)[..., :27], 10, axis=2)
     np.testing.assert_allclose(others, HOT, rtol=0, atol=1e-9)  # K
@@ -315,7 +315,7 @@ def test_bcp_refuses_a_room_beyond_the_response() -> None:
         bcp.separate(half_black(), bcp.BcpSettings(reflected_temperature=500.0))
 
 
-METHODS = {"naive": naive.METHOD, "ratio": ratio.METHOD, "bcp": bcp.METHOD}
+METHODS = {"naive": naive.METHOD, "ratio": pyrometry.RATIO, "bcp": bcp.METHOD}
 
 
 @pytest.fixture(scope="module")
@@ -337,7 +337,7 @@ def test_baselines_behind_solve(method: str, twin: tuple[xr.Dataset, xr.Dataset]
 
 
 def test_bcp_sees_the_whole_image(twin: tuple[xr.Dataset, xr.Dataset]) -> None:
-    """Behind solve the image is one tile: the result is that of the whole problem."""
+    """Behind solve the image is one tile: the result is that of the whole tile."""
     capture, response = twin
     first, second = (responses.curve(response, name) for name in RIG.bands)
     signals = np.stack(
@@ -346,7 +346,7 @@ def test_bcp_sees_the_whole_image(twin: tuple[xr.Dataset, xr.Dataset]) -> None:
             for curve, counts in zip((first, second), capture["counts"].values, strict=True)
         ]
     )
-    whole = bcp.separate(problem_of(signals, (24, 40)), bcp.BcpSettings())
+    whole = bcp.separate(tile_of(signals, (24, 40)), bcp.BcpSettings())
     found = separation.solve(capture, response, "bcp", workers=1)["object_temperature"]
     np.testing.assert_allclose(
         found.values.reshape(40, -1), whole.object_temperature, rtol=0, atol=1e-3

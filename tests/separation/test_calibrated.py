@@ -111,7 +111,7 @@ def test_bound_of_the_ratio_is_that_of_a_linear_model() -> None:
     """The bound equals the inverse Fisher information of the model with all its unknowns."""
     rng = np.random.default_rng(0)
     time, noise, pair = np.arange(40.0), (0.05, 0.3), (0.86, 0.72)
-    background, functions = rng.normal(0, 3, 40), smooth.basis(time, 4)
+    background, functions = rng.normal(0, 3, 40), smooth.polynomial_basis(time, 4)
     ratio = float(limits.reflection_ratio(pair))
     # Unknowns: the ratio, four coefficients of each band's smooth part, one reflection a frame.
     reflection = (1 - pair[0]) * background

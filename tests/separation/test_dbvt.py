@@ -1,6 +1,7 @@
 """The paper's optimiser: its losses one by one, its descent, and what it finds from any start."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,23 +13,11 @@ from numpy.testing import assert_allclose
 
 from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
-from dbthermal.separation._dbvt import (
-    homotopy as continuation,
-)
-from dbthermal.separation._dbvt import (
-    method as dbvt,
-)
-from dbthermal.separation._dbvt import (
-    newton as descent,
-)
-from dbthermal.separation._dbvt import (
-    objective,
-)
-from dbthermal.separation._dbvt import (
-    whittaker as banded,
-)
-from dbthermal.separation._dbvt.objective import Images, Unknowns, Weights
-from dbthermal.separation._problem import Problem
+from dbthermal.separation import DbvtSettings
+from dbthermal.separation._dbvt import method as dbvt
+from dbthermal.separation._dbvt import newton, objective
+from dbthermal.separation._dbvt.objective import Images, Unknowns
+from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Background, Rig
 
 TIME = np.arange(350) / 10.0
@@ -54,7 +43,7 @@ def errors(scene: xr.Dataset, result: xr.Dataset) -> tuple[float, float]:
     return float(of_emissivity.median()), float(((of_object**2).mean("time") ** 0.5).median())
 
 
-def linear(noise: tuple[float, float], pixels: int) -> tuple[Problem, Unknowns]:
+def linear(noise: tuple[float, float], pixels: int) -> tuple[Tile, Unknowns]:
     """Glass as the paper's linear identities have it, and the true unknowns but for the noise."""
     scene, _, response = glass(noise, pixels)
     curves = [responses.curve(response, band, "linear") for band in ("8-14", "9.5")]
@@ -66,8 +55,8 @@ def linear(noise: tuple[float, float], pixels: int) -> tuple[Problem, Unknowns]:
     smooth, second = (torch.as_tensor(e * warm + (1 - e) * rest) for e in GLASS)
     emissivity = torch.tensor(GLASS, dtype=torch.float64)[:, None].repeat(1, pixels)
     truth = Unknowns(smooth, second[0], emissivity, torch.zeros(signals.shape, dtype=torch.float64))
-    problem = Problem(signals, TIME, (curves[0], curves[1]), noise, (1, pixels), rng)
-    return problem, truth
+    tile = Tile(signals, TIME, (curves[0], curves[1]), noise, (1, pixels), rng)
+    return tile, truth
 
 
 def anywhere(frames: int = 12, columns: int = 3) -> tuple[Unknowns, Images]:
@@ -88,8 +77,8 @@ def anywhere(frames: int = 12, columns: int = 3) -> tuple[Unknowns, Images]:
 
 def test_reconstruction_is_exact_at_the_truth() -> None:
     """Without noise the true smooth signals and k2 give back the second band to rounding."""
-    problem, truth = linear((1e-9, 1e-9), 6)
-    _, _, rest = objective.departures(truth, dbvt.images(problem, 6, dbvt.DbvtSettings()))
+    tile, truth = linear((1e-9, 1e-9), 6)
+    _, _, rest = objective.departures(truth, dbvt.tensors(tile, 6, DbvtSettings()))
     assert_allclose(rest, 0.0, rtol=0, atol=1e-7)  # K; a noise of 1e-9 K was needed
 
 
@@ -105,8 +94,8 @@ def test_second_smooth_signal_follows_the_recursion() -> None:
 
 def test_reconstruction_starts_from_the_second_band() -> None:
     """Slip 2: a shift of all of the second band moves its smooth signal and leaves no error."""
-    problem, truth = linear((1e-9, 1e-9), 2)
-    given = dbvt.images(problem, 2, dbvt.DbvtSettings())
+    tile, truth = linear((1e-9, 1e-9), 2)
+    given = dbvt.tensors(tile, 2, DbvtSettings())
     shifted = replace(given, signals=given.signals + torch.tensor([0.0, 7.0])[:, None, None])
     _, _, rest = objective.departures(replace(truth, offset=truth.offset + 7.0), shifted)
     assert_allclose(rest, 0.0, rtol=0, atol=1e-7)
@@ -117,7 +106,7 @@ def test_mean_of_the_noise_is_squared() -> None:
     unknowns, images = anywhere()
     noise = torch.full_like(unknowns.noise, 0.6)
     for sign in (1.0, -1.0):
-        found = objective.losses(replace(unknowns, noise=sign * noise), images, Weights())
+        found = objective.losses(replace(unknowns, noise=sign * noise), images, DbvtSettings())
         expected = (0.6 / 0.3) ** 2 + (0.6 / 0.7) ** 2
         assert_allclose(found["noise_mean"], expected, rtol=1e-12)
 
@@ -140,7 +129,9 @@ def test_huber_loss_has_slope_one_beyond_its_threshold() -> None:
     assert_allclose(found, [0.04, 0.25, 1.25, 2.25], rtol=0, atol=1e-12)
 
 
-def directional(unknowns: Unknowns, images: Images, weights: Weights, way: Unknowns) -> np.ndarray:
+def directional(
+    unknowns: Unknowns, images: Images, weights: DbvtSettings, way: Unknowns
+) -> np.ndarray:
     """Derivative of the objective along a way, from the forms that the descent solves with."""
     emission, _ = objective.ratios(unknowns.emissivity)
     first, second = unknowns.emissivity
@@ -151,10 +142,10 @@ def directional(unknowns: Unknowns, images: Images, weights: Weights, way: Unkno
     steps = [*way.noise, way.smooth, way.offset - change * start - emission * way.smooth[0]]
     steps += [change, reflection]
     total = torch.zeros_like(unknowns.smooth)
-    for row in descent._rows(unknowns, torch.ones(3, dtype=torch.float64), images, weights):
-        for name, slope in row.slopes.items():
-            total = total + row.force * slope * steps[name]
-    bend, square = banded.bending(unknowns.smooth)
+    for term in newton._terms(unknowns, torch.ones(3, dtype=torch.float64), images, weights):
+        for name, slope in term.slopes.items():
+            total = total + term.gradient * slope * steps[name]
+    bend, square = newton.bending(unknowns.smooth)
     stiff = weights.smoothness / (weights.curvature * images.interval**2) ** 2
     smooth = (1 + emission**2) * (bend * way.smooth).sum(dim=0) + emission * square * change
     return np.asarray(2 * (total.sum(dim=0) + stiff * smooth) / unknowns.smooth.shape[0])
@@ -165,8 +156,10 @@ def directional(unknowns: Unknowns, images: Images, weights: Weights, way: Unkno
 def test_slopes_match_finite_differences(name: str, along: str) -> None:
     """The slope of each loss along each unknown is that of its finite differences."""
     unknowns, images = anywhere()
-    nothing = dict.fromkeys(("smoothness", "huber", "reconstruction", "noise_mean"), 0.0)
-    weights = Weights(**(nothing | {"noise": 1.0, "curvature": 50.0, name: 1.3}))
+    nothing: dict[str, Any] = dict.fromkeys(
+        ("smoothness", "huber", "reconstruction", "noise_mean"), 0.0
+    )
+    weights = DbvtSettings(**(nothing | {"noise": 1.0, "curvature": 50.0, name: 1.3}))
     zero = Unknowns(*(torch.zeros_like(value) for value in vars(unknowns).values()))
     direction = torch.as_tensor(
         np.random.default_rng(8).standard_normal(getattr(zero, along).shape)
@@ -189,7 +182,7 @@ def test_banded_solution_meets_its_equations(frames: int, stiffness: float, seed
     rng = np.random.default_rng(seed)
     diagonal, right = rng.uniform(0.5, 2.0, (frames, 2)), rng.standard_normal((frames, 3, 2))
     stiff = torch.full((2,), stiffness, dtype=torch.float64)
-    found = banded.solve(torch.as_tensor(diagonal), stiff, torch.as_tensor(right))
+    found = newton.whittaker(torch.as_tensor(diagonal), stiff, torch.as_tensor(right))
     second = np.diff(np.eye(frames), n=2, axis=0)
     for column in (0, 1):
         matrix = np.diag(diagonal[:, column]) + stiffness * second.T @ second
@@ -199,14 +192,14 @@ def test_banded_solution_meets_its_equations(frames: int, stiffness: float, seed
 
 def test_a_step_never_raises_the_objective() -> None:
     """From a point without symmetry the objective falls monotonically, and far."""
-    problem, truth = linear(QUIET, 8)
-    options = dbvt.DbvtSettings()
-    given = dbvt.images(problem, 8, options)
+    tile, truth = linear(QUIET, 8)
+    options = DbvtSettings()
+    given = dbvt.tensors(tile, 8, options)
     state = replace(truth, emissivity=truth.emissivity - 0.1)
-    search, losses = descent.begin(state, given, options), []
+    search, losses = newton.begin(state, given, options), []
     for _ in range(30):
         losses.append(search.loss)
-        state, search = descent.step(state, search, given, options, options)
+        state, search = newton.step(state, search, given, options)
     history = torch.stack(losses)
     assert bool((torch.diff(history, dim=0) <= 0).all())
     assert bool((history[-1] < 0.01 * history[0]).all())
@@ -214,16 +207,18 @@ def test_a_step_never_raises_the_objective() -> None:
 
 def test_it_stays_at_the_truth() -> None:
     """Started at the truth the emissivities move by less than 0.02 (median)."""
-    problem, truth = linear(QUIET, 30)
-    options = dbvt.DbvtSettings()
-    given = dbvt.images(problem, 30, options)
-    found = continuation.minimise(truth, given, options, options, 1)
+    tile, truth = linear(QUIET, 30)
+    options = DbvtSettings()
+    given = dbvt.tensors(tile, 30, options)
+    found = dbvt.homotopy(truth, given, options, 1)
     moved = (found.unknowns.emissivity - truth.emissivity).abs().amax(dim=0)
     print(f"moved from the truth by {float(moved.median()):.4f}")
     assert float(moved.median()) < 0.02
 
 
-@pytest.mark.parametrize("noise", [QUIET, (0.03, 0.05)], ids=str)
+@pytest.mark.parametrize(
+    "noise", [QUIET, pytest.param((0.03, 0.05), marks=pytest.mark.slow)], ids=str
+)
 def test_random_starts_find_the_emissivities(noise: tuple[float, float]) -> None:
     """From random emissivities the median error at low noise is below 0.02, the object's 0.3 K."""
     scene, capture, response = glass(noise, 50)
@@ -240,7 +235,7 @@ def test_a_start_at_the_separator_is_as_good_as_random_ones() -> None:
     scene, capture, response = glass((0.03, 0.35), 40)
     random = separation.solve(capture, response, "dbvt", seed=3)
     started = separation.solve(
-        capture, response, "dbvt", settings=dbvt.DbvtSettings(start="subspace"), seed=3
+        capture, response, "dbvt", settings=DbvtSettings(start="subspace"), seed=3
     )
     of_random, of_started = errors(scene, random), errors(scene, started)
     print(f"random {of_random}, started {of_started}")
@@ -251,12 +246,13 @@ def test_a_start_at_the_separator_is_as_good_as_random_ones() -> None:
 def test_the_lowest_of_several_starts_is_kept() -> None:
     """Columns are start by start, and NaN is no lowest objective."""
     loss = torch.tensor([3.0, np.nan, 1.0, 2.0, 5.0, 4.0])
-    assert dbvt._choice(loss, 3).tolist() == [3, 4, 2]
+    assert dbvt._least(loss, 3).tolist() == [3, 4, 2]
 
 
 def test_same_seed_same_result() -> None:
     """A seed fixes the result; other random starts end at the same minimum."""
     _, capture, response = glass(QUIET, 12)
+    capture = capture.isel(time=slice(0, 150))
     first, again, other = (
         separation.solve(capture, response, "dbvt", seed=seed) for seed in (1, 1, 2)
     )
@@ -270,7 +266,7 @@ def test_exact_response_is_taken_out() -> None:
     scene, capture, response = glass(QUIET, 40)
     bent = errors(
         scene,
-        separation.solve(capture, response, "dbvt", settings=dbvt.DbvtSettings(bend_updates=0)),
+        separation.solve(capture, response, "dbvt", settings=DbvtSettings(bend_updates=0)),
     )
     straight = errors(scene, separation.solve(capture, response, "dbvt"))
     print(f"linear identities {bent}, bend taken out {straight}")
@@ -280,12 +276,11 @@ def test_exact_response_is_taken_out() -> None:
 def test_too_few_steps_are_flagged() -> None:
     """A pixel that is still improving at its last step says so."""
     _, capture, response = glass(QUIET, 8)
-    result = separation.solve(
-        capture, response, "dbvt", settings=dbvt.DbvtSettings(stages=1, steps=2)
-    )
+    result = separation.solve(capture, response, "dbvt", settings=DbvtSettings(stages=1, steps=2))
     assert np.all(result["status"].values & schema.FLAGS["not_converged"])
 
 
+@pytest.mark.slow
 def test_temperatures_may_come_from_the_measured_signals() -> None:
     """Without the estimated noise the object is smoother, and nearer to the truth."""
     scene, capture, response = glass((0.03, 0.35), 30)
@@ -293,7 +288,7 @@ def test_temperatures_may_come_from_the_measured_signals() -> None:
         errors(
             scene,
             separation.solve(
-                capture, response, "dbvt", settings=dbvt.DbvtSettings(temperatures_from=source)
+                capture, response, "dbvt", settings=DbvtSettings(temperatures_from=source)
             ),
         )[1]
         for source in ("corrected", "measured")
@@ -305,8 +300,9 @@ def test_temperatures_may_come_from_the_measured_signals() -> None:
 @pytest.mark.parametrize("name", ["huber", "reconstruction", "smoothness", "noise", "noise_mean"])
 def test_each_loss_can_be_left_out(name: str) -> None:
     """Without one of the losses it still ends with numbers, and with emissivities in (0, 1)."""
-    problem, _ = linear((0.03, 0.05), 6)
-    result = dbvt.separate(problem, dbvt.DbvtSettings(**{name: 0.0}))  # type: ignore[arg-type]
+    tile, _ = linear((0.03, 0.05), 6)
+    tile = tile.select_frames(TIME < 10.0)
+    result = dbvt.separate(tile, DbvtSettings(**{name: 0.0}))  # type: ignore[arg-type]
     assert np.all((result.emissivity > 0) & (result.emissivity < 1))
 
 
@@ -328,4 +324,4 @@ def test_each_loss_can_be_left_out(name: str) -> None:
 def test_settings_refuse_nonsense(options: dict[str, float], message: str) -> None:
     """What is no search is refused, by name, value and rule."""
     with pytest.raises(ValueError, match=message):
-        dbvt.DbvtSettings(**options)  # type: ignore[arg-type]
+        DbvtSettings(**options)  # type: ignore[arg-type]

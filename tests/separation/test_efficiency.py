@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from dbthermal import _smooth as smooth
 from dbthermal import limits, separation
 from dbthermal import response as responses
-from dbthermal.curves import Curve
+from dbthermal.response import Curve
 from dbthermal.separation._subspace import reflection_ratio as direction
 from dbthermal.simulation import Rig
 from reproduction import experiments
@@ -75,7 +75,7 @@ def test_closed_form_is_the_maximum_of_likelihood(amplitude: float) -> None:
             curves,
             noise[:, np.newaxis],
             float(result["emissivity"].values[0, 0, pixel]),
-            smooth.basis(TIME, int(order)),
+            smooth.polynomial_basis(TIME, int(order)),
             float(ratio[pixel]),
         )
         apart.append((found - ratio[pixel]) / std[pixel])
@@ -119,7 +119,7 @@ def unknown_background(scene: xr.Dataset, noise: tuple[float, float], order: Arr
     cold = scene["background_temperature"].values[:, 0]
     result = np.empty(order.size)
     for one in np.unique(order):
-        part, functions = order == one, smooth.basis(TIME, int(one))
+        part, functions = order == one, smooth.polynomial_basis(TIME, int(one))
         variance = limits.ratio_variance((0.86, 0.72), noise, cold[:, part], functions)
         result[part] = np.sqrt(variance)
     return result

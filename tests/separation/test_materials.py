@@ -11,9 +11,9 @@ from scipy import ndimage
 
 from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
-from dbthermal.separation._pooling import region_merging as regions
-from dbthermal.separation._pooling import superpixels
+from dbthermal.separation._pooling import feature_maps, region_merging
 from dbthermal.separation._pooling.materials import NONE, materials, step
+from dbthermal.separation._pooling.region_merging import Features, Regions
 from dbthermal.simulation import Rig
 
 Array = np.ndarray
@@ -55,7 +55,7 @@ def ratio_of(scene: xr.Dataset) -> tuple[Array, Array]:
     """True ratio of the second band, and its deviation from the energy of the reflection."""
     first, second = 1.0 - scene["emissivity"].values
     moved = (first * scene["background_temperature"].values).reshape(scene.sizes["time"], -1)
-    functions = smooth.basis(scene["time"].values, 6)
+    functions = smooth.polynomial_basis(scene["time"].values, 6)
     energy = np.sum((moved - functions @ (functions.T @ moved)) ** 2, axis=0).reshape(first.shape)
     ratio = second / first
     energy = np.where(energy > 60 * NOISE[0] ** 2, energy, np.nan)
@@ -208,15 +208,15 @@ def test_silence_is_no_agreement(small: Inputs) -> None:
 def test_error_rate_is_kept() -> None:
     """Of images of one material as many are cut, and as many held apart, as the rate allows."""
     rng, rate, tries = np.random.default_rng(8), 0.2, 300
-    cells = superpixels.connected(np.add.outer(np.arange(24) // 8 * 3, np.arange(24) // 8) + 1)
+    cells = feature_maps.connected(np.add.outer(np.arange(24) // 8 * 3, np.arange(24) // 8) + 1)
     cut = apart = 0
     for _ in range(tries):
         std = rng.uniform(0.02, 0.2, (1, 24, 24))
         values = 2.0 + std * rng.standard_normal(std.shape)
-        features = regions.Features(values, std**2, np.array([False]), np.array([0.0]))
-        cut += bool(regions.mixed(cells, features, rate).any())
-        joined = regions.Regions(cells, features, rate)
-        joined.join_alike(regions.neighbours(cells), resolution=0.5)
+        features = Features(values, std**2, np.array([False]), np.array([0.0]))
+        cut += bool(region_merging.mixed(cells, features, rate).any())
+        joined = Regions(cells, features, rate)
+        joined.join_alike(region_merging.neighbours(cells), resolution=0.5)
         apart += np.unique(joined.roots()[1:]).size > 1
     print(f"at a rate of {rate}: {cut / tries:.3f} cut, {apart / tries:.3f} held apart")
     assert cut / tries == pytest.approx(rate, abs=0.07)  # three standard deviations
@@ -231,8 +231,8 @@ def test_a_cell_across_a_border_is_mixed() -> None:
         values = 2.02 + 0.06 * rng.standard_normal((1, 8, 8))
         variances = np.full_like(values, 0.06**2)
         values[0, 0, :5] -= 0.5
-        features = regions.Features(values, variances, np.array([False]), np.array([0.0]))
-        found += int(regions.mixed(cells, features, 0.01 / 400)[1])
+        features = Features(values, variances, np.array([False]), np.array([0.0]))
+        found += int(region_merging.mixed(cells, features, 0.01 / 400)[1])
     print(f"{found} of 100 cells across a border are seen")
     assert found >= 99
 
@@ -243,8 +243,8 @@ def test_common_errors_do_not_shrink() -> None:
     values = np.repeat([[[1.0, 1.1]]], 10, axis=1)
     for common in (False, True):
         spread = np.full_like(values, 0.04)
-        features = regions.Features(values, spread, np.array([common]), np.array([0.0]))
-        joined = regions.Regions(cells, features, 0.1)
+        features = Features(values, spread, np.array([common]), np.array([0.0]))
+        joined = Regions(cells, features, 0.1)
         found.append(joined.compare(np.array([1]), np.array([2])))
     (own, seen), (shared, seen_shared) = found
     np.testing.assert_allclose([own / shared, (seen_shared / seen) ** 2], 10.0, rtol=1e-12)
@@ -296,9 +296,9 @@ def test_cells_cover_what_is_valid(spacing: int) -> None:
     """Each valid pixel, cut off from the markers too, is in a connected cell of about that size."""
     valid = np.ones((32, 48), dtype=bool)
     valid[10], valid[:, 21] = False, False
-    cells = superpixels.cells(np.zeros(valid.shape), valid, spacing)
+    cells = feature_maps.superpixels(np.zeros(valid.shape), valid, spacing)
     np.testing.assert_array_equal(cells > 0, valid)
-    assert superpixels.connected(cells).max() == cells.max()
+    assert feature_maps.connected(cells).max() == cells.max()
     assert 0.7 < cells.max() * spacing**2 / valid.sum() < 2.0
 
 
@@ -309,12 +309,12 @@ def test_edges_count_in_standard_deviations() -> None:
     """
     rng = np.random.default_rng(12)
     picture = rng.normal(0.0, 0.3, (1, 200, 200))
-    strength = superpixels.edges(picture, np.full_like(picture, 0.09))
+    strength = feature_maps.edges(picture, np.full_like(picture, 0.09))
     print(f"mean square of the edge strength {np.mean(strength**2):.2f}")
     picture[..., 100:] += 3.0
-    place = superpixels.edges(picture, np.full_like(picture, 0.09)).argmax(axis=1)
+    place = feature_maps.edges(picture, np.full_like(picture, 0.09)).argmax(axis=1)
     assert np.all(np.isin(place, [99, 100]))
-    assert not np.any(superpixels.edges(picture * np.nan, np.ones_like(picture)))
+    assert not np.any(feature_maps.edges(picture * np.nan, np.ones_like(picture)))
 
 
 BAD: dict[str, tuple[Callable[[Inputs], object], str]] = {

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
-from dbthermal.separation._separated import Separated
+from dbthermal.separation._tiles import Estimate
 from dbthermal.simulation import Background, Rig
 
 RIG = Rig()
@@ -269,7 +269,7 @@ def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> No
     """Where no background gives the signals in any frame: outside, unless a flag says why."""
     before = np.full(1, 0 if name is None else schema.FLAGS[name], dtype=np.uint32)
     warm, none, share = np.full((9, 1), 300.0), np.full((9, 1), np.nan), np.full((2, 1), 0.5)
-    found = Separated(warm, 0.1 * np.ones((9, 1)), none, none, share, 0.1 * share, before)
-    status = found.ranged(responses.curve(RIG.response(), RIG.bands[0])).status
+    found = Estimate(warm, 0.1 * np.ones((9, 1)), none, none, share, 0.1 * share, before)
+    status = found.check_range(responses.curve(RIG.response(), RIG.bands[0])).status
     assert status[0] == before[0] or name is None
     assert status[0] != 0

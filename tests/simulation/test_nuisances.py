@@ -247,7 +247,7 @@ def test_separation_stands_a_shutter_and_lost_frames(
 @pytest.mark.parametrize(("times", "factor"), [((17.5,), 1.90), ((11.0, 24.0), 2.71)])
 def test_a_step_costs_accuracy(times: tuple[float, ...], factor: float) -> None:
     """The smooth part's deviation rises as stated, steps being fitted beside five functions."""
-    functions = smooth.basis(TIME, 5)
+    functions = smooth.polynomial_basis(TIME, 5)
     steps = (TIME[:, np.newaxis] > np.array(times)).astype(float)
     both = np.hstack([functions, steps])
     covariance = np.linalg.inv(both.T @ both)[:5, :5]
@@ -348,7 +348,7 @@ def test_pattern_drift_is_interpolated(
 ) -> None:
     """Pictures before and after the capture take a drift of 25 counts a pixel down to the noise."""
     seen, raw, (before, after) = drifting
-    fixed, undone = frames.correct(raw, before), frames.correct_drifting(raw, before, after)
+    fixed, undone = frames.correct(raw, before), frames.correct(raw, before, after=after)
     errors = pattern_error(fixed, seen), pattern_error(undone, seen)
     print(f"fixed correction {errors[0]:.1f} count, interpolated {errors[1]:.2f} count")
     assert errors[0] > 15.0
@@ -363,17 +363,17 @@ def test_interpolation_has_its_ends(
 ) -> None:
     """The first frame is corrected by the first correction, the last by the last."""
     _, raw, ends = drifting
-    undone = frames.correct_drifting(raw, *ends)["counts"]
+    undone = frames.correct(raw, ends[0], after=ends[1])["counts"]
     for frame, correction in zip((0, -1), ends, strict=True):
         expected = frames.correct(raw, correction)["counts"]
         np.testing.assert_allclose(undone[:, frame], expected[:, frame], rtol=0, atol=0.01)
-    wide = frames.correct_drifting(raw, ends[0], ends[0], times=(-5.0, 20.0))["counts"]
+    wide = frames.correct(raw, ends[0], after=ends[0], times=(-5.0, 20.0))["counts"]
     expected = frames.correct(raw, ends[0])["counts"]
     np.testing.assert_allclose(wide, expected, rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match=re.escape("Invalid times 0.0 s and 5.0 s")):
-        frames.correct_drifting(raw, *ends, times=(0.0, 5.0))
+        frames.correct(raw, ends[0], after=ends[1], times=(0.0, 5.0))
     with pytest.raises(ValueError, match="Invalid size 24 of 'y'"):
-        frames.correct_drifting(raw, ends[0], ends[1].isel(y=slice(3)))
+        frames.correct(raw, ends[0], after=ends[1].isel(y=slice(3)))
 
 
 def test_renewed_offset_evens_the_picture(
@@ -392,7 +392,7 @@ def test_renewed_offset_evens_the_picture(
     assert renewed.attrs["offset_renewed"] == 1
     with pytest.raises(ValueError, match="a good pixel is not finite"):
         frames.renew_offset(correction, flat * np.nan)
-    with pytest.raises(ValueError, match="Invalid flat picture of sizes"):
+    with pytest.raises(ValueError, match="Invalid flat image of sizes"):
         frames.renew_offset(correction, flat.isel(x=slice(3)))
 
 
@@ -453,7 +453,7 @@ def test_bad_pixels_refuse_nonsense() -> None:
         frames.mark_bad(capture, jump=-1)
 
 
-def movie(signal: frames.Array, time: object) -> xr.Dataset:
+def movie(signal: np.ndarray, time: object) -> xr.Dataset:
     """Counts (band, time, y, x), double precision, of one signal (time) in two bands."""
     counts = np.broadcast_to(np.asarray(signal)[:, np.newaxis, np.newaxis], (2, len(signal), 1, 1))
     return xr.Dataset(
@@ -502,7 +502,8 @@ def test_undoing_the_lag_raises_the_noise() -> None:
     assert factor == pytest.approx(np.sqrt(1 + kept**2) / (1 - kept), rel=0.02)
     assert correlation == pytest.approx(-kept / (1 + kept**2), abs=0.02)
     np.testing.assert_allclose(undone.attrs["lag_noise_amplification"], factor, rtol=0.02)
-    factors = frames.noise_amplification(1 / np.array([10.0, 60.0, 100.0]), 0.010)
+    movies = [movie(signal[:9], np.arange(9) / rate) for rate in (10.0, 60.0, 100.0)]
+    factors = [frames.undo_lag(one, 0.010).attrs["lag_noise_amplification"][0] for one in movies]
     np.testing.assert_allclose(factors, [1.0, 1.255, 1.686], rtol=0, atol=0.001)
 
 

@@ -1,10 +1,14 @@
 """Thorlabs APT, the binary protocol of stepper controllers: bytes to messages, and back.
 
-Pure functions and one `Decoder`: nothing here reads or writes a line; `dbthermal.instruments.apt`
-is what `dbthermal.instruments.filterwheel` speaks, and its emulator. `codec` frames messages,
-`requests` has a function for each message that a host sends, `replies` a record for each payload
-that a controller sends. Tested against public byte vectors, against the release 29.0.0 of
-thorlabs-apt-protocol and against an emulator, not against hardware.
+Pure functions and one `Decoder`, without input or output; `dbthermal.instruments.filterwheel`
+speaks it. A message is a header of six bytes, ``id, id, param1, param2, destination, source``, or
+``id, id, length, length, destination | 0x80, source`` followed by data; all little-endian, without
+checksum or start byte. A receiver therefore drops bytes until identifier, length and both addresses
+are possible.
+
+Of the protocol this holds what a filter wheel needs, and the messages that a controller may send
+by itself. Tested against public byte vectors, against the release 29.0.0 of thorlabs-apt-protocol
+and against an emulator, not against hardware.
 
 References
 ----------
@@ -13,19 +17,22 @@ Facts alone were taken, no code: yaq-project/thorlabs-apt-protocol 29.0.0, moons
 (scale of the FW103 wheel), thorlabs_apt_device 0.3.8 (addresses of racks).
 """
 
-from dbthermal.instruments.apt.codec import (
+from dbthermal.instruments.apt._framing import (
     ADDRESSES,
     BAY_1,
     CONTROLLERS,
     HOST,
+    NO,
     RACK,
     UNIT,
+    YES,
     Decoder,
     Id,
     Message,
+    command,
     encode,
 )
-from dbthermal.instruments.apt.replies import (
+from dbthermal.instruments.apt._records import (
     HomeParameters,
     Info,
     Notice,
@@ -34,35 +41,6 @@ from dbthermal.instruments.apt.replies import (
     StatusBits,
     VelocityParameters,
     is_enabled,
-    is_occupied,
-    status_bits,
-)
-from dbthermal.instruments.apt.requests import (
-    acknowledge_status,
-    disconnect,
-    home,
-    identify,
-    move_absolute,
-    move_relative,
-    no_flash_programming,
-    request_bay_used,
-    request_channel_enabled,
-    request_dc_status,
-    request_home_parameters,
-    request_info,
-    request_position,
-    request_status,
-    request_status_bits,
-    request_velocity_parameters,
-    resume_end_of_move,
-    set_channel_enabled,
-    set_home_parameters,
-    set_position,
-    set_velocity_parameters,
-    start_updates,
-    stop,
-    stop_updates,
-    suspend_end_of_move,
 )
 
 __all__ = [
@@ -70,8 +48,10 @@ __all__ = [
     "BAY_1",
     "CONTROLLERS",
     "HOST",
+    "NO",
     "RACK",
     "UNIT",
+    "YES",
     "Decoder",
     "HomeParameters",
     "Id",
@@ -82,33 +62,11 @@ __all__ = [
     "Status",
     "StatusBits",
     "VelocityParameters",
-    "acknowledge_status",
-    "disconnect",
+    "command",
     "encode",
-    "home",
-    "identify",
     "is_enabled",
-    "is_occupied",
-    "move_absolute",
-    "move_relative",
-    "no_flash_programming",
-    "request_bay_used",
-    "request_channel_enabled",
-    "request_dc_status",
-    "request_home_parameters",
-    "request_info",
-    "request_position",
-    "request_status",
-    "request_status_bits",
-    "request_velocity_parameters",
-    "resume_end_of_move",
-    "set_channel_enabled",
-    "set_home_parameters",
-    "set_position",
-    "set_velocity_parameters",
-    "start_updates",
-    "status_bits",
-    "stop",
-    "stop_updates",
-    "suspend_end_of_move",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,9 +1,9 @@
-"""An emulated filter wheel FW103 on an emulated APT controller; no hardware is involved.
+"""Emulated filter wheel FW103 on an emulated APT controller; no hardware is involved.
 
-It answers below the real driver, byte for byte, and has the quirks that users report of real
-ones: speeds near 0 and a motor without current when it gets power, silence if it is addressed
-wrongly, reports of moves whenever they come, another model than on the label. What it does of its
-own accord follows public descriptions only.
+It answers below the real driver, byte for byte, with the quirks that users report of real ones:
+speeds near 0 and a motor without current after power-up, silence if it is addressed wrongly,
+reports of moves at any time, another model than on the label. As in a wheel without an encoder, its
+counter of commanded steps agrees with the wheel only once the home switch was found.
 
 References
 ----------
@@ -12,63 +12,79 @@ AlexShkarin/pyLabLib and from the documentation of thorlabs_apt_device.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, NamedTuple
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.emulated.apt_faults import MODELS, Faults
-from dbthermal.instruments.emulated.apt_motor import Drive, Motor
-from dbthermal.instruments.emulated.options import number, require_known
-from dbthermal.instruments.emulated.port import EmulatedPort
+from dbthermal.instruments.apt import Id, StatusBits
+from dbthermal.instruments.emulated.port import EmulatedPort, number, require_known
 from dbthermal.instruments.emulated.world import World
 
 SERIAL_NUMBER: Final = 40_000_000
-"""Number of a controller unless it is given another."""
+NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")  # in its `Info`
+SLOWEST: Final = 1.0  # [count/s] velocity below which the motor does not move at all
+WINDOW: Final = 1.0  # [deg] largest distance of the wheel from a slot that is in the beam
 
-UPDATE_INTERVAL: Final = 0.1
-"""From one report to the next, where they are started [s]."""
 
-UPDATE_PATIENCE: Final = 5.0
-"""Time after which a controller that reports falls silent for want of an acknowledgement [s]."""
+class Model(NamedTuple):
+    """Counts of a turn, device units of 1 count/s and of 1 count/s^2; a rack has bays."""
 
-NOTES: Final = b"emulated, not hardware".ljust(60, b"\0")
-"""What is in the notes of its `Info`."""
+    turn: int
+    velocity: float
+    acceleration: float
+    is_rack: bool
+
+
+_RACK = Model(409_600, 53.68, 53.68 * 204.94e-6, is_rack=True)
+_UNIT = Model(25_600, 1.0, 1.0, is_rack=False)
+MODELS: Final = MappingProxyType(
+    {"BSC201": _RACK, "BSC203": _RACK, "SCC201": _RACK, "BSC101": _UNIT, "KDC101": _UNIT}
+)
+"""Controllers by the name they give (KDC101 drives no wheel), with numbers of their own."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One motion with a ramp at each end: start [s], origin and distance [count], speeds."""
+
+    start: float
+    origin: float
+    distance: float
+    velocity: float
+    acceleration: float
+    homing: bool
+
+    @property
+    def duration(self) -> float:
+        """Time that it takes [s]."""
+        way, velocity, acceleration = abs(self.distance), self.velocity, self.acceleration
+        if way < velocity**2 / acceleration:  # the ramps meet
+            return 2.0 * math.sqrt(way / acceleration)
+        return way / velocity + velocity / acceleration
+
+    def place(self, time: float) -> float:
+        """Place at a time [count]."""
+        passed = min(time - self.start, self.duration)
+        remaining = self.duration - passed
+        way = min(self._rise(passed), abs(self.distance) / 2)
+        way += abs(self.distance) / 2 - min(self._rise(remaining), abs(self.distance) / 2)
+        return self.origin + math.copysign(way, self.distance)
+
+    def _rise(self, time: float) -> float:
+        """Way from rest in a time, with one ramp [count]."""
+        ramp = min(time, self.velocity / self.acceleration)
+        return self.acceleration * ramp**2 / 2 + self.velocity * (time - ramp)
 
 
 class EmulatedApt:
     """
     A controller and a wheel; a `Device` of `dbthermal.instruments.emulated.port`.
 
-    Parameters
-    ----------
-    world : World
-        Its clock is used, and its wheel is turned.
-    model : str
-        What it says it is: BSC201, BSC203 or SCC201, which are racks, BSC101, or KDC101, which
-        drives no wheel.
-    serial_number : int
-        Of the controller.
-    slot_offset : float
-        From the wheel's home switch to its slot 1 [deg].
-
-    Attributes
-    ----------
-    faults : Faults
-        Knobs.
-    motor : Motor
-        Where the wheel really is.
-    plugged : bool
-        Set it to False to pull out the cable.
-    received : list of Message
-        All that came, also what was addressed to nobody.
-    is_simulated : bool
-        True.
-
-    Raises
-    ------
-    ValueError
-        If there is no such model.
+    It uses the world's clock and turns the world's wheel, whose slot 1 is `slot_offset` [deg] from
+    the home switch. `position` counts the commanded steps, `wheel` is the place of the wheel from
+    its home switch [count]; `plugged` is set to False to pull out the cable.
     """
 
     is_simulated: Final = True
@@ -83,255 +99,151 @@ class EmulatedApt:
     ) -> None:
         if model not in MODELS:
             raise ValueError(f"Invalid model '{model}'. Must be one of {sorted(MODELS)}.")
-        self.faults = Faults()
         self.plugged = True
-        self.received: list[apt.Message] = []
-        self._world = world
-        self._kind = MODELS[model]
-        self._info = apt.Info(serial_number, model, 45, "1.0.0", 1, 0, 1, NOTES)
-        self._unit = apt.RACK if self._kind.is_rack else apt.UNIT
-        self._address = apt.BAY_1 if self._kind.is_rack else apt.UNIT
-        self._slot_offset = slot_offset
+        self.info = apt.Info(serial_number, model, 45, "1.0.0", 1, 0, 1, NOTES)
+        self.model = MODELS[model]
+        self.unit = apt.RACK if self.model.is_rack else apt.UNIT
+        self.address = apt.BAY_1 if self.model.is_rack else apt.UNIT
+        self.world = world
+        self.position, self.enabled, self.homed = 0, False, False
         slot = 1 if world.wheel_position is None else world.wheel_position
-        turn = self._kind.turn
-        self.motor = Motor(turn, ((slot - 1) / 6 + slot_offset / 360.0) * turn)
-        self._velocity = apt.VelocityParameters(1, 0, 0, 0)
+        self._slot_offset = slot_offset
+        self.wheel = ((slot - 1) / 6 + slot_offset / 360.0) * self.model.turn
+        self._drive: Drive | None = None
+        self._speeds = apt.VelocityParameters(1, 0, 0, 0)
         self._home = apt.HomeParameters(1, 2, 1, 0, 0)
         self._decoder = apt.Decoder(apt.CONTROLLERS, (apt.HOST,))
-        self._waiting: list[tuple[float, bytes]] = []
-        self._updates: float | None = None  # when the next report is due
-        self._updates_began = 0.0
+        self._replies: list[bytes] = []
 
     def receive(self, data: bytes) -> None:
-        """
-        Take in bytes from the driver.
-
-        Parameters
-        ----------
-        data : bytes
-            Any number, of any value.
-        """
+        """Take in bytes from the driver."""
         for message in self._decoder.feed(data):
-            self.received.append(message)
             self._advance()
-            mine = message.destination in {self._unit, self._address}
-            if mine and not self.faults.silent and message.id not in self.faults.deaf_to:
-                self._notice(message)
-                self._obey(message)
+            if message.destination in {self.unit, self.address}:
+                self.obey(message)
 
     def poll(self) -> list[bytes]:
-        """Give what is due to be sent now, each piece in a write of its own."""
+        """Messages that are due to be sent now, each in a write of its own."""
         self._advance()
-        now = self._world.clock()
-        due = [data for time, data in self._waiting if time <= now]
-        if not due or (self.faults.hold and len(due) < 2):
-            return []
-        self._waiting = [item for item in self._waiting if item[0] > now]
-        joined = b"".join(due)
-        if self.faults.single_bytes:
-            return [joined[place : place + 1] for place in range(len(joined))]
-        return [joined]
+        replies, self._replies = self._replies, []
+        return replies
 
     def next_due(self) -> float:
         """Time until something may be due [s]; infinite if nothing will unless bytes come."""
-        now = self._world.clock()
-        times = [time for time, _ in self._waiting]
-        if self.motor.drive is not None:
-            times.append(self.motor.drive.end)
-        if self._updates is not None:
-            times.append(self._updates)
-        return max(0.0, min(times, default=math.inf) - now)
+        if self._replies or self._drive is None:
+            return 0.0 if self._replies else math.inf
+        return max(0.0, self._drive.start + self._drive.duration - self.world.clock())
 
-    def _advance(self) -> None:
-        """Go on to now: move the motor, report the end of a motion, turn the world's wheel."""
-        now = self._world.clock()
-        slip = self.faults.slips / 360.0 * self.motor.turn
-        ended = self.motor.advance(now, slip=slip)
-        self._world.wheel_position = self.motor.slot(self._slot_offset)
-        if ended is not None and not self.faults.unreported:
-            self._report(apt.Id.MOT_MOVE_HOMED if ended.homing else apt.Id.MOT_MOVE_COMPLETED)
-        if self._updates is not None and now >= self._updates:
-            self._update(now)
+    def obey(self, message: apt.Message) -> None:
+        """Do what a message asks for; an unknown one is ignored."""
+        match message.id:
+            case Id.HW_REQ_INFO:
+                self.reply(Id.HW_GET_INFO, self.info.pack(), source=message.destination)
+            case Id.MOD_SET_CHANENABLESTATE:
+                self.enabled = message.param2 == apt.YES
+            case Id.MOD_REQ_CHANENABLESTATE:
+                state = apt.YES if self.enabled else apt.NO
+                self.reply(Id.MOD_GET_CHANENABLESTATE, param1=1, param2=state)
+            case Id.MOT_SET_VELPARAMS:
+                self._speeds = apt.VelocityParameters.parse(message)
+            case Id.MOT_REQ_VELPARAMS:
+                self.reply(Id.MOT_GET_VELPARAMS, self._speeds.pack())
+            case Id.MOT_SET_HOMEPARAMS:
+                self._home = apt.HomeParameters.parse(message)
+            case Id.MOT_REQ_HOMEPARAMS:
+                self.reply(Id.MOT_GET_HOMEPARAMS, self._home.pack())
+            case Id.MOT_REQ_STATUSUPDATE:
+                self.reply(Id.MOT_GET_STATUSUPDATE, self.status().pack())
+            case _:
+                self._move(message)
 
-    def _update(self, now: float) -> None:
-        """Report the status, or fall silent if nobody acknowledges it."""
-        self._updates = now + UPDATE_INTERVAL
-        if now - self._updates_began > UPDATE_PATIENCE:
-            self.faults.silent, self._updates = True, None
-            return
-        self._answer(apt.Id.MOT_GET_STATUSUPDATE, self._status().pack())
+    def _move(self, message: apt.Message) -> None:
+        """Begin or end a motion."""
+        if message.id == Id.MOT_MOVE_HOME:
+            # Back to the home switch, or on to it, and further by the controller's own offset.
+            forward = self._home.direction == 1
+            way = -self.wheel % self.model.turn if forward else -(self.wheel % self.model.turn)
+            self.start(way + self._home.offset, self._home.velocity, homing=True)
+        elif message.id == Id.MOT_MOVE_ABSOLUTE and message.data:
+            target = apt.Position.parse(message).position
+            self.start(target - self.position, self._speeds.maximum)
+        elif message.id == Id.MOT_MOVE_STOP:  # at once, ramps are left out
+            self._drive = None
+            self.report(Id.MOT_MOVE_STOPPED)
 
-    def _obey(self, message: apt.Message) -> None:
-        """
-        Do what a message asks for; one that is not known is ignored.
+    def start(self, distance: float, velocity: float, *, homing: bool = False) -> None:
+        """Begin a motion [count], unless the motor has no current or is too slow [device units]."""
+        speed = velocity / self.model.velocity
+        acceleration = self._speeds.acceleration / self.model.acceleration
+        if self.enabled and speed >= SLOWEST and acceleration > 0:
+            now = self.world.clock()
+            self._drive = self.plan(
+                Drive(now, self.position, distance, speed, acceleration, homing)
+            )
+            self.homed &= not homing
+            self._advance()
 
-        So is the acknowledgement of reports, as by some of these controllers.
-        """
-        setters: Mapping[int, Callable[[apt.Message], None]] = {
-            apt.Id.MOD_SET_CHANENABLESTATE: self._enable,
-            apt.Id.MOT_SET_POSCOUNTER: self._set_position,
-            apt.Id.MOT_SET_VELPARAMS: self._set_velocity,
-            apt.Id.MOT_SET_HOMEPARAMS: self._set_home,
-            apt.Id.MOT_MOVE_HOME: self._start_home,
-            apt.Id.MOT_MOVE_ABSOLUTE: self._move_absolute,
-            apt.Id.MOT_MOVE_RELATIVE: self._move_relative,
-            apt.Id.MOT_MOVE_STOP: self._stop,
-            apt.Id.HW_START_UPDATEMSGS: self._start_updates,
-            apt.Id.HW_STOP_UPDATEMSGS: self._stop_updates,
-        }
-        if message.id in setters:
-            setters[message.id](message)
-        elif message.id == apt.Id.HW_REQ_INFO:
-            self._answer(apt.Id.HW_GET_INFO, self._info.pack(), source=message.destination)
-        else:
-            self._tell(message)
+    def plan(self, drive: Drive) -> Drive:
+        """Motion as it is carried out; replaced in tests."""
+        return drive
 
-    def _tell(self, message: apt.Message) -> None:
-        """Answer a question about the motor."""
-        counter = apt.Position(1, self.motor.counter)
-        bits = self._status().bits
-        answers = {
-            apt.Id.MOT_REQ_POSCOUNTER: (apt.Id.MOT_GET_POSCOUNTER, counter.pack()),
-            apt.Id.MOT_REQ_VELPARAMS: (apt.Id.MOT_GET_VELPARAMS, self._velocity.pack()),
-            apt.Id.MOT_REQ_HOMEPARAMS: (apt.Id.MOT_GET_HOMEPARAMS, self._home.pack()),
-            apt.Id.MOT_REQ_STATUSUPDATE: (apt.Id.MOT_GET_STATUSUPDATE, self._status().pack()),
-            apt.Id.MOT_REQ_STATUSBITS: (
-                apt.Id.MOT_GET_STATUSBITS,
-                b"\x01\x00" + int(bits).to_bytes(4, "little"),
-            ),
-        }
-        if message.id in answers:
-            identifier, data = answers[apt.Id(message.id)]
-            self._answer(identifier, data)
-        elif message.id == apt.Id.MOD_REQ_CHANENABLESTATE:
-            state = 1 if self.motor.enabled else 2
-            self._answer(apt.Id.MOD_GET_CHANENABLESTATE, param1=1, param2=state)
-        elif message.id == apt.Id.RACK_REQ_BAYUSED and self._kind.is_rack:
-            used = 1 if message.param1 == 0 else 2
-            answer = apt.Id.RACK_GET_BAYUSED
-            self._answer(answer, param1=message.param1, param2=used, source=self._unit)
+    def finish(self, drive: Drive) -> None:
+        """Take in the end of a motion, and report it."""
+        if drive.homing:
+            self.position, self.homed = 0, True
+        self.report(Id.MOT_MOVE_HOMED if drive.homing else Id.MOT_MOVE_COMPLETED)
 
-    def _answer(
+    def report(self, identifier: Id) -> None:
+        """Report the end of a motion, unasked."""
+        self.reply(identifier, param1=1)
+
+    def reply(
         self,
-        identifier: apt.Id,
+        identifier: Id,
         data: bytes = b"",
         *,
         param1: int = 0,
         param2: int = 0,
         source: int | None = None,
     ) -> None:
-        """Send a message, with what the faults add to it."""
-        if self.faults.drop > 0:
-            self.faults.drop -= 1
-            return
-        address = self._address if source is None else source
+        """Send a message."""
+        address = self.address if source is None else source
         message = apt.Message(identifier, param1, param2, apt.HOST, address, data)
-        stray = apt.Message(apt.Id.MOT_MOVE_COMPLETED, 1, 0, apt.HOST, self._address)
-        before = apt.encode(stray) if self.faults.stray_completed else b""
-        due = self._world.clock() + self.faults.late
-        self._waiting.append((due, self.faults.noise + before + apt.encode(message)))
+        self._replies.append(apt.encode(message))
 
-    def _report(self, identifier: apt.Id) -> None:
-        """Report the end of a motion."""
-        if self.faults.long_reports and identifier != apt.Id.MOT_MOVE_HOMED:
-            self._answer(identifier, self._status().pack())
-        else:
-            self._answer(identifier, param1=1)
+    def status(self) -> apt.Status:
+        """State of the motor, as the controller reports it."""
+        bits = StatusBits.CONNECTED
+        bits |= StatusBits.ENABLED if self.enabled else 0
+        bits |= StatusBits.HOMED if self.homed else 0
+        bits |= StatusBits.JOGGING_FORWARD if self.info.model == "SCC201" else 0  # it sticks
+        if self._drive is not None:
+            forward = self._drive.distance > 0
+            bits |= StatusBits.MOVING_FORWARD if forward else StatusBits.MOVING_REVERSE
+            bits |= StatusBits.HOMING if self._drive.homing else 0
+        return apt.Status(1, self.position, 0, bits)
 
-    def _notice(self, message: apt.Message) -> None:
-        """Report an error, if the faults say so."""
-        if self.faults.notice:
-            notice = apt.Notice(message.id, 1, self.faults.notice)
-            self.faults.notice = ""
-            self._answer(apt.Id.HW_RICHRESPONSE, notice.pack())
-
-    def _status(self) -> apt.Status:
-        bits = self.motor.bits | self.faults.stuck
-        if self._info.model == "SCC201":
-            bits |= apt.StatusBits.JOGGING_FORWARD
-        return apt.Status(1, self.motor.counter, 0, bits)
-
-    def _enable(self, message: apt.Message) -> None:
-        self.motor.enabled = message.param2 == 1
-
-    def _set_position(self, message: apt.Message) -> None:
-        self.motor.position = apt.Position.parse(message).position
-
-    def _set_velocity(self, message: apt.Message) -> None:
-        self._velocity = apt.VelocityParameters.parse(message)
-
-    def _set_home(self, message: apt.Message) -> None:
-        self._home = apt.HomeParameters.parse(message)
-
-    def _start_updates(self, message: apt.Message) -> None:  # noqa: ARG002 - as the others
-        self._updates = self._updates_began = self._world.clock()
-
-    def _stop_updates(self, message: apt.Message) -> None:  # noqa: ARG002 - as the others
-        self._updates = None
-
-    def _start_home(self, message: apt.Message) -> None:  # noqa: ARG002 - as the others
-        """Turn back to the home switch, and on by the controller's own offset."""
-        turn = self.motor.turn
-        way = -(self.motor.wheel % turn) if self._home.direction == 2 else 0.0
-        if self._home.direction == 1:
-            way = -self.motor.wheel % turn
-        drive = self._drive(way + self._home.offset, self._home.velocity)
-        self._start(replace(drive, homing=True))
-
-    def _move_absolute(self, message: apt.Message) -> None:
-        if message.data:  # else it means a place that was stored, which it has none of
-            self._move(apt.Position.parse(message).position - self.motor.position)
-
-    def _move_relative(self, message: apt.Message) -> None:
-        if message.data:
-            self._move(apt.Position.parse(message).position)
-
-    def _move(self, way: float) -> None:
-        """Begin a move; without current it runs away."""
-        if not self.motor.enabled:
-            way = math.inf
-        short = self.faults.stops_short / 360.0 * self.motor.turn
-        self._start(self._drive(way - math.copysign(min(short, abs(way)), way)))
-
-    def _drive(self, way: float, velocity: int | None = None) -> Drive:
-        """Plan a motion by the parameters that were set."""
-        units = self._velocity.maximum if velocity is None else velocity
-        speed = units / self._kind.velocity / self.faults.slow
-        ramp = self._velocity.acceleration / self._kind.acceleration / self.faults.slow**2
-        stands = self.faults.stands_after / 360.0 * self.motor.turn
-        now, place = self._world.clock(), self.motor.position
-        return Drive(now, place, way, speed, ramp, stands_after=stands)
-
-    def _start(self, drive: Drive) -> None:
-        self.motor.start(drive)
-        self._advance()
-
-    def _stop(self, message: apt.Message) -> None:  # noqa: ARG002 - at once, ramps are left out
-        self.motor.drive = None
-        self._report(apt.Id.MOT_MOVE_STOPPED)
+    def _advance(self) -> None:
+        """Go on to now: move the motor, report the end of a motion, turn the world's wheel."""
+        now, drive = self.world.clock(), self._drive
+        if drive is not None:
+            before, self.position = self.position, round(drive.place(now))
+            self.wheel += self.position - before
+            if now >= drive.start + drive.duration:
+                self._drive = None
+                self.finish(drive)
+        sixths = (self.wheel / self.model.turn - self._slot_offset / 360.0) * 6
+        nearest = round(sixths)
+        rests = self._drive is None and abs(sixths - nearest) * 60.0 <= WINDOW
+        self.world.wheel_position = nearest % 6 + 1 if rests else None
 
 
 def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     """
     Start an emulated wheel for ``sim://apt``, on a pseudo-terminal of its own.
 
-    Parameters
-    ----------
-    options : mapping
-        ``model``, ``sn`` (serial number), ``offset`` (slot 1 from the home switch [deg]) and
-        ``name``, which says nothing more: a world has one wheel.
-    world : World or None
-        What it is part of, or None for one of its own.
-
-    Returns
-    -------
-    EmulatedPort
-        Close it to end the wheel.
-
-    Raises
-    ------
-    ValueError
-        If an option is not known or is no number.
+    Its options are ``model``, ``sn`` (serial number), ``offset`` (of slot 1 from the home switch
+    [deg]) and ``name``, without effect; ValueError if one is unknown or invalid.
     """
     require_known(options, ("model", "sn", "offset", "name"))
     device = EmulatedApt(

@@ -27,14 +27,8 @@ class EmulatedTC08:
     """
     The library and one unit, with type-T thermocouples whatever letter they are set to.
 
-    Parameters
-    ----------
-    temperature : callable
-        Temperature [K] of the tip of a channel, 1 to 8; NaN if it is open.
-    clock, sleep : callable
-        Time [s], and waiting [s] while a single reading is converted.
-    junction_temperature : float
-        Temperature of the terminals [K].
+    `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open;
+    `junction_temperature` is that of the terminals [K]; `sleep` waits while a reading is converted.
     """
 
     is_simulated: Final = True
@@ -43,19 +37,18 @@ class EmulatedTC08:
         self,
         temperature: Callable[[int], float],
         *,
-        clock: Callable[[], float],
         sleep: Callable[[float], None] = lambda _: None,
         junction_temperature: float = ROOM,
     ) -> None:
         self.junction_temperature = junction_temperature
-        self._temperature, self._clock, self._sleep = temperature, clock, sleep
+        self._temperature, self._sleep = temperature, sleep
         self._is_open, self._error = False, 0
         self._kinds: dict[int, str] = {}
 
     @classmethod
     def from_world(cls, world: World) -> Self:
-        """Unit whose thermocouples are where `World.thermocouples` says, on the world's clock."""
-        return cls(world.thermocouple_temperature, clock=world.clock)
+        """Unit whose thermocouples are where `World.thermocouples` says."""
+        return cls(world.thermocouple_temperature)
 
     def usb_tc08_open_unit_async(self) -> int:
         """Begin to open the unit: 1, or 0 if it fails."""

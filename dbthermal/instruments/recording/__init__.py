@@ -1,5 +1,28 @@
-"""A recording, made and opened again.
+"""Recorder of captures, and reader of recordings.
 
-`record` lets `fetching` bring frames and readings, and `writing` puts them on a `tape`, whose
-`contents` are named once. A `capture` is what one recording opens as, a `sweep` several of them.
+`record` writes the frames of all cameras and the readings beside them; `open_capture` opens a
+recording as stage `capture`, `notes` its log, `overview` a folder of recordings, and `open_sweep`
+and `bench_series` those of a blackbody. See `dbthermal.instruments.protocols` for whole procedures.
 """
+
+from dbthermal.instruments.recording._capture import mean_reading, notes, open_capture, overview
+from dbthermal.instruments.recording._recorder import Limits, Preview, Reading, Summary, record
+from dbthermal.instruments.recording._sweep import bench_series, open_sweep
+
+__all__ = [
+    "Limits",
+    "Preview",
+    "Reading",
+    "Summary",
+    "bench_series",
+    "mean_reading",
+    "notes",
+    "open_capture",
+    "open_sweep",
+    "overview",
+    "record",
+]
+
+
+def __dir__() -> list[str]:
+    return __all__

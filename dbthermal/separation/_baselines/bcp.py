@@ -26,9 +26,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from dbthermal import planck
-from dbthermal.curves import require_range
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Separated
+from dbthermal.response import require_range
+from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._tiles import Array, Estimate, Method, Tile
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class BcpSettings:
     Attributes
     ----------
     patch : int
-        Side of the patch in which the brightest pixel is looked for [pixel], odd. In a patch the
+        Side of the patch that is searched for the brightest pixel [pixel], odd. In a patch the
         object's temperature should not change: on a plate with a hot middle, 240 pixels wide, 5 is
         better than 15, and 31 worse.
     window : int
@@ -48,11 +48,16 @@ class BcpSettings:
         The guided filter's epsilon: variance below which the guide counts as flat, relative to the
         square of the frame's span [1].
     percentile : float
-        The reflected signal is this percentile of the frame [%], if no temperature is given.
+        The reflected signal is this percentile of the frame [%], without a reflected temperature.
     reflected_temperature : float or None
         Reflected apparent temperature [K], if known.
     least_transmission : float
         t0, below which the emissivity is not divided by [1].
+
+    Raises
+    ------
+    ValueError
+        If a side is not odd or another number lies outside its range.
     """
 
     patch: int = 15
@@ -63,7 +68,7 @@ class BcpSettings:
     least_transmission: float = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse windows without a centre, and fractions that are none."""
+        """Refuse windows without a centre, and numbers outside their range."""
         for name in ("patch", "window"):
             if not (getattr(self, name) >= 1 and getattr(self, name) % 2 == 1):
                 raise ValueError(
@@ -81,108 +86,47 @@ class BcpSettings:
             )
 
 
-def separate(problem: Problem, settings: BcpSettings) -> Separated:
+def separate(tile: Tile, settings: BcpSettings) -> Estimate:
     """
     Remove the reflection from a whole image, each frame by itself.
 
-    Parameters
-    ----------
-    problem : Problem
-        Signals of two bands, of an image of `problem.shape`.
-    settings : BcpSettings
-        Sizes of the filters, and what is known of the reflection.
-
-    Returns
-    -------
-    Separated
-        Object temperature from the quieter band; background temperature, that of the reflected
-        signal A, the same in all pixels; emissivity of each band: the mean over time of its own t.
-        No deviations. Pixels without a temperature, as dead ones, are filled with the frame's
-        median before the filters, and are NaN in the result.
-
-    Raises
-    ------
-    ValueError
-        If the reflected temperature lies outside the response's range.
+    Object temperature from the quieter band; the background's is that of A, the same in all pixels;
+    emissivity of each band is the mean over time of its own t. Pixels without a temperature, as
+    dead ones, are filled with the frame's median before the filters, and are NaN in the result.
     """
-    object_signal, reflected, transmission = _movie(problem, settings, 0)
-    transmissions = np.stack([transmission, _movie(problem, settings, 1)[2]])
-    usable = np.isfinite(problem.temperature(0, problem.signals[0]))
-    warm = np.where(usable, problem.temperature(0, object_signal), np.nan)
-    cold = np.tile(problem.temperature(0, reflected)[:, np.newaxis], warm.shape[1])
-    return Separated(
-        object_temperature=warm,
-        object_temperature_std=np.full_like(warm, np.nan),
-        background_temperature=cold,
-        background_temperature_std=np.full_like(cold, np.nan),
-        emissivity=transmissions,
-        emissivity_std=np.full_like(transmissions, np.nan),
-        status=np.zeros(warm.shape[1], dtype=np.uint32),
-    ).ranged(problem.curves[0], deviations=False)
+    object_signal, reflected, transmission = _remove(tile, settings, 0)
+    transmissions = np.stack([transmission, _remove(tile, settings, 1)[2]])
+    usable = np.isfinite(tile.temperature(0, tile.signals[0]))
+    temperature = np.where(usable, tile.temperature(0, object_signal), np.nan)
+    background = np.tile(tile.temperature(0, reflected)[:, np.newaxis], temperature.shape[1])
+    status = np.zeros(temperature.shape[1], dtype=np.uint32)
+    estimate = point_estimate(temperature, status, transmissions, background)
+    return estimate.check_range(tile.curves[0], deviations=False)
 
 
-def _movie(problem: Problem, settings: BcpSettings, band: int) -> tuple[Array, Array, Array]:
-    """Object signal (time, pixel), reflected signal (time), mean t (pixel), of one band."""
-    clean = np.empty_like(problem.signals[band])
-    reflected, total = np.empty(problem.time.size), np.zeros(clean.shape[1])
-    given = _given(problem, settings, band)
-    for frame, signal in enumerate(problem.signals[band]):
-        image = _filled(problem, band, signal).reshape(problem.shape)
-        level = float(np.percentile(image, settings.percentile)) if given is None else given
+def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array, Array]:
+    """Object signal (time, pixel) [K], reflected signal A (time) [K], mean t (pixel), of a band."""
+    cleaned = np.empty_like(tile.signals[band])
+    reflected, total = np.empty(tile.time.size), np.zeros(cleaned.shape[1])
+    known = None
+    if settings.reflected_temperature is not None:
+        curve = tile.curves[band]
+        value = require_range(settings.reflected_temperature, curve, "reflected_temperature")
+        known = float(tile.blackbody(band, value))
+    for frame, signal in enumerate(tile.signals[band]):
+        image = _filled(tile, band, signal).reshape(tile.shape)
+        level = float(np.percentile(image, settings.percentile)) if known is None else known
         transmission = _transmission(image, level, settings)
-        above = (image - level) / np.maximum(transmission, settings.least_transmission)
-        clean[frame], reflected[frame] = (above + level).ravel(), level
+        # I' = (I - A) / max(t, t0) + A
+        excess = (image - level) / np.maximum(transmission, settings.least_transmission)
+        cleaned[frame], reflected[frame] = (excess + level).ravel(), level
         total += transmission.ravel()
-    return clean, reflected, total / problem.time.size
+    return cleaned, reflected, total / tile.time.size
 
 
-def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Array:
-    r"""
-    Smooth an image along the edges of a guide.
-
-    In every window the result is :math:`a\,\mathrm{guide} + b` with
-    :math:`a = \mathrm{cov}(\mathrm{guide}, \mathrm{image}) / (\mathrm{var}(\mathrm{guide}) +
-    \epsilon)`; a pixel takes the mean of all windows that hold it.
-
-    Parameters
-    ----------
-    guide, image : ndarray, shape (y, x)
-        Guide [its own unit] and image [another].
-    window : int
-        Side of the window [pixel].
-    epsilon : float
-        Variance of the guide below which it counts as flat [square of the guide's unit].
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        The smooth image. Beyond the border both are mirrored.
-
-    References
-    ----------
-    .. [1] He, Sun, Tang (2013), IEEE TPAMI 35, 1397, doi:10.1109/TPAMI.2012.213
-    """
-    guide = guide - guide.mean()  # the variance is a difference of squares
-    mean_guide, mean_image = uniform_filter(guide, window), uniform_filter(image, window)
-    covariance = uniform_filter(guide * image, window) - mean_guide * mean_image
-    variance = uniform_filter(guide * guide, window) - mean_guide**2
-    slope = covariance / (variance + epsilon)
-    intercept = mean_image - slope * mean_guide
-    return np.asarray(uniform_filter(slope, window) * guide + uniform_filter(intercept, window))
-
-
-def _given(problem: Problem, settings: BcpSettings, band: int) -> float | None:
-    """Signal of the given reflected temperature, if there is one."""
-    if settings.reflected_temperature is None:
-        return None
-    curve = problem.curves[band]
-    level = require_range(settings.reflected_temperature, curve, "reflected_temperature")
-    return float(problem.blackbody(band, level))
-
-
-def _filled(problem: Problem, band: int, image: Array) -> Array:
-    """The frame with its median in place of pixels that no temperature gives."""
-    usable = np.isfinite(problem.temperature(band, image))
+def _filled(tile: Tile, band: int, image: Array) -> Array:
+    """The frame with its median at pixels without a temperature."""
+    usable = np.isfinite(tile.temperature(band, image))
     if not np.any(usable):
         return image
     return np.where(usable, image, np.median(image[usable]))
@@ -190,6 +134,7 @@ def _filled(problem: Problem, band: int, image: Array) -> Array:
 
 def _transmission(image: Array, level: float, settings: BcpSettings) -> Array:
     """The smooth t of one frame; 1 where nothing in the patch is brighter than the reflection."""
+    # t = (I - A) / (M - A)
     brightest = maximum_filter(image, settings.patch)
     coarse = np.ones_like(image)
     np.divide(image - level, brightest - level, out=coarse, where=brightest > level)
@@ -199,6 +144,23 @@ def _transmission(image: Array, level: float, settings: BcpSettings) -> Array:
     epsilon = settings.regularisation * span**2
     fine = guided_filter(image, np.clip(coarse, 0.0, 1.0), settings.window, epsilon)
     return np.clip(fine, 0.0, 1.0)
+
+
+def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Array:
+    r"""
+    Smooth an image (y, x) along the edges of a guide (y, x), mirrored at the border.
+
+    In every window of that side [pixel] the result is :math:`a\,\mathrm{guide} + b` with
+    :math:`a = \mathrm{cov}(\mathrm{guide}, \mathrm{image}) / (\mathrm{var}(\mathrm{guide}) +
+    \epsilon)`; a pixel takes the mean of all windows that hold it (He et al. 2013).
+    """
+    guide = guide - guide.mean()  # the variance is a difference of squares
+    mean_guide, mean_image = uniform_filter(guide, window), uniform_filter(image, window)
+    covariance = uniform_filter(guide * image, window) - mean_guide * mean_image
+    variance = uniform_filter(guide * guide, window) - mean_guide**2
+    slope = covariance / (variance + epsilon)
+    intercept = mean_image - slope * mean_guide
+    return np.asarray(uniform_filter(slope, window) * guide + uniform_filter(intercept, window))
 
 
 METHOD: Final = Method(

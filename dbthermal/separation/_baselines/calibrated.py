@@ -12,8 +12,9 @@ from typing import Final
 import numpy as np
 
 from dbthermal import mixing
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Separated, flag
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._tiles import Array, Estimate, Method, Tile
 
 _STEPS: Final = 5
 # Largest last step of a sample that is solved [K].
@@ -23,18 +24,18 @@ _GRAY_SIGMAS: Final = 4.0
 _LEAST_DIFFERENCE: Final = 1e-6
 
 
-def separate(problem: Problem) -> Separated:
+def separate(tile: Tile) -> Estimate:
     """Temperatures with their standard deviations, at the known emissivities (2, pixel)."""
-    if problem.emissivity is None:
+    if tile.emissivity is None:
         raise ValueError("Missing emissivity. Method 'calibrated' must be given one.")
-    emissivity = problem.emissivity
+    emissivity = tile.emissivity
     emissivity_std = (
-        np.zeros_like(emissivity) if problem.emissivity_std is None else problem.emissivity_std
+        np.zeros_like(emissivity) if tile.emissivity_std is None else tile.emissivity_std
     )
-    noise = (problem.noise[0], problem.noise[1])
+    noise = (tile.noise[0], tile.noise[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        temperatures, last_step = _newton(problem, emissivity)
-        jacobian = _jacobian(problem, emissivity, temperatures)
+        temperatures, last_step = _newton(tile, emissivity)
+        jacobian = _jacobian(tile, emissivity, temperatures)
         stds = np.sqrt(temperature_variance(jacobian, noise, temperatures, emissivity_std))
     least = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * np.hypot(*emissivity_std))
     gray = np.abs(emissivity[0] - emissivity[1]) <= least
@@ -42,17 +43,17 @@ def separate(problem: Problem) -> Separated:
     solved &= np.all(np.isfinite(stds), axis=(0, 1))
     undefined = gray | ~solved
     return (
-        Separated(
+        Estimate(
             object_temperature=temperatures[0],
             object_temperature_std=stds[0],
             background_temperature=temperatures[1],
             background_temperature_std=stds[1],
             emissivity=emissivity,
             emissivity_std=emissivity_std,
-            status=flag({"gray": gray, "outside_response": ~solved & ~gray}),
+            status=status_bits({Status.GRAY: gray, Status.OUTSIDE_RESPONSE: ~solved & ~gray}),
         )
-        .without(undefined, np.zeros_like(gray), undefined)
-        .ranged(problem.curves[0])
+        .undefine(undefined, np.zeros_like(gray), undefined)
+        .check_range(tile.curves[0])
     )
 
 
@@ -81,13 +82,13 @@ def temperature_variance(
     return np.asarray(energy / determinant**2)
 
 
-def _newton(problem: Problem, emissivity: Array) -> tuple[Array, Array]:
+def _newton(tile: Tile, emissivity: Array) -> tuple[Array, Array]:
     """Object and background temperature (2, time, pixel) [K], and the last change of both."""
-    temperatures = _invert(_weights(emissivity), problem.signals) + problem.reference
+    temperatures = _invert(_weights(emissivity), tile.signals) + tile.reference
     step = np.zeros_like(temperatures)
     for _ in range(_STEPS):
-        residual = problem.signals - problem.mixed(emissivity, temperatures)
-        step = _invert(_jacobian(problem, emissivity, temperatures), residual)
+        residual = tile.signals - tile.mixed(emissivity, temperatures)
+        step = _invert(_jacobian(tile, emissivity, temperatures), residual)
         temperatures = temperatures + step
     return np.asarray(temperatures), step
 
@@ -97,9 +98,9 @@ def _weights(emissivity: Array) -> Array:
     return np.moveaxis(mixing.matrix(emissivity), -1, 1)[:, :, np.newaxis]
 
 
-def _jacobian(problem: Problem, emissivity: Array, temperatures: Array) -> Array:
+def _jacobian(tile: Tile, emissivity: Array, temperatures: Array) -> Array:
     """Derivative (band, 2, time, pixel) of equation (1) with the two temperatures [1]."""
-    slopes = np.stack([curve.slope(temperatures) for curve in problem.curves])
+    slopes = np.stack([curve.slope(temperatures) for curve in tile.curves])
     return np.asarray(_weights(emissivity) * slopes)
 
 

@@ -22,20 +22,21 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import expit, logit
 
-from dbthermal import planck
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Mask, Separated, flag
+from dbthermal import mixing, planck
+from dbthermal.schema import Status
+from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Tile
 
 # Damping of the first step, relative to the diagonal of the normal equations, and its range; the
 # Schur complement is proportional to the damping, and is rounding below the least.
 _FIRST_DAMPING: Final = 1e-2
 _DAMPING: Final = (1e-8, 1e12)
-# What the damping is multiplied by after a step that lowers the objective, and one that does not.
+# Factors of the damping after a step that lowers the objective, and one that does not.
 _EASIER: Final = 0.2
 _HARDER: Final = 8.0
 # A step that changes a logit by more is not taken: it would end where the logit's slope is nil.
 _LONGEST: Final = 3.0
-
 
 Columns = npt.NDArray[np.intp]
 
@@ -50,84 +51,66 @@ class NaiveSettings:
     starts : int
         Random starts: emissivities uniform in (0, 1); object and background each at the image's
         apparent temperature in the quieter band, shifted for all of time by a random amount.
-    spread : float
+    shift_std : float
         Standard deviation of that shift [K].
     iterations : int
         Most steps from each start.
     tolerance : float
         A start is done when its objective, a sample's mean squared residual in units of the noise's
         variance, is below this, or a step lowers it by less than this fraction [1].
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive.
     """
 
     starts: int = 5
-    spread: float = 2.0
+    shift_std: float = 2.0
     iterations: int = 100
     tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are no search."""
+        """Refuse numbers that are not positive."""
         for name in ("starts", "iterations"):
             if not getattr(self, name) >= 1:
                 raise ValueError(
                     f"Invalid {name} {getattr(self, name)} of method 'naive'. Must be at least 1."
                 )
-        planck.require_positive("spread [K] of method 'naive'", self.spread)
+        planck.require_positive("shift_std [K] of method 'naive'", self.shift_std)
         planck.require_positive("tolerance of method 'naive'", self.tolerance)
 
 
 @dataclass(frozen=True)
 class _State:
-    """Where the search stands: a column for each pixel and start."""
+    """State of the search; columns are the starts of all pixels, start by start."""
 
     logits: Array  # (2, column)
     logarithms: Array  # of object and background temperature / K, (2, time, column)
     damping: Array  # (column,)
     objective: Array  # (column,)
-    going: Mask  # (column,)
+    active: Mask  # (column,)
 
-    def taken(self, columns: Mask | Columns) -> "_State":
-        """Some of the columns."""
+    def select(self, columns: Mask | Columns) -> "_State":
         return _State(**{name: value[..., columns] for name, value in vars(self).items()})
 
 
-def separate(problem: Problem, settings: NaiveSettings, truth: Array | None = None) -> Separated:
+def separate(tile: Tile, settings: NaiveSettings, truth: Array | None = None) -> Estimate:
     """
-    Separate one tile.
+    Temperatures and emissivities of one tile, without deviations.
 
-    Parameters
-    ----------
-    problem : Problem
-        Signals of two bands.
-    settings : NaiveSettings
-        Starts and limits of the search.
-    truth : ndarray, shape (time, pixel), optional
-        True object temperature [K], for an experiment: the start nearest to it is kept, which
-        cannot be done in practice. Not reached from `solve`.
-
-    Returns
-    -------
-    Separated
-        Temperatures and emissivities, without deviations; `not_converged` where the start that is
-        kept was still improving at the last step, or found no finite objective.
+    With the true object temperature (time, pixel) [K], which only an experiment has, the start
+    nearest to it is kept instead of that of least objective. `not_converged` where the kept start
+    was still improving at the last step, or has no finite objective.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
-        state = _search(problem, settings)
-        kept = state.taken(_choice(state, settings, truth))
-        temperatures, emissivity = np.exp(kept.logarithms), expit(kept.logits)
+        state = _search(tile, settings)
+        kept = state.select(_choice(state, settings, truth))
+        (temperature, background), emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
-    return (
-        Separated(
-            object_temperature=temperatures[0],
-            object_temperature_std=np.full_like(temperatures[0], np.nan),
-            background_temperature=temperatures[1],
-            background_temperature_std=np.full_like(temperatures[1], np.nan),
-            emissivity=emissivity,
-            emissivity_std=np.full_like(emissivity, np.nan),
-            status=flag({"not_converged": kept.going | lost}),
-        )
-        .without(lost, lost, lost)
-        .ranged(problem.curves[0], deviations=False)
-    )
+    status = status_bits({Status.NOT_CONVERGED: kept.active | lost})
+    estimate = point_estimate(temperature, status, emissivity, background)
+    return estimate.undefine(lost, lost, lost).check_range(tile.curves[0], deviations=False)
 
 
 def _choice(state: _State, settings: NaiveSettings, truth: Array | None) -> Columns:
@@ -135,44 +118,41 @@ def _choice(state: _State, settings: NaiveSettings, truth: Array | None) -> Colu
     pixels = state.objective.size // settings.starts
     cost = state.objective.reshape(settings.starts, pixels)
     if truth is not None:
-        warm = np.exp(state.logarithms[0]).reshape(-1, settings.starts, pixels)
-        cost = np.mean((warm - truth[:, np.newaxis]) ** 2, axis=0)
+        temperature = np.exp(state.logarithms[0]).reshape(-1, settings.starts, pixels)
+        cost = np.mean((temperature - truth[:, np.newaxis]) ** 2, axis=0)
     start = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=0)
     return np.asarray(start * pixels + np.arange(pixels))
 
 
-def _search(problem: Problem, settings: NaiveSettings) -> _State:
-    """Run all starts to their end; columns are the starts of all pixels, start by start."""
-    signals = np.tile(problem.signals, (1, 1, settings.starts))
-    state = _start(problem, signals, settings)
+def _search(tile: Tile, settings: NaiveSettings) -> _State:
+    """State of all starts at their end."""
+    signals = np.tile(tile.signals, (1, 1, settings.starts))
+    state = _start(tile, signals, settings)
     for _ in range(settings.iterations):
-        columns = state.going
+        columns = state.active
         if not np.any(columns):
             break
-        moved = _step(problem, signals[..., columns], state.taken(columns), settings.tolerance)
+        moved = _step(tile, signals[..., columns], state.select(columns), settings.tolerance)
         for name, value in vars(state).items():
             value[..., columns] = getattr(moved, name)
     return state
 
 
-def _start(problem: Problem, signals: Array, settings: NaiveSettings) -> _State:
+def _start(tile: Tile, signals: Array, settings: NaiveSettings) -> _State:
     """Random emissivities, and temperatures near the image's."""
     columns = signals.shape[-1]
-    logits = logit(problem.rng.uniform(np.finfo(np.float64).tiny, 1.0, (2, columns)))
-    shifts = settings.spread * problem.rng.standard_normal((2, 1, columns))
-    logarithms = np.log(problem.temperature(0, signals[0]) + shifts)
-    objective = _objective(_residual(problem, signals, expit(logits), np.exp(logarithms)))
+    logits = logit(tile.rng.uniform(np.finfo(np.float64).tiny, 1.0, (2, columns)))
+    shifts = settings.shift_std * tile.rng.standard_normal((2, 1, columns))
+    logarithms = np.log(tile.temperature(0, signals[0]) + shifts)
+    objective = _objective(_residual(tile, signals, logits, logarithms))
     damping = np.full(columns, _FIRST_DAMPING)
     return _State(logits, logarithms, damping, objective, np.isfinite(objective))
 
 
-def _residual(problem: Problem, signals: Array, emissivity: Array, temperatures: Array) -> Array:
+def _residual(tile: Tile, signals: Array, logits: Array, logarithms: Array) -> Array:
     """Signals less the model, in units of the noise, (band, time, column)."""
-    rest = np.empty_like(signals)
-    for band, share in enumerate(emissivity):
-        warm, cold = (problem.blackbody(band, part) for part in temperatures)
-        rest[band] = (signals[band] - cold - share * (warm - cold)) / problem.noise[band]
-    return rest
+    model = tile.mixed(expit(logits), np.exp(logarithms))
+    return np.asarray((signals - model) / np.array(tile.noise)[:, np.newaxis, np.newaxis])
 
 
 def _objective(residual: Array) -> Array:
@@ -180,39 +160,40 @@ def _objective(residual: Array) -> Array:
     return np.asarray(np.mean(residual**2, axis=(0, 1)))
 
 
-def _step(problem: Problem, signals: Array, state: _State, tolerance: float) -> _State:
+def _step(tile: Tile, signals: Array, state: _State, tolerance: float) -> _State:
     """One damped step of every column; it is taken where it lowers the objective."""
-    logits_step, logarithms_step = _solve(problem, signals, state)
-    tried = replace(
-        state,
-        logits=state.logits + logits_step,
-        logarithms=state.logarithms + logarithms_step,
-    )
-    residual = _residual(problem, signals, expit(tried.logits), np.exp(tried.logarithms))
-    objective = _objective(residual)
+    logits_step, logarithms_step = _solve(tile, signals, state)
+    logits, logarithms = state.logits + logits_step, state.logarithms + logarithms_step
+    objective = _objective(_residual(tile, signals, logits, logarithms))
     better = objective < state.objective  # false where it is NaN
     better &= np.all(np.abs(logits_step) < _LONGEST, axis=0)
     smallest, largest = _DAMPING
     damping = np.maximum(state.damping * np.where(better, _EASIER, _HARDER), smallest)
     done = better & (objective < tolerance)
     done |= better & (state.objective - objective < tolerance * state.objective)
-    return _State(
-        np.where(better, tried.logits, state.logits),
-        np.where(better, tried.logarithms, state.logarithms),
-        damping,
-        np.where(better, objective, state.objective),
-        ~done & (damping < largest),
+    return replace(
+        state,
+        logits=np.where(better, logits, state.logits),
+        logarithms=np.where(better, logarithms, state.logarithms),
+        damping=damping,
+        objective=np.where(better, objective, state.objective),
+        active=~done & (damping < largest),
     )
 
 
-def _solve(problem: Problem, signals: Array, state: _State) -> tuple[Array, Array]:
-    """Solve the damped normal equations: steps of the logits and of the logarithms."""
-    inner, border = _jacobian(problem, state)
-    residual = _residual(problem, signals, expit(state.logits), np.exp(state.logarithms))
+def _solve(tile: Tile, signals: Array, state: _State) -> tuple[Array, Array]:
+    """
+    Steps of the logits and of the logarithms, from the damped normal equations.
+
+    With T the 2x2 block of a frame's temperatures, S its columns of the border and B the border's
+    own block, the logits solve :math:`(B - S^T T^{-1} S) l = b - S^T T^{-1} f`.
+    """
+    inner, border = _jacobian(tile, state)
+    residual = _residual(tile, signals, state.logits, state.logarithms)
     # Marquardt's damping, in proportion to the diagonal, and Levenberg's, of every logarithm and
     # logit alike: without it an emissivity of 0 or 1 within rounding is a singular system.
     harder, damping = 1.0 + state.damping, state.damping
-    # Frame by frame: ((a, b), (b, c)) of the temperatures, and their columns of the border.
+    # T = ((a, b), (b, c)) frame by frame, f = J^T r
     a, c = (np.sum(inner[:, part] ** 2, axis=0) * harder + damping for part in (0, 1))
     b = np.sum(inner[:, 0] * inner[:, 1], axis=0)
     blocks = (a, b, c)
@@ -229,21 +210,22 @@ def _solve(problem: Problem, signals: Array, state: _State) -> tuple[Array, Arra
     return logits, force - logits[0] * solved[0] - logits[1] * solved[1]
 
 
-def _jacobian(problem: Problem, state: _State) -> tuple[Array, Array]:
+def _jacobian(tile: Tile, state: _State) -> tuple[Array, Array]:
     """
     Derivatives of the model in units of the noise.
 
-    With the logarithms of the temperatures, (band, 2, time, column), and with the band's own logit,
+    With the logarithms of the temperatures (band, 2, time, column) and with the band's own logit
     (band, time, column).
     """
-    temperatures, shares = np.exp(state.logarithms), expit(state.logits)
+    temperatures, emissivity = np.exp(state.logarithms), expit(state.logits)
     inner = np.empty((2, *temperatures.shape))
     border = np.empty_like(temperatures)
-    for band, share in enumerate(shares):
-        slopes = problem.curves[band].slope(temperatures) * temperatures / problem.noise[band]
-        inner[band] = slopes * np.stack([share, 1.0 - share])[:, np.newaxis]
-        warm, cold = (problem.blackbody(band, part) for part in temperatures)
-        border[band] = share * (1.0 - share) * (warm - cold) / problem.noise[band]
+    for band, weights in enumerate(mixing.matrix(emissivity)):
+        # dz/d ln T = (e, 1 - e) u'(T) T,  dz/d logit = e (1 - e) [u(x) - u(y)]
+        slopes = tile.curves[band].slope(temperatures) * temperatures / tile.noise[band]
+        inner[band] = slopes * weights.T[:, np.newaxis]
+        emitted, reflected = (tile.blackbody(band, part) for part in temperatures)
+        border[band] = np.prod(weights, axis=1) * (emitted - reflected) / tile.noise[band]
     return inner, border
 
 

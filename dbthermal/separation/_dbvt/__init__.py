@@ -1,1 +1,145 @@
-"""The paper's optimiser."""
+"""Settings of the paper's optimiser, algorithm DBVT; they need no torch, its modules do."""
+
+import importlib
+from dataclasses import dataclass
+from typing import Final
+
+from dbthermal import planck
+
+_CHOICES: Final = {
+    "start": ("random", "subspace"),
+    "temperatures_from": ("corrected", "measured"),
+    "precision": ("float64", "float32"),
+}
+
+
+@dataclass(frozen=True)
+class DbvtSettings:
+    r"""
+    Options of the paper's optimiser: losses, starts, homotopy, Newton's steps; none is published.
+
+    The scales of the losses are the noise's wherever they can be, so that one set serves at every
+    noise level. A weight of 0 leaves a loss out.
+
+    Attributes
+    ----------
+    smoothness : float
+        :math:`\gamma_1`, of the squared second differences in units of `curvature` [1].
+    huber : float
+        :math:`\gamma_2`, of the Huber loss, which is divided by its threshold: beyond it the slope
+        is 1, whatever the threshold [1].
+    reconstruction : float
+        :math:`\gamma_3`, of the squared reconstruction error in units of the second band's noise
+        [1]: the normalised error, its weight set by the signal-to-noise ratio.
+    noise : float
+        :math:`\gamma_4`, of the noise's square in units of each band's own noise [1]. With 0 no
+        noise is modelled: it is held at zero, and its mean with it.
+    noise_mean : float
+        :math:`\gamma_5`, of the square of the noise's mean over time, in the same units [1].
+    curvature : float
+        Second derivative of a smooth signal that costs 1 [K/s^2].
+    huber_threshold : float
+        Where the Huber loss turns from square to linear, in units of each band's noise [1].
+    deviation_floor : float
+        Least deviation by which a signal is divided, in units of its noise [1].
+    stages : int
+        Stages of the homotopy, from a small share of the reconstruction's weight to all of it; with
+        1 all of it counts from the first step on.
+    stage_steps : int
+        Steps in each stage but the last.
+    first_share : float
+        Weight of the normalised reconstruction error in the first stage, as a fraction of
+        `reconstruction`; in the last it counts in units of the noise, not of the deviation [1].
+    steps : int
+        Most steps in the last stage.
+    tolerance, patience : float, int
+        A pixel is done when no step lowers its objective by more than this fraction [1], so many
+        times in a row.
+    largest_step : float
+        Largest change of an emissivity in a step [1].
+    margin : float
+        Least distance of an emissivity from 0 and 1 [1].
+    start : {"random", "subspace"}
+        Emissivities uniform in (0, 1), as published; or emissivities and object of the subspace
+        separator, and at random where it has none.
+    starts : int
+        Random starts, of which the one of least objective is kept; 1 as published. A start at the
+        separator comes before them, and is one of them.
+    smooth_from_zero : bool
+        A random start's smooth signal is zero, as published, and not the signal itself.
+    bend_updates : int
+        Number of times that the nonlinearity of an exact response is taken out; 0 for the paper's
+        linear identities.
+    temperatures_from : {"corrected", "measured"}
+        Signals without their estimated noise, or as measured.
+    batch : int
+        Pixels in a tile.
+    device : str
+        Where to compute, in torch's words: "cpu", "cuda".
+    precision : {"float64", "float32"}
+        Floating-point type.
+
+    Raises
+    ------
+    ValueError
+        If a choice is unknown, a number outside its range, or the device is missing.
+    """
+
+    smoothness: float = 1.0
+    huber: float = 0.5
+    reconstruction: float = 10.0
+    noise: float = 1.0
+    noise_mean: float = 1.0
+    curvature: float = 0.5
+    huber_threshold: float = 1.0
+    deviation_floor: float = 1.0
+    stages: int = 9
+    stage_steps: int = 9
+    first_share: float = 1e-6
+    steps: int = 80
+    tolerance: float = 1e-5
+    patience: int = 8
+    largest_step: float = 0.2
+    margin: float = 0.01
+    start: str = "random"
+    starts: int = 1
+    smooth_from_zero: bool = False
+    bend_updates: int = 1
+    temperatures_from: str = "corrected"
+    batch: int = 512
+    device: str = "cpu"
+    precision: str = "float64"
+
+    def __post_init__(self) -> None:
+        """Refuse unknown choices and numbers outside their range."""
+        for name, allowed in _CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(
+                    f"Unknown {name} '{getattr(self, name)}' of method 'dbvt'. "
+                    f"Must be one of {allowed}."
+                )
+        weights = ("smoothness", "huber", "reconstruction", "noise", "noise_mean", "bend_updates")
+        counts = ("stages", "stage_steps", "steps", "patience", "starts", "batch")
+        for least, names in enumerate((weights, counts)):
+            for name in names:
+                value = getattr(self, name)
+                if not least <= value < float("inf"):
+                    raise ValueError(
+                        f"Invalid {name} {value} of method 'dbvt'. Must be at least {least}."
+                    )
+        positive = ("curvature", "huber_threshold", "deviation_floor")
+        for name in (*positive, "first_share", "tolerance", "largest_step"):
+            planck.require_positive(f"{name} of method 'dbvt'", getattr(self, name))
+        if not 0 < self.margin < 0.5:
+            raise ValueError(
+                f"Invalid margin {self.margin} of method 'dbvt'. Must lie in (0, 0.5)."
+            )
+        if self.device != "cpu":
+            _require_device(self.device)
+
+
+def _require_device(name: str) -> None:
+    """Refuse a CUDA device where there is none."""
+    torch = importlib.import_module("torch")
+    if torch.device(name).type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"Invalid device '{name}' of method 'dbvt'. No CUDA device is available.")

@@ -1,14 +1,13 @@
-r"""Minimising the paper's objective: damped Newton steps in all unknowns of a pixel at once.
+r"""Damped Newton steps of the paper's objective, in all unknowns of a pixel at once.
 
 The objective (`objective`) is convex in everything but the two emissivities, and its second
 derivatives have a shape that is solved in a time proportional to the number of frames: a 2x2 block
-of noise for each frame, a band of width five for the smooth signal, a border of three columns for
-its second offset and the emissivities. A step solves for all of them. Away from its threshold the
-Huber loss has no curvature; it is given between that and the one of a parabola that lies above
-it (Huber 1981, doi:10.1002/0471725250), as much as it takes for the step to lower the objective.
+of noise for each frame, a band of width five for the smooth signal (Whittaker's smoother), a border
+of three columns for its second offset and the two ratios. A step solves for all of them.
 
-From any start the emissivities find their valley by continuation: the reconstruction counts little
-at first, so that the smooth signals settle and with them the emission ratio, then more and more.
+Away from its threshold the Huber loss has no curvature; a share of the curvature of a parabola that
+lies above it (Huber 1981, doi:10.1002/0471725250) is added, as much as it takes for the step to
+lower the objective.
 """
 
 from dataclasses import dataclass
@@ -17,249 +16,168 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from dbthermal import planck
-from dbthermal.separation._dbvt import objective
-from dbthermal.separation._dbvt import whittaker as banded
-from dbthermal.separation._dbvt.objective import Columned, Images, Unknowns, Weights
+from dbthermal.separation._dbvt import DbvtSettings, objective
+from dbthermal.separation._dbvt.objective import Columns, Images, Unknowns
 
 # Unknowns of a step: noise of both bands, smooth signal, and the border.
 _FIRST, _SECOND, _SMOOTH, _OFFSET, _EMISSION, _REFLECTION = range(6)
 _BORDER: Final = (_OFFSET, _EMISSION, _REFLECTION)
 # Weight of the noise where none is modelled.
 _NO_NOISE: Final = 1e8
-# Damping of the emissivities, per frame: first, least and most; what a good step divides it by, and
-# a bad one multiplies it with. The same for the curvature that the Huber loss is lent.
+# Damping of the emissivities, per frame: first, range, and its factors after a step that lowers the
+# objective and one that does not. The same for the share of the parabola's curvature.
 _FIRST_DAMPING, _DAMPING, _EASIER, _HARDER = 1e-2, (1e-6, 1e12), 0.1, 10.0
-_LENT, _LESS, _MORE = (1e-4, 1.0), 0.3, 4.0
+_SHARE, _LESS, _MORE = (1e-4, 1.0), 0.3, 4.0
 
 
 @dataclass(frozen=True)
-class Search(Columned):
-    """
-    Where the minimisation stands.
+class Search(Columns):
+    """State of the minimisation, (column,) each."""
 
-    Attributes
-    ----------
-    damping : Tensor, shape (column,)
-        Of the emissivities' step, per frame.
-    lent : Tensor, shape (column,)
-        Share of the parabola's curvature that the Huber loss is lent.
-    loss : Tensor, shape (column,)
-        The objective.
-    quiet : Tensor of int, shape (column,)
-        Steps since the objective last fell by more than the tolerance.
-    """
-
-    damping: Tensor
-    lent: Tensor
-    loss: Tensor
-    quiet: Tensor
+    damping: Tensor  # of the emissivities' step, per frame
+    huber_share: Tensor  # share of the parabola's curvature in that of the Huber loss
+    loss: Tensor  # the objective
+    stalled: Tensor  # steps since the objective last fell by more than the tolerance
 
 
-@dataclass(frozen=True)
-class Limits:
-    """
-    Bounds of the steps, stages, and when to stop.
-
-    Attributes
-    ----------
-    stages : int
-        Stages of the continuation, from a small share of the reconstruction's weight to all of it;
-        with 1 all of it counts from the first step on.
-    stage_steps : int
-        Steps in each stage but the last.
-    first_share : float
-        Weight of the normalised reconstruction error in the first stage, as a fraction of
-        `reconstruction`; in the last it counts in units of the noise, not of the deviation [1].
-    steps : int
-        Most steps in the last stage.
-    tolerance : float
-        A pixel is done when no step lowers its objective by more than this fraction [1] ...
-    patience : int
-        ... so many times in a row.
-    largest_step : float
-        Most that an emissivity changes in a step [1].
-    margin : float
-        Least distance of an emissivity from 0 and 1 [1].
-    """
-
-    stages: int = 9
-    stage_steps: int = 9
-    first_share: float = 1e-6
-    steps: int = 80
-    tolerance: float = 1e-5
-    patience: int = 8
-    largest_step: float = 0.2
-    margin: float = 0.01
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that are no descent."""
-        for name in ("stages", "stage_steps", "steps", "patience"):
-            if not getattr(self, name) >= 1:
-                raise ValueError(
-                    f"Invalid {name} {getattr(self, name)} of method 'dbvt'. Must be at least 1."
-                )
-        for name in ("first_share", "tolerance", "largest_step"):
-            planck.require_positive(f"{name} of method 'dbvt'", getattr(self, name))
-        if not 0 < self.margin < 0.5:
-            raise ValueError(
-                f"Invalid margin {self.margin} of method 'dbvt'. Must lie in (0, 0.5)."
-            )
-
-
-def begin(unknowns: Unknowns, images: Images, weights: Weights) -> Search:
-    """
-    Search at a start.
-
-    Parameters
-    ----------
-    unknowns, images, weights
-        See `objective`.
-
-    Returns
-    -------
-    Search
-        With the first damping.
-    """
-    loss = _total(unknowns, images, weights)
+def begin(unknowns: Unknowns, images: Images, settings: DbvtSettings) -> Search:
+    """Search at a start."""
+    loss = objective.total(unknowns, images, settings)
     return Search(
         torch.full_like(loss, _FIRST_DAMPING),
-        torch.full_like(loss, _LENT[1]),
+        torch.full_like(loss, _SHARE[1]),
         loss,
         torch.zeros_like(loss, dtype=torch.int64),
     )
 
 
 def step(
-    unknowns: Unknowns, search: Search, images: Images, weights: Weights, limits: Limits
+    unknowns: Unknowns, search: Search, images: Images, settings: DbvtSettings
 ) -> tuple[Unknowns, Search]:
-    """
-    One step of every column, taken where it lowers the objective.
-
-    Parameters
-    ----------
-    unknowns, search, images, weights, limits
-        Where it stands, and the objective.
-
-    Returns
-    -------
-    tuple of Unknowns, Search
-        Where it stands then.
-    """
-    tried = _propose(unknowns, search, images, weights, limits)
-    loss = _total(tried, images, weights)
+    """One step of every column, taken where it lowers the objective."""
+    proposal = _propose(unknowns, search, images, settings)
+    loss = objective.total(proposal, images, settings)
     better = loss <= search.loss  # false where it is NaN
-    kept = torch.where(better, loss, search.loss)
-    still = search.loss - kept <= limits.tolerance * search.loss
+    least = torch.where(better, loss, search.loss)
+    stalled = search.loss - least <= settings.tolerance * search.loss
     damping = search.damping * torch.where(better, _EASIER, _HARDER)
-    lent = search.lent * torch.where(better, _LESS, _MORE)
-    quiet = torch.where(still, search.quiet + 1, 0)
-    following = Search(damping.clamp(*_DAMPING), lent.clamp(*_LENT), kept, quiet)
-    return tried.chosen(unknowns, better), following
-
-
-def _total(unknowns: Unknowns, images: Images, weights: Weights) -> Tensor:
-    return torch.stack(list(objective.losses(unknowns, images, weights).values())).sum(dim=0)
+    share = search.huber_share * torch.where(better, _LESS, _MORE)
+    count = torch.where(stalled, search.stalled + 1, 0)
+    after = Search(damping.clamp(*_DAMPING), share.clamp(*_SHARE), least, count)
+    return proposal.where(better, unknowns), after
 
 
 @dataclass(frozen=True)
-class _Row:
-    """Terms of the objective that depend on one linear form: its slopes, force and stiffness."""
+class _Term:
+    """Part of the objective that depends on one linear form of the unknowns, per frame."""
 
-    slopes: dict[int, Tensor | float]
-    force: Tensor
-    stiffness: Tensor
+    slopes: dict[int, Tensor | float]  # of the form, by unknown
+    gradient: Tensor  # with the form
+    curvature: Tensor
 
 
-def _rows(unknowns: Unknowns, lent: Tensor, images: Images, weights: Weights) -> list[_Row]:
-    """Half the derivatives of the objective, times the number of frames, form by form."""
+def _terms(
+    unknowns: Unknowns, share: Tensor, images: Images, settings: DbvtSettings
+) -> list[_Term]:
+    """Half the derivatives of the objective but its smoothness, times the number of frames."""
     emission, reflection = objective.ratios(unknowns.emissivity)
-    first, second, rest = objective.departures(unknowns, images)
-    rows = []
-    for band, part in enumerate((first, second)):
-        quiet = (weights.noise or _NO_NOISE) / images.sigma[band] ** 2
+    first, second, error = objective.departures(unknowns, images)
+    # p_2 = I_2 - n_2 - I2~, with I2~ of equation (1) of the objective
+    of_second: dict[int, Tensor | float] = {
+        _SECOND: -1.0,
+        _SMOOTH: -emission,
+        _OFFSET: -1.0,
+        _EMISSION: -unknowns.smooth,
+    }
+    of_first: dict[int, Tensor | float] = {_FIRST: -1.0, _SMOOTH: -1.0}
+    terms = []
+    for band, (part, slopes) in enumerate(((first, of_first), (second, of_second))):
+        variance = images.sigma[band] ** 2
+        square = (settings.noise or _NO_NOISE) / variance
         # Jensen: the square of a mean lies below a mean of squares that touches it here.
-        mean = weights.noise_mean / images.sigma[band] ** 2
+        mean = settings.noise_mean / variance
         noise = unknowns.noise[band]
-        rows.append(_Row({band: 1.0}, quiet * noise + mean * noise.mean(dim=0), quiet + mean))
-        slopes: dict[int, Tensor | float] = {_FIRST: -1.0, _SMOOTH: -1.0}
-        if band == 1:
-            slopes = _second_slopes(unknowns, emission)
-        rows.append(_far(part, slopes, images, weights, band, lent))
-    stiff = weights.reconstruction * images.share / images.sigma[1] ** 2
-    slopes = _second_slopes(unknowns, emission)
-    slopes |= {_FIRST: reflection, _SMOOTH: reflection - emission, _REFLECTION: -first}
-    return [*rows, _Row(slopes, stiff * rest, stiff)]
+        gradient = square * noise + mean * noise.mean(dim=0)
+        terms.append(_Term({band: 1.0}, gradient, square + mean))
+        terms.append(_huber_term(part, slopes, images, settings, band, share))
+    # r = p_2 - k_2 p_1
+    weight = settings.reconstruction * images.share / images.sigma[1] ** 2
+    of_error = of_second | {
+        _FIRST: reflection,
+        _SMOOTH: reflection - emission,
+        _REFLECTION: -first,
+    }
+    return [*terms, _Term(of_error, weight * error, weight)]
 
 
-def _second_slopes(unknowns: Unknowns, emission: Tensor) -> dict[int, Tensor | float]:
-    """Slopes of the second band's departure from its smooth signal."""
-    return {_SECOND: -1.0, _SMOOTH: -emission, _OFFSET: -1.0, _EMISSION: -unknowns.smooth}
-
-
-def _far(
+def _huber_term(
     part: Tensor,
     slopes: dict[int, Tensor | float],
     images: Images,
-    weights: Weights,
+    settings: DbvtSettings,
     band: int,
-    lent: Tensor,
-) -> _Row:
-    """Huber loss of one band: the parabola that touches it, beyond the threshold only partly."""
-    threshold = weights.huber_threshold * images.sigma[band]
+    share: Tensor,
+) -> _Term:
+    """Huber loss of one band; beyond the threshold a share of the touching parabola's curvature."""
+    threshold = settings.huber_threshold * images.sigma[band]
     size = part.abs()
-    parabola = 0.5 * weights.huber / images.deviation[band] / torch.maximum(size, threshold)
-    stiffness = torch.where(size <= threshold, parabola, lent * parabola)
-    return _Row(slopes, parabola * part, stiffness)
+    parabola = 0.5 * settings.huber / images.deviation[band] / torch.maximum(size, threshold)
+    curvature = torch.where(size <= threshold, parabola, share * parabola)
+    return _Term(slopes, parabola * part, curvature)
 
 
 class _System:
-    """Newton's equations of a step, the noise of each frame eliminated."""
+    r"""
+    Newton's equations of a step, the noise of each frame eliminated.
 
-    def __init__(self, rows: list[_Row], like: Tensor) -> None:
-        self._like, self._rows = like, rows
-        a, b, c = (
-            self._curvature(*pair) for pair in ((_FIRST, _FIRST), (_FIRST, _SECOND), (_SECOND,) * 2)
-        )
+    With N the 2x2 block of a frame's noise, c its coupling to another unknown and f the forces
+    (negative gradients), :math:`H - c^T N^{-1} c` and :math:`f - c^T N^{-1} f_n` are left.
+    """
+
+    def __init__(self, terms: list[_Term], like: Tensor) -> None:
+        self._like, self._terms = like, terms
+        a = self._curvature(_FIRST, _FIRST)
+        b = self._curvature(_FIRST, _SECOND)
+        c = self._curvature(_SECOND, _SECOND)
         self._block = (a, b, c, a * c - b * b)
         self._coupling = {
             name: (self._curvature(_FIRST, name), self._curvature(_SECOND, name))
             for name in (_SMOOTH, *_BORDER)
         }
-        self._pull = self.noise(self._force(_FIRST), self._force(_SECOND))
-        self._response = {name: self.noise(*pair) for name, pair in self._coupling.items()}
+        self._pull = self._solve(self._force(_FIRST), self._force(_SECOND))
+        self._response = {name: self._solve(*pair) for name, pair in self._coupling.items()}
 
     def _curvature(self, one: int, other: int) -> Tensor:
         total = torch.zeros_like(self._like)
-        for row in self._rows:
-            if one in row.slopes and other in row.slopes:
-                total = total + row.stiffness * row.slopes[one] * row.slopes[other]
+        for term in self._terms:
+            if one in term.slopes and other in term.slopes:
+                total = total + term.curvature * term.slopes[one] * term.slopes[other]
         return total
 
     def _force(self, name: int) -> Tensor:
         total = torch.zeros_like(self._like)
-        for row in self._rows:
-            if name in row.slopes:
-                total = total - row.force * row.slopes[name]
+        for term in self._terms:
+            if name in term.slopes:
+                total = total - term.gradient * term.slopes[name]
         return total
 
-    def noise(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """Solve the frame's own 2x2 block."""
+    def _solve(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+        """Solve the 2x2 block of each frame's noise."""
         a, b, c, determinant = self._block
         return (c * first - b * second) / determinant, (a * second - b * first) / determinant
 
-    def reduced(self, one: int, other: int) -> Tensor:
-        """Curvature with the noise following."""
+    def curvature(self, one: int, other: int) -> Tensor:
+        """Curvature (time, column) with the noise eliminated."""
         (u, v), (f, s) = self._coupling[one], self._response[other]
         return self._curvature(one, other) - u * f - v * s
 
     def force(self, name: int) -> Tensor:
-        """Force with the noise following."""
+        """Force (time, column) with the noise eliminated."""
         u, v = self._coupling[name]
         return self._force(name) - u * self._pull[0] - v * self._pull[1]
 
-    def following(self, steps: dict[int, Tensor]) -> Tensor:
-        """Step of the noise, (2, time, column), given those of the others."""
+    def noise_step(self, steps: dict[int, Tensor]) -> Tensor:
+        """Step of the noise (2, time, column) that follows from those of the others."""
         parts = [
             self._pull[band] - sum(self._response[name][band] * by for name, by in steps.items())
             for band in (0, 1)
@@ -268,68 +186,121 @@ class _System:
 
 
 def _propose(
-    unknowns: Unknowns, search: Search, images: Images, weights: Weights, limits: Limits
+    unknowns: Unknowns, search: Search, images: Images, settings: DbvtSettings
 ) -> Unknowns:
-    """Solve for the step of all unknowns."""
+    """Unknowns after a Newton step: noise, then smooth signal, then border are eliminated."""
     emission, reflection = objective.ratios(unknowns.emissivity)
     smooth = unknowns.smooth
-    system = _System(_rows(unknowns, search.lent, images, weights), smooth)
-    stiff = weights.smoothness / (weights.curvature * images.interval**2) ** 2
-    bend, slack = banded.bending(smooth)
-    sides = [system.reduced(_SMOOTH, name) for name in _BORDER]
+    system = _System(_terms(unknowns, search.huber_share, images, settings), smooth)
+    # The smoothness loss is stiff (1 + k_1^2) |D s|^2 / 2, in the smooth signal s and in k_1.
+    stiff = settings.smoothness / (settings.curvature * images.interval**2) ** 2
+    bend, square = bending(smooth)
+    sides = [system.curvature(_SMOOTH, name) for name in _BORDER]
     sides[1] = sides[1] + stiff * emission * bend
-    right = system.force(_SMOOTH) - stiff * (1 + emission**2) * bend
-    solved = banded.solve(
-        system.reduced(_SMOOTH, _SMOOTH),
+    force = system.force(_SMOOTH) - stiff * (1 + emission**2) * bend
+    # (diag(h) + lambda D^T D) [s, S] = [force, sides]
+    solved = whittaker(
+        system.curvature(_SMOOTH, _SMOOTH),
         stiff * (1 + emission**2),
-        torch.stack([right, *sides], dim=1),
+        torch.stack([force, *sides], dim=1),
     )
+    # Schur complement of the border (offset, k_1, k_2): B - sides^T S, f - sides^T s
     forces = torch.stack([system.force(name).sum(dim=0) for name in _BORDER])
     forces = forces - torch.einsum("btc,tc->bc", torch.stack(sides), solved[:, 0])
-    forces[1] = forces[1] - stiff * emission * slack
-    matrix = torch.stack(
-        [torch.stack([system.reduced(a, b).sum(dim=0) for b in _BORDER]) for a in _BORDER]
+    forces[1] = forces[1] - stiff * emission * square
+    border = torch.stack(
+        [torch.stack([system.curvature(a, b).sum(dim=0) for b in _BORDER]) for a in _BORDER]
     )
-    matrix = matrix - torch.einsum("atc,tbc->abc", torch.stack(sides), solved[:, 1:])
-    matrix[1, 1] = matrix[1, 1] + stiff * slack
-    emissivity = _emissivity(unknowns.emissivity, matrix, forces, search, smooth.shape[0], limits)
+    border = border - torch.einsum("atc,tbc->abc", torch.stack(sides), solved[:, 1:])
+    border[1, 1] = border[1, 1] + stiff * square
+    damping = search.damping * smooth.shape[0]
+    emissivity = _emissivity(unknowns.emissivity, border, forces, damping, settings)
+    # Back substitution: the ratios as they became, then the offset, the smooth signal, the noise.
     new_emission, new_reflection = objective.ratios(emissivity)
     changes = torch.stack([new_emission - emission, new_reflection - reflection])
-    offset = (forces[0] - (matrix[0, 1:] * changes).sum(dim=0)) / matrix[0, 0]
-    border = torch.stack([offset, *changes])
-    moved = solved[:, 0] - (solved[:, 1:] * border).sum(dim=1)
-    steps = dict(zip(_BORDER, border, strict=True)) | {_SMOOTH: moved}
-    # The offset of the line between the smooth signals, back at the first frame.
+    offset = (forces[0] - (border[0, 1:] * changes).sum(dim=0)) / border[0, 0]
+    moves = torch.stack([offset, *changes])
+    smooth_step = solved[:, 0] - (solved[:, 1:] * moves).sum(dim=1)
+    steps = dict(zip(_BORDER, moves, strict=True)) | {_SMOOTH: smooth_step}
+    # The border's offset is that of the line between the smooth signals: back to the first frame.
     line = unknowns.offset - emission * smooth[0] + offset
     return Unknowns(
-        smooth + moved,
-        line + new_emission * (smooth + moved)[0],
+        smooth + smooth_step,
+        line + new_emission * (smooth + smooth_step)[0],
         emissivity,
-        unknowns.noise + system.following(steps),
+        unknowns.noise + system.noise_step(steps),
     )
 
 
 def _emissivity(
-    emissivity: Tensor,
-    matrix: Tensor,
-    forces: Tensor,
-    search: Search,
-    frames: int,
-    limits: Limits,
+    emissivity: Tensor, border: Tensor, forces: Tensor, damping: Tensor, settings: DbvtSettings
 ) -> Tensor:
-    """New emissivities: damped, of limited change, inside (0, 1)."""
-    # The offset follows; what is left is a system in the two ratios, then in the emissivities.
-    pair = matrix[1:, 1:] - matrix[1:, :1] * matrix[:1, 1:] / matrix[0, 0]
-    force = forces[1:] - matrix[1:, 0] * forces[0] / matrix[0, 0]
+    """New emissivities (2, column): damped, of limited change, inside (0, 1)."""
+    # The offset is eliminated: a system A in the two ratios.
+    pair = border[1:, 1:] - border[1:, :1] * border[:1, 1:] / border[0, 0]
+    force = forces[1:] - border[1:, 0] * forces[0] / border[0, 0]
+    # With J = d(k_1, k_2) / d(e_1, e_2): (J^T A J + damping) de = J^T f
     first, second = emissivity
     zero = torch.zeros_like(first)
-    emission = torch.stack([-second / first**2, 1 / first])
-    reflection = torch.stack([(1 - second) / (1 - first) ** 2, zero - 1 / (1 - first)])
-    slopes = torch.stack([emission, reflection])
-    square = torch.einsum("aic,abc,bjc->ijc", slopes, pair, slopes)
-    push = torch.einsum("aic,ac->ic", slopes, force)
-    damping = search.damping * frames
+    of_emission = torch.stack([-second / first**2, 1 / first])
+    of_reflection = torch.stack([(1 - second) / (1 - first) ** 2, zero - 1 / (1 - first)])
+    jacobian = torch.stack([of_emission, of_reflection])
+    square = torch.einsum("aic,abc,bjc->ijc", jacobian, pair, jacobian)
+    push = torch.einsum("aic,ac->ic", jacobian, force)
     a, b, c = square[0, 0] + damping, square[0, 1], square[1, 1] + damping
-    step = torch.stack([c * push[0] - b * push[1], a * push[1] - b * push[0]]) / (a * c - b * b)
-    step = step * (limits.largest_step / step.abs().amax(dim=0)).clamp(max=1.0)
-    return (emissivity + step).clamp(limits.margin, 1.0 - limits.margin)
+    change = torch.stack([c * push[0] - b * push[1], a * push[1] - b * push[0]]) / (a * c - b * b)
+    change = change * (settings.largest_step / change.abs().amax(dim=0)).clamp(max=1.0)
+    return (emissivity + change).clamp(settings.margin, 1.0 - settings.margin)
+
+
+def bending(signal: Tensor) -> tuple[Tensor, Tensor]:
+    r""":math:`D^T D x` (time, column) and :math:`|D x|^2` (column,), D the second differences."""
+    second = torch.diff(signal, n=2, dim=0)
+    result = torch.zeros_like(signal)
+    result[2:] += second
+    result[1:-1] -= 2 * second
+    result[:-2] += second
+    return result, (second**2).sum(dim=0)
+
+
+def whittaker(diagonal: Tensor, stiffness: Tensor, right: Tensor) -> Tensor:
+    r"""
+    Solutions (time, side, column) of Whittaker's smoother for many pixels at once.
+
+    .. math:: (\mathrm{diag}(d) + \lambda D^T D)\, x = b
+
+    with d (time, column) positive, :math:`\lambda` (column,), b (time, side, column) of at least
+    four times (Whittaker 1923, doi:10.1017/S0013091500077853): of bandwidth five, positive
+    definite, solved by the factors :math:`L\,\mathrm{diag}(p)\,L^T` with a recursion over time.
+    """
+    frames = diagonal.shape[0]
+    main = (diagonal + _with_ends(frames, (1.0, 5.0), 6.0, diagonal) * stiffness).unbind()
+    near = (_with_ends(frames - 1, (-2.0,), -4.0, diagonal) * stiffness).unbind()
+    solved, pivots = list(right.unbind()), [main[0]]
+    below, further = [torch.zeros_like(stiffness)], [torch.zeros_like(stiffness)]
+    for t in range(1, frames):
+        # Rows t - 1 and t - 2 of the factor; the first rows have no further neighbour.
+        far = stiffness / pivots[t - 2] if t > 1 else further[0]
+        raw = near[t - 1] - far * pivots[t - 2] * below[t - 1] if t > 1 else near[0]
+        close = raw / pivots[t - 1]
+        pivot = main[t] - close * raw
+        solved[t] = solved[t] - close * solved[t - 1]
+        if t > 1:
+            pivot = pivot - far * stiffness
+            solved[t] = solved[t] - far * solved[t - 2]
+        pivots.append(pivot)
+        below.append(close)
+        further.append(far)
+    solved = [part / pivot for part, pivot in zip(solved, pivots, strict=True)]
+    solved[-2] = solved[-2] - below[-1] * solved[-1]
+    for t in range(frames - 3, -1, -1):
+        solved[t] = solved[t] - below[t + 1] * solved[t + 1] - further[t + 2] * solved[t + 2]
+    return torch.stack(solved)
+
+
+def _with_ends(size: int, ends: tuple[float, ...], middle: float, like: Tensor) -> Tensor:
+    """Column of one number but for its two ends."""
+    column = torch.full((size, 1), middle, dtype=like.dtype, device=like.device)
+    for place, value in enumerate(ends):
+        column[place] = column[-1 - place] = value
+    return column

@@ -1,80 +1,71 @@
-"""Pictures of a capture in which borders show: means over time, and what of them is reflected."""
+"""Feature maps of a capture that show borders of materials, and cells cut along their edges.
 
+Maps are the means of the bands' signals over time and their reflected part. Waterpixels: a
+watershed from a regular grid of markers floods the edge strength, which is a statistic in standard
+deviations rather than a gradient in some unit; a smooth gradient is a plateau to it and makes no
+border. The watershed is scikit-image's, imported when it is used.
+"""
+
+import importlib
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy import ndimage
 from scipy.special import ndtri
 
 from dbthermal import response as responses
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Labels = npt.NDArray[np.intp]
 
+# Rows of a capture that are read at a time.
 _ROWS: Final = 64
-"""Rows of a capture that are read at a time."""
-
+# Normal standard deviation over the median absolute deviation.
 _MAD: Final = 1.0 / float(ndtri(0.75))
+# Standard deviation of the Gaussian window of the edge statistic, and distance of the windows'
+# centres from the pixel, to both sides [pixel].
+_BLUR: Final = 1.0
+_REACH: Final = 1
+# Edge strength [standard deviation] that a path longer by one pixel is worth.
+_COMPACTNESS: Final = 0.5
+# Share of the largest weight below which a window holds nothing [1].
+_EMPTY: Final = 1e-3
 
 
-def means(
+def mean_signals(
     corrected: xr.Dataset, response: xr.Dataset, bands: list[int], noise: Array
 ) -> tuple[Array, Array]:
     """
-    Linearised signals, mean over the frames, and their variances.
+    Mean linearised signals (band, y, x) [K] of the bands, reference first, and variances [K^2].
 
-    Where neighbours differ by more than the noise explains, as by a fixed pattern that is left,
-    that is added to the variance.
-
-    Parameters
-    ----------
-    corrected, response : Dataset
-        As of `materials`.
-    bands : list of int
-        Positions of the bands, the reference first.
-    noise : ndarray, shape (band,)
-        Their noise [K].
-
-    Returns
-    -------
-    tuple of ndarray, shape (band, y, x)
-        Means [K], NaN where there is no sample, and variances [K2].
+    NaN without a sample. Where neighbours differ by more than the noise (band) [K] explains, as by
+    a residual fixed pattern, that is added to the variance.
     """
     counts = corrected["counts"]
     shape = (len(bands), counts.sizes["y"], counts.sizes["x"])
-    found, frames = np.empty(shape), np.empty(shape)
+    means, frames = np.empty(shape), np.empty(shape)
     for index, band in enumerate(bands):
         curve = responses.curve(response, str(counts["band"].values[band]))
         for top in range(0, shape[1], _ROWS):
             rows = slice(top, top + _ROWS)
             part = counts.isel(band=band, y=rows).astype(np.float64)
-            found[index, rows] = curve.linearise(part.mean("time").values)
+            means[index, rows] = curve.linearise(part.mean("time").values)
             frames[index, rows] = part.count("time").values
-    share = np.divide(1.0, frames, out=np.full(shape, np.inf), where=frames > 0)
-    variances = noise[:, np.newaxis, np.newaxis] ** 2 * share
+    # var(mean) = s_m^2 / N, and var(pattern) = var(z_m - z_r from pixel to pixel) - both of these
+    inverse = np.divide(1.0, frames, out=np.full(shape, np.inf), where=frames > 0)
+    variances = noise[:, np.newaxis, np.newaxis] ** 2 * inverse
     for index in range(1, len(bands)):
-        known = float(np.median(variances[0] + variances[index]))
-        pattern = _scatter(found[index] - found[0]) ** 2 - known
+        of_noise = float(np.median(variances[0] + variances[index]))
+        pattern = _pixel_scatter(means[index] - means[0]) ** 2 - of_noise
         variances[index] += max(pattern, 0.0)
-    return found, variances
+    return means, variances
 
 
-def change(corrected: xr.Dataset, response: xr.Dataset, band: int) -> Array:
-    """
-    Mean linearised signal of the last third of the frames, less that of the first.
-
-    Parameters
-    ----------
-    corrected, response : Dataset
-        As of `materials`.
-    band : int
-        Position of the band.
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        The object's change as that band sees it [K].
-    """
+def signal_change(corrected: xr.Dataset, response: xr.Dataset, band: int) -> Array:
+    """Mean signal (y, x) [K] of a band in the last third of the frames, less that in the first."""
     counts = corrected["counts"].isel(band=band)
     curve = responses.curve(response, str(corrected["band"].values[band]))
     third = max(counts.sizes["time"] // 3, 1)
@@ -85,26 +76,14 @@ def change(corrected: xr.Dataset, response: xr.Dataset, band: int) -> Array:
     return np.asarray((last - first) / curve.reference_slope)
 
 
-def reflected(result: xr.Dataset, bands: list[int]) -> tuple[Array, Array]:
+def reflected_difference(result: xr.Dataset, bands: list[int]) -> tuple[Array, Array]:
     r"""
-    Reflection in the differences of the bands' mean signals, and its variance.
+    Reflection in the differences of the bands' mean signals, (band - 1, y, x) [K], and variance.
 
     .. math:: (k_m - 1) (1 - e_{ref}) (\bar y - \mathrm{median}\, y)
 
-    The median is the background at rest, which makes no edges. 0 where there is no background:
+    The median is the background at rest, which makes no edges. 0 without a background estimate:
     that is where nothing moved.
-
-    Parameters
-    ----------
-    result : Dataset
-        As of `materials`.
-    bands : list of int
-        Positions of the bands, the reference first.
-
-    Returns
-    -------
-    tuple of ndarray, shape (band - 1, y, x)
-        Reflection [K] and variance [K2].
     """
     share = (result["reflection_ratio"].values[bands[1:]] - 1.0) * (
         1.0 - result["emissivity"].values[bands[0]]
@@ -116,14 +95,71 @@ def reflected(result: xr.Dataset, bands: list[int]) -> tuple[Array, Array]:
         background = result["background_temperature"].isel(y=rows).values
         excess[rows] = background.mean(axis=0) - np.median(background, axis=0)
         deviation[rows] = result["background_temperature_std"].isel(y=rows).values.mean(axis=0)
-    # Variance of a mean less a median of normal noise, times the number of samples.
+    # var(mean - median) = (pi / 2 - 1) s^2 / N of normal noise
     variance = (np.pi / 2 - 1) * (share * deviation) ** 2 / frames
     known = np.isfinite(share * excess * variance)
     return np.where(known, share * excess, 0.0), np.where(known, variance, 0.0)
 
 
-def _scatter(picture: Array) -> float:
+def _pixel_scatter(image: Array) -> float:
     """Robust standard deviation from pixel to pixel [K], a fixed pattern's included; 0 if none."""
-    bend = (picture[2:] - 2.0 * picture[1:-1] + picture[:-2]) / np.sqrt(6.0)
+    # var(a - 2 b + c) = 6 s^2
+    bend = (image[2:] - 2.0 * image[1:-1] + image[:-2]) / np.sqrt(6.0)
     known = np.abs(bend[np.isfinite(bend)])
     return _MAD * float(np.median(known)) if known.size else 0.0
+
+
+def edges(maps: Array, variances: Array) -> Array:
+    r"""
+    Strength (y, x) of an edge through each pixel of maps (feature, y, x) [standard deviation].
+
+    Weighted means before and after a pixel are compared, along y and along x; the larger of
+
+    .. math:: t^2 = \sum_f \frac{(m_+ - m_-)^2}{\mathrm{var}(m_+) + \mathrm{var}(m_-)}
+
+    counts, 0 where all features are NaN.
+    """
+    known = np.isfinite(maps) & np.isfinite(variances) & (variances > 0)
+    weight = np.divide(1.0, variances, out=np.zeros_like(maps), where=known)
+    window = np.array([0.0, _BLUR, _BLUR])
+    # m = sum g w f / sum g w,  var(m) = sum g^2 w / (sum g w)^2
+    total = ndimage.gaussian_filter(weight, window)
+    # The square of a Gaussian is a narrower Gaussian.
+    squares = ndimage.gaussian_filter(weight, window / np.sqrt(2)) / (4 * np.pi * _BLUR**2)
+    weighted = ndimage.gaussian_filter(weight * np.where(known, maps, 0.0), window)
+    valid = total > _EMPTY * weight.max(axis=(1, 2), keepdims=True)
+    mean = np.divide(weighted, total, out=np.zeros_like(total), where=valid)
+    variance = np.divide(squares, total**2, out=np.full_like(total, np.inf), where=valid)
+    return np.asarray(np.sqrt(np.maximum(*(_contrast(mean, variance, axis) for axis in (1, 2)))))
+
+
+def _contrast(mean: Array, variance: Array, axis: int) -> Array:
+    """Squared difference of the means on both sides along an axis, over its variance."""
+    size = mean.shape[axis]
+    before, after = (np.clip(np.arange(size) + s, 0, size - 1) for s in (-_REACH, _REACH))
+    difference = mean.take(after, axis) - mean.take(before, axis)
+    total = variance.take(after, axis) + variance.take(before, axis)
+    return np.asarray(np.sum(difference**2 / total, axis=0))
+
+
+def superpixels(strength: Array, valid: Mask, spacing: int) -> Labels:
+    """
+    Connected cells of about `spacing` by `spacing` pixels, numbered from 1; 0 where not valid.
+
+    Waterpixels of the edge strength: Machairas et al. (2015), IEEE Trans. Image Process. 24, 3707,
+    doi:10.1109/TIP.2015.2451011.
+    """
+    segmentation = importlib.import_module("skimage.segmentation")
+    rows, columns = (np.arange(min(spacing // 2, n - 1), n, spacing) for n in strength.shape)
+    markers = np.zeros(strength.shape, dtype=np.intp)
+    markers[np.ix_(rows, columns)] = 1 + np.arange(rows.size * columns.size).reshape(rows.size, -1)
+    flooded = segmentation.watershed(
+        strength, markers * valid, mask=valid, compactness=_COMPACTNESS
+    )
+    return connected(np.where(valid, 1 + flooded, 0))
+
+
+def connected(values: Labels) -> Labels:
+    """Numbers (y, x) from 1 of the parts of equal value connected by sides; 0 where that is 0."""
+    measure = importlib.import_module("skimage.measure")
+    return np.asarray(measure.label(values, connectivity=1), dtype=np.intp)

@@ -1,23 +1,22 @@
-r"""Pixels of one material, found from a first separation, to pool a second one over.
+r"""Materials of a capture, found from a first separation, to pool a second one over.
 
 The reflection ratio :math:`k_m = (1-e_m)/(1-e_{ref})` belongs to the material alone, but of one
-pixel it is known to a few percent only. So the pictures propose and the statistics decide:
+pixel it is known to a few percent only. So the maps propose and the statistics decide:
 
-1. `superpixels` cuts the image into cells, along the edges of the ratio and of the difference of
+1. `feature_maps` cuts the image into cells, along the edges of the ratio and of the difference of
    the bands' mean signals. A pattern of the object's temperature shows in that difference, which is
    0 for a gray body, far less than a border of emissivity.
 2. A cell whose ratios scatter more than their deviations allow lies across a border: it is cut
    into smaller ones.
 3. Neighbours whose pooled ratios and emissivities agree are joined, the most alike first
-   (`regions`), as long as a difference that matters would be seen.
-4. A cell whose own ratio says too little, as where nothing moved, joins a neighbour towards which
-   the pictures have no step.
+   (`region_merging`), as long as a difference that matters would be seen.
+4. A cell whose own ratio is too uncertain, as where nothing moved, joins a neighbour towards which
+   the maps have no step.
 
 A material is connected: two bodies that do not touch are never pooled, however alike. Wrong
-pooling is a bias that no deviation tells of, while a body in two parts costs a little noise.
+pooling is a bias that no deviation covers, while a body in two parts costs a little noise.
 """
 
-import importlib
 from typing import Final
 
 import numpy as np
@@ -27,8 +26,7 @@ from scipy.stats import chi2
 
 from dbthermal import response as responses
 from dbthermal import schema
-from dbthermal.separation._pooling import feature_maps as pictures
-from dbthermal.separation._pooling import region_merging as regions
+from dbthermal.separation._pooling import feature_maps, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
 
 Array = npt.NDArray[np.float64]
@@ -37,43 +35,34 @@ Mask = npt.NDArray[np.bool_]
 NONE: Final = -1
 """Label of pixels that belong to no material: they are pooled with nobody."""
 
+# Sizes of the cells, and of those that a mixed cell is cut into [pixel].
 _SPACINGS: Final = (8, 4, 2)
-"""Sizes of the cells, and of those that a mixed cell is cut into [pixel]."""
-
+# Probability that a step is seen where there is none [1]. A link that is refused in error is made
+# elsewhere; one that is made in error bleeds: this is no small number.
 _STEP_RATE: Final = 0.1
-"""Probability that a step is seen where there is none [1]. A link that is refused in error is made
-elsewhere; one that is made in error bleeds: this is no small number."""
-
-_MISFIT_RATE: Final = 0.01
-"""Probability that two cells without a border are said to hold one [1]."""
-
-_LEAST: Final = 0.05
-"""Step at a border, relative to the change of the reference band's signal, that must be visible
-before its absence tells anything [1]."""
-
+# Probability that two cells without a border are said to hold one [1].
+_BORDER_RATE: Final = 0.01
+# Step at a border, relative to the change of the reference band's signal, that must be visible
+# before its absence counts [1].
+_LEAST_STEP: Final = 0.05
+# Powers of x and y in the smooth function that a step is distinguished from.
 _POWERS: Final = tuple((i, j) for i in range(4) for j in range(4 - i))
-"""Powers of x and y in the smooth function that a step is told from."""
-
+# Standard deviation of the ratio, relative to it, that pooling does not reduce [1]: the parts of
+# the object's and the background's curves outside the separator's model.
 _TOLERANCE: Final = 0.0025
-"""Standard deviation of the ratio, relative to it, that pooling does not take away [1]: the parts
-of the object's and the background's curves that the separator's model leaves."""
-
+# Standard deviation of a pixel's ratio, relative to it, beyond which it is left out [1]: neither
+# its own distribution nor that of the emissivity is a normal one there.
 _VAGUE: Final = 0.3
-"""Standard deviation of a pixel's ratio, relative to it, beyond which it says nothing [1]: neither
-its own distribution nor that of the emissivity is a normal one there."""
-
+# Fewest pixels of a material: remainders at a border, which stand out by their errors, have fewer.
+_SMALLEST: Final = 16
 _NEEDED: Final = tuple(
     name + ending
     for name in ("reflection_ratio", "emissivity", "background_temperature")
     for ending in ("", "_std")
 )
-
-_UNUSABLE: Final = ("invalid_samples", "constant_signal", "dead_pixel")
-"""Flags of pixels that have no signal."""
-
-_SMALLEST: Final = 16
-"""Fewest pixels of a material: what is left over at a border, and stands out by its errors, has
-fewer."""
+_UNUSABLE: Final = (
+    schema.Status.INVALID_SAMPLES | schema.Status.CONSTANT_SIGNAL | schema.Status.DEAD_PIXEL
+)
 
 
 def materials(
@@ -92,13 +81,13 @@ def materials(
     result : Dataset
         From `solve` without labels, of the same capture, with `reflection_ratio` and `emissivity`
         (band, y, x) [1], `background_temperature` (time, y, x) [K], their deviations, `noise` and
-        `status`. Pixels with a ratio that is NaN are told by the picture alone.
+        `status`. Pixels with a ratio of NaN are labelled by the maps alone.
     corrected : Dataset
         The capture: `counts` (band, time, y, x) [count]. May be lazy; only means over time are
         kept. Frames that are NaN are left out, and of a capture with a `segment` all but the
         longest.
     response : Dataset
-        As given to `solve`.
+        As in `solve`.
     error_rate : float
         Probability, in the whole image, that cells of one material are cut or held apart by
         chance [1]. It is shared out among the tests.
@@ -109,14 +98,14 @@ def materials(
     Returns
     -------
     DataArray
-        `material` (y, x), int32: connected regions from 0, the largest first; `NONE` (-1) for
-        pixels without a signal, for regions in which no pixel has a ratio and that no neighbour
-        takes in, and for regions of less than 16 pixels.
+        `material` (y, x), int32: connected regions from 0, the largest first; -1 for pixels without
+        a signal, for regions in which no pixel has a ratio and that no neighbour takes in, and for
+        regions of less than 16 pixels.
 
     Raises
     ------
     ImportError
-        If scikit-image is not installed, see `superpixels`.
+        If scikit-image is not installed (extra "materials").
     ValueError
         If a rate is not in (0, 1), a variable is missing, or bands or sizes differ.
 
@@ -128,32 +117,48 @@ def materials(
     deviations of the ratios of several bands are taken as independent.
 
     Borders are found within 2 pixels, single pixels apart; at one, a few pixels may belong to none.
-    Where nothing moved and the object hardly changed, no picture shows a border, and pixels belong
+    Where nothing moved and the object hardly changed, no map shows a border, and pixels belong
     to none too.
     A ratio that is withheld by its own value, as for being close to 1, biases the pooled one.
+
+    Examples
+    --------
+    A plate of glass before people who walk by:
+
+    >>> import numpy as np, xarray as xr
+    >>> from dbthermal import separation, simulation
+    >>> rig, rng, time = simulation.Rig(), np.random.default_rng(0), np.arange(100) / 10.0
+    >>> glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    >>> scene = simulation.walkers(time, (24, 24), glass, rng)
+    >>> capture, response = simulation.observe(scene, rig.response(), rng), rig.response()
+    >>> alone = separation.solve(capture, response)
+    >>> labels = separation.materials(alone, capture, response)
+    >>> pooled = separation.solve(capture, response, pool=labels)
+    >>> labels.dims, int(labels.max())
+    (('y', 'x'), 0)
     """
     _check(result, corrected, error_rate, resolution)
     frames = _longest_segment(corrected)
     corrected, result = corrected.isel(time=frames), result.isel(time=frames)
     bands, noise = _order(result, response)
-    means, variances = pictures.means(corrected, response, bands, noise)
-    change = pictures.change(corrected, response, bands[0])
-    reflected, of_reflected = pictures.reflected(result, bands)
-    of_ratio, features = _features(result, bands)
-    bits = sum(schema.FLAGS[name] for name in _UNUSABLE)
-    valid = np.all(np.isfinite(means), axis=0) & (result["status"].values & bits == 0)
-    cells = _cells(of_ratio, means, variances, valid, error_rate)
-    found = Regions(cells, features, error_rate)
-    pairs = regions.neighbours(cells)
-    found.join_alike(pairs, resolution)
-    roots = found.roots()[pairs]
-    apart = (roots[:, 0] != roots[:, 1]) & (found.compare(*roots.T)[1] > resolution)
+    means, variances = feature_maps.mean_signals(corrected, response, bands, noise)
+    change = feature_maps.signal_change(corrected, response, bands[0])
+    reflected, reflected_variance = feature_maps.reflected_difference(result, bands)
+    ratios, features = _features(result, bands)
+    valid = np.all(np.isfinite(means), axis=0) & (result["status"].values & int(_UNUSABLE) == 0)
+    cells = _cells(ratios, means, variances, valid, error_rate)
+    regions = Regions(cells, features, error_rate)
+    pairs = region_merging.neighbours(cells)
+    regions.join_alike(pairs, resolution)
+    # Pairs whose ratios could not show a difference are compared by what they emit.
+    roots = regions.roots()[pairs]
+    vague = (roots[:, 0] != roots[:, 1]) & (regions.compare(*roots.T)[1] > resolution)
     emitted = means[1:] - means[0] - reflected
-    spread = variances[1:] + variances[0] + of_reflected
-    linked, steps = _links(cells, pairs[apart], emitted, spread, change)
-    found.join_in_order(linked, steps)
-    found.join_alike(pairs, resolution)
-    return _labelled(cells, found, result)
+    variance = variances[1:] + variances[0] + reflected_variance
+    linked, steps = _links(cells, pairs[vague], emitted, variance, change)
+    regions.join_in_order(linked, steps)
+    regions.join_alike(pairs, resolution)
+    return _labelled(cells, regions, result)
 
 
 def _check(result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolution: float) -> None:
@@ -198,7 +203,7 @@ def _order(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
 
 
 def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:
-    """Ratios of all bands but the reference; and the reference's emissivity with them."""
+    """Ratios of all bands but the reference; and these with the reference's emissivity."""
     ratio, ratio_std, emissivity, emissivity_std = (
         result[name].values.astype(np.float64)
         for name in ("reflection_ratio", "reflection_ratio_std", "emissivity", "emissivity_std")
@@ -207,31 +212,31 @@ def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]
     vague = ~(ratio_std[others] < _VAGUE * np.abs(ratio[others]))
     ratio[others] = np.where(vague, np.nan, ratio[others])
     emissivity = np.where(np.any(vague, axis=0), np.nan, emissivity)
-    none = np.zeros(len(others), dtype=bool)
-    alone = Features(ratio[others], ratio_std[others] ** 2, none, np.full(len(others), _TOLERANCE))
+    common = np.zeros(len(others), dtype=bool)
+    tolerance = np.full(len(others), _TOLERANCE)
+    ratios = Features(ratio[others], ratio_std[others] ** 2, common, tolerance)
     both = Features(
-        np.concatenate([alone.values, emissivity[reference]]),
-        np.concatenate([alone.variances, emissivity_std[reference] ** 2]),
-        np.append(none, True),
-        np.append(alone.tolerance, 0.0),
+        np.concatenate([ratios.values, emissivity[reference]]),
+        np.concatenate([ratios.variances, emissivity_std[reference] ** 2]),
+        np.append(common, True),
+        np.append(tolerance, 0.0),
     )
-    return alone, both
+    return ratios, both
 
 
 def _cells(
-    of_ratio: Features, means: Array, variances: Array, valid: Mask, error_rate: float
+    ratios: Features, means: Array, variances: Array, valid: Mask, error_rate: float
 ) -> Labels:
-    """Cells of which none is seen to lie across a border, or that are of the smallest size."""
-    superpixels = importlib.import_module("dbthermal.separation._pooling.superpixels")
-    strength = superpixels.edges(
-        np.concatenate([of_ratio.values, means[1:] - means[0]]),
-        np.concatenate([of_ratio.variances, variances[1:] + variances[0]]),
+    """Cells (y, x) that are not seen to lie across a border, or are of the smallest size."""
+    strength = feature_maps.edges(
+        np.concatenate([ratios.values, means[1:] - means[0]]),
+        np.concatenate([ratios.variances, variances[1:] + variances[0]]),
     )
-    cells: Labels = superpixels.cells(strength, valid, _SPACINGS[0])
+    cells = feature_maps.superpixels(strength, valid, _SPACINGS[0])
     for spacing in _SPACINGS[1:]:
-        mixed = regions.mixed(cells, of_ratio, error_rate)[cells]
-        finer = cells.max() + superpixels.cells(strength, valid, spacing)
-        cells = superpixels.connected(np.where(mixed, finer, cells))
+        mixed = region_merging.mixed(cells, ratios, error_rate)[cells]
+        finer = cells.max() + feature_maps.superpixels(strength, valid, spacing)
+        cells = feature_maps.connected(np.where(mixed, finer, cells))
     return cells
 
 
@@ -239,26 +244,22 @@ def _links(
     cells: Labels, pairs: Labels, emitted: Array, variances: Array, change: Array
 ) -> tuple[Labels, Array]:
     """
-    Pairs of cells with no step between them in what is emitted, and the steps' significances.
+    Pairs of cells with no step between them in the emitted maps, and the steps' significances.
 
-    A border shows in proportion to the object's change: no step is no proof where there was none.
+    A border shows in proportion to the object's change: no step is no proof without one.
     """
-    places, shape = _places(cells), (len(emitted), -1)
-    flat, noise, steps = emitted.reshape(shape), variances.reshape(shape), np.empty(len(pairs))
+    order = np.argsort(cells, axis=None, kind="stable")
+    places = np.split(order, np.cumsum(np.bincount(cells.ravel()))[:-1])  # pixels of each cell
+    shape = (len(emitted), -1)
+    values, noise, steps = emitted.reshape(shape), variances.reshape(shape), np.empty(len(pairs))
     for index, pair in enumerate(pairs):
         first, second = (places[cell] for cell in pair)
         both = np.concatenate([first, second])
-        least = _LEAST * np.abs(np.mean(change.ravel()[both]))
+        least = _LEAST_STEP * np.abs(np.mean(change.ravel()[both]))
         where = np.divmod(both, cells.shape[1])
-        steps[index] = step(where, flat[:, both], noise[:, both].mean(axis=1), first.size, least)
-    fine = steps < chi2.isf(_STEP_RATE, len(emitted))
-    return pairs[fine], steps[fine]
-
-
-def _places(cells: Labels) -> list[Labels]:
-    """Flat indices of each cell's pixels, those of no cell first."""
-    order = np.argsort(cells, axis=None, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(cells.ravel()))[:-1])
+        steps[index] = step(where, values[:, both], noise[:, both].mean(axis=1), first.size, least)
+    unbroken = steps < chi2.isf(_STEP_RATE, len(emitted))
+    return pairs[unbroken], steps[unbroken]
 
 
 def step(
@@ -269,27 +270,11 @@ def step(
 
     .. math:: f(x, y) = \sum_{i + j \le 3} c_{ij} x^i y^j + h [p \in \mathrm{second}]
 
-    by least squares. Where the residual is more than noise, a border lies elsewhere than between
-    the cells, and the step is called infinite.
-
-    Parameters
-    ----------
-    places : tuple of ndarray of int, shape (pixel,)
-        Rows and columns, the first cell's before the second's.
-    values : ndarray, shape (picture, pixel)
-        What may have a step [K].
-    variance : ndarray, shape (picture,)
-        Variance of the noise of one pixel [K2].
-    first : int
-        Number of the first cell's pixels.
-    least : float
-        Step that must be visible, at three standard deviations [K].
-
-    Returns
-    -------
-    float
-        Sum over the pictures of :math:`h^2 / \mathrm{var}(h)`; infinite too where the
-        pixels are too few to tell, or too noisy.
+    is fitted to maps (map, pixel) [K] of a noise variance (map,) [K^2] by least squares; rows and
+    columns (pixel,) list the first cell's pixels before the second's. The result is the sum over
+    the maps of :math:`h^2 / \mathrm{var}(h)`. It is infinite where the residual is more than noise,
+    for then a border lies elsewhere than between the cells, and where the pixels are too few, or
+    too noisy to show the least step [K] at three standard deviations.
     """
     pixels = places[0].size
     y, x = ((place - place.mean()) / _SPACINGS[0] for place in places)
@@ -297,21 +282,21 @@ def step(
     design = np.stack([*(x**i * y**j for i, j in _POWERS), second], axis=1)
     if pixels < 3 * design.shape[1]:
         return np.inf
+    # design = Q R: h = q^T f / r with q, r the last column and corner, var(h) = s^2 / r^2.
     orthonormal, triangle = np.linalg.qr(design)
-    # The step comes last: its coefficient is a quotient by this corner, and so is its deviation.
     if np.any(9.0 * variance > (least * triangle[-1, -1]) ** 2):
         return np.inf
     heights = values @ orthonormal
-    left = np.sum((values - heights @ orthonormal.T) ** 2, axis=1) / variance
-    if np.any(left > chi2.isf(_MISFIT_RATE, pixels - design.shape[1])):
+    residual = np.sum((values - heights @ orthonormal.T) ** 2, axis=1) / variance
+    if np.any(residual > chi2.isf(_BORDER_RATE, pixels - design.shape[1])):
         return np.inf
     return float(np.sum(heights[:, -1] ** 2 / variance))
 
 
-def _labelled(cells: Labels, found: Regions, result: xr.Dataset) -> xr.DataArray:
+def _labelled(cells: Labels, regions: Regions, result: xr.Dataset) -> xr.DataArray:
     """Regions with a ratio, numbered by size."""
-    roots = found.roots()[cells]
-    roots[(cells == 0) | ~found.known()[roots]] = 0
+    roots = regions.roots()[cells]
+    roots[(cells == 0) | ~regions.known()[roots]] = 0
     sizes = np.bincount(roots.ravel())
     sizes[0] = 0
     sizes[sizes < _SMALLEST] = 0

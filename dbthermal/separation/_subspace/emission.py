@@ -1,164 +1,279 @@
-"""The object and the emissivities of one tile, given the direction of the reflection."""
+r"""Object temperature, emissivities and background of one tile, given the reflection ratios.
+
+Steps 2 to 4 of `method`, whose numbers of equations are used here. The error of the ratios enters
+the object through one number, the error :math:`\epsilon` of :math:`w \cdot \kappa`, of variance
+:math:`\sigma^2` times the null variance.
+
+The emissivity is the slope of the first band's signal against the object's own (eq. 7). A part of
+the background that changes as the object does, :math:`y = \ldots + c \, u_1(x)`, changes the slope
+by :math:`(1 - e_1) c`, and nothing in the data tells the two apart. So its size is assumed, in two
+ways that add (`drift_variance`):
+
+- a drift: over the capture, the background's change along the object's curve lies anywhere within
+  a limit that the user states;
+- an extrapolation: the part of the resting background's change that is *not* along the object's
+  curve is seen. Its spectrum over the smooth functions is continued to the curve, as that of a
+  random walk, whose energy falls with the square of the degree.
+"""
 
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
+from scipy.special import ndtri, stdtrit
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._problem import Problem
-from dbthermal.separation._separated import Array
-from dbthermal.separation._subspace import drift_prior as slow
-from dbthermal.separation._subspace import regression as robust
-from dbthermal.separation._subspace.reflection_ratio import Direction, ratio_variance
+from dbthermal import mixing
+from dbthermal.separation._subspace import residuals
+from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
+from dbthermal.separation._tiles import Array, Mask, Tile
 
 _ROUNDS: Final = 2
-# Energy of the object's change over that of its noise, below which its emissivity is not told.
+# Energy of the object's change over that of its noise, below which its emissivity is undefined.
 _OBJECT_TO_NOISE: Final = 10.0
 # The background counts as resting within so many standard deviations, in that share of frames.
 _WITHIN: Final = 3.0
 _RESTING: Final = 0.3
+# Degrees of the polynomials over which a spectrum is averaged: from, and up to, not including;
+# and degrees of freedom lost: of the first three, one is along the object's curve.
+_OCTAVES: Final = ((1, 4, 1), (4, 8, 0))
+# Bound of a 95 % interval of the normal distribution.
+NORMAL95: Final = float(ndtri(0.975))
 
 
 @dataclass(frozen=True)
 class Emission:
-    r"""
-    Object and emissivities, with the derivatives that carry their uncertainty.
+    """Object and emissivities, with the derivatives that carry their uncertainty."""
 
-    The direction's error enters the object through one number, the error :math:`\epsilon` of
-    :math:`w \cdot \kappa`, of variance :math:`\sigma^2 \, \mathrm{across}`.
-
-    Attributes
-    ----------
-    temperature : ndarray, shape (time, pixel)
-        Object temperature [K].
-    per_direction : ndarray, shape (time, pixel)
-        Its derivative with :math:`\epsilon` [K].
-    smooth_variance : ndarray, shape (time, pixel)
-        Its variance from the smoothed noise [K^2].
-    emissivity : ndarray, shape (band, pixel)
-        Emissivities [1].
-    own_variance, common_variance : ndarray, shape (pixel,)
-        Variances of the first emissivity that do not come from the direction: from the noise of
-        the regression, and from the background's slow part [1].
-    constant, restless : ndarray of bool, shape (pixel,)
-        Where the object does not change enough to tell the emissivity, and where the background
-        hardly rests.
-    """
-
-    temperature: Array
-    per_direction: Array
-    smooth_variance: Array
-    emissivity: Array
-    own_variance: Array
-    common_variance: Array
-    constant: npt.NDArray[np.bool_]
-    restless: npt.NDArray[np.bool_]
+    temperature: Array  # of the object (time, pixel) [K]
+    temperature_std: Array  # its standard deviation (time, pixel) [K]
+    sensitivity: Array  # its derivative with epsilon (time, pixel) [K]
+    smooth_variance: Array  # its variance from the smoothed noise (time, pixel) [K^2]
+    emissivity: Array  # (band, pixel) [1]
+    emissivity_variance: Array  # (band, pixel) [1]
+    noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
+    drift_variance: Array  # of e_1, from the background's slow part (pixel) [1]
+    constant: Mask  # the object changes too little to tell the emissivity (pixel)
+    restless: Mask  # the background hardly rests (pixel)
 
 
 def estimate(
-    problem: Problem, functions: smooth.Subspace, found: Direction, prior: slow.Prior
+    tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio, background_drift: float
 ) -> Emission:
-    """
-    Alternate the object temperature and the emissivity, steps 2 and 3 of `subspace`.
-
-    Parameters
-    ----------
-    problem : Problem
-        The tile.
-    functions : Subspace
-        Smooth functions.
-    found : Direction
-        Direction of the reflection.
-    prior : Prior
-        What is assumed of the background's slow part.
-
-    Returns
-    -------
-    Emission
-        Object and emissivities.
-    """
-    smoothed = np.einsum("bp,bcp->cp", found.weights, found.coefficients)
-    clean = functions.own @ smoothed
-    temperature = problem.temperature(1, clean)
-    middle = _middle(found.ratio)
+    """Alternate the object temperature and the emissivity, steps 2 and 3 of `method`."""
+    # Eq. 5: q = w.z, smoothed, less the steps of the camera.
+    smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
+    target = functions.object_part @ smoothed
+    temperature = tile.temperature(1, target)
+    middle = _middle(ratios.ratio)
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
-    guess = robust.plain_slope(problem.blackbody(0, temperature), problem.signals[0])
+    guess = _plain_slope(tile.blackbody(0, temperature), tile.signals[0])
     emissivity = np.where((guess > 0) & (guess < 1), guess, middle)
-    temperature = _newton(problem, found, emissivity, clean, temperature)[0]
-    line: robust.Line | None = None
+    temperature = _newton(tile, ratios, emissivity, target, temperature)[0]
+    line: residuals.Line | None = None
     for _ in range(_ROUNDS):
-        own = problem.blackbody(0, temperature)
-        line = robust.regress(own, problem.signals[0], problem.noise[0], start=line)
-        constant = line.spread < _OBJECT_TO_NOISE * found.order * found.across
+        # Eq. 7: the slope of z_1 on u_1(x); of a material, its emissivity.
+        emitted = tile.blackbody(0, temperature)
+        line = residuals.regress(emitted, tile.signals[0], tile.noise[0], start=line)
+        constant = line.energy < _OBJECT_TO_NOISE * ratios.order * ratios.null_variance
         emissivity = np.where(constant, middle, line.slope)
-        if problem.shared is not None:
-            given = found.given & np.isfinite(problem.shared.emissivity)
-            constant = constant & ~given
-            emissivity = np.where(given, problem.shared.emissivity, emissivity)
-        temperature, steepness, emitted = _newton(problem, found, emissivity, clean, temperature)
+        if tile.material is not None:
+            known = ratios.pooled & np.isfinite(tile.material.emissivity)
+            constant = constant & ~known
+            emissivity = np.where(known, tile.material.emissivity, emissivity)
+        temperature, steepness, partial = _newton(tile, ratios, emissivity, target, temperature)
     assert line is not None
-    per_direction = (emitted - functions.own @ found.coefficients[0]) / steepness
-    leverage = functions.leverage()[:, found.order - 1]
-    smooth_variance = leverage * found.across / steepness**2
+    # Eq. 6 by implicit differentiation: dx/deps = (dh/deps - dq/deps) / h', var x = var q / h'^2.
+    sensitivity = (partial - functions.object_part @ ratios.coefficients[0]) / steepness
+    leverage = functions.leverage()[:, ratios.order - 1]
+    smooth_variance = leverage * ratios.null_variance / steepness**2
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
-    left_out = smooth_variance * np.log(problem.time.size) / found.order
-    expected = problem.noise[0] ** 2 + emissivity**2 * (
-        per_direction**2 * found.spread * found.across + smooth_variance + left_out
+    left_out = smooth_variance * np.log(tile.time.size) / ratios.order
+    # Residual of the line in a frame of rest: s_1^2 + e_1^2 var x.
+    expected = tile.noise[0] ** 2 + emissivity**2 * (
+        sensitivity**2 * ratios.inverse_energy * ratios.null_variance + smooth_variance + left_out
     )
-    own_variance = line.variance + emissivity**2 * found.across / line.spread
-    drifting = slow.variance(line, own, 1.0 - emissivity, functions, problem.noise[0], prior)
-    if problem.shared is not None:
-        given = found.given & np.isfinite(problem.shared.emissivity)
-        own_variance = np.where(given, problem.shared.own_variance, own_variance)
-        drifting = np.where(given, problem.shared.common_variance, drifting)
+    # Variance of the slope: of the ordinate's noise, and of the abscissa's, e_1^2 var q / sum u^2.
+    noise_variance = line.variance + emissivity**2 * ratios.null_variance / line.energy
+    drifting = drift_variance(
+        line, emitted, 1.0 - emissivity, functions, tile.noise[0], background_drift
+    )
+    if tile.material is not None:
+        known = ratios.pooled & np.isfinite(tile.material.emissivity)
+        noise_variance = np.where(known, tile.material.noise_variance, noise_variance)
+        drifting = np.where(known, tile.material.drift_variance, drifting)
+    epsilon = ratios.inverse_energy * ratios.null_variance
+    emissivities = 1.0 - ratios.ratio * (1.0 - emissivity)
+    slope_variance = noise_variance + drifting
     return Emission(
         temperature=temperature,
-        per_direction=per_direction,
+        temperature_std=np.sqrt(_fieller(sensitivity, epsilon) + smooth_variance),
+        sensitivity=sensitivity,
         smooth_variance=smooth_variance,
-        emissivity=1.0 - found.ratio * (1.0 - emissivity),
-        own_variance=own_variance,
-        common_variance=drifting,
+        emissivity=emissivities,
+        emissivity_variance=_emissivity_variance(
+            emissivities[0], slope_variance, ratios, np.array(tile.noise)
+        ),
+        noise_variance=noise_variance,
+        drift_variance=drifting,
         constant=constant,
         restless=np.mean(line.residual**2 < _WITHIN**2 * expected, axis=0) < _RESTING,
     )
 
 
-def variance(found: Direction, fit: Emission, noise: Array) -> Array:
+def _plain_slope(abscissa: Array, ordinate: Array) -> Array:
+    """Slope (pixel) of the ordinary least-squares line through points (time, pixel)."""
+    centred = abscissa - abscissa.mean(axis=0)
+    energy = np.einsum("tp,tp->p", centred, centred)
+    return np.asarray(np.einsum("tp,tp->p", centred, ordinate) / energy)
+
+
+def _fieller(sensitivity: Array, epsilon: Array) -> Array:
+    """
+    Variance (time, pixel) [K^2] of the object through epsilon, of variance (pixel) [1].
+
+    The object is a ratio with an uncertain denominator: half the width of its 95 % interval by
+    Fieller's theorem (1954), doi:10.1111/j.2517-6161.1954.tb00159.x
+    """
+    return np.asarray(sensitivity**2 * epsilon / (1.0 - NORMAL95**2 * epsilon) ** 2)
+
+
+def _emissivity_variance(
+    first: Array, slope_variance: Array, ratios: ReflectionRatio, noise: Array
+) -> Array:
     r"""
-    Variance of the emissivities, from the direction and from the first one's own variance.
+    Variance of the emissivities (band, pixel) [1], from the ratios and from the slope (eq. 8).
 
     .. math:: \delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o, \quad
               \delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m
-
-    Parameters
-    ----------
-    found : Direction
-        Direction of the reflection.
-    fit : Emission
-        Emissivities and the first one's own variance.
-    noise : ndarray, shape (band,)
-        Noise of the bands [K].
-
-    Returns
-    -------
-    ndarray, shape (band, pixel)
-        Variance [1].
     """
-    ratio, first = found.ratio, fit.emissivity[0]
-    dark, squares = 1.0 - first, (noise**2)[:, np.newaxis]
-    # Covariance of the ratios with epsilon, over the direction's variance.
-    common = squares * found.weights - ratio * squares[0] * found.weights[0]
-    common[0] = 0.0
-    through = (ratio * first * dark) ** 2 * found.across + 2.0 * ratio * first * dark**2 * common
-    own = ratio**2 * (fit.own_variance + fit.common_variance)
-    return np.asarray(own + through * found.spread + dark**2 * ratio_variance(found, noise))
+    ratio, weights = ratios.ratio, ratios.null_weights
+    reflectivity, squares = 1.0 - first, (noise**2)[:, np.newaxis]
+    # Covariance of kappa_m with epsilon over sigma^2: s_m^2 w_m - kappa_m s_1^2 w_1.
+    covariance = squares * weights - ratio * squares[0] * weights[0]
+    covariance[0] = 0.0
+    # Terms with epsilon: (kappa e_1 (1 - e_1))^2 var(eps) + 2 kappa e_1 (1 - e_1)^2 cov.
+    through = (ratio * first * reflectivity) ** 2 * ratios.null_variance
+    through += 2.0 * ratio * first * reflectivity**2 * covariance
+    direct = reflectivity**2 * ratios.variance
+    return np.asarray(ratio**2 * slope_variance + through * ratios.inverse_energy + direct)
+
+
+def drift_variance(
+    line: residuals.Line,
+    emitted: Array,
+    reflectivity: Array,
+    functions: smooth.Subspace,
+    noise: float,
+    background_drift: float,
+) -> Array:
+    r"""
+    Variance (pixel) [1] of the regression's slope from the background's slow part.
+
+    With the largest drift d [K], uniform, unit coefficients :math:`\xi_j` of the object's curve
+    `emitted` (time, pixel) of norm :math:`|u|` and range :math:`\Delta`, and the energy A of a
+    random walk in the residual's spectrum, the larger of those of two octaves at the upper end of
+    their 95 % interval,
+
+    .. math:: \mathrm{var}(e_1) = \frac{(1 - e_1)^2 d^2}{3 \Delta^2}
+              + \frac{A}{|u|^2} \sum_j \frac{\xi_j^2}{j^2}
+    """
+    columns = functions.functions[:, functions.steps + 1 :]
+    degree = np.arange(1.0, columns.shape[1] + 1)[:, np.newaxis]
+    # Spectra of the residual, over the share of frames that the weights keep, and of the curve.
+    share = line.weights.mean(axis=0)
+    spectrum = columns.T @ (line.residual * line.weights) / share
+    curve = columns.T @ emitted
+    energy = (curve**2).sum(axis=0)
+    unit = curve / np.sqrt(energy)
+    # Only what is across the object's curve is the background's alone.
+    spectrum = spectrum - unit * (unit * spectrum).sum(axis=0)
+    # Energy of a walk at degree 1: j^2 times that at degree j, less the noise's.
+    walk = degree**2 * (spectrum**2 - noise**2 / share)
+    octaves = []
+    for low, high, lost in _OCTAVES:
+        if (freedom := len(walk[low - 1 : high - 1]) - lost) > 0:
+            widened = (stdtrit(freedom, 0.975) / NORMAL95) ** 2
+            octaves.append(walk[low - 1 : high - 1].sum(axis=0) / freedom * widened)
+    strongest = np.max(octaves, axis=0, initial=0.0)
+    extrapolated = strongest * (unit**2 / degree**2).sum(axis=0) / energy
+    # A uniform distribution in [-d, d] has the variance d^2 / 3.
+    drift = (reflectivity * background_drift / np.ptp(emitted, axis=0)) ** 2 / 3.0
+    return np.asarray(drift + extrapolated)
+
+
+def estimate_background(
+    tile: Tile, emission: Emission, ratios: ReflectionRatio
+) -> tuple[Array, Array]:
+    r"""
+    Background temperature (time, pixel) [K] from all bands, and its variance [K^2] (eq. 9, 10).
+
+    The bands are weighted by their noise; NaN where no temperature gives the signal. The variance
+    comes from the noise, the ratios, the smoothed object and the first emissivity's own variance,
+
+    .. math:: \delta y = (y - x) \left( s_1 \delta v_1 - e_1 \epsilon
+              + \frac{\delta o}{1 - e_1} \right) - r \, \delta x
+
+    where r is the weighted mean of :math:`e_m / (1 - e_m)` and :math:`v = \kappa / s`.
+    """
+    bands = range(len(tile.noise))
+    noise = np.array(tile.noise)[:, np.newaxis]
+    reflectivity = 1.0 - emission.emissivity
+    precision = (reflectivity / noise) ** 2
+    total = precision.sum(axis=0)
+    weights = precision / total
+    reflected = [
+        mixing.background(
+            emission.emissivity[m], tile.signals[m], tile.blackbody(m, emission.temperature)
+        )
+        for m in bands
+    ]
+    # Start from the mean signal, then one Gauss-Newton step of eq. 9 on the exact responses.
+    start = tile.temperature(0, np.asarray(sum(weights[m] * reflected[m] for m in bands)))
+    slopes = [curve.slope(start) for curve in tile.curves]
+    curvature = sum(weights[m] * slopes[m] ** 2 for m in bands)
+    step = sum(weights[m] * slopes[m] * (reflected[m] - tile.blackbody(m, start)) for m in bands)
+    background = start + step / curvature
+    # Eq. 10, term by term: through epsilon, (y - x) e_1 + r dx/deps; its covariance with v_1,
+    # w_1 s_1^2 sigma^2; and the variance of s_1 v_1, (s_1^2 - 1 / |v|^2) sigma^2.
+    first, first_noise = emission.emissivity[0], tile.noise[0]
+    object_share = (weights * emission.emissivity / reflectivity).sum(axis=0)
+    contrast = background - emission.temperature
+    through = contrast * first + object_share * emission.sensitivity
+    covariance = 2.0 * first_noise**2 * ratios.null_weights[0] * ratios.inverse_energy
+    of_first = first_noise**2 - 1.0 / ((ratios.ratio / noise) ** 2).sum(axis=0)
+    slope = (emission.noise_variance + emission.drift_variance) / (1.0 - first) ** 2
+    variance = 1.0 / (total * curvature) + object_share**2 * emission.smooth_variance
+    variance += through * (
+        through * (ratios.null_variance * ratios.inverse_energy) - contrast * covariance
+    )
+    variance += contrast**2 * (of_first * ratios.inverse_energy + slope)
+    return background, np.asarray(variance)
+
+
+def bend(tile: Tile, emission: Emission, background: Array) -> Array:
+    r"""
+    Part of the reflections (band - 1, time, pixel) [K] that the responses bend apart (eq. 11).
+
+    :math:`(1 - e_m) \, (u_m(y) - u_1(y))`: taken from band m, it leaves the same signal
+    :math:`u_1(y)` reflected in all, so that the reflection ratios are one number for small and
+    large changes of the background. Zero where a background or an emissivity is not physical.
+    """
+    first = tile.blackbody(0, background)
+    signal = np.stack(
+        [
+            (1.0 - emission.emissivity[m]) * (tile.blackbody(m, background) - first)
+            for m in range(1, len(tile.noise))
+        ]
+    )
+    physical = np.all((emission.emissivity > 0) & (emission.emissivity < 1), axis=0)
+    physical &= np.all(np.isfinite(signal), axis=(0, 1))
+    return np.where(physical, signal, 0.0)
 
 
 def _middle(ratio: Array) -> Array:
-    """Middle of what the ratios leave possible for e1, for where the object does not tell."""
+    """Middle of the interval that the ratios leave for e_1, where the object does not tell it."""
     largest = ratio.max(axis=0)
     lowest = np.zeros_like(largest)
     np.divide(largest - 1.0, largest, out=lowest, where=largest > 1.0)
@@ -166,21 +281,24 @@ def _middle(ratio: Array) -> Array:
 
 
 def _newton(
-    problem: Problem, found: Direction, emissivity: Array, clean: Array, temperature: Array
+    tile: Tile, ratios: ReflectionRatio, emissivity: Array, target: Array, temperature: Array
 ) -> tuple[Array, Array, Array]:
     r"""
-    One step towards the object, :math:`h(x) = \sum w_m e_m u_m(x) = q`.
+    One Newton step towards the object, :math:`h(x) = \sum w_m e_m u_m(x) = q` (eq. 6).
 
-    Returns the new x, h'(x), and what the first band holds of :math:`\partial h / \partial
-    \epsilon` beside its own signal, at the old x.
+    Returns the new x, h'(x), and the part of the first band's signal in :math:`\partial h /
+    \partial \epsilon` at the old x.
     """
-    factors = found.weights * (1.0 - found.ratio * (1.0 - emissivity))
-    own = [problem.blackbody(band, temperature) for band in range(len(factors))]
-    slopes = [curve.slope(temperature) for curve in problem.curves]
-    value, steepness = _weighted(own, factors), _weighted(slopes, factors)
-    other = own[1] if len(own) == 2 else _weighted(own[1:], _shares(found, problem.noise))
-    emitted = other - emissivity * (other - own[0])
-    return temperature + (clean - value) / steepness, steepness, np.asarray(emitted)
+    factors = ratios.null_weights * (1.0 - ratios.ratio * (1.0 - emissivity))
+    emitted = [tile.blackbody(band, temperature) for band in range(len(factors))]
+    slopes = [curve.slope(temperature) for curve in tile.curves]
+    value, steepness = _weighted(emitted, factors), _weighted(slopes, factors)
+    # The error of w.kappa moves weight from the other bands to the first, by their share in it.
+    others = emitted[1]
+    if len(emitted) > 2:
+        others = _weighted(emitted[1:], _shares(ratios, tile.noise))
+    partial = mixing.mixed(emissivity, emitted[0], others)
+    return temperature + (target - value) / steepness, steepness, np.asarray(partial)
 
 
 def _weighted(parts: list[Array], weights: Array) -> Array:
@@ -191,8 +309,8 @@ def _weighted(parts: list[Array], weights: Array) -> Array:
     return np.asarray(total)
 
 
-def _shares(found: Direction, noise: tuple[float, ...]) -> Array:
-    """Share (band - 1, pixel) of the ratios but the first in the variance of epsilon."""
+def _shares(ratios: ReflectionRatio, noise: tuple[float, ...]) -> Array:
+    """Share (band - 1, pixel) [1] of the ratios but the first in the variance of epsilon."""
     squares = (np.array(noise) ** 2)[:, np.newaxis]
-    parts = (found.weights**2 * (squares + found.ratio**2 * squares[0]))[1:]
+    parts = (ratios.null_weights**2 * (squares + ratios.ratio**2 * squares[0]))[1:]
     return np.asarray(parts / parts.sum(axis=0))

@@ -1,19 +1,43 @@
 r"""The subspace separator: closed forms for a smooth object before an abrupt background.
 
-1. The direction of the rapid changes gives the reflection ratios :math:`\kappa_m = (1 - e_m) /
-   (1 - e_1)` (`direction`).
-2. The combination of bands :math:`q = \sum w_m z_m` with :math:`w \cdot \kappa = 0` holds no
-   background. Smoothed in the subspace, it is inverted for the object temperature:
-   :math:`\sum w_m e_m u_m(x) = q`.
-3. The slope of a robust regression of :math:`z_1` on :math:`u_1(x)` is :math:`e_1`, if the
-   background rests now and then; :math:`e_m = 1 - \kappa_m (1 - e_1)`. Steps 2 and 3 alternate
-   (`emission`). What a slow part of the background can do to the slope is carried in its standard
-   deviation (`slow`).
-4. The background follows from all bands, weighted by their noise (`background`). Where it changes
-   by many kelvins its signals are no longer proportional: what bends them apart is taken out, and
-   steps 1 to 4 are done again, on the exact model.
-5. Where what is left is no noise, one jump of the object is looked for (`jumps`), and taken into
-   the subspace.
+The image formation (`mixing`) of band m, with noise of standard deviation :math:`s_m`, is
+
+.. math:: z_m = e_m u_m(x) + (1 - e_m) u_m(y) + n_m \qquad (1)
+
+1. The rapid changes of the bands lie along the reflection ratios (`reflection_ratio`)
+
+   .. math:: \kappa_m = (1 - e_m) / (1 - e_1) \qquad (2)
+
+   the principal axis of the scatter of the whitened signals outside the smooth subspace,
+   projected out by P:
+
+   .. math:: S_{mn} = \sum_t (P z_m)(P z_n) / (s_m s_n) \qquad (3)
+
+   .. math:: \mathrm{var}(\kappa_m) = \sigma^2 (s_m^2 + \kappa_m^2 s_1^2) \qquad (4)
+
+2. The null combination of bands holds no background. Smoothed in the subspace, it is inverted for
+   the object temperature (`emission`):
+
+   .. math:: q = \sum w_m z_m, \quad \sum w_m \kappa_m = 0, \quad \sum w_m = 1 \qquad (5)
+
+   .. math:: h(x) = \sum w_m e_m u_m(x) = q \qquad (6)
+
+3. If the background rests now and then, a robust regression of :math:`z_1` on :math:`u_1(x)` has
+   the slope :math:`e_1`. Steps 2 and 3 alternate.
+
+   .. math:: e_1 = \mathrm{d} z_1 / \mathrm{d} u_1(x), \quad
+             e_m = 1 - \kappa_m (1 - e_1) \qquad (7)
+
+   Its standard deviation (8) holds what a slow part of the background can do to the slope.
+4. The background minimises, at every frame, with a variance (10) by propagation,
+
+   .. math:: \sum_m \frac{(1 - e_m)^2}{s_m^2}
+             \left[ \frac{z_m - e_m u_m(x)}{1 - e_m} - u_m(y) \right]^2 \qquad (9)
+
+   Where it changes by many kelvins its signals are no longer proportional: the part that bends
+   them apart (11) is taken out, and steps 1 to 4 are done again, on the exact model.
+5. Where the residual is not noise, one jump of the object is looked for (`residuals`), and taken
+   into the subspace.
 
 Every output carries a standard deviation, propagated from the noise. Second-order blind source
 separation in the sense of Belouchrani et al. (1997), doi:10.1109/78.554307, for the image
@@ -22,63 +46,45 @@ formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
-from scipy.special import ndtri
 
 from dbthermal import _smooth as smooth
-from dbthermal import schema
-from dbthermal.separation._problem import Method, Problem
-from dbthermal.separation._separated import Array, Mask, Record, Separated, Survey, flag, updated
-from dbthermal.separation._subspace import (
-    background,
-    emission,
-)
-from dbthermal.separation._subspace import (
-    change_points as jumps,
-)
-from dbthermal.separation._subspace import (
-    diagnostics as residual,
-)
-from dbthermal.separation._subspace import (
-    drift_prior as slow,
-)
-from dbthermal.separation._subspace import (
-    reflection_ratio as direction,
-)
+from dbthermal.schema import Status
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._subspace import emission as emissions
+from dbthermal.separation._subspace import reflection_ratio, residuals
+from dbthermal.separation._subspace.emission import Emission
+from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
+from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Survey, Tile
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
-_MISFIT_SIGMAS: Final = 8.0
-_MEMORY_SIGMAS: Final = 3.5
+_CHI2_SIGMAS: Final = 8.0
+_CORRELATION_SIGMAS: Final = 3.5
 _GRAY_SIGMAS: Final = 4.0
-_APART_SIGMAS: Final = 4.0
-_BROKEN: Final = np.uint32(schema.FLAGS["object_not_smooth"] | schema.FLAGS["bands_apart"])
+_DELAY_SIGMAS: Final = 4.0
+_BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Flags of pixels in which a jump of the object is looked for.
 _SUSPECT: Final = np.uint32(
-    sum(
-        schema.FLAGS[name]
-        for name in (
-            "object_not_smooth",
-            "gray",
-            "nonphysical_emissivity",
-            "roles_may_be_swapped",
-            "background_never_rests",
-        )
-    )
+    Status.OBJECT_NOT_SMOOTH
+    | Status.GRAY
+    | Status.NONPHYSICAL_EMISSIVITY
+    | Status.ROLES_MAY_BE_SWAPPED
+    | Status.BACKGROUND_NEVER_RESTS
 )
-# Bound of a 95 % interval of the normal distribution.
-_NORMAL95: Final = float(ndtri(0.975))
 # Energy of the bend between the two responses, in units of the second band's noise, from which it
 # is worth taking out: it moves no linear function of the signal by more standard deviations.
 _BEND: Final = 0.2
+
+Record = TypeVar("Record", Estimate, Survey)
 
 
 @dataclass(frozen=True)
 class SubspaceSettings:
     """
-    Options of the method.
+    Options of the method "subspace".
 
     Attributes
     ----------
@@ -91,7 +97,7 @@ class SubspaceSettings:
     background_drift: float = 3.0
 
     def __post_init__(self) -> None:
-        """Refuse what is no standard deviation."""
+        """Refuse a drift that is negative or not finite."""
         if not 0 <= self.background_drift < np.inf:
             raise ValueError(
                 f"Invalid background_drift {self.background_drift} K. Must be zero or positive."
@@ -99,198 +105,161 @@ class SubspaceSettings:
 
 
 @dataclass(frozen=True)
-class _Estimate:
-    """Everything that one pass over a tile finds."""
+class _Solution:
+    """Steps 1 to 4 of a tile."""
 
-    found: direction.Direction
-    emission: emission.Emission
-    background: Array
-    background_variance: Array
-    memory: Array
-    lateness: Array
+    ratios: ReflectionRatio
+    emission: Emission
+    background: Array  # (time, pixel) [K]
+    background_variance: Array  # (time, pixel) [K^2]
+    straight: Tile  # the tile with signals of proportional reflections
 
 
-def separate(problem: Problem, settings: SubspaceSettings) -> Separated:
-    """
-    Separate one tile.
-
-    Parameters
-    ----------
-    problem : Problem
-        Signals of two bands or more, and what is known of them.
-    settings : SubspaceSettings
-        Options.
-
-    Returns
-    -------
-    Separated
-        Temperatures, emissivities, standard deviations and flags.
-    """
+def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
+    """Separate one tile of two bands or more."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        result = _exact(problem, _functions(problem), settings, _report)
-        return _with_jumps(problem, result, settings)
+        functions = _functions(tile)
+        return _with_jumps(tile, functions, _exact(tile, functions, settings, _report), settings)
 
 
-def survey(problem: Problem, settings: SubspaceSettings) -> Survey:
-    """
-    What the pixels of a tile tell of their materials, each alone.
-
-    Parameters
-    ----------
-    problem : Problem
-        The tile.
-    settings : SubspaceSettings
-        Options.
-
-    Returns
-    -------
-    Survey
-        Scatter and emissivity of the pixels that have no flag; the others tell nothing.
-    """
+def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
+    """Scatter and emissivity of the pixels of a tile, each alone; of those without a flag."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        # Together the pixels see what is too small to be seen in each.
-        return _exact(problem, _functions(problem), settings, _tell, least=0.0)
+        # Together the pixels see a bend that is too small to be seen in each.
+        return _exact(tile, _functions(tile), settings, _survey, least=0.0)
 
 
-def _tell(problem: Problem, estimate: _Estimate) -> Survey:
-    """Only broken models are left out: a choice by the estimate itself would bias the sum."""
-    status = _report(problem, estimate).status
-    fit, found = estimate.emission, estimate.found
-    moving = (status & _BROKEN) == 0
-    return Survey(
-        scatter=np.where(moving, found.scatter, 0.0),
-        frames=moving * np.asarray(problem.time.size - found.order, dtype=np.float64),
-        ratio=found.ratio,
-        weights=found.weights,
-        emissivity=np.where(status == 0, fit.emissivity[0], np.nan),
-        own_variance=fit.own_variance,
-        common_variance=fit.common_variance,
-    )
-
-
-def _functions(problem: Problem, jump: int | None = None) -> smooth.Subspace:
-    order = min(direction.HIGHEST_ORDER, problem.time.size // 4)
-    return smooth.subspace(problem.time, order, segment=problem.segment, jump=jump)
+def _functions(tile: Tile, jump: int | None = None) -> smooth.Subspace:
+    order = min(reflection_ratio.HIGHEST_ORDER, tile.time.size // 4)
+    return smooth.subspace(tile.time, order, segment=tile.segment, jump=jump)
 
 
 def _exact(
-    problem: Problem,
+    tile: Tile,
     functions: smooth.Subspace,
     settings: SubspaceSettings,
-    finish: Callable[[Problem, _Estimate], Record],
+    finish: Callable[[Tile, smooth.Subspace, _Solution], Record],
     least: float = _BEND,
 ) -> Record:
     """Steps 1 to 4, where it matters a second time on signals with proportional reflections."""
-    estimate = _pass(problem, problem, functions, settings)
-    result = finish(problem, estimate)
-    bend = background.bend(problem, estimate.emission, estimate.background)
-    apart = bend - bend.mean(axis=1, keepdims=True)
-    energy = np.einsum("btp,btp->bp", apart, apart)
-    bent = np.any(energy > (least * np.array(problem.noise[1:])[:, np.newaxis]) ** 2, axis=0)
+    solution = _steps(tile, tile, functions, settings)
+    bend = emissions.bend(tile, solution.emission, solution.background)
+    result = finish(tile, functions, solution)
+    change = bend - bend.mean(axis=1, keepdims=True)
+    energy = np.einsum("btp,btp->bp", change, change)
+    bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
     if not np.any(bent):
         return result
-    part = problem.of(bent)
-    straight = part.signals.copy()
-    straight[1:] -= bend[..., bent]
-    again = _pass(part, replace(part, signals=straight), functions, settings)
-    return updated(result, bent, finish(part, again))
+    part = tile.select_pixels(bent)
+    signals = part.signals.copy()
+    signals[1:] -= bend[..., bent]
+    again = _steps(part, replace(part, signals=signals), functions, settings)
+    return result.replace_pixels(bent, finish(part, functions, again))
 
 
-def _pass(
-    problem: Problem, straight: Problem, functions: smooth.Subspace, settings: SubspaceSettings
-) -> _Estimate:
+def _steps(
+    tile: Tile, straight: Tile, functions: smooth.Subspace, settings: SubspaceSettings
+) -> _Solution:
     """Steps 1 to 4; the first three on signals whose reflections are proportional."""
-    noise, shared = np.array(problem.noise), problem.shared
-    known = None if shared is None else direction.Known(shared.ratio, shared.spread)
-    found = direction.estimate(straight.signals, functions, noise, known)
-    prior = slow.Prior(settings.background_drift)
-    object_found = emission.estimate(straight, functions, found, prior)
-    reflected = background.estimate(problem, object_found, found)
-    left = residual.of_combination(straight.signals, functions, found)
-    lateness = residual.lateness(left, straight.signals[0], functions, found, problem.noise[0])
-    return _Estimate(found, object_found, *reflected, residual.memory(left), lateness)
+    noise = np.array(tile.noise)
+    ratios = reflection_ratio.estimate(straight.signals, functions, noise, tile.material)
+    emission = emissions.estimate(straight, functions, ratios, settings.background_drift)
+    background = emissions.estimate_background(tile, emission, ratios)
+    return _Solution(ratios, emission, *background, straight)
 
 
-def _report(problem: Problem, estimate: _Estimate) -> Separated:
-    """Standard deviations, flags, and NaN where a quantity is undefined."""
-    found, fit = estimate.found, estimate.emission
-    flags = _flags(problem, estimate)
-    still, undefined = flags["no_background_motion"], flags["no_background_motion"] | flags["gray"]
-    unidentified = undefined | fit.constant
-    of_ratio = direction.ratio_variance(found, np.array(problem.noise))
-    result = Separated(
-        object_temperature=fit.temperature,
-        object_temperature_std=_object_std(estimate),
-        background_temperature=estimate.background,
-        background_temperature_std=np.sqrt(estimate.background_variance),
-        emissivity=fit.emissivity,
-        emissivity_std=np.sqrt(emission.variance(found, fit, np.array(problem.noise))),
-        reflection_ratio=np.where(still, np.nan, found.ratio),
-        reflection_ratio_std=np.where(still, np.nan, np.sqrt(of_ratio)),
-        status=flag(flags),
+def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Estimate:
+    """Values, standard deviations and flags; NaN where a quantity is undefined."""
+    ratios, emission = solution.ratios, solution.emission
+    flags = _flags(tile, functions, solution)
+    still = flags[Status.NO_BACKGROUND_MOTION]
+    undefined = still | flags[Status.GRAY]
+    unidentified = undefined | emission.constant
+    result = Estimate(
+        object_temperature=emission.temperature,
+        object_temperature_std=emission.temperature_std,
+        background_temperature=solution.background,
+        background_temperature_std=np.sqrt(solution.background_variance),
+        emissivity=emission.emissivity,
+        emissivity_std=np.sqrt(emission.emissivity_variance),
+        reflection_ratio=np.where(still, np.nan, ratios.ratio),
+        reflection_ratio_std=np.where(still, np.nan, np.sqrt(ratios.variance)),
+        status=status_bits(flags),
     )
-    no_background = unidentified | flags["nonphysical_emissivity"]
-    return result.without(undefined, unidentified, no_background).ranged(problem.curves[0])
+    no_background = unidentified | flags[Status.NONPHYSICAL_EMISSIVITY]
+    return result.undefine(undefined, unidentified, no_background).check_range(tile.curves[0])
 
 
-def _object_std(estimate: _Estimate) -> Array:
-    """
-    Standard deviation of the object temperature (time, pixel) [K].
+def _survey(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Survey:
+    """Only broken models are left out: a choice by the estimate itself would bias the sum."""
+    status = _report(tile, functions, solution).status
+    ratios, emission = solution.ratios, solution.emission
+    sound = (status & _BROKEN) == 0
+    return Survey(
+        scatter=np.where(sound, ratios.scatter, 0.0),
+        frames=sound * np.asarray(tile.time.size - ratios.order, dtype=np.float64),
+        ratio=ratios.ratio,
+        null_weights=ratios.null_weights,
+        emissivity=np.where(status == 0, emission.emissivity[0], np.nan),
+        noise_variance=emission.noise_variance,
+        drift_variance=emission.drift_variance,
+    )
 
-    The object is a ratio with an uncertain denominator: half the width of its 95 % interval by
-    Fieller's theorem (1954), doi:10.1111/j.2517-6161.1954.tb00159.x
-    """
-    found, fit = estimate.found, estimate.emission
-    epsilon = found.spread * found.across
-    through = fit.per_direction**2 * epsilon / (1.0 - _NORMAL95**2 * epsilon) ** 2
-    return np.asarray(np.sqrt(through + fit.smooth_variance))
 
-
-def _flags(problem: Problem, estimate: _Estimate) -> dict[str, Mask]:
-    """What is wrong with each pixel."""
-    found, fit = estimate.found, estimate.emission
-    frames, others = problem.time.size, len(problem.noise) - 1
-    still = ~found.given & (found.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames))
+def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[Status, Mask]:
+    """Conditions (pixel) of the bits of the status."""
+    ratios, emission, signals = solution.ratios, solution.emission, solution.straight.signals
+    residual = residuals.null_residual(signals, functions, ratios)
+    correlation = residuals.autocorrelation(residual)
+    delay = residuals.interband_delay(residual, signals[0], functions, ratios, tile.noise[0])
+    frames, others = tile.time.size, len(tile.noise) - 1
+    still = ~ratios.pooled & (ratios.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames))
     # Not even in the quietest band is there more than its noise.
-    still |= ~found.given & (found.scatter[0, 0] <= 0)
-    still |= ~np.isfinite(found.spread)
-    gray = ~still & (found.spread * found.across > 1.0 / _GRAY_SIGMAS**2)
-    told = ~still & ~gray & ~fit.constant
-    nonphysical = told & np.any((fit.emissivity <= 0) | (fit.emissivity >= 1), axis=0)
-    misfit = 2.0 * _MISFIT_SIGMAS / np.sqrt(2.0 * others * (frames - found.order))
+    still |= ~ratios.pooled & (ratios.scatter[0, 0] <= 0)
+    still |= ~np.isfinite(ratios.inverse_energy)
+    epsilon = ratios.inverse_energy * ratios.null_variance
+    gray = ~still & (epsilon > 1.0 / _GRAY_SIGMAS**2)
+    defined = ~still & ~gray & ~emission.constant
+    nonphysical = defined & np.any((emission.emissivity <= 0) | (emission.emissivity >= 1), axis=0)
+    swapped = defined & ~nonphysical & (emission.emissivity.mean(axis=0) < 0.5)
+    # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
+    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * (frames - ratios.order))
+    rough = (correlation > _CORRELATION_SIGMAS) | (ratios.reduced_chi2 > 1.0 + excess)
     return {
-        "no_background_motion": still,
-        "gray": gray,
-        "constant_object": ~still & ~gray & fit.constant,
-        "background_never_rests": told & fit.restless,
-        "nonphysical_emissivity": nonphysical,
-        "roles_may_be_swapped": told & ~nonphysical & (fit.emissivity.mean(axis=0) < 0.5),
-        "bands_apart": ~still & (estimate.lateness > _APART_SIGMAS),
-        "object_not_smooth": (estimate.memory > _MEMORY_SIGMAS) | (found.misfit > 1.0 + misfit),
+        Status.NO_BACKGROUND_MOTION: still,
+        Status.GRAY: gray,
+        Status.CONSTANT_OBJECT: ~still & ~gray & emission.constant,
+        Status.BACKGROUND_NEVER_RESTS: defined & emission.restless,
+        Status.NONPHYSICAL_EMISSIVITY: nonphysical,
+        Status.ROLES_MAY_BE_SWAPPED: swapped,
+        Status.BANDS_APART: ~still & (delay > _DELAY_SIGMAS),
+        Status.OBJECT_NOT_SMOOTH: rough,
     }
 
 
-def _with_jumps(problem: Problem, result: Separated, settings: SubspaceSettings) -> Separated:
+def _with_jumps(
+    tile: Tile, functions: smooth.Subspace, result: Estimate, settings: SubspaceSettings
+) -> Estimate:
     """Step 5: pixels that do not fit are solved anew with a jump in the subspace."""
-    functions, inside = _functions(problem), jumps.candidates(problem.time)
-    ramp = jumps.spread(problem.time)
+    inside, ramp = residuals.candidates(tile.time), residuals.ramp_frames(tile.time)
     if inside.size == 0:
         return result
-    suspect = ((result.status & _SUSPECT) != 0) | jumps.alone(problem.signals[0], functions, ramp)
+    isolated = residuals.isolated_change(tile.signals[0], functions, ramp)
+    suspect = ((result.status & _SUSPECT) != 0) | isolated
     if not np.any(suspect):
         return result
-    noise = np.array(problem.noise)
-    frame, gain = jumps.find(problem.signals[..., suspect], functions, noise, inside, ramp)
+    noise = np.array(tile.noise)
+    frame, gain = residuals.find_jump(tile.signals[..., suspect], functions, noise, inside, ramp)
     first = np.full(suspect.shape, -1)
     first[suspect] = np.where(gain > 0, frame, -1)
     for jump in np.unique(first[first >= 0]):
-        kept = jumps.outside(problem.time, int(jump), problem.segment)
+        kept = residuals.beside_jump(tile.time, int(jump), tile.segment)
         before = int(kept[:jump].sum())
-        part = problem.of(first == jump).at(kept)
+        part = tile.select_pixels(first == jump).select_frames(kept)
         functions = _functions(part, jump=before if 0 < before < part.time.size else None)
         again = _exact(part, functions, settings, _report)
-        again = replace(again, status=again.status | np.uint32(schema.FLAGS["object_jump"]))
-        result = updated(result, first == jump, again.spread(kept))
+        again = replace(again, status=again.status | np.uint32(Status.OBJECT_JUMP))
+        result = result.replace_pixels(first == jump, again.expand_frames(kept))
     return result
 
 

@@ -18,9 +18,9 @@ import xarray as xr
 
 from dbthermal import mixing, store
 from dbthermal import response as responses
-from dbthermal.curves import Curve
 from dbthermal.instruments.emulated.world import World
-from dbthermal.simulation._rig import Rig, digitise
+from dbthermal.response import Curve
+from dbthermal.simulation import Rig, digitise
 
 Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.uint16]
@@ -190,7 +190,7 @@ def shown(scene: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
     scene : Dataset
         As for `Views.movie`, with attribute ``began``, when time 0 was on the host's clock [s].
     capture : Dataset
-        From `dbthermal.instruments.recording.capture.open_capture`, or made of it.
+        From `dbthermal.instruments.recording.open_capture`, or made of it.
 
     Returns
     -------

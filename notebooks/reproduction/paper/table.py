@@ -186,14 +186,14 @@ _LAST: Final = (
     Row(
         "Fig. 6",
         "coffee pot: map of the reflection, correlation with the authors'",
-        "04_separation",
+        "12_published",
         ("coffeepot_map_correlation",),
         "published video",
     ),
     Row(
         "Fig. 6",
         "glass plate: the same",
-        "04_separation",
+        "12_published",
         ("glass-plate_map_correlation",),
         "published video",
     ),

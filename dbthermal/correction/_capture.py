@@ -1,0 +1,141 @@
+"""All corrections of a capture, in the one order in which they are right."""
+
+import xarray as xr
+
+from dbthermal import schema
+from dbthermal.correction._nonuniformity import (
+    DETECTOR_MAXIMUM,
+    OUTLIER,
+    correct,
+    renew_offset,
+)
+from dbthermal.correction._pixels import mark_bad
+from dbthermal.correction._shutter import find_shutter, mark_shutter
+from dbthermal.correction._temporal import undo_drift, undo_lag
+
+
+def correct_capture(
+    capture: xr.Dataset,
+    correction: xr.Dataset,
+    *,
+    flat: xr.DataArray | None = None,
+    flat_after: xr.DataArray | None = None,
+    shutter: bool = True,
+    time_constant: float | xr.DataArray | None = None,
+    bad_pixels: float | None = OUTLIER,
+    drift_reference: xr.DataArray | None = None,
+) -> xr.Dataset:
+    """
+    Raw capture to corrected counts with a status: every correction, in the right order.
+
+    1. `find_shutter` on the raw counts, where a frame that the camera repeats is an exact copy; the
+       bit `schema.SHUTTER_CLOSED` of the recorded `frame_flags`, if there are any, adds the frames
+       that the camera reports as closed.
+    2. `renew_offset` and `correct`: gain and offset of each pixel, saturated and dead pixels. The
+       limits of the detector hold for raw counts, so this comes before anything mixes frames.
+    3. `mark_shutter`: repeated and closed frames become NaN, and so do frames without an exposure
+       time, which are damaged; `segment` counts the events.
+    4. `undo_lag`, only now: a repeated frame says nothing of the pixel's past. With constant gain
+       and offset the order of 2 and 4 does not matter, for the weights of the lag add up to one.
+    5. `mark_bad`: pixels that are noisy, stuck or jump in this capture, in units of its own noise.
+    6. `undo_drift` last, so that no bad pixel is part of the reference patch.
+
+    Parameters
+    ----------
+    capture : Dataset
+        Stage `capture` of `schema`, raw: `counts` (band, time, y, x) [count], uint16; optionally
+        `frame_flags` and `exposure_time` (band, time), as recorded.
+    correction : Dataset
+        From `fit_correction`; it may hold more bands.
+    flat, flat_after : DataArray, optional
+        Mean raw frames (band, y, x) [count] of a uniform view, taken before and after the capture.
+        The first renews the offsets; to the second they go in proportion to time.
+    shutter : bool
+        False if no camera had a shutter, and no frame was lost.
+    time_constant : float or DataArray, optional
+        Thermal time constant of the pixels [s], of all bands or (band). By default the lag is left.
+    bad_pixels : float, optional
+        Limit of the robust z-score of noise and jumps [1]; None leaves the bad pixels of the
+        correction only, as in a capture of fewer than 16 frames.
+    drift_reference : DataArray, optional
+        True on a patch of constant temperature in view, (y, x), bool. By default the common drift
+        is left.
+
+    Returns
+    -------
+    Dataset
+        Stage `corrected`: `counts` (band, time, y, x) [count], float32, NaN where a frame is no
+        measurement; `status` (y, x); `segment` (time); `drift` (band, time) [count]. The attributes
+        of the steps state what was done with which parameters; ``shutter_closed_frames`` is the
+        number of frames (by band) that were recorded as closed, -1 without `frame_flags`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As the steps; and if offsets are to change in proportion to time across a shutter event,
+        where the camera renews them.
+
+    Examples
+    --------
+    Two bands of 40 frames, of which the camera repeats one five times while its shutter is closed.
+
+    >>> import numpy as np, xarray as xr
+    >>> maps, rng = ("band", "y", "x"), np.random.default_rng(1)
+    >>> gain = 1 + 0.02 * rng.standard_normal((2, 8, 8))
+    >>> correction = xr.Dataset(
+    ...     {"gain": (maps, gain), "offset": (maps, 0 * gain), "bad": (maps, gain < 0)},
+    ...     {"band": ["8-14", "9.5"]},
+    ... )
+    >>> counts = rng.normal(20000, 4, (2, 40, 8, 8)) / gain[:, np.newaxis]
+    >>> counts[1, 21:26] = counts[1, 20]
+    >>> capture = xr.Dataset(
+    ...     {"counts": (("band", "time", "y", "x"), counts.round().astype(np.uint16))},
+    ...     {"band": ["8-14", "9.5"], "time": np.arange(40) / 10.0},
+    ... )
+    >>> corrected = correct_capture(capture, correction)
+    >>> corrected.shutter_events, corrected.frames_taken_out, int(corrected.segment[-1])
+    (1, [0, 5], 1)
+    >>> float(corrected.counts.std()) < 5
+    True
+    """
+    closed = _closed(capture)
+    events = find_shutter(capture, closed=closed) if shutter else None
+    before = correction if flat is None else renew_offset(correction, flat)
+    after = None if flat_after is None else renew_offset(correction, flat_after)
+    maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
+    result = correct(capture, before, after=after, maximum=maximum)
+    if events is not None:
+        result = mark_shutter(result, events)
+        if after is not None and result["segment"].values[-1] > 0:
+            raise ValueError(
+                f"Invalid flat_after: {result.attrs['shutter_events']} shutter events renew the "
+                "offsets within the capture. Must have none, for offsets in proportion to time."
+            )
+    result = _without_damaged(result)
+    if time_constant is not None:
+        result = undo_lag(result, time_constant)
+    if bad_pixels is not None:
+        result = mark_bad(result, threshold=bad_pixels, jump=bad_pixels)
+    if drift_reference is not None:
+        result = undo_drift(result, drift_reference)
+    number = -1 if closed is None else closed.sum("time").values.tolist()
+    return result.assign_attrs(shutter_closed_frames=number)
+
+
+def _closed(capture: xr.Dataset) -> xr.DataArray | None:
+    """Frames (band, time) recorded as taken with the shutter closed; None if not recorded."""
+    if "frame_flags" not in capture:
+        return None
+    flags = capture["frame_flags"]
+    schema.check_variable(flags, schema.FRAME_FLAGS, "'frame_flags'")
+    return schema.has_flag(flags, schema.SHUTTER_CLOSED)
+
+
+def _without_damaged(corrected: xr.Dataset) -> xr.Dataset:
+    """NaN in frames that have no exposure time, and their number by band as an attribute."""
+    if "exposure_time" not in corrected:
+        return corrected
+    counts, valid = corrected["counts"], corrected["exposure_time"].notnull()
+    if not valid.all():
+        corrected = corrected.assign(counts=counts.where(valid).assign_attrs(counts.attrs))
+    return corrected.assign_attrs(damaged_frames=(~valid).sum("time").values.tolist())

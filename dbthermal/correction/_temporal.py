@@ -1,0 +1,216 @@
+"""Behaviour of the detector in time: thermal lag of its pixels, common drift of its offsets."""
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import _smooth as smooth
+from dbthermal import planck, schema
+
+Array = npt.NDArray[np.float64]
+
+
+def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
+    r"""
+    Signal that pixels of first-order lag would have shown without it.
+
+    A pixel of a microbolometer is a small body that follows :math:`\tau \dot I = z - I`. For z held
+    from each frame to the next, exactly,
+
+    .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad
+              z_n = \frac{I_n - a_n I_{n-1}}{1 - a_n}, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
+
+    The first frame becomes NaN, for the one before it is not known; so does a frame after one that
+    is NaN. White noise is raised by :math:`\sqrt{1 + a^2} / (1 - a)` (1.00005 at 10 Hz, 1.25 at 60
+    Hz for 10 ms), and successive frames then have the correlation :math:`-a / (1 + a^2)`: undo a
+    lag that matters, not one that does not.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`, after `mark_shutter`: a repeated frame is no measurement.
+    time_constant : float or DataArray
+        Time constant of the pixels [s], of all bands or (band), by name.
+
+    Returns
+    -------
+    Dataset
+        The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
+        ``lag_noise_amplification`` [1], each by band, the latter at the median interval. A known
+        noise must be multiplied by it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the dataset is not as `schema` has it, has fewer than two frames, was undone before or
+        holds whole numbers, or a time constant is not finite and positive or a band has none.
+    """
+    counts = schema.check(corrected, "corrected")["counts"]
+    if "lag_time_constant" in corrected.attrs:
+        raise ValueError("Invalid dataset: the lag was undone before. Must be as the pixels lag.")
+    if counts.sizes["time"] < 2:
+        raise ValueError("Invalid capture of 1 frame. Must have at least 2, for a lag.")
+    if counts.dtype.kind != "f":
+        raise TypeError(f"Invalid dtype {counts.dtype} of the counts. Must be floating, for NaN.")
+    old, new = lag_coefficients(time_constant, counts)
+    signal = np.full_like(counts.values, np.nan)
+    for band in range(counts.sizes["band"]):
+        movie = counts.isel(band=band).values
+        for frame in range(1, movie.shape[0]):
+            # z_n = I_n + (I_n - I_n-1) a / (1 - a): a correction that is small where the lag is.
+            gain = old[band, frame - 1] / new[band, frame - 1]
+            signal[band, frame] = movie[frame] + (movie[frame] - movie[frame - 1]) * gain
+    middle = np.median(np.diff(counts["time"].values.astype(np.float64)))
+    constants = _time_constants(time_constant, counts)
+    return corrected.assign(counts=(counts.dims, signal, counts.attrs)).assign_attrs(
+        lag_time_constant=constants.tolist(),
+        lag_noise_amplification=_noise_amplification(middle / constants).tolist(),
+    )
+
+
+def lag_coefficients(
+    time_constant: float | xr.DataArray, counts: xr.DataArray
+) -> tuple[Array, Array]:
+    r"""
+    Weights of the frame before and of the new signal in a pixel of first-order lag.
+
+    Parameters
+    ----------
+    time_constant : float or DataArray
+        Time constant of the pixels [s], of all bands or (band), by name.
+    counts : DataArray
+        Signal (band, time, ...).
+
+    Returns
+    -------
+    tuple of ndarray, each (band, time - 1)
+        :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a` [1], both to full precision.
+
+    Raises
+    ------
+    ValueError
+        If a time constant is not finite and positive, or a band has none.
+    """
+    interval = np.diff(counts["time"].values.astype(np.float64))
+    ratio = interval / _time_constants(time_constant, counts)[:, np.newaxis]
+    return np.exp(-ratio), -np.expm1(-ratio)
+
+
+def undo_drift(corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5) -> xr.Dataset:
+    r"""
+    Subtract from all of a band the drift that a patch of constant temperature shows.
+
+    The patch's mean is smoothed by polynomials in time, in each segment between two shutter events
+    by itself, and
+
+    .. math:: I'(t) = I(t) - [c(t) - c(t_0)]
+
+    with c the smooth curve and :math:`t_0` the segment's first frame. The steps between segments
+    are left for the separation, which estimates them pixel by pixel. Of n pixels of noise s the
+    patch adds an error of about :math:`s K / \sqrt{n N}` in N frames with K functions, the one at
+    the ends of a polynomial: 0.11 counts for 100 pixels of 4 counts and 350 frames. A motion in
+    front of the patch, or reflected in it, is taken for drift.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`; with `segment` (time) of `mark_shutter` where there were
+        shutter events.
+    reference : DataArray
+        True on the patch, (y, x), bool: a blackbody, a wall. Its pixels that are flagged in
+        `status` are left out.
+    order : int
+        Number of polynomials in a segment, the constant included; in one that has fewer frames,
+        as many as frames.
+
+    Returns
+    -------
+    Dataset
+        The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted,
+        NaN in frames that are; and the attributes ``drift_order`` and ``drift_pixels``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the dataset is not as `schema` has it or its drift was undone before, the reference is
+        no boolean of its pixels or marks no good pixel, `order` is below 2 (a constant is no
+        drift), or a pixel of the patch is NaN in a frame in which others are not.
+    """
+    counts = schema.check(corrected, "corrected")["counts"]
+    if "drift" in corrected:
+        raise ValueError("Invalid dataset: the drift was undone before. Must be as it drifts.")
+    if order < 2:
+        raise ValueError(f"Invalid order {order} of the drift. Must be 2 or more.")
+    rows, columns = np.nonzero(_patch(corrected, reference))
+    patch = counts.isel(y=xr.DataArray(rows, dims="p"), x=xr.DataArray(columns, dims="p"))
+    level = patch.mean("p", dtype=np.float64, skipna=False)
+    _require_whole(patch, level)
+    segment = corrected["segment"].values if "segment" in corrected else np.zeros(level.shape[1])
+    curves = np.stack([_smooth_change(part, segment, order) for part in level])
+    drift = xr.DataArray(
+        curves,
+        dims=("band", "time"),
+        coords={name: counts[name] for name in ("band", "time")},
+        attrs=schema.OPTIONAL["corrected"]["drift"].attrs,
+    )
+    undone = (counts - drift).astype(counts.dtype if counts.dtype.kind == "f" else np.float32)
+    return corrected.assign(
+        counts=undone.transpose(*counts.dims).assign_attrs(counts.attrs), drift=drift
+    ).assign_attrs(drift_order=order, drift_pixels=len(rows))
+
+
+def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -> Array:
+    """Time constant of each band [s]."""
+    names = [str(name) for name in counts["band"].values]
+    if isinstance(time_constant, xr.DataArray):
+        places = schema.band_positions(time_constant, names, "the time constants")
+        return planck.require_positive("time_constant [s]", time_constant.values[places])
+    value = planck.require_positive("time_constant [s]", time_constant)
+    return np.full(len(names), float(value))
+
+
+def _noise_amplification(ratio: Array) -> Array:
+    """Factor of white noise when the lag is undone, by interval over time constant [1]."""
+    # z = (I_n - a I_n-1) / (1 - a), of independent noises: sqrt(1 + a^2) / (1 - a).
+    return np.asarray(np.hypot(1.0, np.exp(-ratio)) / -np.expm1(-ratio))
+
+
+def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:
+    """Good pixels (y, x) of the reference patch."""
+    image = tuple(corrected.sizes[dim] for dim in ("y", "x"))
+    if reference.dtype != bool:
+        raise TypeError(f"Invalid dtype {reference.dtype} of the reference. Must be bool.")
+    if reference.dims != ("y", "x") or reference.shape != image:
+        raise ValueError(
+            f"Invalid reference of sizes {dict(reference.sizes)}. Must be (y, x), of {image}."
+        )
+    good = reference.values.copy()
+    if "status" in corrected:
+        good &= corrected["status"].values == 0
+    if not good.any():
+        raise ValueError("Invalid reference: it marks no good pixel. Must mark at least one.")
+    return good
+
+
+def _require_whole(patch: xr.DataArray, level: xr.DataArray) -> None:
+    """Refuse a patch that is NaN in part: its mean would jump with the pixels that remain."""
+    torn = np.isnan(level.values) & patch.notnull().any("p").values
+    if torn.any():
+        band, frame = np.argwhere(torn)[0]
+        raise ValueError(
+            f"Invalid reference: a part of it is NaN in frame {frame} of band "
+            f"'{patch['band'].values[band]}'. Must be NaN as a whole, or not at all."
+        )
+
+
+def _smooth_change(level: xr.DataArray, segment: npt.NDArray[np.generic], order: int) -> Array:
+    """Smooth change (time) of a level (time) since the first frame of each segment."""
+    values, time = level.values, level["time"].values.astype(np.float64)
+    curve = np.full(values.shape, np.nan)
+    for part in np.unique(segment):
+        here = (segment == part) & np.isfinite(values)
+        if here.any():
+            functions = smooth.polynomial_basis(time[here], min(order, int(here.sum())))
+            fitted = functions @ (functions.T @ values[here])
+            curve[here] = fitted - fitted[0]
+    return curve

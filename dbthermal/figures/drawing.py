@@ -1,0 +1,149 @@
+"""Parts that all figures share: canvas, colours, labels, images, limits, plain ticks."""
+
+from typing import Final
+
+import matplotlib.pyplot as plt
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+__all__ = [
+    "COLORS",
+    "band_label",
+    "canvas",
+    "draw_image",
+    "limits_of",
+    "percent",
+    "plain_decades",
+    "plain_ticks",
+    "provenance_note",
+]
+
+COLORS: Final = ("#1b6ca8", "#d1495b", "#66a182", "#edae49", "#6c4f77")
+"""Colours of the bands, in their order."""
+
+_LABELS: Final = {"8-14": "8-14 \N{MICRO SIGN}m"}
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+def canvas(
+    rows: int, columns: int, size: tuple[float, float]
+) -> tuple[Figure, npt.NDArray[np.object_]]:
+    """Figure and axes (rows, columns), owned by nobody but the caller."""
+    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    plt.close(figure)
+    return figure, axes
+
+
+def band_label(name: object) -> str:
+    """
+    Label of a band, with its unit.
+
+    Parameters
+    ----------
+    name : object
+        Name of the band.
+
+    Returns
+    -------
+    str
+        E.g. "9.5 um", with a micro sign.
+    """
+    return _LABELS.get(str(name), f"{name} \N{MICRO SIGN}m")
+
+
+def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
+    """
+    Say what the data are, for a title.
+
+    Parameters
+    ----------
+    data : Dataset or DataArray
+        With the attributes `origin` ("simulated", "measured", ...), `twin` (name of the scene
+        that a simulation is a twin of) and `radiometric` (0 if the values are a picture's and
+        not counts).
+
+    Returns
+    -------
+    str
+        E.g. " (simulated)" or " (not radiometric)"; empty for measured radiometric data.
+    """
+    notes = []
+    origin = str(data.attrs.get("origin", ""))
+    if origin.startswith("simulated"):
+        notes.append("simulated twin" if "twin" in data.attrs else origin)
+    if data.attrs.get("radiometric", 1) == 0:
+        notes.append("not radiometric")
+    return f" ({', '.join(notes)})" if notes else ""
+
+
+def draw_image(
+    figure: Figure,
+    axis: Axes,
+    image: xr.DataArray,
+    title: str,
+    label: str,
+    *,
+    cmap: str = "inferno",
+    limits: tuple[float, float] | None = None,
+) -> None:
+    """
+    Draw an image with its colour bar; pixels without a value are gray.
+
+    Parameters
+    ----------
+    figure, axis : Figure, Axes
+        Where to draw.
+    image : DataArray
+        (y, x).
+    title, label : str
+        Title, and label of the colour bar with its unit.
+    cmap : str
+        Colour map.
+    limits : tuple of float, optional
+        Values at the ends of the colour map; the image's own if not given.
+    """
+    lowest, highest = limits if limits is not None else (None, None)
+    drawn = axis.imshow(image.values, cmap=cmap, vmin=lowest, vmax=highest, interpolation="nearest")
+    axis.set_facecolor("0.8")
+    axis.set_title(title, fontsize=9)
+    axis.set_xticks([])
+    axis.set_yticks([])
+    figure.colorbar(drawn, ax=axis, label=label, shrink=0.85)
+
+
+def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, float]:
+    """Range that holds all but one in a hundred of the values at either end."""
+    values = image.values[np.isfinite(image.values)]
+    if values.size == 0:
+        return 0.0, 1.0
+    lowest, highest = np.percentile(values, [1, 99])
+    if symmetric:
+        highest = max(abs(lowest), abs(highest))
+        lowest = -highest
+    return float(lowest), float(highest) if highest > lowest else float(lowest) + 1.0
+
+
+def plain_ticks(axis: Axes, places: xr.DataArray) -> None:
+    """Ticks at some places of a logarithmic axis, as plain numbers, and a grid."""
+    axis.set_xticks(places.values, [f"{place:g}" for place in places.values], fontsize=8)
+    axis.set_xticks([], minor=True)
+    axis.grid(visible=True, which="major", color="0.9")
+
+
+def plain_decades(axis: Axes) -> None:
+    """Ticks at 1, 2 and 5 of each decade of a logarithmic vertical axis, as plain numbers."""
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.yaxis.set_minor_locator(NullLocator())
+
+
+def percent(share: float) -> str:
+    """A share in percent, that is not 0.0 where there is a pixel."""
+    return "< 0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"

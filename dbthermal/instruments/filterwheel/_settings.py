@@ -1,0 +1,176 @@
+"""Properties of one wheel and its controller: scales, filters, speeds, limits of time.
+
+References
+----------
+pylablib 1.4.5, ``Thorlabs/kinesis.py`` (scales and units of speed); instrumentkit,
+``thorlabsapt.py`` (25600 counts for an FW103); thorlabs_apt_device 0.3.8, ``bsc.py`` (the same
+units, and addresses). Facts alone, no code.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final
+
+from dbthermal.instruments import apt
+
+POSITIONS: Final = 6  # slots of the wheel, numbered from 1
+
+_POSITIVE = (
+    *("velocity", "home_velocity", "acceleration", "tolerance", "reply_timeout", "home_timeout"),
+    *("move_timeout", "start_timeout", "stall_timeout", "poll_interval"),
+)
+_HOME = {"home_direction": (1, 2), "home_limit_switch": (1, 4)}
+
+
+@dataclass(frozen=True)
+class Scale:
+    """
+    Units of a controller.
+
+    Attributes
+    ----------
+    turn : int
+        Counts of one turn of the wheel.
+    velocity, acceleration : float
+        Device units of one count/s and of one count/s^2.
+    """
+
+    turn: int
+    velocity: float
+    acceleration: float
+
+    def target(self, position: int, offset: float = 0.0) -> int:
+        """
+        Absolute place [count] of a slot, `offset` [deg] being that of slot 1 after homing.
+
+        A sixth of a turn is not a whole number of counts. Each place is rounded by itself, so that
+        errors of up to half a count never add up. ValueError if the slot is not 1 to 6.
+        """
+        if position not in range(1, POSITIONS + 1):
+            raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
+        return round(((position - 1) / POSITIONS + offset / 360.0) * self.turn)
+
+    def position(self, count: int, tolerance: float, offset: float = 0.0) -> int | None:
+        """Slot within `tolerance` [deg] of a place [count] of any turn; None between two slots."""
+        sixths = (count / self.turn - offset / 360.0) * POSITIONS
+        nearest = round(sixths)
+        near = abs(sixths - nearest) * 360.0 / POSITIONS <= tolerance
+        return nearest % POSITIONS + 1 if near else None
+
+    def degrees(self, counts: int) -> float:
+        """Angle [deg] of a number of counts."""
+        return counts / self.turn * 360.0
+
+    def device_velocity(self, velocity: float) -> int:
+        """Velocity in device units, of one in turns/s."""
+        return round(velocity * self.turn * self.velocity)
+
+    def device_acceleration(self, acceleration: float) -> int:
+        """Acceleration in device units, of one in turns/s^2."""
+        return round(acceleration * self.turn * self.acceleration)
+
+
+BSC20X: Final = Scale(turn=409_600, velocity=53.68, acceleration=53.68 * 204.94e-6)
+"""200 full steps of 2048 microsteps."""
+
+BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
+"""200 full steps of 128 microsteps."""
+
+MODELS: Final[Mapping[str, Scale]] = MappingProxyType(
+    {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
+)
+"""Beginnings of the model names that are accepted; some BSC201 call themselves SCC201."""
+
+CHANNEL: Final = 1  # of the motor at its address
+FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
+"""State that is an error; it is uncertain if a wheel's controller sets these bits."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """
+    Properties of one wheel.
+
+    Attributes
+    ----------
+    filters : mapping
+        Band in each slot, by its number 1 to 6. Slots left out hold no filter.
+    serial_number : int, optional
+        Serial number of the controller; another one is then refused.
+    addresses : tuple of tuple
+        Where the controller is looked for, in this order: address of its identity, and of its
+        motor. A BSC20x is a rack and silently ignores messages to a unit.
+    home_offset : float
+        From the position after homing to slot 1 [deg]. Differs from wheel to wheel: look.
+    home_direction, home_limit_switch : int, optional
+        1 forward, 2 reverse; 1 the reverse switch, 4 the forward one. Which a wheel needs is
+        uncertain: None keeps what the controller has.
+    velocity, home_velocity : float
+        [turn/s].
+    acceleration : float
+        [turn/s^2].
+    tolerance : float
+        Largest distance of the wheel from a slot [deg], below half the way to the next, 30.
+    reply_timeout, home_timeout, move_timeout : float
+        Longest wait for a reply, for the home switch, for a move [s].
+    start_timeout : float
+        Longest wait until a move is seen to start [s].
+    stall_timeout : float
+        Longest time for which the position may not change in a move [s].
+    poll_interval : float
+        Time between two status requests [s].
+
+    Raises
+    ------
+    ValueError
+        If a slot is not 1 to 6, two filters have one name, or a number is out of its range.
+    """
+
+    filters: Mapping[int, str] = field(default_factory=dict)
+    serial_number: int | None = None
+    addresses: tuple[tuple[int, int], ...] = ((apt.UNIT, apt.UNIT), (apt.RACK, apt.BAY_1))
+    home_offset: float = 0.0
+    home_direction: int | None = None
+    home_limit_switch: int | None = None
+    velocity: float = 1.0
+    home_velocity: float = 0.2
+    acceleration: float = 1.0
+    tolerance: float = 0.1
+    reply_timeout: float = 1.0
+    home_timeout: float = 60.0
+    move_timeout: float = 20.0
+    start_timeout: float = 1.0
+    stall_timeout: float = 2.0
+    poll_interval: float = 0.05
+
+    def __post_init__(self) -> None:
+        for position in self.filters:
+            BSC20X.target(position)
+        repeated = [name for name, count in Counter(self.filters.values()).items() if count > 1]
+        if repeated:
+            raise ValueError(f"Repeated filter '{repeated[0]}'. Each must have a name of its own.")
+        for name in _POSITIVE:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"Invalid {name} {value} of the wheel. Must be positive.")
+        if self.tolerance >= 180.0 / POSITIONS:
+            raise ValueError(f"Invalid tolerance {self.tolerance} deg. Must be less than 30 deg.")
+        if not self.addresses:
+            raise ValueError("Invalid addresses () of the wheel. Must be one pair at least.")
+        if not -360.0 < self.home_offset < 360.0:
+            raise ValueError(f"Invalid home_offset {self.home_offset}. Must lie in (-360, 360).")
+        for name, allowed in _HOME.items():
+            value = getattr(self, name)
+            if value is not None and value not in allowed:
+                raise ValueError(f"Invalid {name} {value}. Must be one of {allowed}, or None.")
+
+    def position(self, band: str) -> int:
+        """Slot of a band's filter; ValueError if no filter has this name."""
+        for position, name in self.filters.items():
+            if name == band:
+                return position
+        bands = sorted(self.filters.values())
+        raise ValueError(f"Invalid band '{band}' of the wheel. Must be one of {bands}.")

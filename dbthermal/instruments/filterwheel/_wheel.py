@@ -1,0 +1,340 @@
+"""Filter wheel: homing, moves to six absolute places, and the band in the beam.
+
+A motion is over when two things agree: the controller reports its end or the moving bits are clear,
+and the wheel is where it should be. Neither is enough alone. Bits were seen to stick, the report of
+an earlier move may come late, and before a move starts the bits are clear too.
+"""
+
+import logging
+import time as system_time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Self
+
+from dbthermal.instruments import apt
+from dbthermal.instruments.filterwheel._controller import (
+    Controller,
+    NotHomedError,
+    StalledWheelError,
+    WheelError,
+    WheelTimeoutError,
+)
+from dbthermal.instruments.filterwheel._settings import FAULTS, Settings
+from dbthermal.instruments.transport import Closing, SerialTransport, Transport, open_serial
+
+BAUDRATE: Final = 115_200  # [bit/s]
+SETTLING: Final = 0.05  # [s] between taking RTS down and up, as in the maker's example
+
+MOVING: Final = (
+    apt.StatusBits.MOVING_FORWARD | apt.StatusBits.MOVING_REVERSE | apt.StatusBits.HOMING
+)
+"""Bits of a wheel that moves. The jogging bits are left out: they were seen to stick."""
+
+CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
+
+_LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Identity of the controller; the model it gives is not always the one on its label."""
+
+    model: str
+    serial_number: int
+    firmware: str
+    addresses: str
+    is_simulated: bool
+
+
+class FilterWheel(Closing):
+    """
+    A filter wheel whose line is open, for one thread at a time; see `from_url`.
+
+    Parameters
+    ----------
+    transport : Transport
+        Open; closed with the wheel.
+    settings : Settings
+        Properties of this wheel.
+    clock, sleep : callable
+        Time [s], and waiting [s]; replaced in tests.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: Settings,
+        *,
+        clock: Callable[[], float] = system_time.monotonic,
+        sleep: Callable[[float], None] = system_time.sleep,
+    ) -> None:
+        self.settings = settings
+        self._transport = transport
+        self._controller = Controller(transport, settings, clock=clock)
+        self._clock, self._sleep = clock, sleep
+        self._is_lost = False  # the counter may not be where the wheel is
+
+    @classmethod
+    def from_url(cls, url: str, settings: Settings, *, world: object | None = None) -> Self:
+        """
+        Open the line and `connect`; the wheel does not move.
+
+        Parameters
+        ----------
+        url : str
+            ``serial:///dev/ttyUSB0``, ``pty:///dev/pts/3`` or ``sim://apt``.
+        settings : Settings
+            Properties of this wheel.
+        world : object, optional
+            Emulated bench of a ``sim://`` wheel.
+
+        Raises
+        ------
+        ValueError, TransportError
+            As `dbthermal.instruments.transport.open_serial`.
+        WheelError
+            As `connect`; the line is closed again.
+        """
+        transport = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
+        wheel = cls(transport, settings)
+        try:
+            _toggle_rts(transport)
+            wheel.connect()
+        except BaseException:
+            wheel.close()
+            raise
+        return wheel
+
+    def connect(self) -> apt.Info:
+        """
+        Find the controller, check its identity, set the speeds and enable the motor.
+
+        Raises
+        ------
+        NoReplyError, WrongDeviceError
+            If nothing replies, or the device is another one.
+        WheelError, TransportError
+            If the controller does not take the speeds or enable the motor, or is gone.
+        """
+        info = self._controller.find()
+        self._controller.prepare()
+        return info
+
+    @property
+    def is_simulated(self) -> bool:
+        """True if an emulator is at the other end."""
+        return self._transport.is_simulated
+
+    def identity(self) -> Identity:
+        """Identity of the controller; `WheelError` if the wheel is not connected."""
+        controller, info = self._controller, self._controller.info
+        addresses = f"0x{controller.unit:02X}, 0x{controller.motor:02X}"
+        return Identity(info.model, info.serial_number, info.firmware, addresses, self.is_simulated)
+
+    def status(self) -> apt.Status:
+        """Position [count] and state; NoReplyError or TransportError if the motor is silent."""
+        return self._controller.status()
+
+    def home(self) -> None:
+        """
+        Search for the home switch, from which all places count.
+
+        The speeds are set before: where they are near 0, as in some controllers that were just
+        switched on, homing does nothing and says nothing.
+
+        Raises
+        ------
+        StalledWheelError, WheelTimeoutError
+            If the wheel does not start or stops before the switch, the controller reports a fault,
+            or it takes longer than the settings' `home_timeout`; the wheel was stopped.
+        WheelError
+            If it is still moving, or the controller reports an error or does not take the speeds.
+        NoReplyError, TransportError
+            If the controller falls silent, or the device is gone.
+        """
+        self._controller.prepare()
+        self._require_rest()
+        self._is_lost = True
+        self._controller.start_home()
+        # The counter may stand while a controller searches for the switch: no stall limit.
+        timeout = self.settings.home_timeout
+        self._follow(_Motion("Search for home", apt.Id.MOT_MOVE_HOMED, timeout, timeout), _is_home)
+        self._is_lost = False
+
+    def move_to(self, position: int) -> None:
+        """
+        Turn a slot, 1 to 6, into the beam, and confirm that it is there.
+
+        Raises
+        ------
+        ValueError
+            If the slot is not 1 to 6.
+        NotHomedError
+            If the controller was not homed since it was switched on, or steps may be lost since.
+        StalledWheelError
+            If the wheel does not move, stops elsewhere, or the controller reports a fault: steps
+            may be lost, and it must be homed before the next move.
+        WheelTimeoutError
+            If it takes longer than the settings' `move_timeout`; the wheel was stopped.
+        WheelError
+            If it is still moving, or the controller reports an error.
+        NoReplyError, TransportError
+            If the controller falls silent, or the device is gone.
+        """
+        scale, settings = self._controller.scale, self.settings
+        target = scale.target(position, settings.home_offset)
+        self._require_home(self._require_rest())
+
+        def is_there(motion: _Motion, status: apt.Status) -> bool:
+            distance = abs(scale.degrees(status.position - target))
+            return distance <= settings.tolerance and (motion.reported or motion.rests > 0)
+
+        name = f"Move to {scale.degrees(target):.2f} deg"
+        limits = settings.move_timeout, settings.stall_timeout
+        self._controller.start_move(target)
+        try:
+            self._follow(_Motion(name, apt.Id.MOT_MOVE_COMPLETED, *limits), is_there)
+        except StalledWheelError:
+            self._is_lost = True
+            raise
+
+    def select(self, band: str) -> None:
+        """Turn a band's filter into the beam; ValueError if it has none, else as `move_to`."""
+        self.move_to(self.settings.position(band))
+
+    def position(self) -> int:
+        """
+        Slot in the beam, 1 to 6.
+
+        Raises
+        ------
+        WheelError, TransportError
+            If the wheel is between two slots, moving, or not homed, or the device is gone.
+        """
+        status = self._require_rest()
+        self._require_home(status)
+        scale, settings = self._controller.scale, self.settings
+        position = scale.position(status.position, settings.tolerance, settings.home_offset)
+        if position is None:
+            raise WheelError(
+                f"The wheel is between two slots, at {scale.degrees(status.position):.2f} deg. "
+                f"Must be within {settings.tolerance} deg of one: move it."
+            )
+        return position
+
+    def band(self) -> str:
+        """Name of the filter in the beam; raises as `position`, and if this slot has no filter."""
+        position = self.position()
+        if position not in self.settings.filters:
+            known = dict(self.settings.filters)
+            raise WheelError(f"No filter in slot {position}. Filters are in {known}.")
+        return self.settings.filters[position]
+
+    def stop(self) -> None:
+        """Stop the wheel by a ramp; TransportError if the device is gone."""
+        self._controller.stop()
+
+    def close(self) -> None:
+        """Close the line; the wheel stays where it is. A second call does nothing."""
+        self._transport.close()
+
+    def _require_rest(self) -> apt.Status:
+        """Status of a wheel that does not move."""
+        status = self._controller.status()
+        if status.bits & MOVING:
+            raise WheelError("The wheel is still moving. Must be at rest: wait, or stop it.")
+        return status
+
+    def _require_home(self, status: apt.Status) -> None:
+        """Raise unless the controller knows where the wheel is."""
+        if self._is_lost or not status.bits & apt.StatusBits.HOMED:
+            raise NotHomedError(
+                "The wheel was not homed since it was switched on, or has lost steps since. "
+                "Must be homed."
+            )
+
+    def _follow(self, motion: "_Motion", is_over: "Callable[[_Motion, apt.Status], bool]") -> None:
+        """Poll until a motion is over; stop the wheel if it takes too long."""
+        motion.began = motion.changed = self._clock()
+        confirmed = 0
+        while confirmed < CONFIRMATIONS:
+            status = self._poll(motion)
+            confirmed = confirmed + 1 if is_over(motion, status) else 0
+            if not confirmed:
+                self._check(motion, status)
+            self._sleep(self.settings.poll_interval)
+
+    def _poll(self, motion: "_Motion") -> apt.Status:
+        """Take in the motor's state."""
+        controller = self._controller
+        status = controller.status()
+        controller.raise_notice()
+        faults = status.bits & FAULTS
+        if faults:
+            controller.stop()
+            raise StalledWheelError(
+                f"The controller reports {faults.name}, and the wheel was stopped. Must be none."
+            )
+        motion.update(status, self._clock())
+        motion.reported = controller.has_reported(motion.end)
+        return status
+
+    def _check(self, motion: "_Motion", status: apt.Status) -> None:
+        """Raise if the wheel rests where it should not, stands still, or takes too long."""
+        place = f"at {self._controller.scale.degrees(status.position):.2f} deg"
+        now = self._clock()
+        started = motion.moved or now - motion.began > self.settings.start_timeout
+        if started and motion.rests >= CONFIRMATIONS:
+            action = "stopped" if motion.moved else "did not start and is"
+            raise StalledWheelError(f"{motion.name}: the wheel {action} {place}. Must arrive.")
+        if now - motion.began > motion.timeout:
+            self._controller.stop()
+            raise WheelTimeoutError(
+                f"{motion.name}: the wheel was still {place} after {motion.timeout} s, and was "
+                "stopped. Must arrive in this time."
+            )
+        if now - motion.changed > motion.stall:
+            self._controller.stop()
+            raise StalledWheelError(
+                f"{motion.name}: the wheel stood {place} for {motion.stall} s while it should "
+                "move, and was stopped. Must turn freely."
+            )
+
+
+@dataclass
+class _Motion:
+    """Name, end report and limits [s] of one motion, and its course so far, times in s."""
+
+    name: str
+    end: apt.Id
+    timeout: float
+    stall: float
+    began: float = 0.0
+    changed: float = 0.0
+    last: int | None = None
+    moved: bool = False
+    reported: bool = False
+    rests: int = 0
+
+    def update(self, status: apt.Status, time: float) -> None:
+        """Take in one status."""
+        moving = bool(status.bits & MOVING)
+        self.moved |= moving or (self.last is not None and status.position != self.last)
+        if status.position != self.last:
+            self.last, self.changed = status.position, time
+        self.rests = 0 if moving else self.rests + 1
+
+
+def _is_home(motion: _Motion, status: apt.Status) -> bool:
+    """True if the switch was found: the homed bit alone may be that of an earlier search."""
+    homed = status.bits & (apt.StatusBits.HOMED | apt.StatusBits.HOMING)
+    done = motion.reported or (motion.moved and motion.rests > 0)
+    return done and homed == apt.StatusBits.HOMED
+
+
+def _toggle_rts(transport: SerialTransport) -> None:
+    """Take RTS down and up again, where the line has one; a pseudo-terminal has none."""
+    transport.set_rts(level=False)
+    system_time.sleep(SETTLING)
+    if not transport.set_rts(level=True):
+        _LOGGER.info("The line %s has no RTS.", transport.url)

@@ -1,0 +1,370 @@
+"""Live view of a recording: its pictures, its losses, and the state of its cameras.
+
+A `View` is passed to `dbthermal.instruments.recording.record` as `preview`, and shows one picture
+of each band, in place, in a notebook or nowhere::
+
+    from IPython.display import DisplayHandle
+
+    view = live.View(DisplayHandle(), title=session.name, is_simulated=session.simulated)
+    record(session, devices.sources, path, readings=devices.readings(), preview=view)
+
+A `Watch` computes the numbers that are shown, and draws nothing: matplotlib is loaded with the
+first picture. The queue of the recording has to bridge the time that an update takes.
+"""
+
+import io
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+from scipy.constants import zero_Celsius
+
+from dbthermal.instruments.camera import FfcStatus, Frame, FrameFlag, Metadata
+from dbthermal.instruments.recording import Preview
+
+if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it
+    from matplotlib.figure import Figure
+
+    from dbthermal.figures import LiveFigure
+
+__all__ = ["Display", "Picture", "Status", "View", "Watch"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+_WINDOW: Final = 3.0  # time over which a frame rate is measured [s]
+_PERIOD: Final = 1.0  # least time from picture to picture [s]; one takes a tenth of it
+_PERCENTILES: Final = (1.0, 99.0)  # of the counts that are black and white in the picture [%]
+_LEAST_SHARE: Final = 0.01  # of pixels at either end of the range, from which a warning comes [1]
+_FPA: Final = "fpa "  # begins the name of a camera's temperature reading; its band follows
+_FFC: Final = "ffc "  # begins the name of a camera's `FfcStatus` reading; its band follows
+_COMPRESSION: Final = 1  # of zlib's 1 to 9
+_RANGE: Final = np.iinfo(np.uint16)
+_STEP: Final = 4  # every fourth pixel of every fourth row is enough for percentiles
+_FFC_STATES: Final = {float(state): state.name.lower().replace("_", " ") for state in FfcStatus}
+_IN_PROGRESS: Final = _FFC_STATES[FfcStatus.IN_PROGRESS]
+
+
+@dataclass(frozen=True)
+class Status:
+    """Recording state of one band; numbers of its last frame are NaN before it."""
+
+    band: str
+    frame_rate: float  # over the last window, by the times of arrival [Hz]; 0 if none came in it
+    frames: int
+    lost: int
+    refused: int
+    damaged: int
+    fpa_temperature: float = math.nan  # from the reading "fpa <band>", or the telemetry [K]
+    ffc: str = "unknown"  # "in progress", by flag of the last frame, or reading "ffc <band>"
+    ffc_age: float = math.nan  # since a correction was last seen in this recording [s]
+    limits: tuple[float, float] = (math.nan, math.nan)  # 1st and 99th percentile [count]
+    lowest: float = math.nan  # [count]
+    highest: float = math.nan  # [count]
+    dead: float = math.nan  # share of pixels at 0 [1]
+    saturated: float = math.nan  # share of pixels at 65535 [1]
+
+    @property
+    def text(self) -> str:
+        """Two lines: frames, then temperature [degree Celsius] and flat-field correction."""
+        rate = "-" if math.isnan(self.frame_rate) else f"{self.frame_rate:.1f}"
+        age = f", last {self.ffc_age:.0f} s ago" if self.ffc_age > 0 else ""
+        return (
+            f"{rate} frames/s, {self.lost} lost, {self.refused} refused, {self.damaged} damaged\n"
+            f"FPA {_celsius(self.fpa_temperature)}, FFC {self.ffc}{age}"
+        )
+
+    @property
+    def warning(self) -> str:
+        """A line for each defect that makes the last frames useless; empty without any."""
+        warnings = [
+            (self.frames == 0, "no frame has come"),
+            (self.frames > 0 and self.frame_rate == 0, "no new frames come"),
+            (self.ffc == _IN_PROGRESS, "shutter closed: FFC in progress"),
+            (self.dead > _LEAST_SHARE, _at(self.dead, _RANGE.min, "dead")),
+            (self.saturated > _LEAST_SHARE, _at(self.saturated, _RANGE.max, "saturated")),
+            (self.lowest == self.highest, f"every pixel at {self.lowest:.0f}: nothing is seen"),
+        ]
+        return "\n".join(line for is_so, line in warnings if is_so)
+
+
+def _at(share: float, counts: int, meaning: str) -> str:
+    return f"{100 * share:.1f} % of the pixels at {counts}: {meaning}"
+
+
+class Watch:
+    """
+    Numbers of a recording while it goes on, from its previews.
+
+    `window` is the time over which frame rates are measured [s]; ValueError if not positive.
+    """
+
+    def __init__(self, window: float = _WINDOW) -> None:
+        if not 0 < window < math.inf:
+            raise ValueError(f"Invalid window {window} s. Must be positive.")
+        self._window = window
+        self._last: Preview | None = None
+        self._past: deque[tuple[float, dict[str, tuple[int, float]]]] = deque()
+        self._ffc_seen: dict[str, float] = {}
+
+    def note(self, preview: Preview) -> bool:
+        """Take the next preview; return True if it is the first one of a recording."""
+        before, self._last = self._last, preview
+        if before is None or _is_other(before, preview):
+            before = None
+            self._past.clear()
+            self._ffc_seen.clear()
+        for band in preview.totals:
+            if _ffc(band, preview) == _IN_PROGRESS or _corrected(band, before, preview):
+                self._ffc_seen[band] = preview.time
+        marks = {
+            band: (preview.totals[band]["frames"], frame.host_time)
+            for band, frame in preview.frames.items()
+        }
+        self._past.append((preview.time, marks))
+        while len(self._past) > 1 and self._past[1][0] <= preview.time - self._window:
+            self._past.popleft()
+        return before is None
+
+    def status(self) -> dict[str, Status]:
+        """Band to its `Status` at the last preview; empty before the first one."""
+        last = self._last
+        if last is None:
+            return {}
+        return {
+            band: Status(
+                band,
+                frame_rate=self._rate(band),
+                frames=totals["frames"],
+                lost=totals["lost"],
+                refused=totals["refused"],
+                damaged=totals["damaged"],
+                fpa_temperature=self._fpa_temperature(band, last),
+                ffc=_ffc(band, last),
+                ffc_age=last.time - self._ffc_seen.get(band, math.nan),
+                **_levels(last.frames.get(band)),
+            )
+            for band, totals in last.totals.items()
+        }
+
+    @staticmethod
+    def _fpa_temperature(band: str, preview: Preview) -> float:
+        """Temperature of the focal-plane array by its reading, else by the telemetry [K]."""
+        reading = preview.readings.get(_FPA + band, math.nan)
+        return reading if math.isfinite(reading) else _metadata(band, preview).fpa_temperature
+
+    def _rate(self, band: str) -> float:
+        """Rate by the times at which the frames came: they are written in bursts."""
+        marks = [marks[band] for _, marks in self._past if band in marks]
+        if not marks:
+            return math.nan
+        (before, start), (now, stop) = marks[0], marks[-1]
+        if stop > start:
+            return (now - before) / (stop - start)
+        is_old = self._past[-1][0] - self._past[0][0] >= self._window
+        return 0.0 if is_old else math.nan
+
+
+def _is_other(before: Preview, now: Preview) -> bool:
+    """Whether a preview is of another recording than the one before it."""
+    return (
+        tuple(before.totals) != tuple(now.totals)
+        or now.time < before.time
+        or any(now.totals[band]["frames"] < before.totals[band]["frames"] for band in now.totals)
+    )
+
+
+def _metadata(band: str, preview: Preview | None) -> Metadata:
+    """Metadata of a band's last frame, empty without any."""
+    frame = preview.frames.get(band) if preview else None
+    return (frame and frame.metadata) or Metadata()
+
+
+def _corrected(band: str, before: Preview | None, now: Preview) -> bool:
+    """Whether the telemetry says that the offsets were renewed between two previews."""
+    earlier, later = (_metadata(band, shown).last_ffc_frame for shown in (before, now))
+    return None not in {earlier, later} and earlier != later
+
+
+def _ffc(band: str, preview: Preview) -> str:
+    """State of the flat-field correction; a camera that corrects answers late, a flag does not."""
+    frame = preview.frames.get(band)
+    if frame is not None and FrameFlag.SHUTTER_CLOSED in frame.flags:
+        return _IN_PROGRESS
+    reading = preview.readings.get(_FFC + band)
+    return "unknown" if reading is None else _ffc_state(reading)
+
+
+def _levels(frame: Frame | None) -> dict[str, Any]:
+    """Range of the counts of a frame, and the shares of its pixels at the ends of the range."""
+    if frame is None:
+        return {}
+    counts = frame.counts
+    low, high = np.percentile(counts[::_STEP, ::_STEP], _PERCENTILES)
+    return {
+        "limits": (float(low), float(high)),
+        "lowest": float(counts.min()),
+        "highest": float(counts.max()),
+        "dead": np.count_nonzero(counts == _RANGE.min) / counts.size,
+        "saturated": np.count_nonzero(counts == _RANGE.max) / counts.size,
+    }
+
+
+class Display(Protocol):
+    """Display of a picture, such as IPython's ``DisplayHandle``: shown first, then replaced."""
+
+    def display(self, obj: Any, /) -> Any: ...  # noqa: D102
+
+    def update(self, obj: Any, /) -> Any: ...  # noqa: D102
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """Picture for a notebook (PNG) with the same in words for a terminal."""
+
+    png: bytes
+    text: str
+
+    def __repr__(self) -> str:
+        return self.text
+
+    def _repr_png_(self) -> bytes:
+        return self.png
+
+
+class View:
+    """
+    Live view: an instance is the `preview` of a recording, or of several.
+
+    One update of two bands of 640 x 512 takes about a tenth of a second of one core; the fetching
+    threads go on meanwhile.
+
+    Parameters
+    ----------
+    display : Display, optional
+        Where it is shown; without one the figure is only kept.
+    is_simulated : bool
+        Whether the cameras are emulated; the title says so.
+    title : str
+        Name of the recording.
+    period : float
+        Least time from update to update [s], not negative.
+    window : float
+        Time over which frame rates are measured [s], positive.
+
+    Examples
+    --------
+    >>> view = View(is_simulated=True, title="pot")
+    >>> view.status
+    {}
+    """
+
+    def __init__(
+        self,
+        display: Display | None = None,
+        *,
+        is_simulated: bool,
+        title: str = "recording",
+        period: float = _PERIOD,
+        window: float = _WINDOW,
+    ) -> None:
+        if not 0 <= period < math.inf:
+            raise ValueError(f"Invalid period {period} s. Must be 0 or more.")
+        self._display, self._period = display, period
+        self._title = f"{title} (emulated)" if is_simulated else title
+        self._watch = Watch(window)
+        self._drawn: LiveFigure | None = None
+        self._is_shown, self._time = False, -math.inf
+
+    @property
+    def figure(self) -> "Figure | None":
+        """The figure as it was last drawn, None before the first preview."""
+        return self._drawn.figure if self._drawn else None
+
+    @property
+    def status(self) -> dict[str, Status]:
+        """Band to its `Status` at the last preview, whether it was drawn or not."""
+        return self._watch.status()
+
+    def __call__(self, preview: Preview) -> None:
+        """Take a preview; show it if the one shown last is old enough, or of another recording."""
+        if self._watch.note(preview):
+            self._time = -math.inf
+        # Nothing is drawn before the first frame: only a frame knows the size of a picture.
+        if preview.frames and preview.time - self._time >= self._period:
+            self._time = preview.time
+            self._show(preview)
+
+    def _show(self, preview: Preview) -> None:
+        from dbthermal.figures import LiveFigure, Panel  # noqa: PLC0415 - loads matplotlib
+
+        status, frames = self._watch.status(), preview.frames
+        bands, shape = tuple(preview.totals), next(iter(frames.values())).counts.shape
+        if self._drawn is None or (self._drawn.bands, self._drawn.shape) != (bands, shape):
+            self._drawn = LiveFigure(bands, shape)
+        panels = {}
+        for band, one in status.items():
+            image = frames[band].counts if band in frames else None
+            panels[band] = Panel(image, _apart(one.limits), one.text, one.warning)
+        title, foot = f"{self._title}, {preview.time:.1f} s", _foot(preview)
+        self._drawn.update(panels, title=title, foot=foot)
+        if self._display is not None:
+            lines = [f"{band}: {one.text}\n{one.warning}" for band, one in status.items()]
+            picture = Picture(_png(self._drawn), "\n".join((title, *lines, foot)))
+            (self._display.update if self._is_shown else self._display.display)(picture)
+            self._is_shown = True
+
+
+def _apart(limits: tuple[float, float]) -> tuple[float, float]:
+    """Black and white, apart even where all counts are equal; 0 and 1 where there are none."""
+    low, high = limits
+    if math.isnan(low):
+        return 0.0, 1.0
+    return low, max(high, low + 1.0)
+
+
+def _foot(preview: Preview) -> str:
+    """Readings that belong to no band that is shown: of thermocouples, of the blackbody."""
+    used = {prefix + band for prefix in (_FPA, _FFC) for band in preview.totals}
+    return ", ".join(
+        f"{name} {_reading(name, value, preview.units.get(name, 'K'))}"
+        for name, value in preview.readings.items()
+        if name not in used
+    )
+
+
+def _reading(name: str, value: float, unit: str) -> str:
+    if name.startswith(_FFC):
+        return _ffc_state(value)
+    if math.isnan(value):
+        return "no answer"
+    if unit == "K":
+        return _celsius(value)
+    return f"{value:g}" if unit == "1" else f"{value:g} {unit}"
+
+
+def _png(drawn: "LiveFigure") -> bytes:
+    """Write the figure as PNG, fast rather than small."""
+    from matplotlib.image import imsave  # noqa: PLC0415 - see the module's imports
+
+    buffer = io.BytesIO()
+    imsave(buffer, drawn.pixels(), format="png", pil_kwargs={"compress_level": _COMPRESSION})
+    return buffer.getvalue()
+
+
+def _celsius(temperature: float) -> str:
+    """A temperature [K] in degrees Celsius, or ``"unknown"``."""
+    if math.isnan(temperature):
+        return "unknown"
+    return f"{temperature - zero_Celsius:.1f} \N{DEGREE SIGN}C"
+
+
+def _ffc_state(reading: float) -> str:
+    """Name of an `FfcStatus` reading, ``"no answer"`` for NaN, or the number if unknown."""
+    if math.isnan(reading):
+        return "no answer"
+    return _FFC_STATES.get(reading, f"state {reading:g}")

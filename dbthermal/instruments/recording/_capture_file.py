@@ -1,0 +1,393 @@
+"""The capture file: a recording while it grows, frame by frame and note by note.
+
+Each frame is compared with the one before: a number that leaps is a loss, one that does not rise a
+repetition, a stamp that does not rise, or cannot be, is no time, and an image without a changed
+pixel was not taken anew. Nothing is left out: a damaged frame is written with its flags, and only
+its exposure time is NaN, so that `dbthermal.alignment` passes over it. Losses, shutter events and
+readings of other instruments go into the log. The store explains its contents in words, for a
+reader may have no more than the store.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal import store
+from dbthermal.alignment import fill_times
+from dbthermal.instruments import telemetry
+from dbthermal.instruments.camera import (
+    DAMAGED,
+    GOOD,
+    MEANINGS,
+    UNTIMED,
+    Counts,
+    FfcStatus,
+    Frame,
+    FrameFlag,
+    FrameSource,
+    Metadata,
+    Shutter,
+    next_shutter,
+)
+from dbthermal.schema import EXPOSURE_TIME, STAGES, Variable
+
+CHUNK: Final = 30
+"""Frames of a chunk: half a second at 60 Hz, the most that a kill may cost."""
+
+_AHEAD: Final = 1e-3  # by how much a stamp may be later than the frame's arrival [s]
+_STALE: Final = 3.0  # age at which a reading of the serial line says no more of the shutter [s]
+_HELD: Final = 1.0  # how long a note may wait for a chunk before it is written without one [s]
+_FILLS: Final = MappingProxyType(
+    {"frame_flags": int(FrameFlag.PADDED), "sequence": -1, "frame_counter": -1}
+)
+
+
+class Note(IntEnum):
+    """Kinds of notes in the log; `NOTES` has the meaning of the value of each."""
+
+    READING = 0
+    READING_FAILED = 1
+    FRAMES_LOST = 2
+    FRAMES_REFUSED = 3
+    SEQUENCE_STANDS = 4
+    DAMAGED = 5
+    SHUTTER_CLOSED = 6
+    SHUTTER_OPEN = 7
+    CORRECTION = 8
+    NO_FRAME = 9
+    SOURCE_LOST = 10
+
+
+NOTES: Final = MappingProxyType(
+    {
+        Note.READING: "the reading",
+        Note.READING_FAILED: "NaN, the instrument gave none",
+        Note.FRAMES_LOST: "number of frames missing by the driver's numbers",
+        Note.FRAMES_REFUSED: "number of frames that came, but for which the queue was full",
+        Note.SEQUENCE_STANDS: "step of the driver's number, 0 or less",
+        Note.DAMAGED: "flags of the frame",
+        Note.SHUTTER_CLOSED: "driver's number of the first frame with a closed shutter",
+        Note.SHUTTER_OPEN: "driver's number of the first frame with an open one",
+        Note.CORRECTION: "frame_counter at which the camera renewed its offsets, from telemetry",
+        Note.NO_FRAME: "time without a frame [s]",
+        Note.SOURCE_LOST: "NaN, the source gives no more frames",
+    }
+)
+"""Kind of a note to the meaning of its value."""
+
+
+@dataclass(frozen=True)
+class _Explained(Variable):
+    """A variable with more attributes than unit and meaning."""
+
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def attrs(self) -> dict[str, Any]:
+        return {**super().attrs, **self.more}
+
+
+def _of_frames(dtype: str, units: str, long_name: str) -> Variable:
+    return Variable(("band", "time"), dtype, units, long_name)
+
+
+def _of_log(dtype: str, long_name: str, units: str = "1") -> Variable:
+    return Variable(("log",), dtype, units, long_name)
+
+
+def _coded(variable: Variable, meanings: Mapping[Any, str]) -> Variable:
+    """Variable with CF attributes of its codes, and a sentence for each."""
+    sentences = {str(code.name).lower(): text for code, text in meanings.items()}
+    masks = all(isinstance(code, IntFlag) for code in meanings)
+    attrs = {
+        "flag_masks" if masks else "flag_values": [int(code) for code in meanings],
+        "flag_meanings": " ".join(sentences),
+        "comment": "; ".join(f"{name}: {text}" for name, text in sentences.items()),
+    }
+    return _Explained(variable.dims, variable.dtype, variable.units, variable.long_name, attrs)
+
+
+ABOUT: Final = (
+    "Raw frames as they came. Frame n of one band and frame n of another are not of one moment: "
+    "each has its exposure_time, and the coordinate time is the first band's, without holes. "
+    "exposure_time, host_time and log_time count from attribute clock_origin on the host's "
+    "monotonic clock, which was attribute started in UTC; device_time is as the device gave it. "
+    "exposure_time is NaN where a frame is no measurement; frame_flags say why. A band has the "
+    "number of frames that frames_written says; what follows is its last one, repeated. "
+    "Note n of the log is of log_sources[log_source], and its log_value is what log_kind says; a "
+    "reading is in the unit that log_units says. totals: frames of each band, those lost by the "
+    "driver's numbers, refused by a full queue, damaged. ended: why it ended; complete: as was "
+    "planned; closed: false if it is being written or was cut short, and then only frames_written "
+    "and log_written are valid."
+)
+"""Explanation for a reader of the store: its attribute ``comment``."""
+
+_LAYOUT: Final = (
+    "16-bit words of a Boson; likely, not certain, are the words (of a longer number the high one "
+    "first; value = number / steps + zero): "
+    + ", ".join(
+        f"{name} {place.word} to {place.word + place.words - 1}"
+        + (f" (steps {place.steps}, zero {place.zero:g})" if place.steps else "")
+        for name, place in telemetry.FIELDS.items()
+    )
+)
+
+VARIABLES: Final = MappingProxyType(
+    {
+        "counts": STAGES["capture"]["counts"],
+        "exposure_time": EXPOSURE_TIME,
+        "device_time": _of_frames("float64", "s", "device's stamp of the frame, as it came"),
+        "host_time": _of_frames("float64", "s", "arrival at the host, since clock_origin"),
+        "sequence": _of_frames("int64", "1", "number of the frame by its driver"),
+        "frame_flags": _coded(_of_frames("uint16", "1", "flags, 0 for a good frame"), MEANINGS),
+        "log_time": _of_log("float64", "time of the note, since clock_origin", "s"),
+        "log_kind": _coded(_of_log("int16", "kind of the note"), NOTES),
+        "log_source": _of_log("int16", "source of the note: place in attribute log_sources"),
+        "log_value": _of_log("float64", "value by kind of the note; see attribute log_units"),
+    }
+)
+"""Variables of every recording; `ABOUT` explains them together."""
+
+TELEMETRY: Final = MappingProxyType(
+    {
+        "telemetry": _Explained(
+            ("band", "time", "telemetry_row", "x"),
+            "uint16",
+            "1",
+            "telemetry rows as they came",
+            {"comment": _LAYOUT},
+        ),
+        "fpa_temperature": _of_frames("float32", "K", "temperature of the focal-plane array"),
+        "frame_counter": _of_frames("int64", "1", "camera's own number of the frame, or -1"),
+    }
+)
+"""Variables of a recording of cameras that give telemetry. Where `frame_counter` leaps and
+`sequence` does not, frames were lost before the driver saw them; its usual step is not documented
+for all rates, so that the recorder draws no conclusion."""
+
+
+@dataclass
+class _Band:
+    """Recording state of one band."""
+
+    block: dict[str, npt.NDArray[Any]]
+    filled: int = 0
+    image: Counts | None = None
+    sequence: int | None = None
+    device_time: float = -math.inf
+    shutter: Shutter = field(default_factory=Shutter)
+    ffc_status: tuple[float, FfcStatus | None] = (-math.inf, None)
+    last_correction: int | None = None
+    counts: dict[str, int] = field(
+        default_factory=lambda: dict.fromkeys(("frames", "lost", "refused", "damaged"), 0)
+    )
+
+
+class CaptureFile:
+    """
+    A new recording at `path` that takes frames and notes in the order in which they come.
+
+    `readings` has the unit of each further instrument, `origin` is the host's clock at time 0 [s],
+    `attrs` are attributes of the recording (JSON), and `chunk` is the number of frames that are
+    written together. FileExistsError if `path` exists; ValueError if the sources differ in shape or
+    telemetry. After a failed write `broken` is True: what was written before is valid, and nothing
+    more may be handed over.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        sources: Mapping[str, FrameSource],
+        *,
+        readings: Mapping[str, str],
+        origin: float,
+        attrs: Mapping[str, Any],
+        chunk: int = CHUNK,
+    ) -> None:
+        (rows, columns), telemetry_rows = _common_format(sources)
+        self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
+        self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
+        self._origin, self._chunk = origin, chunk
+        self._names = [*sources, *readings]
+        self._notes: list[tuple[float, int, int, float]] = []
+        self.broken = False
+        self.recording = store.Recording.create(
+            path,
+            self._variables,
+            self._sizes,
+            list(sources),
+            chunk=chunk,
+            attrs={
+                **attrs,
+                "comment": ABOUT,
+                "clock_origin": origin,
+                "log_sources": self._names,
+                "log_units": dict(readings),
+                "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
+            },
+            fills=_FILLS,
+        )
+        self._bands = {band: _Band(self._new_block()) for band in sources}
+
+    @property
+    def totals(self) -> dict[str, dict[str, int]]:
+        """Band to its ``frames``, ``lost``, ``refused`` and ``damaged``, numbers of frames."""
+        return {band: dict(state.counts) for band, state in self._bands.items()}
+
+    def frame(self, band: str, frame: Frame, refused: int = 0) -> FrameFlag:
+        """
+        Take a frame, write the chunk if it is full, and return all flags of the frame.
+
+        `refused` is the number of frames of this band that came before it and were not taken.
+        """
+        state = self._bands[band]
+        flags = frame.flags | self._compared(band, frame, refused)
+        flags |= self._watch_shutter(band, frame, flags)
+        if flags & DAMAGED:
+            state.counts["damaged"] += 1
+            self.note(Note.DAMAGED, band, frame.host_time, int(flags))
+        timed = not flags & (UNTIMED | FrameFlag.FOREIGN_CLOCK)
+        values: dict[str, Any] = {
+            "counts": frame.counts,
+            "exposure_time": frame.device_time - self._origin if timed else math.nan,
+            "device_time": frame.device_time,
+            "host_time": frame.host_time - self._origin,
+            "sequence": frame.sequence,
+            "frame_flags": int(flags),
+            **self._decoded(band, frame),
+        }
+        for name, value in values.items():
+            state.block[name][state.filled] = value
+        state.filled += 1
+        state.counts["frames"] += 1
+        if state.filled == self._chunk:
+            self._write(band)
+        return flags
+
+    def note(self, kind: Note, source: str, time: float, value: float = math.nan) -> None:
+        """Put a line into the log: a kind, a band or the name of a reading, time [s], value."""
+        band = source.removeprefix("ffc ")
+        if kind is Note.READING and source != band and band in self._bands:
+            status = FfcStatus(int(value)) if value in set(FfcStatus) else None
+            self._bands[band].ffc_status = time, status
+        row = time - self._origin, int(kind), self._names.index(source), value
+        self._notes.append(row)
+        if row[0] - self._notes[0][0] > _HELD:
+            self._write_notes()
+
+    def refused(self, band: str, number: int, time: float) -> None:
+        """Count frames of a band that came and were not taken, and note it."""
+        if number:
+            self._bands[band].counts["refused"] += number
+            self.note(Note.FRAMES_REFUSED, band, time, number)
+
+    def close(self, *, complete: bool, ended: str) -> None:
+        """Write the rest, and the coordinate `time`: the first band's exposure times."""
+        for band in self._bands:
+            self._write(band)
+        self._write_notes()
+        stamps = self.recording.read("exposure_time", next(iter(self._bands)))
+        time = fill_times(stamps) if np.isfinite(stamps).sum() > 1 else None
+        self.recording.close(complete=complete, time=time, ended=ended, totals=self.totals)
+
+    def _compared(self, band: str, frame: Frame, refused: int) -> FrameFlag:
+        """Flags from the frame before, with notes of the frames that are missing between them."""
+        state, flags = self._bands[band], GOOD
+        self.refused(band, refused, frame.host_time)
+        step = 1 if state.sequence is None else frame.sequence - state.sequence
+        lost = step - 1 - refused
+        if step < 1:
+            flags |= FrameFlag.SEQUENCE_STANDS
+            self.note(Note.SEQUENCE_STANDS, band, frame.host_time, step)
+        elif lost > 0:
+            state.counts["lost"] += lost
+            self.note(Note.FRAMES_LOST, band, frame.host_time, lost)
+        flags |= FrameFlag.FRAMES_LOST_BEFORE if step > 1 else GOOD
+        if state.image is not None and np.array_equal(frame.counts, state.image):
+            flags |= FrameFlag.IMAGE_REPEATED
+        state.sequence, state.image = frame.sequence, frame.counts
+        return flags | self._timed(state, frame)
+
+    def _timed(self, state: _Band, frame: Frame) -> FrameFlag:
+        """Flag of an invalid stamp; one of the future must not spoil those that follow."""
+        has_own_clock, time = FrameFlag.FOREIGN_CLOCK in frame.flags, frame.device_time
+        if not has_own_clock and (time < self._origin or time > frame.host_time + _AHEAD):
+            return FrameFlag.TIME_WRONG
+        if not frame.device_time > state.device_time:  # NaN too
+            return FrameFlag.TIME_STANDS
+        state.device_time = frame.device_time
+        return GOOD
+
+    def _watch_shutter(self, band: str, frame: Frame, flags: FrameFlag) -> FrameFlag:
+        """Flag of a closed shutter, from telemetry, serial line and image."""
+        state = self._bands[band]
+        read_at, status = state.ffc_status
+        was_closed = state.shutter.closed
+        state.shutter = next_shutter(
+            state.shutter,
+            repeated=FrameFlag.IMAGE_REPEATED in flags,
+            last_ffc_frame=frame.metadata.last_ffc_frame if frame.metadata else None,
+            ffc_status=status if frame.host_time - read_at <= _STALE else None,
+        )
+        if state.shutter.closed != was_closed:
+            kind = Note.SHUTTER_CLOSED if state.shutter.closed else Note.SHUTTER_OPEN
+            self.note(kind, band, frame.host_time, frame.sequence)
+        return FrameFlag.SHUTTER_CLOSED if state.shutter.closed else GOOD
+
+    def _decoded(self, band: str, frame: Frame) -> dict[str, Any]:
+        """Telemetry as it came, and its values that are stored for each frame."""
+        if frame.telemetry is None:
+            return {}
+        state, fields = self._bands[band], frame.metadata or Metadata()
+        if fields.last_ffc_frame is not None:
+            if state.last_correction not in {None, fields.last_ffc_frame}:
+                self.note(Note.CORRECTION, band, frame.host_time, fields.last_ffc_frame)
+            state.last_correction = fields.last_ffc_frame
+        return {
+            "telemetry": frame.telemetry,
+            "fpa_temperature": fields.fpa_temperature,
+            "frame_counter": fields.frame_counter,
+        }
+
+    def _write(self, band: str) -> None:
+        state = self._bands[band]
+        if state.filled:
+            self.broken = True
+            block = {name: values[: state.filled] for name, values in state.block.items()}
+            self.recording.append(band, block)
+            state.filled = 0
+        self._write_notes()
+
+    def _write_notes(self) -> None:
+        self.broken = True
+        if self._notes:
+            names = ("log_time", "log_kind", "log_source", "log_value")
+            columns = zip(names, zip(*self._notes, strict=True), strict=True)
+            self.recording.append_log(
+                {name: np.array(values, self._variables[name].dtype) for name, values in columns}
+            )
+            self._notes = []
+        self.recording.commit(totals=self.totals)
+        self.broken = False
+
+    def _new_block(self) -> dict[str, npt.NDArray[Any]]:
+        sizes = {**self._sizes, "time": self._chunk}
+        return {
+            name: np.zeros([sizes[dim] for dim in variable.dims[1:]], variable.dtype)
+            for name, variable in self._variables.items()
+            if variable.dims[0] == "band"
+        }
+
+
+def _common_format(sources: Mapping[str, FrameSource]) -> tuple[tuple[int, int], int]:
+    formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
+    if len(set(formats.values())) != 1:
+        raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
+    return next(iter(formats.values()))

@@ -1,0 +1,423 @@
+"""The recorder: the frames of all cameras and the readings beside them, into one capture file.
+
+A thread for each camera fetches its frames, one more reads the other instruments, so that none
+waits for another: a command that a camera answers late, because it corrects its offsets just then,
+costs no frame. A queue of bounded length leads to the thread that writes. If the disk is too slow
+the queue fills, frames are refused, and the recording says how many and when.
+
+The caller's thread shows the preview. A preview that is slow or raises, or an interrupt by the
+keyboard, twice maybe, stops no chunk half-way: the frames that came before are written before the
+writer ends.
+"""
+
+import errno
+import math
+import queue
+import shutil
+import threading
+import time as system_time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from dbthermal import store
+from dbthermal.instruments.camera import (
+    Frame,
+    FrameFlag,
+    FrameSource,
+    NoFrameError,
+    SourceLostError,
+)
+from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
+from dbthermal.instruments.session import Session
+
+Identities = Mapping[str, Mapping[str, str | bool]]
+
+_SHOW_POLL: Final = 0.01  # least wait between two looks for a preview [s]
+_WRITE_POLL: Final = 0.05  # how long the writer waits for a frame [s]
+_HELD: Final = 2.0  # how long after the start a frame may still come that a driver held [s]
+_BYTES: Final = 2  # of a pixel
+
+
+@dataclass(frozen=True)
+class Reading:
+    """
+    Another instrument that is read beside the frames; `read` may take its time.
+
+    OSError, RuntimeError and ValueError of it are noted as a failed reading; any other error ends
+    the recording.
+    """
+
+    read: Callable[[], float]
+    units: str = "K"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Sizes and waiting times of a recording."""
+
+    chunk: int = CHUNK  # frames of a chunk: the most that a kill may cost
+    queue: int = 120  # frames of each band held until they are written
+    reserve: int = 10**9  # space that must stay free [byte]
+    silence: float = 1.0  # wait for a frame before it is noted that none came [s]
+    reading_period: float = 1.0  # time from reading to reading [s]
+    patience: float = 10.0  # wait, at the end, for a device that hangs [s]
+    preview_period: float = 0.2  # least time from preview to preview [s]
+
+
+@dataclass(frozen=True)
+class Preview:
+    """
+    State of a recording while it goes on.
+
+    `totals` has numbers of frames for each band: ``frames``, ``lost``, ``refused``, ``damaged``.
+    """
+
+    time: float  # since the start [s]
+    frames: Mapping[str, Frame]  # last frame of each band that had one
+    totals: Mapping[str, Mapping[str, int]]
+    readings: Mapping[str, float]  # last value of each reading, NaN if it failed
+    units: Mapping[str, str] = field(default_factory=dict)  # of the readings, else kelvin
+
+
+@dataclass(frozen=True)
+class Summary:
+    """
+    Result of a recording, with `totals` as in `Preview`.
+
+    `ended` is ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is
+    lost), or ``"no frames"`` if a band had none.
+    """
+
+    path: Path
+    ended: str
+    totals: Mapping[str, Mapping[str, int]]
+
+
+def record(  # noqa: PLR0913 - all but the first three are by name
+    session: Session,
+    sources: Mapping[str, FrameSource],
+    path: str | Path,
+    *,
+    readings: Mapping[str, Reading] | None = None,
+    identities: Identities | None = None,
+    limits: Limits | None = None,
+    preview: Callable[[Preview], None] | None = None,
+    stop: threading.Event | None = None,
+    clock: Callable[[], float] = system_time.monotonic,
+) -> Summary:
+    """
+    Record until the session's duration is over, `stop` is set or no source is left.
+
+    Frames that a driver held from before the start, by their stamps, are not recorded: they show
+    another filter, or another scene. Two seconds after the start such a stamp counts as wrong.
+
+    Parameters
+    ----------
+    session : Session
+        Bands, format, duration.
+    sources : mapping
+        Band to an open source, in the session's order; they stay open.
+    path : str or Path
+        Folder ``*.zarr`` to make; see `open_capture`.
+    readings : mapping, optional
+        Name to another instrument: thermocouples, the cameras' temperatures, the blackbody.
+    identities : mapping, optional
+        Band, or name of another device, to model and numbers, beside those of the sources.
+    limits : Limits, optional
+        Sizes and waiting times.
+    preview : callable, optional
+        Called now and then with a `Preview`, in the caller's thread; it may take its time.
+    stop : Event, optional
+        Ends the recording when set.
+    clock : callable
+        Host's monotonic clock [s], that of the sources' stamps.
+
+    Returns
+    -------
+    Summary
+        How it ended, and numbers of frames; also in the store.
+
+    Raises
+    ------
+    FileExistsError
+        If `path` exists.
+    OSError
+        If there is too little space, before or on the way.
+    ValueError
+        If the sources are not the session's, or are emulated where it says hardware, or vice versa.
+    Exception
+        Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
+        what was recorded is kept. A second interrupt ends the wait, not the writing.
+    """
+    limits, readings = limits or Limits(), readings or {}
+    _check(session, sources)
+    start = clock()
+    file = _new_file(session, sources, readings, identities or {}, Path(path), start, limits)
+    end, stop = clock() + session.duration, stop or threading.Event()
+    run = _Run(file, sources, readings, limits, clock, start, end, stop)
+    # No daemon: it ends its work whatever becomes of this thread.
+    writer = threading.Thread(target=run.write, name="writer")
+    try:
+        writer.start()
+        run.show(preview)
+    except BaseException:
+        run.interrupted = True
+        raise
+    finally:
+        run.over.set()
+        if writer.ident is not None:  # None only where an interrupt came before its start
+            run.done.wait()
+    if run.errors:
+        raise run.errors[0]
+    return Summary(Path(path), run.ended, file.totals)
+
+
+def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
+    if tuple(sources) != session.bands:
+        raise ValueError(
+            f"Invalid sources {list(sources)}. Must be the bands {list(session.bands)}."
+        )
+    for band, source in sources.items():
+        if source.is_simulated != session.simulated:
+            raise ValueError(
+                f"Invalid source of band '{band}': is_simulated is {source.is_simulated}. "
+                f"Must be {session.simulated}, as the session says."
+            )
+        if source.shape != session.shape:
+            raise ValueError(
+                f"Invalid shape {source.shape} of band '{band}'. Must be {session.shape}."
+            )
+
+
+def _new_file(
+    session: Session,
+    sources: Mapping[str, FrameSource],
+    readings: Mapping[str, Reading],
+    identities: Identities,
+    path: Path,
+    start: float,
+    limits: Limits,
+) -> CaptureFile:
+    """Begin the capture file, if there is room for all of it, uncompressed."""
+    folder = path.absolute().parent
+    folder.mkdir(parents=True, exist_ok=True)
+    rows, columns = session.shape
+    frames = sum(session.duration * source.frame_rate for source in sources.values())
+    _check_space(folder, limits.reserve + int(_BYTES * rows * columns * frames))
+    known = {band: dict(source.identity) for band, source in sources.items()}
+    attrs = {
+        "is_simulated": session.simulated,
+        "origin": "simulated, emulated rig" if session.simulated else "measured",
+        "identities": {
+            name: {**known.get(name, {}), **identities.get(name, {})}
+            for name in {**known, **identities}
+        },
+        "frame_rates": {band: source.frame_rate for band, source in sources.items()},
+        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "provenance": store.provenance(session.content()),
+    }
+    units = {name: reading.units for name, reading in readings.items()}
+    return CaptureFile(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)
+
+
+class _Run:
+    """One recording: the threads that fetch, read and write, and what they share."""
+
+    def __init__(
+        self,
+        file: CaptureFile,
+        sources: Mapping[str, FrameSource],
+        readings: Mapping[str, Reading],
+        limits: Limits,
+        clock: Callable[[], float],
+        start: float,
+        end: float,
+        stop: threading.Event,
+    ) -> None:
+        self.file, self.readings, self.limits = file, readings, limits
+        self.clock, self.start, self.end, self.stop = clock, start, end, stop
+        self.over, self.done = threading.Event(), threading.Event()
+        self.errors: list[BaseException] = []
+        self.interrupted, self.ended = False, ""
+        # For the preview, after each frame is written: totals, last frames, last readings.
+        self.totals: dict[str, dict[str, int]] = {}
+        self.last_frames: dict[str, Frame] = {}
+        self.last_readings: dict[str, float] = {}
+        # (band, frame, number refused before it); at most `limits.queue` frames of each band.
+        self._frames: queue.SimpleQueue[tuple[str, Frame, int]] = queue.SimpleQueue()
+        self._room = {band: threading.Semaphore(limits.queue) for band in sources}
+        self._notes: queue.SimpleQueue[tuple[Note, str, float, float]] = queue.SimpleQueue()
+        self._lost_sources: list[str] = []
+        self._refused_last: dict[str, int] = {}
+        self._fetching = [
+            threading.Thread(target=self.fetch, args=item, name=item[0], daemon=True)
+            for item in sources.items()
+        ]
+        self._reading = threading.Thread(target=self.read, name="readings", daemon=True)
+
+    def is_going(self) -> bool:
+        """Whether neither end nor stop nor an error has come."""
+        return not (self.over.is_set() or self.stop.is_set() or self.clock() >= self.end)
+
+    def fetch(self, band: str, source: FrameSource) -> None:
+        """
+        Bring the frames of one source to the queue, until it is over.
+
+        Where the queue has no more room for the band a frame is refused, and the next one that is
+        not says how many were.
+        """
+        refused = 0
+        try:
+            while self.is_going():
+                try:
+                    frame = source.read(self.limits.silence)
+                except NoFrameError:
+                    self._notes.put((Note.NO_FRAME, band, self.clock(), self.limits.silence))
+                    continue
+                if self._room[band].acquire(blocking=False):
+                    self._frames.put((band, frame, refused))
+                    refused = 0
+                else:
+                    refused += 1
+        except SourceLostError:
+            self._lost_sources.append(band)
+            self._notes.put((Note.SOURCE_LOST, band, self.clock(), math.nan))
+        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
+            self.errors.append(error)
+            self.over.set()
+        finally:
+            self._refused_last[band] = refused
+
+    def read(self) -> None:
+        """Read all other instruments, one after the other, until it is over."""
+        try:
+            while self.readings and self.is_going():
+                for name, reading in self.readings.items():
+                    try:
+                        value, kind = float(reading.read()), Note.READING
+                    except (OSError, RuntimeError, ValueError):
+                        value, kind = math.nan, Note.READING_FAILED
+                    self._notes.put((kind, name, self.clock(), value))
+                self.over.wait(min(self.limits.reading_period, max(0.0, self.end - self.clock())))
+        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
+            self.errors.append(error)
+            self.over.set()
+
+    def show(self, preview: Callable[[Preview], None] | None) -> None:
+        """Call the preview now and then, until nothing more is written."""
+        units = {name: reading.units for name, reading in self.readings.items()}
+        period = _SHOW_POLL  # until there is something to show
+        # Not `Thread.join`: interrupted, Python 3.11's takes a running thread for an ended one.
+        while not self.done.wait(period):
+            if preview and self.last_frames and self.is_going():
+                period = max(_SHOW_POLL, self.limits.preview_period)
+                time, totals = self.clock() - self.start, self.totals
+                frames, readings = dict(self.last_frames), dict(self.last_readings)
+                preview(Preview(time, frames, totals, readings, units))
+
+    def write(self) -> None:
+        """
+        Start the other threads, write frames and notes until all is over, and close the file.
+
+        Errors go to `errors`. After one of writing itself the file is left as it is on the disk,
+        for nothing more can be written.
+        """
+        threads = (*self._fetching, self._reading)
+        try:
+            for thread in threads:
+                thread.start()
+            self._write_frames()
+        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
+            self.errors.append(error)
+        self.over.set()
+        for thread in threads:
+            self._join(thread)
+        try:
+            if not self.file.broken:
+                self._write_rest()
+                self.ended = self._reason()
+                is_complete = self.ended in {"duration", "stopped"}
+                self.file.close(complete=is_complete, ended=self.ended)
+        except BaseException as error:  # noqa: BLE001 - as above
+            self.errors.append(error)
+        finally:
+            self.done.set()
+
+    def _write_frames(self) -> None:
+        number = 0
+        while self.is_going() and any(thread.is_alive() for thread in self._fetching):
+            self._take_notes()
+            try:
+                band, frame, refused = self._frames.get(timeout=_WRITE_POLL)
+            except queue.Empty:
+                continue
+            self._take(band, frame, refused)
+            self._room[band].release()
+            number += 1
+            if number % self.limits.chunk == 0:
+                _check_space(self.file.recording.path, self.limits.reserve)
+
+    def _write_rest(self) -> None:
+        """Write what is still in the queues, when the threads have ended."""
+        while not self._frames.empty():
+            self._take(*self._frames.get_nowait())
+        self._take_notes()
+        for band, number in self._refused_last.items():
+            self.file.refused(band, number, self.clock())
+
+    def _take(self, band: str, frame: Frame, refused: int) -> None:
+        """Write a frame, unless the driver held it from before the start."""
+        has_own_clock = FrameFlag.FOREIGN_CLOCK in frame.flags  # which cannot say
+        early = frame.device_time < self.start and frame.host_time < self.start + _HELD
+        if band not in self.last_frames and early and not has_own_clock:
+            return
+        flags = self.file.frame(band, frame, refused)
+        self.last_frames[band] = replace(frame, flags=flags)
+        self.totals = self.file.totals
+
+    def _take_notes(self) -> None:
+        while not self._notes.empty():
+            kind, source, time, value = self._notes.get_nowait()
+            self.file.note(kind, source, time, value)
+            if kind in {Note.READING, Note.READING_FAILED}:
+                self.last_readings[source] = value
+
+    def _reason(self) -> str:
+        """Why the recording ended."""
+        if self.errors:
+            return "no space" if getattr(self.errors[0], "errno", 0) == errno.ENOSPC else "error"
+        if self.interrupted:
+            return "interrupted"
+        if self._lost_sources:
+            return "source lost"
+        if len(self.last_frames) < len(self._room):
+            return "no frames"
+        return "stopped" if self.stop.is_set() else "duration"
+
+    def _join(self, thread: threading.Thread) -> None:
+        """Wait for a thread; one that hangs in its device must not keep what was recorded."""
+        if thread.ident is None:
+            return
+        thread.join(self.limits.patience)
+        if thread.is_alive():
+            self.errors.append(
+                TimeoutError(
+                    f"No answer of the device of '{thread.name}' within {self.limits.patience} s "
+                    "after the end. Must keep its time limits."
+                )
+            )
+
+
+def _check_space(path: Path, least: int) -> None:
+    available = _free(path)
+    if available < least:
+        message = f"Too little space: {available} bytes are free. Must be {least}"
+        raise OSError(errno.ENOSPC, message, str(path))
+
+
+def _free(path: Path) -> int:
+    """Space that is free on the file system of a folder [byte]."""
+    return shutil.disk_usage(path).free

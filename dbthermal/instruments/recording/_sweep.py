@@ -1,0 +1,270 @@
+"""Reader of a blackbody sweep: one recording for each temperature and filter.
+
+Only the folder is read: the recordings say which session they are of. Temperatures are the readings
+during the recordings, not the set points.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import schema, store
+from dbthermal.correction import correct
+from dbthermal.instruments.recording._capture import good_frames, mean_reading, notes, open_capture
+
+BLACKBODY = "blackbody"
+"""Name of the reading of the blackbody's temperature [K]."""
+
+Region = tuple[slice, slice]
+
+
+def step_path(folder: str | Path, name: str, number: int, band: str | None) -> Path:
+    """Path of a recording: ``<name>_<number>_<band>.zarr``, or without a wheel no band."""
+    behind = "" if band is None else f"_{band}"
+    return Path(folder) / f"{name}_{number:02d}{behind}.zarr"
+
+
+def require_filter(path: str | Path, band: str | None) -> None:
+    """ValueError unless the filter of a band stayed in the beam throughout a recording."""
+    if band is None:
+        return
+    filters = store.open_dataset(path).attrs["provenance"]["parameters"]["filters"]
+    slots = {value for _, _, source, value in notes(path) if source == "filter_wheel"}
+    if {filters.get(f"{slot:.0f}") for slot in slots} != {band}:
+        raise ValueError(
+            f"Invalid slots {sorted(slots)} of the wheel in the recording '{path}'. "
+            f"Must be that of filter '{band}' throughout: move it away, and record it again."
+        )
+
+
+def is_complete(path: str | Path) -> bool:
+    """Whether a recording went to its planned end; False, too, if the folder does not exist."""
+    try:
+        return bool(store.open_dataset(path).attrs.get("complete", False))
+    except FileNotFoundError:
+        return False
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """Session of a sweep, as its recordings tell it."""
+
+    folder: Path
+    name: str
+    temperatures: list[float]
+    stability: float
+    bands: list[str | None]
+    attrs: Mapping[str, Any]
+
+    def steps(self) -> Iterator[list[Path]]:
+        """Recordings of each temperature, one for each filter; ValueError unless complete."""
+        for number in range(len(self.temperatures)):
+            paths = [step_path(self.folder, self.name, number, band) for band in self.bands]
+            for path in paths:
+                if not is_complete(path):
+                    state = "Incomplete" if path.exists() else "Missing"
+                    raise ValueError(
+                        f"{state} recording '{path}' of the sweep. Must be recorded to its end."
+                    )
+            for path, band in zip(paths, self.bands, strict=True):
+                require_filter(path, band)
+            yield paths
+
+
+def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
+    """
+    Join the recordings of a blackbody sweep into one dataset.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Of `dbthermal.instruments.protocols.record_sweep`.
+    name : str
+        Of the session.
+    frames : int
+        Frames to take of each: the first ones of each band that are whole and show the blackbody.
+
+    Returns
+    -------
+    Dataset
+        Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x) [count]. The
+        bands are those of all filters, and that of the other camera, which is taken from the
+        recordings through the first filter. `temperature` is the mean of the blackbody's readings
+        during the recordings of a step [K].
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no recording of such a session.
+    ValueError
+        If a recording is missing or incomplete, has fewer good frames in a band, or no reading of
+        the blackbody, or those of a step differ by more than the session's stability.
+    """
+    sweep = _find(folder, name)
+    temperatures, movies = [], []
+    for paths in sweep.steps():
+        temperatures.append(_agreed(paths, BLACKBODY, sweep.stability))
+        movies.append(_movie(paths, frames))
+    order = np.argsort(temperatures)
+    axis = xr.DataArray(
+        np.array(temperatures)[order],
+        dims="temperature",
+        name="temperature",
+        attrs=schema.COORDINATES["temperature"].attrs,
+    )
+    counts = xr.concat([movies[place] for place in order], dim=axis)
+    counts = counts.transpose("band", "temperature", "frame", "y", "x")
+    return schema.check(
+        counts.to_dataset(name="counts").assign_attrs(sweep.attrs), "blackbody_movies"
+    )
+
+
+def bench_series(
+    folder: str | Path,
+    name: str,
+    region: Mapping[str, Region],
+    correction: xr.Dataset | None = None,
+) -> dict[str, xr.Dataset]:
+    """
+    Mean counts and temperatures of an emissivity bench, a measurement for each step.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Of `dbthermal.instruments.protocols.record_sweep`.
+    name : str
+        Of the session.
+    region : mapping
+        Material to its rows and columns. The thermocouple named like it is the object's.
+    correction : Dataset, optional
+        From `dbthermal.correction.fit_correction`, of all bands. With it, the counts are corrected,
+        and pixels that are bad or saturated are left out.
+
+    Returns
+    -------
+    dict
+        Material to its series, stage `contact` of `schema`: `counts` (band, measurement), mean over
+        the region and the good frames [count]; `object_temperature` and `background_temperature`
+        (measurement), means of the readings during the recordings [K].
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        As `open_sweep`; or if a region has no pixel or a band no good frame.
+    """
+    sweep = _find(folder, name)
+    columns: dict[str, list[dict[str, Any]]] = {material: [] for material in region}
+    for paths in sweep.steps():
+        background = _agreed(paths, BLACKBODY, sweep.stability)
+        captures = list(_bands(paths))
+        for material, place in region.items():
+            columns[material].append(
+                {
+                    "counts": {
+                        band: _mean(capture, band, place, correction) for band, capture in captures
+                    },
+                    "object_temperature": _agreed(paths, material, sweep.stability),
+                    "background_temperature": background,
+                }
+            )
+    return {
+        material: _contact(rows).assign_attrs(sweep.attrs, material=material)
+        for material, rows in columns.items()
+    }
+
+
+def _find(folder: str | Path, name: str) -> _Sweep:
+    """Description of a sweep, from the first of its recordings."""
+    for path in sorted(Path(folder).glob(f"{name}_[0-9][0-9]*.zarr")):
+        attrs = store.open_dataset(path).attrs
+        session = attrs["provenance"]["parameters"]
+        if session["name"] == name and session["blackbody"] is not None:
+            filters = session["filters"].values()
+            behind = [band for band in session["cameras"] if band in filters]
+            return _Sweep(
+                Path(folder),
+                name,
+                session["blackbody"]["temperatures"],
+                session["blackbody"]["stability"],
+                session["sweep"] or behind or [None],
+                {name: attrs[name] for name in ("is_simulated", "origin")},
+            )
+    raise FileNotFoundError(f"No recording of a sweep '{name}' in '{folder}'. Must have one.")
+
+
+def _agreed(paths: list[Path], source: str, stability: float) -> float:
+    """Mean of a reading over the recordings of a step; ValueError if they differ."""
+    means = [mean_reading(path, source) for path in paths]
+    if np.ptp(means) > stability:
+        raise ValueError(
+            f"Invalid readings {means} K of '{source}' in the recordings "
+            f"{[path.name for path in paths]}. Must agree within {stability} K: move them "
+            "away, and this step is recorded again."
+        )
+    return float(np.mean(means))
+
+
+def _bands(paths: list[Path]) -> Iterator[tuple[str, xr.Dataset]]:
+    """Each band with the first recording that has it."""
+    known: set[str] = set()
+    for path in paths:
+        capture = open_capture(path).assign_attrs(path=str(path))
+        for band in map(str, capture["band"].values):
+            if band not in known:
+                known.add(band)
+                yield band, capture
+
+
+def _movie(paths: list[Path], frames: int) -> xr.DataArray:
+    """Counts (band, frame, y, x) of a step."""
+    parts = []
+    for band, capture in _bands(paths):
+        good = good_frames(capture, band)
+        if good.size < frames:
+            raise ValueError(
+                f"Invalid recording '{capture.attrs['path']}' with {good.size} good frames in band "
+                f"'{band}'. Must have {frames}."
+            )
+        # Read in one piece, up to the last one that is needed.
+        counts = capture["counts"].sel(band=band).isel(time=slice(0, int(good[frames - 1]) + 1))
+        parts.append(counts.load().isel(time=good[:frames]).drop_vars("time").rename(time="frame"))
+    return xr.concat(parts, dim="band")
+
+
+def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset | None) -> float:
+    """Mean counts of a region in the good frames of a band."""
+    place = {"y": region[0], "x": region[1]}
+    good = good_frames(capture, band)
+    part = capture[["counts"]].sel(band=[band]).isel(time=good).isel(place)
+    source = f"of band '{band}' in '{capture.attrs['path']}'"
+    if part["counts"].size == 0:
+        raise ValueError(f"No frame or no pixel {source}. Must have one.")
+    counts = part["counts"]
+    if correction is not None:
+        corrected = correct(part, correction.isel(place))
+        counts = corrected["counts"].where(corrected["status"] == 0)
+    mean = float(counts.astype(np.float64).mean())
+    if not np.isfinite(mean):
+        raise ValueError(f"No good pixel {source}. Must have one.")
+    return mean
+
+
+def _contact(rows: list[dict[str, Any]]) -> xr.Dataset:
+    """Series of one material, stage `contact`, from its measurements."""
+    variables = schema.STAGES["contact"]
+    bands = list(rows[0]["counts"])
+    counts = [[row["counts"][band] for row in rows] for band in bands]
+    temperatures = {
+        name: ("measurement", [row[name] for row in rows], variables[name].attrs)
+        for name in ("object_temperature", "background_temperature")
+    }
+    attrs = variables["counts"].attrs
+    series = xr.Dataset(
+        {"counts": (("band", "measurement"), np.array(counts), attrs), **temperatures},
+        coords={"band": bands},
+    )
+    return schema.check(series, "contact")

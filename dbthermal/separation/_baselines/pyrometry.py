@@ -1,0 +1,161 @@
+r"""Pyrometry, which neglects the background: apparent temperature, and dual-wavelength ratio.
+
+The apparent temperature is that of a blackbody in the quieter band, as a camera shows it. The ratio
+of two radiances gives the temperature of a gray body,
+
+.. math:: R = \frac{L_1}{L_2} = \frac{e_1 B_1(T)}{e_2 B_2(T)} = \frac{B_1(T)}{B_2(T)}
+          \quad\text{if}\quad e_1 = e_2 \qquad (1)
+
+No background is reflected and the emissivity is the same in both bands: the two assumptions of the
+method, see Araujo (2017), Meas. Sci. Technol. 28, 082002, doi:10.1088/1361-6501/aa7b4b. Near room
+temperature neither holds, which is what this baseline shows. What it can do itself it does well:
+bands of any width are inverted exactly, and the radiances are smoothed before their ratio is taken,
+since 9.5 against 8-14 um changes by 0.16 % a kelvin only.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from dbthermal import _smooth as smooth
+from dbthermal import bands, planck
+from dbthermal.response import Curve
+from dbthermal.schema import Status
+from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._quality import status_bits
+from dbthermal.separation._tiles import Array, Estimate, Method, Tile
+
+KINDS: Final = ("wide", "narrow")
+# Knots of the table of ln R, in which 1/T is nearly straight: the spline is within 1 uK.
+_KNOTS: Final = 256
+
+
+def apparent(tile: Tile) -> Estimate:
+    """Apparent temperature in the quieter band; NaN where no temperature gives the signal."""
+    temperature = tile.temperature(0, tile.signals[0])
+    missing = np.any(np.isnan(temperature), axis=0)
+    return point_estimate(temperature, status_bits({Status.OUTSIDE_RESPONSE: missing}))
+
+
+@dataclass(frozen=True)
+class RatioSettings:
+    r"""
+    Options of dual-wavelength pyrometry.
+
+    Attributes
+    ----------
+    kind : {"wide", "narrow"}
+        Radiance in the whole band, or spectral radiance at the band's centre; both by Planck's law.
+        Both are exact for a blackbody; for a gray body "wide" is, and "narrow" only as far as a
+        band is narrow. Wien's law, with which the method is usually written,
+        :math:`1/T = [\ln R - 5 \ln(\lambda_2/\lambda_1)] / [c_2 (1/\lambda_2 - 1/\lambda_1)]`,
+        is 3 K off at 9.5 and 11 um near room temperature.
+    order : int or None
+        Number of polynomials of time that both radiances are smoothed with, by least squares,
+        before their ratio is taken; None for no smoothing.
+
+    Raises
+    ------
+    ValueError
+        If the kind is unknown or the order is less than 1.
+    """
+
+    kind: str = "wide"
+    order: int | None = 5
+
+    def __post_init__(self) -> None:
+        """Refuse unknown kinds and orders without a function."""
+        if self.kind not in KINDS:
+            raise ValueError(
+                f"Unknown kind '{self.kind}' of method 'ratio'. Must be one of {KINDS}."
+            )
+        if self.order is not None and not self.order >= 1:
+            raise ValueError(f"Invalid order {self.order} of method 'ratio'. Must be at least 1.")
+
+
+def ratio(tile: Tile, settings: RatioSettings) -> Estimate:
+    """
+    Temperature of a gray body before a background that emits nothing, for bands of `bands.FILTERS`.
+
+    NaN where no temperature in the response's range has the ratio. The emissivity is the radiance
+    over that of a blackbody at this temperature, in the quieter band, mean over the valid frames.
+    """
+    first, second = tile.curves
+    inverse = _inverse((first, second), settings.kind)
+    radiances = _radiances(tile, settings)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        temperature = inverse(np.log(radiances[0] / radiances[1]))
+    # e = L_1 / B_1(T)
+    valid = ~np.isnan(temperature)
+    blackbody = _radiance(first, settings.kind, temperature)
+    emissivity = np.divide(radiances[0], blackbody, out=np.zeros_like(blackbody), where=valid)
+    frames = valid.sum(axis=0)
+    mean = np.full(frames.shape, np.nan)
+    np.divide(emissivity.sum(axis=0), frames, out=mean, where=frames > 0)
+    status = status_bits(
+        {
+            Status.OUTSIDE_RESPONSE: frames < temperature.shape[0],
+            Status.NONPHYSICAL_EMISSIVITY: (mean <= 0) | (mean >= 1),
+        }
+    )
+    return point_estimate(temperature, status, np.stack([mean, mean]))
+
+
+def _radiances(tile: Tile, settings: RatioSettings) -> Array:
+    """Radiance (2, time, pixel) of the bands, smoothed; NaN where the response has none."""
+    radiances = np.stack(
+        [
+            _radiance(curve, settings.kind, tile.temperature(band, tile.signals[band]))
+            for band, curve in enumerate(tile.curves)
+        ]
+    )
+    if settings.order is None:
+        return radiances
+    functions = smooth.polynomial_basis(tile.time, settings.order)
+    return np.asarray(functions @ (functions.T @ radiances))
+
+
+def _radiance(curve: Curve, kind: str, temperature: Array) -> Array:
+    """Radiance of a blackbody in a band; NaN where the temperature is no blackbody's."""
+    band = bands.get(curve.band)
+    lowest, highest = bands.TEMPERATURE_RANGE
+    valid = (temperature >= lowest) & (temperature <= highest)
+    result = np.full_like(temperature, np.nan)
+    if kind == "wide":
+        result[valid] = band.radiance(temperature[valid])
+    else:
+        result[valid] = planck.spectral_radiance(band.centre, temperature[valid])
+    return result
+
+
+def _inverse(curves: tuple[Curve, Curve], kind: str) -> Callable[[Array], Array]:
+    """Inverse of equation (1): temperature of ln R, NaN outside the response's range."""
+    grid = np.linspace(1.0 / curves[0].lowest, 1.0 / curves[0].highest, _KNOTS)
+    first, second = (_radiance(curve, kind, 1.0 / grid) for curve in curves)
+    logarithm = np.log(first / second)
+    steps = np.diff(logarithm)
+    if not (np.all(steps > 0) or np.all(steps < 0)):
+        turn = int(np.argmax(np.sign(steps) != np.sign(steps[0])))
+        raise ValueError(
+            f"Invalid bands '{curves[0].band}', '{curves[1].band}' of method 'ratio': the ratio of "
+            f"their radiances is stationary near {1.0 / grid[turn]:.1f} K. Must be monotonic over "
+            f"the response's range [{curves[0].lowest}, {curves[0].highest}] K."
+        )
+    order = np.argsort(logarithm)
+    spline = CubicSpline(logarithm[order], grid[order], extrapolate=False)
+    return lambda value: np.asarray(1.0 / spline(value))
+
+
+_WITHOUT_BACKGROUND: Final = (
+    "object_temperature_std",
+    "background_temperature",
+    "background_temperature_std",
+    "emissivity_std",
+)
+APPARENT: Final = Method(apparent, not_estimated=(*_WITHOUT_BACKGROUND, "emissivity"))
+"""The camera's own reading, for `solve`."""
+RATIO: Final = Method(ratio, settings=RatioSettings, not_estimated=_WITHOUT_BACKGROUND)
+"""Dual-wavelength pyrometry, for `solve`."""

@@ -1,0 +1,200 @@
+"""Reflections as pictures: of uncalibrated movies, and of a result in the first band's unit."""
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import _smooth as smooth
+from dbthermal import schema
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+# Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
+_UNCORRELATED: Final = 0.1
+_FEWEST: Final = 100
+
+
+def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
+    r"""
+    Change of the first band's apparent temperature that the reflection causes.
+
+    .. math:: (1 - e_1) (y - \bar y)
+
+    with the mean over time, in the linear response of small changes. Where the object is constant
+    its emissivity is undefined, but then all that changes is reflected: there it is the apparent
+    temperature less its own mean.
+
+    Parameters
+    ----------
+    apparent : DataArray
+        Apparent temperature of the inputs (band, time, y, x) [K], from
+        `response.apparent_temperature`.
+    result : Dataset
+        From `solve`, of the same capture.
+
+    Returns
+    -------
+    DataArray
+        (time, y, x) [K], float32; NaN where neither is known.
+
+    Raises
+    ------
+    ValueError
+        If the first bands differ.
+    """
+    if str(apparent["band"].values[0]) != str(result["band"].values[0]):
+        raise ValueError(
+            f"Invalid first band '{apparent['band'].values[0]}'. "
+            f"Must be '{result['band'].values[0]}', as in the result."
+        )
+    first = apparent.isel(band=0, drop=True)
+    background = result["background_temperature"]
+    reflectivity = 1.0 - result["emissivity"].isel(band=0, drop=True)
+    change = (background - background.mean("time")) * reflectivity
+    constant = (result["status"] & int(schema.Status.CONSTANT_OBJECT)) != 0
+    change = change.where(~constant, first - first.mean("time"))
+    attrs = {"units": "K", "long_name": "reflection, change of the apparent temperature"}
+    return change.astype("float32").rename("reflected_change").assign_attrs(attrs)
+
+
+def uncalibrated_reflection(
+    signal: xr.DataArray,
+    *,
+    mask: xr.DataArray | None = None,
+    order: int = 9,
+    correlated: float = 0.5,
+) -> xr.Dataset:
+    r"""
+    Separate rapid, correlated changes from slow ones in two bands of any unit.
+
+    Without a response there are no temperatures, but the rapid changes are still the background's,
+    and their ratio between the bands still differs from pixel to pixel. Smooth functions of time,
+    which hold the object's change, are projected out of both bands. Frame by frame, the gain and
+    offset errors of the picture's own scaling are fitted to the uncorrelated pixels (correlation
+    below 0.1) and subtracted. With :math:`\lambda` the noise variance of the second band over that
+    of the first there, the ratio k of a pixel is that of Deming's regression [2]_, the pooled ratio
+    is its median over the correlated pixels, and the reflection in the first band's unit is the
+    best linear estimate
+
+    .. math:: r(t) = \frac{r_1(t) + (k / \lambda) \, r_2(t)}{1 + k^2 / \lambda}
+
+    Parameters
+    ----------
+    signal : DataArray
+        (band, time, y, x), two bands in units of their own, `time` [s].
+    mask : DataArray, optional
+        Pixels (y, x) of the object; all if not given.
+    order : int
+        Number of smooth functions.
+    correlated : float
+        Correlation from which a pixel enters the pooled ratio.
+
+    Returns
+    -------
+    Dataset
+        `ratio`, `correlation` (y, x) [1]; `reflection` (time, y, x) and `emission` (time, y, x),
+        the first band less the reflection, in the first band's unit; attributes `pooled_ratio`,
+        `noise_ratio`, `correlated_pixels`, `order`, and those of the signal.
+
+    Raises
+    ------
+    ValueError
+        If dims are wrong, a value is not finite, there are not two bands, the correlation is not
+        in (0, 1), or fewer than 100 pixels are uncorrelated or correlated.
+
+    References
+    ----------
+    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334, equation 22
+    .. [2] Fuller (1987), Measurement Error Models, doi:10.1002/9780470316665
+    """
+    inside = _check(signal, mask, correlated)
+    frames, image = signal.sizes["time"], signal.shape[2:]
+    values = signal.values.reshape(2, frames, -1).astype(np.float64)
+    functions = smooth.polynomial_basis(signal["time"].values, order)
+    rapid = np.stack([part - functions @ (functions.T @ part) for part in values])
+    quiet = inside & (np.abs(_correlation(rapid)) < _UNCORRELATED)
+    _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")
+    rapid -= [_scaling(*parts, quiet) for parts in zip(rapid, values.mean(axis=1), strict=True)]
+    correlation = _correlation(rapid)
+    quiet = inside & (np.abs(correlation) < _UNCORRELATED)
+    moving = inside & (correlation > correlated)
+    _require(moving, f"correlation above {correlated}")
+    # lambda = s_2^2 / s_1^2
+    power = np.einsum("btp,btp->bp", rapid, rapid)
+    noise_ratio = float(power[1, quiet].mean() / power[0, quiet].mean())
+    ratio = _deming(rapid, power, noise_ratio)
+    pooled = float(np.median(ratio[moving]))
+    # r = (r_1 / s_1^2 + k r_2 / s_2^2) / (1 / s_1^2 + k^2 / s_2^2)
+    reflection = rapid[0] + pooled / noise_ratio * rapid[1]
+    reflection /= 1.0 + pooled**2 / noise_ratio
+    units = {"units": signal.attrs["units"]} if "units" in signal.attrs else {}
+    variables = {
+        name: (("y", "x"), part.reshape(image), {"units": "1"})
+        for name, part in (("ratio", ratio), ("correlation", correlation))
+    } | {
+        name: (("time", "y", "x"), part.reshape(frames, *image).astype(np.float32), units)
+        for name, part in (("reflection", reflection), ("emission", values[0] - reflection))
+    }
+    attrs = {
+        **signal.attrs,
+        "pooled_ratio": pooled,
+        "noise_ratio": noise_ratio,
+        "correlated_pixels": int(moving.sum()),
+        "order": order,
+    }
+    coords = {name: signal[name] for name in ("time", "y", "x") if name in signal.coords}
+    return xr.Dataset(variables, coords=coords, attrs=attrs)
+
+
+def _check(signal: xr.DataArray, mask: xr.DataArray | None, correlated: float) -> Mask:
+    """Refuse all but two movies; return the pixels (pixel) to take the statistics from."""
+    if signal.dims != ("band", "time", "y", "x") or signal.sizes["band"] != 2:
+        raise ValueError(
+            f"Invalid signal {dict(signal.sizes)}. Must be (band, time, y, x) of two bands."
+        )
+    if not 0 < correlated < 1:
+        raise ValueError(f"Invalid correlation {correlated}. Must lie in (0, 1).")
+    if not np.all(np.isfinite(signal.values)):
+        raise ValueError("Invalid signal: NaN or infinite. Must be finite.")
+    image = (signal.sizes["y"], signal.sizes["x"])
+    if mask is None:
+        return np.ones(image[0] * image[1], dtype=bool)
+    if mask.dims != ("y", "x") or mask.shape != image:
+        raise ValueError(f"Invalid mask {dict(mask.sizes)}. Must be (y, x) of {image}.")
+    return np.asarray(mask.values.astype(bool).ravel())
+
+
+def _require(pixels: Mask, rule: str) -> None:
+    if pixels.sum() < _FEWEST:
+        raise ValueError(
+            f"Invalid signal: {pixels.sum()} pixels have a {rule}. Must be at least {_FEWEST}."
+        )
+
+
+def _correlation(rapid: Array) -> Array:
+    """Correlation (pixel) of the two bands; 0 where a band does not change."""
+    cross = np.einsum("tp,tp->p", rapid[0], rapid[1])
+    size = np.sqrt(np.prod(np.einsum("btp,btp->bp", rapid, rapid), axis=0))
+    return np.asarray(np.divide(cross, size, out=np.zeros_like(cross), where=size > 0))
+
+
+def _scaling(rapid: Array, mean: Array, quiet: Mask) -> Array:
+    """Gain and offset errors (time, pixel) of each frame, fitted to the quiet pixels."""
+    design = np.stack([np.ones_like(mean), mean], axis=1)
+    errors, *_ = np.linalg.lstsq(design[quiet], rapid[:, quiet].T, rcond=None)
+    return np.asarray((design @ errors).T)
+
+
+def _deming(rapid: Array, power: Array, noise_ratio: float) -> Array:
+    r"""
+    Slope (pixel) of Deming's regression of the second band on the first.
+
+    The principal axis of the scatter S whitened by the noise, :math:`k = \sqrt\lambda \tan\phi`
+    with :math:`\tan 2\phi = 2 \sqrt\lambda S_{12} / (\lambda S_{11} - S_{22})`.
+    """
+    cross = np.einsum("tp,tp->p", rapid[0], rapid[1])
+    angle = 0.5 * np.arctan2(2.0 * cross * np.sqrt(noise_ratio), noise_ratio * power[0] - power[1])
+    return np.asarray(np.sqrt(noise_ratio) * np.tan(angle))

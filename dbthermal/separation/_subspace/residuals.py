@@ -1,0 +1,336 @@
+"""Statistics of residuals in time, of many pixels at once.
+
+Robust regression finds a line beside outliers on one side; the autocorrelation and the interband
+delay test a residual for white noise, which it is if the model holds; a change point is the step
+of an object that breaks the cue of its smoothness.
+"""
+
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtri
+
+from dbthermal import _smooth as smooth
+from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
+from dbthermal.separation._tiles import Array, Mask, Whole
+
+Precision = TypeVar("Precision", np.float32, np.float64)
+
+TUNING: Final = 4.685
+"""Tukey's constant: 95 % efficiency for normal noise (Huber 1981, doi:10.1002/0471725250)."""
+
+LAGS: Final = 5
+"""Frames over which `autocorrelation` looks for a correlation."""
+
+AROUND: Final = 1.0
+"""Time before and after a jump that is left out [s]: the part of it that is not sudden."""
+
+# Share of the points that must lie on the line: the scale is taken from their deviation, as an
+# absolute deviation of that rank -> standard deviation of a normal distribution.
+_SHARE: Final = 0.3
+_TO_STD: Final = 1.0 / float(ndtri(0.5 * (1.0 + _SHARE)))
+_ANNEALING: Final = 0.7
+_STARTING_STEPS: Final = 5
+_STARTING_POINTS: Final = 100
+_STEPS: Final = 3
+# Deviations of noise from which a difference between frames is a change.
+_CHANGE: Final = 5.0
+# Smooth functions beside which a jump is sought.
+_ORDER: Final = 7
+# A change from frame to frame is isolated if it is so many times the third largest.
+_ISOLATED: Final = 3.0
+# Fewest frames before and after a jump.
+_MARGIN: Final = 24
+
+
+@dataclass(frozen=True)
+class Line:
+    """Straight line fitted to each pixel's points."""
+
+    slope: Array  # (pixel)
+    scale: Array  # robust standard deviation of the residuals, at least the noise (pixel)
+    residual: Array  # ordinate less the line (time, pixel)
+    energy: Array  # weighted sum of squares of the abscissa about its mean (pixel)
+    variance: Array  # of the slope, with the residuals' correlation in time (pixel)
+    weights: Array  # final weights in [0, 1] (time, pixel)
+
+
+def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None = None) -> Line:
+    r"""
+    Robust regression of an ordinate on an abscissa (time, pixel), with Tukey's bisquare weights.
+
+    Iteratively reweighted least squares with :math:`w = (1 - (r / c s)^2)^2` inside
+    :math:`c s` and 0 outside. The scale s is the absolute deviation of rank 30 %, as a standard
+    deviation, renewed at every step and never below the `noise` of the ordinate. A first fit tries
+    several starts, see `_first_residual`; a `start` of nearly the same points gives its weights.
+
+    With residuals of lag-one correlation :math:`\rho` only :math:`(1 - \rho) / (1 + \rho)` of
+    the points are independent; the variance is divided by that fraction.
+
+    References
+    ----------
+    .. [1] Beaton, Tukey (1974), Technometrics 16, 147, doi:10.1080/00401706.1974.10489171
+    """
+    if start is None:
+        residual = _first_residual(abscissa, ordinate, noise)
+    else:
+        residual = _fit(abscissa, ordinate, start.weights)[2]
+    for _ in range(_STEPS):
+        scale = np.maximum(noise, _TO_STD * _ranked_magnitude(residual))
+        weights = _tukey(residual, scale)
+        slope, _, residual, energy = _fit(abscissa, ordinate, weights)
+    # var(slope) = s^2 / sum w (x - mean)^2, over the fraction of independent points.
+    variance = scale**2 / energy / _independent(residual, weights)
+    return Line(slope, scale, residual, energy, variance, weights)
+
+
+def null_residual(signals: Array, functions: smooth.Subspace, ratios: ReflectionRatio) -> Array:
+    """
+    Residual (time, pixel) [K] of the null combination of bands, its smooth part taken out.
+
+    White noise of the null variance where the model holds.
+    """
+    residual = np.einsum("bp,btp->tp", ratios.null_weights, signals)
+    smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
+    residual -= functions.functions @ smoothed
+    return np.asarray(residual)
+
+
+def autocorrelation(residual: Array) -> Array:
+    """
+    Mean autocorrelation (pixel) of a residual (time, pixel) over lags of 1 to `LAGS` frames.
+
+    In standard deviations of white noise. A change of the object that the smooth functions do not
+    follow, or a background with other ratios, leaves a correlation.
+    """
+    energy = np.einsum("tp,tp->p", residual, residual)
+    lagged = np.zeros_like(energy)
+    for lag in range(1, LAGS + 1):
+        lagged += np.einsum("tp,tp->p", residual[lag:], residual[:-lag])
+    mean = np.divide(lagged, LAGS * energy, out=np.zeros_like(energy), where=energy > 0)
+    # White noise of N frames: each lag has the variance 1 / N, independently of the others.
+    return np.asarray(mean * np.sqrt(LAGS * residual.shape[0]))
+
+
+def interband_delay(
+    residual: Array,
+    first: Array,
+    functions: smooth.Subspace,
+    ratios: ReflectionRatio,
+    noise: float,
+) -> Array:
+    r"""
+    Score (pixel) of rapid changes that are not simultaneous in all bands.
+
+    A band that is a frame late, or early, leaves the difference between two frames of the others'
+    signal. The null residual r is therefore held against both differences of the `first` band's
+    signal (time, pixel) [K] of standard deviation `noise` [K], a matched filter,
+
+    .. math:: \sum_t r(t) \, (z_1(t \pm 1) - z_1(t)) + n \, w_1 s_1^2
+
+    where the last term takes out that the residual holds the noise of :math:`z_1(t)`. A delay that
+    changes sign, as after an interpolation between frames, is seen in the energy of the residual
+    in the frames at a change, over that of the noise. The score is the largest in magnitude, in
+    standard deviations of white noise.
+    """
+    rapid = first - functions.functions @ ratios.coefficients[0]
+    change = np.diff(rapid, axis=0)
+    freedom = residual.shape[0] - ratios.order - functions.steps
+    common = freedom * ratios.null_weights[0] * noise**2
+    late = np.einsum("tp,tp->p", residual[:-1], change) + common
+    early = np.einsum("tp,tp->p", residual[1:], change) - common
+    strongest = np.maximum(np.abs(late), np.abs(early))
+    variance = ratios.null_variance * np.einsum("tp,tp->p", change, change)
+    score = np.divide(
+        strongest, np.sqrt(variance), out=np.zeros_like(strongest), where=variance > 0
+    )
+    return np.asarray(np.maximum(score, _excess(residual, change, ratios.null_variance, noise)))
+
+
+def find_jump(
+    signals: Array, functions: smooth.Subspace, noise: Array, inside: Whole, ramp: Whole
+) -> tuple[Whole, Array]:
+    r"""
+    Change point (pixel): first frame after the step that lowers the energy across the axis most.
+
+    Sought in signals (band, time, pixel) [K] of `noise` (band) [K], among the frames `inside` from
+    `candidates`, for a sudden step and one spread evenly over the frames of `ramp` beside it.
+    With the smooth functions projected out, a step at frame t takes from the whitened scatter
+    :math:`S` the part :math:`g g^T / n`, with g the sum of the residuals from t on, and n the
+    energy of the step orthogonal to the functions. The second value is by how much the information
+    criterion falls (pixel): positive where a step explains more than chance.
+    """
+    frames = signals.shape[1]
+    basis = functions.functions[:, : functions.steps + _ORDER]
+    residual = signals / noise[:, np.newaxis, np.newaxis]
+    residual = residual - np.einsum("tc,bcp->btp", basis, np.einsum("tc,btp->bcp", basis, residual))
+    # Inner products of a step at each frame with the residual, with the functions and with itself.
+    after = np.cumsum(residual[:, ::-1], axis=1)[:, ::-1]
+    held = np.cumsum(basis[::-1], axis=0)[::-1]
+    norm = np.arange(frames, 0.0, -1.0)
+    scatter = np.einsum("btp,ctp->pbc", residual, residual)
+    before = np.linalg.eigvalsh(scatter)[..., :-1].sum(axis=-1)
+    first, lowest = np.zeros(before.size, dtype=np.intp), np.full(before.size, np.inf)
+    for offsets in (np.zeros(1, dtype=np.intp), ramp):
+        places = inside[:, np.newaxis] + offsets
+        energy = norm[places].mean(axis=1) - np.abs(offsets[:, np.newaxis] - offsets).mean() / 2.0
+        energy -= np.sum(held[places].mean(axis=1) ** 2, axis=1)
+        # A running sum: side by side, the offsets of a fast film would need a gigabyte.
+        mean = np.zeros((len(after), inside.size, after.shape[2]))
+        for offset in offsets:
+            mean += after[:, inside + offset] / offsets.size
+        part = np.einsum("btp,ctp->tpbc", mean, mean) / energy[:, None, None, None]
+        null_energy = np.linalg.eigvalsh(scatter - part)[..., :-1].sum(axis=-1)
+        best = np.argmin(null_energy, axis=0)
+        least = null_energy[best, np.arange(best.size)]
+        first = np.where(least < lowest, inside[best], first)
+        lowest = np.minimum(least, lowest)
+    gain = frames * np.log(before / np.maximum(lowest, np.finfo(np.float64).tiny))
+    return first, gain - 4.0 * np.log(frames)
+
+
+def isolated_change(signal: Array, functions: smooth.Subspace, ramp: Whole) -> Mask:
+    """
+    Pixels of a signal (time, pixel) with one change far larger than all others.
+
+    From frame to frame, or over the frames of `ramp`. A background comes and goes: its largest
+    changes come in pairs at least.
+    """
+    basis = functions.functions[:, : functions.steps + _ORDER]
+    residual = signal - basis @ (basis.T @ signal)
+    blocks = residual.shape[0] // ramp.size
+    slow = residual[: blocks * ramp.size].reshape(blocks, ramp.size, -1).mean(axis=1)
+    return _outstanding(residual) | _outstanding(slow)
+
+
+def candidates(time: Array) -> Whole:
+    """Frames that may be the first after a jump: with enough others before and after."""
+    between = 0.5 * (time[1:] + time[:-1])
+    before = np.searchsorted(time, between - AROUND)
+    after = np.searchsorted(time, between + AROUND, side="right")
+    good = np.minimum(before, time.size - after) >= _MARGIN
+    return np.asarray(1 + np.flatnonzero(good))
+
+
+def ramp_frames(time: Array) -> Whole:
+    """Frames, relative to its middle, of a jump that takes as long as is left out on one side."""
+    half = int(0.5 * AROUND / np.median(np.diff(time)))
+    return np.arange(-half, half + 1)
+
+
+def beside_jump(time: Array, jump: int, segment: Whole | None = None) -> Mask:
+    """
+    Frames (time) to use, before and after a jump but not close to it.
+
+    Where a shutter event as close, by `segment`, hides the height of the jump: the more numerous
+    of the two.
+    """
+    between = 0.5 * (time[jump - 1] + time[jump])
+    kept = np.abs(time - between) > AROUND
+    before, after = kept & (time < between), kept & (time > between)
+    if segment is not None and segment[before].max() != segment[after].min():
+        return np.asarray(before if before.sum() >= after.sum() else after)
+    return np.asarray(kept)
+
+
+def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
+    """
+    Residual from the best of three starts: all points, those above, those below the plain line.
+
+    What disturbs a resting background lies mostly on one side of it, and one of the halves is
+    then nearly free of it. Each start closes in on the densest half of the points by a scale that
+    is a fraction of the deviation; the one with the smallest deviation wins, pixel by pixel. A
+    hundred points in single precision are enough to start from.
+    """
+    every = slice(None, None, max(1, abscissa.shape[0] // _STARTING_POINTS))
+    # About its mean, or single precision would not resolve a small spread.
+    centred, up = abscissa - abscissa.mean(axis=0), ordinate - ordinate.mean(axis=0)
+    few = centred[every].astype(np.float32), up[every].astype(np.float32)
+    plain = _fit(*few, np.ones_like(few[0]))[2]
+    slope, intercept, smallest = (np.full(plain.shape[1], np.inf) for _ in range(3))
+    for start in (np.ones_like(plain), plain >= 0, plain <= 0):
+        weights = start.astype(np.float32)
+        for _ in range(_STARTING_STEPS):
+            *line, residual, _ = _fit(*few, weights)
+            deviation = _ranked_magnitude(residual)
+            weights = _tukey(residual, np.maximum(noise, _ANNEALING * _TO_STD * deviation))
+        better = deviation < smallest
+        slope, intercept = np.where(better, line, (slope, intercept))
+        smallest = np.where(better, deviation, smallest)
+    return np.asarray(up - intercept - slope * centred)
+
+
+def _fit(
+    abscissa: npt.NDArray[Precision],
+    ordinate: npt.NDArray[Precision],
+    weights: npt.NDArray[Precision],
+) -> tuple[
+    npt.NDArray[Precision], npt.NDArray[Precision], npt.NDArray[Precision], npt.NDArray[Precision]
+]:
+    """Weighted least squares: slope, intercept, residual (time, pixel), energy of the abscissa."""
+    total = weights.sum(axis=0)
+    weighted = weights * abscissa
+    middle = weighted.sum(axis=0) / total
+    centre = np.einsum("tp,tp->p", weights, ordinate) / total
+    energy = np.einsum("tp,tp->p", weighted, abscissa) - total * middle**2
+    slope = (np.einsum("tp,tp->p", weighted, ordinate) - total * middle * centre) / energy
+    intercept = centre - slope * middle
+    return slope, intercept, ordinate - intercept - slope * abscissa, energy
+
+
+def _ranked_magnitude(residual: npt.NDArray[Precision]) -> Array:
+    """Absolute value of rank `_SHARE` over time; in single precision, which is much faster."""
+    magnitude = np.abs(residual.T, dtype=np.float32, casting="same_kind")
+    middle = int(_SHARE * residual.shape[0])
+    return np.asarray(np.partition(magnitude, middle, axis=1)[:, middle], dtype=np.float64)
+
+
+def _tukey(residual: npt.NDArray[Precision], scale: Array) -> npt.NDArray[Precision]:
+    """Tukey's bisquare weights, (1 - (r / c s)^2)^2 inside c s."""
+    kept = residual * (1.0 / (TUNING * scale)).astype(residual.dtype)
+    kept *= kept
+    np.subtract(1.0, kept, out=kept)
+    np.maximum(kept, 0.0, out=kept)
+    kept *= kept
+    return np.asarray(kept)
+
+
+def _independent(residual: Array, weights: Array) -> Array:
+    """Fraction of independent points, from the lag-one correlation of the kept residuals."""
+    kept = residual * weights
+    energy = np.einsum("tp,tp->p", kept, kept)
+    lagged = np.einsum("tp,tp->p", kept[1:], kept[:-1])
+    correlation = np.clip(
+        np.divide(lagged, energy, out=np.zeros_like(energy), where=energy > 0), 0, 0.98
+    )
+    return np.asarray((1.0 - correlation) / (1.0 + correlation))
+
+
+def _excess(residual: Array, change: Array, null_variance: Array, noise: float) -> Array:
+    """
+    Energy beyond that of the noise in frames at a change, in standard deviations (pixel).
+
+    A chi-square variable of few degrees of freedom has a long tail: its cube root is nearly normal
+    (Wilson, Hilferty 1931, doi:10.1073/pnas.17.12.684).
+    """
+    steps = np.abs(change) > _CHANGE * np.sqrt(2.0) * noise
+    at = np.zeros(residual.shape, dtype=bool)
+    at[1:] |= steps
+    at[:-1] |= steps
+    count = at.sum(axis=0)
+    energy = np.einsum("tp,tp->p", residual * at, residual) / null_variance
+    mean = np.divide(energy, count, out=np.ones_like(energy), where=count > 0)
+    # The cube root of a chi-square over its n degrees has the mean 1 - v and the variance v.
+    variance = 2.0 / (9.0 * np.maximum(count, 1))
+    return np.asarray((np.cbrt(mean) - (1.0 - variance)) / np.sqrt(variance))
+
+
+def _outstanding(signal: Array) -> Mask:
+    """Pixels of which the largest change is several times the third largest."""
+    change = np.abs(np.diff(signal.T, axis=1)).astype(np.float32)
+    if change.shape[1] < 3:
+        return np.zeros(change.shape[0], dtype=bool)
+    largest = np.partition(change, -3, axis=1)[:, -3:]
+    return np.asarray(largest.max(axis=1) > _ISOLATED * largest[:, 0])

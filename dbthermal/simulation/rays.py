@@ -1,0 +1,237 @@
+r"""Ray casting: what a pinhole camera sees of a mesh, and where its mirror-like surface reflects.
+
+Meshes are `trimesh.Trimesh`, directions unit vectors in a world whose z points up, lengths in
+metres. The mirror law is :math:`r = d - 2 (d \cdot n) n` for a ray along d and a unit normal n,
+which is interpolated between the vertices' normals (smooth shading), so that a reflection does not
+break up along the edges of the mesh.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+__all__ = ["MISSED", "Camera", "Caster", "Hits", "mirror", "unit"]
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Point = tuple[float, float, float]
+
+MISSED: Final = -1
+"""Face number of a ray that meets nothing."""
+
+# A reflected ray starts this far off the surface, in units of the mesh's size: well above the
+# rounding of single precision, well below what can be seen.
+_LIFT: Final = 1e-4
+# Two points on a surface are one within this, in units of the mesh's size.
+_SAME: Final = 1e-3
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+@dataclass(frozen=True)
+class Camera:
+    """
+    A pinhole camera with square pixels.
+
+    Attributes
+    ----------
+    position, target : tuple of float
+        Position of the camera, and the point at the middle of its view [m].
+    shape : tuple of int
+        Rows and columns.
+    field_of_view : float
+        Horizontal field of view [degrees]; 24 in the paper.
+    up : tuple of float
+        Direction that is up in the image.
+
+    Raises
+    ------
+    ValueError
+        If the field of view lies outside (0, 180), the shape is not positive, or the view is
+        parallel to `up`.
+    """
+
+    position: Point
+    target: Point
+    shape: tuple[int, int]
+    field_of_view: float = 24.0
+    up: Point = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Check field of view, shape and orientation."""
+        if not 0 < self.field_of_view < 180:
+            raise ValueError(
+                f"Invalid field_of_view {self.field_of_view} degrees. Must lie in (0, 180)."
+            )
+        if min(self.shape) < 1:
+            raise ValueError(f"Invalid shape {self.shape} of the camera. Must be positive.")
+        right = np.cross(np.subtract(self.target, self.position), self.up)
+        if not np.linalg.norm(right) > 0:
+            raise ValueError(
+                f"Invalid up {self.up} of the camera at {self.position}. Must not be parallel to "
+                f"the view, towards {self.target}."
+            )
+
+    @cached_property
+    def axes(self) -> Array:
+        """Unit vectors to the right, down and forward, shape (3, 3), a row each."""
+        forward = unit(np.subtract(self.target, self.position))
+        right = unit(np.cross(forward, self.up))
+        return np.stack([right, np.cross(forward, right), forward])
+
+    @property
+    def _pixel(self) -> float:
+        """Size of a pixel at unit distance [1]."""
+        return float(2.0 * np.tan(np.radians(self.field_of_view) / 2.0) / self.shape[1])
+
+    def directions(self, offset: npt.ArrayLike = (0.0, 0.0)) -> Array:
+        """Unit vectors of the pixels' rays, (pixel, 3) in C order, off the middle by [pixel]."""
+        places = np.indices(self.shape).reshape(2, -1).T + np.asarray(offset)
+        middle = (np.array(self.shape) - 1.0) / 2.0
+        down, right = ((places - middle) * self._pixel).T
+        return unit(np.stack([right, down, np.ones_like(right)], axis=-1) @ self.axes)
+
+    def project(self, points: npt.ArrayLike) -> Array:
+        """
+        Row and column (..., 2) [pixel] at which points (..., 3) [m] appear.
+
+        The inverse of `directions`; whole numbers are the middles of pixels. Raises a ValueError
+        if a point lies behind the camera.
+        """
+        right, down, depth = np.moveaxis((np.asarray(points) - self.position) @ self.axes.T, -1, 0)
+        if not np.all(depth > 0):
+            raise ValueError(f"Invalid depth {np.min(depth)} m of a point. Must be positive.")
+        middle = (np.array(self.shape) - 1.0) / 2.0
+        places = np.stack([down, right], axis=-1) / (depth[..., np.newaxis] * self._pixel)
+        return np.asarray(places + middle)
+
+    def beside(self, baseline: float) -> "Camera":
+        """Same camera moved to the right by a baseline [m], looking at the same target."""
+        place = np.asarray(self.position) + baseline * self.axes[0]
+        return replace(self, position=(float(place[0]), float(place[1]), float(place[2])))
+
+
+@dataclass(frozen=True)
+class Hits:
+    """
+    First intersections of rays with a mesh.
+
+    Attributes
+    ----------
+    face : ndarray of int, shape (ray,)
+        Face that is met, or `MISSED`.
+    distance : ndarray, shape (ray,)
+        Distance from the ray's origin [m], infinite where nothing is met.
+    weights : ndarray, shape (ray, 3)
+        Barycentric weights of the face's corners [1], zero where nothing is met.
+    """
+
+    face: npt.NDArray[np.int64]
+    distance: Array
+    weights: Array
+
+    @property
+    def met(self) -> Mask:
+        """Rays that meet the mesh, shape (ray,)."""
+        return np.asarray(self.face != MISSED)
+
+    def of(self, rays: Mask) -> "Hits":
+        """Intersections of the selected rays, in their order."""
+        return Hits(self.face[rays], self.distance[rays], self.weights[rays])
+
+
+class Caster:
+    """
+    Ray caster for one mesh.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        The mesh [m]; its normals point outward.
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self.faces = np.asarray(mesh.faces)
+        self.corners: Array = np.asarray(mesh.vertices)[self.faces]
+        self.normals: Array = np.asarray(mesh.vertex_normals)[self.faces]
+        self.face_normals: Array = np.asarray(mesh.face_normals)
+        self.size = float(mesh.scale)
+        self._intersector = RayMeshIntersector(mesh)
+
+    def cast(self, origins: Array, directions: Array) -> Hits:
+        """
+        First intersection of each ray, of origins [m] and unit directions (ray, 3).
+
+        The face is found in single precision, the point on it in double.
+        """
+        origins, directions = np.broadcast_arrays(origins, directions)
+        face = np.asarray(self._intersector.intersects_first(origins, directions), dtype=np.int64)
+        hits = Hits(face, np.full(face.shape, np.inf), np.zeros((face.size, 3)))
+        met = hits.met
+        weights = self._weights(face[met], origins[met], directions[met])
+        place = np.einsum("rc,rcx->rx", weights, self.corners[face[met]])
+        hits.weights[met] = weights
+        hits.distance[met] = np.einsum("rx,rx->r", place - origins[met], directions[met])
+        return hits
+
+    def _weights(self, face: npt.NDArray[np.int64], origins: Array, directions: Array) -> Array:
+        """Barycentric weights (ray, 3) in the faces' planes: Moller, Trumbore (1997)."""
+        first, second, third = self.corners[face].swapaxes(0, 1)
+        right, left, way = second - first, third - first, origins - first
+        normal = np.cross(directions, left)
+        scale = np.einsum("rx,rx->r", right, normal)
+        u = np.einsum("rx,rx->r", way, normal) / scale
+        v = np.einsum("rx,rx->r", directions, np.cross(way, right)) / scale
+        # A ray along the edge of a face may leave it by rounding: back onto it.
+        inside = np.maximum(np.stack([1.0 - u - v, u, v], axis=-1), 0.0)
+        return np.asarray(inside / inside.sum(axis=-1, keepdims=True))
+
+    def points(self, hits: Hits) -> Array:
+        """Points of intersection (ray, 3) [m]; all rays must meet the mesh."""
+        return np.asarray(np.einsum("rc,rcx->rx", hits.weights, self.corners[hits.face]))
+
+    def interpolate(self, hits: Hits, values: Array) -> Array:
+        """Values (..., ray) linear within a face, of values (..., vertex); all rays must meet."""
+        parts = (values[..., self.faces[hits.face, corner]] for corner in range(3))
+        return np.asarray(sum(part * hits.weights[:, corner] for corner, part in enumerate(parts)))
+
+    def mirrored(self, hits: Hits, directions: Array) -> tuple[Array, Array]:
+        """
+        Origins [m] and directions (ray, 3) of rays that the mesh reflects, on either side.
+
+        All rays must meet the mesh. The reflected ones start a little off the surface. Where the
+        interpolated normal would send one into its own face, as it may at a silhouette, the
+        face's normal is taken.
+        """
+        flat = self.face_normals[hits.face]
+        smooth = unit(np.einsum("rc,rcx->rx", hits.weights, self.normals[hits.face]))
+        outward = -np.sign(np.einsum("rx,rx->r", directions, flat))[:, np.newaxis] * flat
+        reflected = mirror(directions, smooth)
+        inward = np.einsum("rx,rx->r", reflected, outward) <= 0
+        reflected[inward] = mirror(directions[inward], flat[inward])
+        return self.points(hits) + _LIFT * self.size * outward, reflected
+
+    def visible(self, points: Array, position: npt.ArrayLike) -> Mask:
+        """Points (point, 3) of the surface that no part of it hides from a position (3,) [m]."""
+        way = points - np.asarray(position)
+        hits = self.cast(np.broadcast_to(np.asarray(position), points.shape), unit(way))
+        return np.asarray(hits.distance > np.linalg.norm(way, axis=-1) - _SAME * self.size)
+
+
+def unit(vectors: npt.ArrayLike) -> Array:
+    """Vectors (..., 3) divided by their length."""
+    vectors = np.asarray(vectors, dtype=np.float64)
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def mirror(directions: Array, normals: Array) -> Array:
+    r"""Mirror law :math:`r = d - 2 (d \cdot n) n` for directions and unit normals (..., 3)."""
+    along = np.sum(directions * normals, axis=-1, keepdims=True)
+    return np.asarray(directions - 2.0 * along * normals)

@@ -1,0 +1,249 @@
+"""Surroundings of an object: a room, and bodies that move in it; what reflected rays meet.
+
+A ray carries the temperature of the first body that it meets, or that of the room. All are taken
+as blackbodies: skin, clothes, walls and hot drinks have emissivities of 0.95 and more.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from dbthermal.simulation._scenes import increasing
+from dbthermal.simulation.rays import Caster, Hits
+
+__all__ = ["Actor", "Pose", "Room", "distance", "gliding", "hinged", "incident", "painted"]
+
+Array = npt.NDArray[np.float64]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+@dataclass(frozen=True)
+class Pose:
+    """
+    Position and orientation of a rigid body: its point p is at R p + t in the world.
+
+    Attributes
+    ----------
+    rotation : scipy.spatial.transform.Rotation
+        Rotation R.
+    translation : array_like, shape (3,)
+        Translation t [m].
+    """
+
+    rotation: Rotation = field(default_factory=Rotation.identity)
+    translation: npt.ArrayLike = (0.0, 0.0, 0.0)
+
+    def __matmul__(self, inner: "Pose") -> "Pose":
+        """Pose in the world of a body whose pose within this one is the inner pose."""
+        return Pose(self.rotation * inner.rotation, self.outwards(inner.translation))
+
+    def outwards(self, points: npt.ArrayLike) -> Array:
+        """Points (..., 3) of the body's own frame, in the world."""
+        return np.asarray(points @ self.rotation.as_matrix().T + np.asarray(self.translation))
+
+    def inwards(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """Origins and directions (ray, 3) of the world, in the body's own frame."""
+        matrix = self.rotation.as_matrix()
+        return (origins - np.asarray(self.translation)) @ matrix, directions @ matrix
+
+
+Motion = Callable[[float], Pose]
+"""Pose at a time [s]."""
+Warmth = Callable[[float], Array]
+"""Temperature of each vertex (vertex,) [K] at a time [s]."""
+
+
+def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:
+    """Pose of a body rotated about a joint (3,) [m] of its own."""
+    joint = np.asarray(joint, dtype=np.float64)
+    return Pose(rotation, joint - rotation.apply(joint))
+
+
+def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
+    """
+    Motion in straight lines from place to place, without turning.
+
+    Parameters
+    ----------
+    times : array_like, shape (stop,)
+        Time of arrival at each place [s], increasing; two or more.
+    places : array_like, shape (stop, 3)
+        Places [m].
+
+    Returns
+    -------
+    function of time
+        The pose; before and after, that of the nearest stop.
+
+    Raises
+    ------
+    ValueError
+        If the times do not increase, or the places are not finite, or not one for each time.
+    """
+    times, places = increasing(times, "a motion"), np.asarray(places, dtype=np.float64)
+    if places.shape != (times.size, 3) or not np.all(np.isfinite(places)):
+        raise ValueError(
+            f"Invalid places of shape {places.shape} of a motion. Must be finite, "
+            f"({times.size}, 3)."
+        )
+    return lambda now: Pose(translation=[np.interp(now, times, along) for along in places.T])
+
+
+@dataclass(frozen=True)
+class Actor:
+    """
+    A rigid body of the surroundings.
+
+    Attributes
+    ----------
+    mesh : trimesh.Trimesh
+        Its mesh, in its own frame [m].
+    temperature : ndarray, shape (vertex,), or function of time
+        Temperature [K].
+    motion : function of time, optional
+        Its pose; without one it stands still, its own frame being the world's.
+
+    Raises
+    ------
+    ValueError
+        If the temperatures are not finite, one for each vertex; of a function, when it is called.
+    """
+
+    mesh: trimesh.Trimesh
+    temperature: Array | Warmth
+    motion: Motion | None = None
+
+    def __post_init__(self) -> None:
+        """Check a constant temperature."""
+        if not callable(self.temperature):
+            self._checked(self.temperature)
+
+    def warmth(self, time: float) -> Array:
+        """Temperature of each vertex (vertex,) [K] at a time [s]."""
+        if not callable(self.temperature):
+            return self.temperature
+        return self._checked(self.temperature(time))
+
+    def _checked(self, temperature: Array) -> Array:
+        """Temperatures that are finite, one for each vertex."""
+        expected = (len(self.mesh.vertices),)
+        if np.shape(temperature) != expected or not np.all(np.isfinite(temperature)):
+            raise ValueError(
+                f"Invalid temperature of shape {np.shape(temperature)} of an actor. "
+                f"Must be finite, {expected}."
+            )
+        return temperature
+
+
+@dataclass(frozen=True)
+class Room:
+    r"""
+    Walls of constant temperature behind all bodies, :math:`T + g \cdot d` along direction d.
+
+    Attributes
+    ----------
+    temperature : float
+        Mean temperature [K].
+    gradient : tuple of float
+        Change of temperature from the middle to each of the directions x, y and z [K]: (0, 0, 1)
+        is a room whose ceiling is 2 K warmer than its floor.
+    """
+
+    temperature: float = 295.15
+    gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def seen(self, directions: Array) -> Array:
+        """Temperature (ray,) [K] of the walls along directions (ray, 3)."""
+        return np.asarray(self.temperature + directions @ np.asarray(self.gradient))
+
+
+def painted(parts: Sequence[tuple[trimesh.Trimesh, float]], motion: Motion | None = None) -> Actor:
+    """Rigid actor of several meshes, each of one temperature [K], side by side."""
+    warmth = [np.full(len(mesh.vertices), temperature) for mesh, temperature in parts]
+    whole = trimesh.util.concatenate([mesh for mesh, _ in parts])
+    return Actor(cast("trimesh.Trimesh", whole), np.concatenate(warmth), motion)
+
+
+class _Target:
+    """One actor, ready for rays of fixed origins and directions (ray, 3)."""
+
+    def __init__(self, actor: Actor, origins: Array, directions: Array) -> None:
+        self.actor, self.caster = actor, Caster(actor.mesh)
+        self.rays = (origins, directions)
+        low, high = actor.mesh.bounds
+        self.middle = (low + high) / 2.0
+        self.radius = float(np.max(np.linalg.norm(actor.mesh.vertices - self.middle, axis=1)))
+
+    def at(self, time: float) -> tuple[npt.NDArray[np.int64], Hits]:
+        """Numbers of the rays that meet the actor at a time [s], and their intersections."""
+        motion = self.actor.motion
+        return self._unmoved if motion is None else self._cast(motion(time))
+
+    @cached_property
+    def _unmoved(self) -> tuple[npt.NDArray[np.int64], Hits]:
+        """Intersections with an actor without motion: cast once for all frames."""
+        return self._cast(Pose())
+
+    def _cast(self, pose: Pose) -> tuple[npt.NDArray[np.int64], Hits]:
+        origins, directions = self.rays
+        near = np.flatnonzero(self._near(pose.outwards(self.middle)))
+        hits = self.caster.cast(*pose.inwards(origins[near], directions[near]))
+        return near[hits.met], hits.of(hits.met)
+
+    def _near(self, middle: Array) -> npt.NDArray[np.bool_]:
+        """Rays that pass through the sphere about the actor."""
+        origins, directions = self.rays
+        way = middle - origins
+        along = np.einsum("rx,rx->r", way, directions)
+        square = np.einsum("rx,rx->r", way, way)
+        inside = square < self.radius**2
+        return np.asarray(inside | ((along > 0) & (square - along**2 < self.radius**2)))
+
+
+def incident(
+    origins: Array, directions: Array, time: Array, room: Room, actors: Sequence[Actor]
+) -> Array:
+    """
+    Blackbody temperature (time, ray) [K] that rays meet, frame by frame.
+
+    Parameters
+    ----------
+    origins, directions : ndarray, shape (ray, 3)
+        Origins [m] and unit vectors of the rays, the same in all frames.
+    time : ndarray, shape (time,)
+        Times [s].
+    room : Room
+        Walls behind all actors.
+    actors : sequence of Actor
+        Bodies; the nearest hides the others.
+    """
+    targets = [_Target(actor, origins, directions) for actor in actors]
+    result = np.tile(room.seen(directions), (time.size, 1))
+    for frame, now in zip(result, time, strict=True):
+        nearest = np.full(frame.shape, np.inf)
+        for target in targets:
+            rays, hits = target.at(float(now))
+            first = hits.distance < nearest[rays]
+            selected, warmth = rays[first], target.actor.warmth(float(now))
+            nearest[selected] = hits.distance[first]
+            frame[selected] = target.caster.interpolate(hits.of(first), warmth)
+    return result
+
+
+def distance(origins: Array, directions: Array, time: Array, actors: Sequence[Actor]) -> Array:
+    """Least distance (ray,) [m] to any actor over all frames; infinite where no actor is met."""
+    nearest = np.full(len(origins), np.inf)
+    for target in (_Target(actor, origins, directions) for actor in actors):
+        for now in time:
+            rays, hits = target.at(float(now))
+            nearest[rays] = np.minimum(nearest[rays], hits.distance)
+    return nearest

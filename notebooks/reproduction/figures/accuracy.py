@@ -1,0 +1,183 @@
+"""Figures of accuracy: errors and error bars case by case, and pixels to trust under stress."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dbthermal.figures import REASONS, first_reason
+from dbthermal.figures.drawing import COLORS, band_label, canvas, percent, provenance_note
+
+_RIGHT: Final = "#a8d5b0"
+
+_WRONG: Final = "#e3000f"
+
+# What a 95 % interval should hold, and where the axis of the coverage begins [%].
+_SPAN: Final = (92.0, 98.0)
+
+_LOWEST: Final = 50.0
+
+_ARROW: Final = 48.5
+
+_DOTS: Final = (COLORS[0], COLORS[3], COLORS[4], COLORS[2])
+
+
+def accuracy(sweep: xr.Dataset) -> Figure:
+    """
+    Errors of the object temperature and of the emissivities, case by case.
+
+    Parameters
+    ----------
+    sweep : Dataset
+        `object_temperature_rmse` [K], `emissivity_error` (band) [1], over `case`.
+
+    Returns
+    -------
+    Figure
+        Two panels.
+    """
+    figure, axes = canvas(1, 2, (11.0, 0.34 * sweep.sizes["case"] + 1.8))
+    place = np.arange(sweep.sizes["case"])
+    left, right = axes[0]
+    left.barh(place, sweep["object_temperature_rmse"], color=COLORS[0])
+    bands = sweep["band"].values
+    for index, band in enumerate(bands):
+        shifted = place + 0.36 * (index - (len(bands) - 1) / 2)
+        values = sweep["emissivity_error"].sel(band=band)
+        right.barh(shifted, values, 0.34, color=COLORS[index], label=band_label(band))
+    for axis in (left, right):
+        axis.set_yticks(place, sweep["case"].values, fontsize=8)
+        axis.invert_yaxis()
+    right.legend(frameon=False, fontsize=8)
+    left.set_xlabel("median RMSE of the object temperature [K]")
+    right.set_xlabel("median error of the emissivity [1]")
+    right.set_yticklabels([])
+    figure.suptitle("Accuracy of the separation" + provenance_note(sweep))
+    return figure
+
+
+def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
+    """
+    Distribution of error over standard deviation; a true error bar gives the normal curve.
+
+    Parameters
+    ----------
+    scores : mapping of str to DataArray
+        Quantity, and its errors divided by their standard deviation [1]; the first one's
+        attributes say what the data are.
+
+    Returns
+    -------
+    Figure
+        Histograms over the standard normal density.
+    """
+    figure, axes = canvas(1, len(scores), (3.4 * len(scores), 3.0))
+    grid = np.linspace(-5, 5, 201)
+    normal = np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi)
+    for axis, (name, values) in zip(axes[0], scores.items(), strict=True):
+        axis.hist(values.values.ravel(), bins=50, range=(-5, 5), density=True, color=COLORS[0])
+        axis.plot(grid, normal, color="black", linewidth=1)
+        axis.set(title=name.replace("_", " "), xlabel="error / standard deviation [1]")
+    axes[0, 0].set_ylabel("density [1]")
+    data = next(iter(scores.values()))
+    figure.suptitle("Error bars against errors" + provenance_note(data))
+    return figure
+
+
+def validity(stress: xr.Dataset) -> Figure:
+    """
+    What becomes of the pixels, case by case: right, wrong without a warning, or flagged and why.
+
+    Left, a bar of all pixels: no flag and right; no flag and wrong, in red, the one thing that
+    must not be; flagged, by the flag that says most. Right, how many of the 95 % intervals hold
+    the truth, over the span from 92 to 98 %: of the object temperature in pixels without a flag,
+    of the emissivities in all that have a value. What lies left of the axis is an arrow.
+
+    Parameters
+    ----------
+    stress : Dataset
+        From `experiments.stress.sweep`: `status` (case, pixel), `bad` (case, kind, pixel),
+        `object_coverage` (case, among), `emissivity_coverage` (case, among, band) [1].
+
+    Returns
+    -------
+    Figure
+        A row a case.
+    """
+    figure, axes = canvas(1, 2, (12.5, 5.0))
+    left, right = axes[0]
+    left.get_gridspec().set_width_ratios([1.4, 1.0])
+    _bars(left, stress["status"], stress["bad"].sel(kind="any"))
+    found = {"object temperature, no flag": stress["object_coverage"].sel(among="unflagged")}
+    for band in stress["band"].values:
+        among_all = stress["emissivity_coverage"].sel(among="all", band=band)
+        found[f"emissivity, {band_label(band)}, all with a value"] = among_all
+    _dots(right, found)
+    place = np.arange(stress.sizes["case"])
+    left.set_yticks(place, stress["case"].values, fontsize=8)
+    right.set_yticks(place, [""] * place.size)
+    for axis in (left, right):
+        axis.set_ylim(place.size - 0.4, -0.6)
+        axis.spines[["top", "right"]].set_visible(False)
+    style: dict[str, Any] = {"frameon": False, "fontsize": 8}
+    words, dots = (axis.get_legend_handles_labels() for axis in (left, right))
+    figure.legend(*words, loc="outside lower left", ncols=2, **style)
+    rows = max(-(-len(words[1]) // 2), len(dots[1]))
+    figure.set_figheight(0.29 * place.size + 0.18 * rows + 1.7)
+    figure.legend(*dots, loc="outside lower right", **style)
+    figure.suptitle("Which pixels can be trusted, and why not" + provenance_note(stress))
+    return figure
+
+
+def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
+    """Stacked bars (case): right, wrong, and each flag; the wrong ones as a number, too."""
+    first, wrong = first_reason(flags.transpose("case", "pixel")), bad.transpose("case", "pixel")
+    parts = {
+        "no flag and right": (_RIGHT, (first == "") & ~wrong.values),
+        "no flag and wrong (error above 4 standard deviations)": (
+            _WRONG,
+            (first == "") & wrong.values,
+        ),
+    }
+    parts |= {words: (color, first == name) for name, (words, color) in REASONS.items()}
+    place, reached = np.arange(flags.sizes["case"]), np.zeros(flags.sizes["case"])
+    for label, (color, mask) in parts.items():
+        share = 100 * mask.mean(axis=1)
+        if share.any() or color in {_RIGHT, _WRONG}:
+            axis.barh(place, share, 0.8, left=reached, color=color, label=label)
+        if color == _WRONG:
+            _count(axis, share)
+        reached += share
+    axis.set(xlim=(0, 100), xlabel="share of the pixels [%]")
+
+
+def _count(axis: Axes, share: npt.NDArray[np.float64]) -> None:
+    """Shares of wrong pixels [%] at the end of the bars, for some are too few to be seen."""
+    for row in np.flatnonzero(share).tolist():
+        text = f"{percent(share[row] / 100)} wrong"
+        axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
+
+
+def _dots(axis: Axes, coverage: dict[str, xr.DataArray]) -> None:
+    """Coverage [%] of several quantities, a dot a case, over the span that it should lie in."""
+    axis.axvspan(*_SPAN, color=_RIGHT, alpha=0.6, linewidth=0, label="92 to 98 %")
+    for index, (label, share) in enumerate(coverage.items()):
+        value = 100 * share.values
+        place = np.arange(value.size) + 0.22 * (index - (len(coverage) - 1) / 2)
+        color = _DOTS[index % len(_DOTS)]
+        axis.plot(value, place, "o", color=color, markersize=5, label=label)
+        low = place[value < _LOWEST]
+        axis.plot(np.full(low.size, _ARROW), low, "<", color=color, markersize=5)
+    empty = np.all([share.isnull() for share in coverage.values()], axis=0)
+    for row in np.flatnonzero(empty).tolist():
+        axis.text(
+            _SPAN[0] - 2, row, "none to judge", color="0.5", fontsize=8, va="center", ha="right"
+        )
+    axis.set(xlim=(_LOWEST - 3, 100.5), xlabel="95 % intervals that hold the truth [%]")
+    axis.set_title(f"arrow: below {_LOWEST:.0f} %", loc="left", fontsize=8, color="0.4")
+    axis.grid(visible=True, axis="y", color="0.93")
+    axis.set_axisbelow(True)

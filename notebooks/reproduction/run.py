@@ -1,0 +1,104 @@
+"""Results of a notebook: one object keeps their paths, figures, numbers and provenance.
+
+In a notebook with the parameter `results`, the name of the run::
+
+    run = Run("05_methods", globals())
+    response = run.open("01_calibration", "_response")
+    run.save(comparison)
+    run.figure(figures.error_over_noise(error), "_noise")
+    run.finish(numbers)
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import joblib
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+import yaml
+
+from dbthermal import store
+from reproduction import cache, manifest, paths
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Numbers = Mapping[str, store.Number | np.generic]
+
+
+class Run:
+    """
+    One run of a notebook, with its results in ``results/<name>/<stem>*``.
+
+    Each result is saved with the provenance: the notebook's parameters, versions, commit, and the
+    checksums of the inputs that were opened before.
+
+    Parameters
+    ----------
+    stem : str
+        Name of the notebook, such as ``"03_simulation"``.
+    namespace : mapping
+        ``globals()`` of the notebook, with a value for each parameter in its YAML file, `results`
+        among them; else KeyError.
+    """
+
+    def __init__(self, stem: str, namespace: Mapping[str, Any]) -> None:
+        """Read the parameters' names from the YAML file, and their values from `namespace`."""
+        names = yaml.safe_load(paths.params(stem).read_text(encoding="utf-8"))
+        missing = [name for name in names if name not in namespace]
+        if missing:
+            raise KeyError(f"Missing parameter '{missing[0]}' of '{stem}'. Must have a value.")
+        parameters = {name: namespace[name] for name in names}
+        self.stem, self.name = stem, str(parameters["results"])
+        self.provenance = store.provenance(parameters)
+
+    def input(self, name: str, path: Path) -> Path:
+        """Path of an input, of which the provenance then holds the checksum."""
+        self.provenance["inputs"][name] = store.checksum(path)
+        return path
+
+    def open(self, stem: str, ending: str = "") -> xr.Dataset:
+        """Dataset of this run that another notebook saved."""
+        path = paths.result(self.name, stem, f"{ending}.zarr")
+        return store.open_dataset(self.input(f"{stem}{ending}", path)).load()
+
+    def data(self, collection: str) -> dict[str, Path]:
+        """Verified outside files of a collection, name to path; empty if it is not at hand."""
+        if not manifest.available(collection):
+            return {}
+        sums = manifest.provenance(collection)
+        self.provenance["inputs"] |= {f"{collection}/{name}": sums[name] for name in sums}
+        return manifest.local(collection)
+
+    def save(self, dataset: xr.Dataset, ending: str = "") -> None:
+        """Save a dataset as ``<stem><ending>.zarr``."""
+        store.save(dataset, self._path(f"{ending}.zarr"), self.provenance)
+
+    def figure(self, figure: "Figure", ending: str) -> "Figure":
+        """Save a figure as ``<stem><ending>.png``, and hand it back for display."""
+        store.save_figure(figure, self._path(f"{ending}.png"), self.provenance)
+        return figure
+
+    def film(self, frames: Iterable[npt.NDArray[np.uint8]], ending: str, rate: float) -> None:
+        """Save a film of `rate` [Hz] as ``<stem><ending>.mp4``."""
+        store.save_video(frames, self._path(f"{ending}.mp4"), self.provenance, rate=rate)
+
+    def text(self, text: str, ending: str) -> None:
+        """Save a text in Markdown as ``<stem><ending>.md``."""
+        store.save_text(text, self._path(f"{ending}.md"), self.provenance)
+
+    def cached(self, experiment: Callable[..., xr.Dataset]) -> Callable[..., Any]:
+        """Experiment whose results are kept, delayed for `joblib.Parallel`."""
+        kept = cache.memory(paths.cells(self.stem)).cache(experiment)
+        delayed: Callable[..., Any] = joblib.delayed(kept)
+        return delayed
+
+    def finish(self, numbers: Numbers) -> Numbers:
+        """Save the headline numbers as ``<stem>.json``, and hand them back for display."""
+        store.save_numbers(numbers, self._path(".json"), self.provenance)
+        return numbers
+
+    def _path(self, ending: str) -> Path:
+        return paths.result(self.name, self.stem, ending)

@@ -1,0 +1,345 @@
+"""Frame correction: one mechanism at a time on frames whose gains and offsets are known."""
+
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from dbthermal import schema
+from dbthermal.correction import blackbody_statistics, correct, fit_correction
+from dbthermal.schema import Status
+
+TEMPERATURES = np.array([288.15, 298.15, 308.15, 318.15])
+LEVELS = np.array([20000.0, 21200.0, 22500.0, 23900.0])  # counts of an ideal pixel
+
+
+def blackbody(gain: object, offset: object, levels: object = LEVELS) -> xr.Dataset:
+    """Frames (band, temperature, y, x) of pixels that give (level - offset) / gain counts."""
+    gain, offset, levels = (np.asarray(values, dtype=float) for values in (gain, offset, levels))
+    counts = (levels[:, np.newaxis, np.newaxis] - offset) / gain
+    return xr.Dataset(
+        {"counts": (("band", "temperature", "y", "x"), counts[np.newaxis])},
+        coords={"band": ["8-14"], "temperature": TEMPERATURES[: len(levels)]},
+    )
+
+
+def centred(gain: object, offset: object) -> xr.Dataset:
+    """Frames of pixels whose mean is the ideal pixel's: what makes gain and offset identifiable."""
+    slope = 1.0 / np.asarray(gain, dtype=float)
+    shift = -np.asarray(offset, dtype=float) * slope
+    return blackbody(slope.mean() / slope, (shift.mean() - shift) / slope)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Seeded random numbers."""
+    return np.random.default_rng(3)
+
+
+@pytest.fixture
+def ideal(rng: np.random.Generator) -> xr.Dataset:
+    """Frames of 12 by 16 good pixels with 3 % of gain, 200 counts of offset and 2 of noise."""
+    size = (12, 16)
+    made = centred(1.0 + 0.03 * rng.standard_normal(size), 200.0 * rng.standard_normal(size))
+    return made + 2.0 * rng.standard_normal(made["counts"].shape)
+
+
+@pytest.fixture
+def capture() -> xr.Dataset:
+    """Two bands of three frames, every sample inside the detector's range."""
+    counts = 20000 + np.arange(2 * 3 * 2 * 4, dtype=np.uint16).reshape(2, 3, 2, 4)
+    return xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts, {"units": "count"})},
+        coords={"band": ["8-14", "9.5"], "time": [0.0, 0.1, 0.3]},
+        attrs={"camera": "simulated"},
+    )
+
+
+@pytest.fixture
+def correction() -> xr.Dataset:
+    """Gains and offsets of three bands, in another order, with one bad pixel."""
+    rng = np.random.default_rng(5)
+    dims, shape = ("band", "y", "x"), (3, 2, 4)
+    bad = np.zeros(shape, dtype=bool)
+    bad[2, 1, 3] = True
+    return xr.Dataset(
+        {
+            "gain": (dims, 1.0 + 0.05 * rng.standard_normal(shape)),
+            "offset": (dims, 100.0 * rng.standard_normal(shape)),
+            "bad": (dims, bad),
+        },
+        coords={"band": ["9.5", "10.6", "8-14"]},
+        attrs={"threshold": 6.0, "origin": "simulated"},
+    )
+
+
+@given(
+    arrays(float, (3, 4), elements=st.floats(0.7, 1.4)),
+    arrays(float, (3, 4), elements=st.floats(-2000.0, 2000.0)),
+)
+def test_known_gain_and_offset_come_back(gain: np.ndarray, offset: np.ndarray) -> None:
+    """Without noise the fit returns each pixel's own gain and offset, whatever they are."""
+    made = centred(gain, offset)
+    fitted = fit_correction(made, threshold=1e6)
+    corrected = fitted["gain"] * made["counts"] + fitted["offset"]
+    expected = np.broadcast_to(LEVELS[:, np.newaxis, np.newaxis], (4, 3, 4))
+    assert not fitted["bad"].any()
+    np.testing.assert_allclose(fitted["level"][0], LEVELS, rtol=0, atol=1e-8)  # count
+    np.testing.assert_allclose(corrected.transpose(..., "y", "x")[0], expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(fitted["residual"], 0.0, rtol=0, atol=1e-6)
+
+
+def test_two_temperatures_are_enough() -> None:
+    """Through two points the line is exact."""
+    fitted = fit_correction(blackbody([[0.9, 1.1]], [[50.0, -50.0]], LEVELS[:2]), threshold=9)
+    np.testing.assert_allclose(fitted["residual"], 0.0, rtol=0, atol=1e-9)
+
+
+def test_least_squares_against_polyfit(ideal: xr.Dataset) -> None:
+    """With noise a pixel's line is the one that an independent least squares gives."""
+    fitted = fit_correction(ideal)
+    pixel = ideal["counts"].values[0, :, 4, 7]
+    gain, offset = np.polyfit(pixel - 21000.0, fitted["level"].values[0], 1)
+    assert fitted["gain"].values[0, 4, 7] == pytest.approx(gain, abs=1e-10)
+    assert fitted["offset"].values[0, 4, 7] == pytest.approx(offset - 21000.0 * gain, abs=1e-5)
+
+
+def test_residual_is_the_noise(ideal: xr.Dataset) -> None:
+    """Two of four degrees of freedom are left: 2 counts of noise leave an RMS of sqrt(2) counts."""
+    fitted = fit_correction(ideal)
+    assert not fitted["bad"].any()
+    assert float(fitted["residual"][0]) == pytest.approx(2.0**0.5, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [
+        np.full(4, 20500.0),
+        np.array([20500.0, 20501.0, 20499.5, 20500.5]),
+        LEVELS[::-1],
+        np.array([20000.0, 21200.0, np.nan, 23900.0]),
+        np.array([20000.0, 21200.0, np.inf, 23900.0]),
+        np.array([20000.0, 21200.0, 22500.0, 65535.0]),
+        np.array([0.0, 21200.0, 22500.0, 23900.0]),
+        20000.0 + 0.5 * (LEVELS - 20000.0),
+        LEVELS + np.array([0.0, 150.0, -150.0, 0.0]),
+    ],
+    ids=["stuck", "dead", "falling", "NaN", "inf", "saturated", "zero", "low gain", "bent"],
+)
+def test_bad_pixel_is_found_and_left_out(ideal: xr.Dataset, samples: np.ndarray) -> None:
+    """Each kind of bad pixel is marked, alone, and does not shift the others' level."""
+    spoiled = ideal.copy(deep=True)
+    spoiled["counts"][0, :, 5, 6] = samples
+    fitted = fit_correction(spoiled)
+    assert fitted["bad"].dtype == bool
+    np.testing.assert_array_equal(np.argwhere(fitted["bad"].values), [[0, 5, 6]])
+    rest = ideal["counts"].values.reshape(4, -1)[:, np.arange(192) != 5 * 16 + 6]
+    np.testing.assert_allclose(fitted["level"][0], rest.mean(axis=1), rtol=0, atol=1e-8)
+    assert fitted["gain"].values[0, 5, 6] == 1.0
+    assert fitted["offset"].values[0, 5, 6] == 0.0
+
+
+def test_pixels_that_are_alike_are_all_good() -> None:
+    """Where no pixel differs from another, rounding makes no outlier."""
+    fitted = fit_correction(blackbody(np.ones((5, 5)), np.zeros((5, 5))))
+    assert not fitted["bad"].any()
+    np.testing.assert_allclose(fitted["gain"], 1.0, rtol=0, atol=1e-12)
+
+
+def test_threshold_is_the_caller_s(ideal: xr.Dataset) -> None:
+    """A lower threshold marks the pixel of the largest gain; one of zero or less is refused."""
+    gain = fit_correction(ideal)["gain"].values
+    marked = fit_correction(ideal, threshold=2.0)["bad"].values
+    assert marked.flat[np.argmax(gain)]
+    assert 0.0 < marked.mean() < 0.3
+    with pytest.raises(ValueError, match=re.escape("Invalid threshold 0 of bad pixels")):
+        fit_correction(ideal, threshold=0)
+
+
+def test_fit_leaves_its_input(ideal: xr.Dataset) -> None:
+    """The frames are read, not changed."""
+    before = ideal.copy(deep=True)
+    fit_correction(ideal)
+    xr.testing.assert_identical(ideal, before)
+
+
+def test_one_temperature_is_not_enough() -> None:
+    """A gain needs two levels."""
+    with pytest.raises(ValueError, match="Invalid blackbody frames of 1 temperature"):
+        fit_correction(blackbody([[1.0]], [[0.0]], LEVELS[:1]))
+
+
+def test_most_pixels_must_be_usable() -> None:
+    """A median over a minority of pixels would say what is normal, and be wrong."""
+    made = blackbody(np.ones((2, 2)), np.zeros((2, 2)))
+    made["counts"][0, 1, 0] = np.nan
+    with pytest.raises(ValueError, match=re.escape("band '8-14': 2 of 4 pixels are usable")):
+        fit_correction(made)
+
+
+def test_level_must_rise_with_temperature() -> None:
+    """Frames under another's temperature are refused."""
+    with pytest.raises(ValueError, match=r"Invalid levels .* Must rise"):
+        fit_correction(blackbody(np.ones((2, 2)), np.zeros((2, 2)), LEVELS[[1, 0, 2]]))
+
+
+def test_correct_applies_gain_and_offset(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """Each band gets its own maps, by name and not by place."""
+    result = correct(capture, correction)
+    for band in ("8-14", "9.5"):
+        maps, raw = correction.sel(band=band), capture["counts"].sel(band=band).astype(float)
+        expected = (maps["gain"] * raw + maps["offset"]).transpose("time", "y", "x")
+        difference = result["counts"].sel(band=band) - expected
+        np.testing.assert_allclose(difference, 0.0, rtol=0, atol=0.005)  # count, float32
+    assert result["counts"].dtype == np.float32
+    assert schema.check(result, "corrected") is result
+
+
+def test_corrected_blackbody_is_uniform(rng: np.random.Generator) -> None:
+    """What the fit learned from noisy frames makes a new frame of the blackbody even."""
+    gain, offset = 1.0 + 0.03 * rng.standard_normal((12, 16)), 200 * rng.standard_normal((12, 16))
+    made = centred(gain, offset)
+    fitted = fit_correction(made + 0.5 * rng.standard_normal(made["counts"].shape))
+    movie = made["counts"].round().astype(np.uint16).rename(temperature="time")
+    movie = movie.assign_coords(time=np.arange(4.0))
+    corrected = correct(movie.to_dataset(name="counts"), fitted)["counts"]
+    assert made["counts"].std(("y", "x")).min() > 500.0  # count
+    assert corrected.std(("y", "x")).max() < 1.0
+
+
+def test_status_tells_dead_from_saturated(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """A bit a cause, from whichever band it comes; the counts stay as they are."""
+    capture["counts"][1, 2, 0, 1] = 65535
+    capture["counts"][0, 1, 1, 3] = 0
+    result = correct(capture, correction)
+    saturated, dead = Status.SATURATED, Status.DEAD_PIXEL
+    np.testing.assert_array_equal(
+        result["status"], [[0, saturated, 0, 0], [0, 0, 0, saturated | dead]]
+    )
+    assert result["status"].dtype == np.uint32
+    maps = correction.sel(band="9.5").isel(y=0, x=1)
+    expected = 65535 * float(maps["gain"]) + float(maps["offset"])
+    assert float(result["counts"][1, 2, 0, 1]) == pytest.approx(expected, abs=0.02)
+
+
+def test_maximum_is_the_detector_s(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """A detector of fewer bits saturates lower."""
+    result = correct(capture, correction.assign(bad=correction["bad"] & False), maximum=20047)
+    np.testing.assert_array_equal(result["status"], [[0, 0, 0, 0], [0, 0, 0, 128]])
+
+
+def test_provenance_is_written(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """The result says what was done to it, with which parameters, beside what it was."""
+    attrs = correct(capture, correction).attrs
+    assert attrs == {
+        "camera": "simulated",
+        "gain_offset_corrected": 1,
+        "gain_offset_threshold": 6.0,
+        "detector_maximum": 65535,
+        "dead_pixels": 1,
+        "saturated_pixels": 0,
+    }
+
+
+def test_correct_leaves_its_input(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """Neither capture nor correction is changed, and other variables are handed on."""
+    capture["fpa_temperature"] = ("time", [300.0, 300.1, 300.2])
+    before = capture.copy(deep=True), correction.copy(deep=True)
+    result = correct(capture, correction)
+    xr.testing.assert_identical(capture, before[0])
+    xr.testing.assert_identical(correction, before[1])
+    xr.testing.assert_identical(result["fpa_temperature"], capture["fpa_temperature"])
+
+
+def test_corrected_twice_is_refused(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """A second correction would undo the first; scaled counts are no raw ones."""
+    corrected = correct(capture, correction)
+    with pytest.raises(ValueError, match="corrected before"):
+        correct(corrected, correction)
+    with pytest.raises(TypeError, match="Invalid dtype float64 of the capture's counts"):
+        correct(capture.astype(float), correction)
+
+
+def test_unordered_time_is_refused(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """The stage's own rules hold."""
+    with pytest.raises(ValueError, match="Unordered 'time'"):
+        correct(capture.isel(time=[0, 2, 1]), correction)
+
+
+def test_band_must_be_corrected(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """A band without a correction is named."""
+    with pytest.raises(ValueError, match=re.escape("Missing band '9.5' in the correction")):
+        correct(capture, correction.isel(band=[1, 2]))
+
+
+def test_pixels_must_be_the_same(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """A correction of another size, or of another window of the detector, is refused."""
+    with pytest.raises(ValueError, match="Invalid size 4 of 'x' of the capture"):
+        correct(capture, correction.isel(x=slice(3)))
+    with pytest.raises(ValueError, match="Invalid 'y' of the capture"):
+        correct(capture.assign_coords(y=[0, 1]), correction.assign_coords(y=[1, 2]))
+
+
+def test_correction_must_be_whole(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """A gain of NaN would pass in silence; bad pixels that are not marked, too."""
+    with pytest.raises(ValueError, match="Invalid gain of the correction: not finite"):
+        correct(capture, correction.assign(gain=correction["gain"] * np.nan))
+    with pytest.raises(ValueError, match="Missing 'bad'"):
+        correct(capture, correction.drop_vars("bad"))
+
+
+@pytest.fixture
+def movies(rng: np.random.Generator) -> xr.Dataset:
+    """Movies of 12 frames with 20 counts of noise in one band and 60 in the other."""
+    shape = (2, 4, 12, 20, 20)
+    noise = np.array([20.0, 60.0]).reshape(2, 1, 1, 1, 1) * rng.standard_normal(shape)
+    counts = np.round(LEVELS.reshape(1, 4, 1, 1, 1) + noise).astype(np.uint16)
+    return xr.Dataset(
+        {"counts": (("band", "temperature", "frame", "y", "x"), counts)},
+        coords={"band": ["8-14", "9.5"], "temperature": TEMPERATURES},
+    )
+
+
+def test_noise_of_movies(movies: xr.Dataset) -> None:
+    """Mean frames and noise come back; the standard deviation of this median is 0.6 %."""
+    result = schema.check(blackbody_statistics(movies), "blackbody_frames")
+    np.testing.assert_allclose(result["noise"], [20.0, 60.0], rtol=0.02)
+    levels = result["counts"].mean(("y", "x"))
+    np.testing.assert_allclose(levels, [LEVELS, LEVELS], rtol=0, atol=4.0)  # count
+    assert result["noise"].attrs["units"] == "count"
+
+
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_noise_of_few_frames(movies: xr.Dataset, count: int) -> None:
+    """The median's bias at few frames is removed: 33 % at two."""
+    result = blackbody_statistics(movies.isel(frame=slice(count)))
+    np.testing.assert_allclose(result["noise"], [20.0, 60.0], rtol=0.05)
+
+
+def test_drift_is_no_noise(movies: xr.Dataset) -> None:
+    """A drift of 200 counts over the movie is not taken for noise."""
+    drift = xr.DataArray(np.linspace(0.0, 200.0, 12).round().astype(np.uint16), dims="frame")
+    drifting = movies + drift
+    noise = blackbody_statistics(drifting.transpose(*movies["counts"].dims))["noise"]
+    assert float(noise[1]) == pytest.approx(60.0, rel=0.04)
+
+
+def test_statistics_feed_the_fit(movies: xr.Dataset) -> None:
+    """The stages fit together: movies, frames, correction."""
+    correction = fit_correction(blackbody_statistics(movies))
+    assert correction["gain"].dims == ("band", "y", "x")
+    np.testing.assert_allclose(correction["level"], [LEVELS, LEVELS], rtol=0, atol=4.0)  # count
+
+
+def test_movies_must_vary(movies: xr.Dataset) -> None:
+    """One frame, or a frozen image, has no noise."""
+    with pytest.raises(ValueError, match="Invalid movies of 1 frame"):
+        blackbody_statistics(movies.isel(frame=[0]))
+    with pytest.raises(ValueError, match=re.escape("Invalid noise 0.0 count")):
+        blackbody_statistics(movies.isel(frame=[0, 0, 0]))
+    with pytest.raises(ValueError, match=re.escape("Invalid noise nan count")):
+        blackbody_statistics(movies.astype(float).where(movies["frame"] != 1))

@@ -1,0 +1,202 @@
+"""A recording is written to its end, whoever looks on or interrupts, and says how it ended."""
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from faulty_camera import Faults, FaultyCamera
+from test_record import BANDS, CHUNK, SMALL, bench, session
+
+from dbthermal import store
+from dbthermal.instruments.camera import Frame, FrameFlag, FrameSource
+from dbthermal.instruments.emulated.world import CameraState
+from dbthermal.instruments.recording import (
+    Limits,
+    Preview,
+    _recorder,
+    notes,
+    open_capture,
+    record,
+)
+from dbthermal.instruments.recording._capture_file import CaptureFile
+
+
+@pytest.fixture(autouse=True)
+def keyboard() -> Iterator[None]:
+    """Let the keyboard interrupt: what a shell starts in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def interrupt(_: Preview | None = None) -> None:
+    """Interrupt the main thread as the keyboard does."""
+    main = threading.main_thread().ident
+    assert main is not None
+    signal.pthread_kill(main, signal.SIGINT)
+
+
+def slow_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writing a frame takes 0.03 s, three times as long as to take one."""
+    frame = CaptureFile.frame
+
+    def slow(own: CaptureFile, band: str, shot: Frame, refused: int = 0) -> FrameFlag:
+        time.sleep(0.03)
+        return frame(own, band, shot, refused)
+
+    monkeypatch.setattr(CaptureFile, "frame", slow)
+
+
+def test_slow_disk_refuses_frames_and_counts_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every frame of a queue that overflows is either there or counted as refused or lost."""
+    limits, path = Limits(chunk=CHUNK, reserve=0, queue=2), tmp_path / "a.zarr"
+    slow_down(monkeypatch)
+    summary = record(session(0.5), bench(), path, limits=limits)
+    opened = open_capture(path)
+    for place, band in enumerate(BANDS):
+        total = summary.totals[band]
+        assert total["refused"] > 5
+        last = int(opened["sequence"][place].max())
+        noted = [n[3] for n in notes(path) if n[1:3] == ("frames_refused", band)]
+        assert sum(noted) == total["refused"]
+        behind = sum(total.values()) - 1 - last
+        assert 0 <= behind <= noted[-1]
+        flags = np.bitwise_or.reduce(opened["frame_flags"][place].values)
+        assert FrameFlag.FRAMES_LOST_BEFORE & int(flags)
+
+
+def written(path: Path) -> int:
+    """Frames of all bands that a recording says it has."""
+    return int(sum(store.open_dataset(path).attrs["frames_written"].values()))
+
+
+def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
+    """While something is drawn, frames are written."""
+    path, seen = tmp_path / "a.zarr", []
+
+    def draw(_: Preview) -> None:
+        until = time.monotonic() + 20
+        while not (chunks := written(path) // CHUNK) and time.monotonic() < until:
+            time.sleep(0.01)
+        seen.append(chunks)
+
+    record(session(1.0), bench(), path, limits=SMALL, preview=draw)
+    assert seen[0] >= 1
+
+
+@pytest.mark.parametrize("drawing", [True, False])
+def test_keyboard_interrupt_keeps_everything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, drawing: bool
+) -> None:
+    """Interrupted, while it draws or waits, all frames that came are written, and it says so."""
+    slow_down(monkeypatch)
+    came: list[int] = []
+    read = FaultyCamera.read
+
+    def counting(camera: FaultyCamera, timeout: float = 1.0) -> Frame:
+        frame = read(camera, timeout)
+        came.append(frame.sequence)
+        if len(came) == 40 and not drawing:
+            interrupt()
+        return frame
+
+    monkeypatch.setattr(FaultyCamera, "read", counting)
+    limits, path = Limits(chunk=CHUNK, reserve=0, preview_period=0.3), tmp_path / "a.zarr"
+    with pytest.raises(KeyboardInterrupt):
+        record(
+            session(60.0),
+            bench(),
+            path,
+            limits=limits,
+            preview=interrupt if drawing else None,
+        )
+    opened = store.open_dataset(path)
+    assert (opened.attrs["closed"], opened.attrs["ended"]) == (True, "interrupted")
+    assert written(path) == len(came)
+    found = opened["sequence"].values
+    assert sorted(found[found >= 0]) == sorted(came)
+
+
+def state(sources: dict[str, FrameSource], band: str) -> CameraState:
+    """State of an emulated camera."""
+    camera = sources[band]
+    assert isinstance(camera, FaultyCamera)
+    return camera.world.camera(band)
+
+
+def test_a_lost_camera_is_told_though_it_was_stopped(tmp_path: Path) -> None:
+    """Who stops a recording that lost a camera has none that is complete."""
+    stop, path, sources = threading.Event(), tmp_path / "a.zarr", bench(Faults(unplugged=5))
+
+    def look(_: Preview) -> None:
+        if not state(sources, "8-14").plugged:
+            stop.set()
+
+    summary = record(session(9.0), sources, path, limits=SMALL, preview=look, stop=stop)
+    assert (summary.ended, store.open_dataset(path).attrs["complete"]) == ("source lost", False)
+
+
+def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
+    """A band without a frame is no complete recording, and the log says how long it was mute."""
+    sources, path = bench(None, Faults(mute=True)), tmp_path / "a.zarr"
+    summary = record(session(), sources, path, limits=SMALL)
+    assert (summary.ended, summary.totals["9.5"]["frames"]) == ("no frames", 0)
+    assert store.open_dataset(path).attrs["complete"] is False
+    assert ("no_frame", "9.5", 0.1) in [note[1:] for note in notes(path)]
+
+
+def test_wrong_stamps_cost_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A camera whose stamps are all of long ago is recorded, without times, once none is held."""
+    monkeypatch.setattr(_recorder, "_HELD", 0.1)
+    read = FaultyCamera.read
+
+    def stampless(camera: FaultyCamera, timeout: float = 1.0) -> Frame:
+        frame = read(camera, timeout)
+        return replace(frame, device_time=0.0) if camera.name == "9.5" else frame
+
+    monkeypatch.setattr(FaultyCamera, "read", stampless)
+    record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)
+    opened = store.open_dataset(tmp_path / "a.zarr")
+    frames = slice(0, opened.attrs["frames_written"]["9.5"])
+    one = opened.sel(band="9.5").isel(time=frames)
+    assert one.sizes["time"] > 5
+    assert (one["frame_flags"] & int(FrameFlag.TIME_WRONG)).all()
+    assert np.isnan(one["exposure_time"]).all()
+
+
+def test_second_interrupt_stops_no_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted again while it waits for the writer, it returns; the writer ends its work."""
+    path, free, close = tmp_path / "a.zarr", threading.Event(), CaptureFile.close
+
+    def interrupted_close(own: CaptureFile, *, complete: bool, ended: str) -> None:
+        interrupt()
+        free.wait(20)
+        close(own, complete=complete, ended=ended)
+
+    monkeypatch.setattr(CaptureFile, "close", interrupted_close)
+    with pytest.raises(KeyboardInterrupt):
+        record(session(60.0), bench(), path, limits=SMALL, preview=interrupt)
+    assert store.open_dataset(path).attrs["closed"] is False
+    free.set()
+    (writer,) = (thread for thread in threading.enumerate() if thread.name == "writer")
+    writer.join(20)
+    assert store.open_dataset(path).attrs["ended"] == "interrupted"
+
+
+def test_a_thread_that_exits_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What ends a camera's thread without a usual error is no end as planned, either."""
+
+    def leave(*_: object) -> Frame:
+        raise SystemExit("left")
+
+    monkeypatch.setattr(FaultyCamera, "read", leave)
+    with pytest.raises(SystemExit, match="left"):
+        record(session(9.0), bench(), tmp_path / "a.zarr", limits=SMALL)
+    assert store.open_dataset(tmp_path / "a.zarr").attrs["ended"] == "error"

@@ -1,0 +1,114 @@
+"""The prior on the background's slow part: emissivity bars that hold where nothing can be seen."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import _smooth as smooth
+from dbthermal import separation
+from dbthermal.separation._subspace import emission, residuals
+from dbthermal.simulation import Rig
+from reproduction import experiments
+
+RIG = Rig()
+TIME = np.arange(350) / 10.0
+GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
+SLOW: tuple[dict[str, Any], ...] = (
+    {},
+    {"drift": 5.0},
+    *({"kind": "random walk", "memory": memory} for memory in (0.3, 3.0, 30.0)),
+)
+
+
+def coverage(scene: xr.Dataset, result: xr.Dataset) -> np.ndarray:
+    """Share of the 95 % intervals of the emissivity that hold, in each band."""
+    error = abs(result["emissivity"] - scene["emissivity"])
+    within = (error < 1.96 * result["emissivity_std"]).where(error.notnull())
+    return np.asarray(within.mean(("y", "x")).values)
+
+
+@pytest.mark.parametrize("stop", [45, 60])
+@pytest.mark.parametrize("background", SLOW, ids=str)
+def test_intervals_hold_on_slow_backgrounds(background: dict[str, Any], stop: int) -> None:
+    """92 % of the emissivity's 95 % intervals hold, whatever the background does."""
+    case = {**GLASS, "stop": stop, "background": background}
+    scene, result = experiments.run_case(case, RIG, TIME, 600, seed=1)
+    share = coverage(scene, result)
+    good = float((result["status"] == 0).mean())
+    print(f"{background} to {stop} C: intervals {share.round(3)}, {100 * good:.0f} % unflagged")
+    assert np.all(share >= 0.92)
+
+
+@pytest.mark.parametrize("stop", [45, 60])
+def test_clean_intervals_are_not_too_wide(stop: int) -> None:
+    """Where nothing is slow they are at most three times as wide as they need be."""
+    scene, result = experiments.run_case({**GLASS, "stop": stop}, RIG, TIME, 1000, seed=2)
+    error = (result["emissivity"] - scene["emissivity"]).values[:, 0]
+    spread = np.diff(np.nanquantile(error, [0.1587, 0.8413], axis=1), axis=0)[0] / 2
+    width = np.nanmedian(result["emissivity_std"].values[:, 0], axis=1) / spread
+    print(f"to {stop} C: stated over true {width.round(2)}")
+    assert np.all(width <= 3.0)
+    assert np.all(width >= 0.8)
+
+
+def test_prior_widens_emissivity_and_background_alone() -> None:
+    """A larger drift widens their bars; no value, and nothing of the object, changes."""
+    _, capture, response = experiments.simulate(GLASS, RIG, TIME, 100, seed=3)
+    none, some, much = [
+        separation.solve(capture, response, settings=separation.SubspaceSettings(drift))
+        for drift in (0.0, 2.0, 20.0)
+    ]
+    for name in ("object_temperature", "background_temperature", "emissivity"):
+        np.testing.assert_array_equal(none[name].values, much[name].values)
+    np.testing.assert_array_equal(
+        none["object_temperature_std"].values, much["object_temperature_std"].values
+    )
+    for name in ("emissivity_std", "background_temperature_std"):
+        assert bool((none[name] <= some[name]).all())
+        assert float((some[name] < much[name]).mean()) > 0.99
+
+
+def test_drift_is_that_of_the_closed_form() -> None:
+    """Over an object that warms by w a drift of up to d costs (1 - e) d / (w sqrt(3))."""
+    _, capture, response = experiments.simulate(GLASS, RIG, TIME, 50, seed=4)
+    none, much = (
+        separation.solve(capture, response, settings=separation.SubspaceSettings(drift))
+        for drift in (0.0, 20.0)
+    )
+    variances = [result["emissivity_std"].values[0, 0] ** 2 for result in (none, much)]
+    added = np.sqrt(variances[1] - variances[0])
+    warming = np.ptp(none["object_temperature"].values[:, 0], axis=0)
+    expected = (1.0 - none["emissivity"].values[0, 0]) * 20.0 / np.sqrt(3.0) / warming
+    print(f"added {np.median(added):.4f}, expected {np.median(expected):.4f}")
+    np.testing.assert_allclose(added, expected, rtol=0.15)  # the response bends over 40 K
+
+
+@pytest.mark.parametrize("walk", [0.0, 1.0])
+def test_a_random_walk_is_extrapolated(walk: float) -> None:
+    """Slopes under a random walk scatter as the stated variance; without one it is nearly 0."""
+    rng = np.random.default_rng(5)
+    functions = smooth.subspace(TIME, 14)
+    own = np.repeat(20.0 * (1 - np.exp(-TIME / 12.0))[:, np.newaxis], 2000, axis=1)
+    steps = walk * rng.standard_normal(own.shape) / np.sqrt(350)
+    ordinate = 0.8 * own + np.cumsum(steps, axis=0) + 0.03 * rng.standard_normal(own.shape)
+    line = residuals.regress(own, ordinate, 0.03)
+    found = emission.drift_variance(line, own, np.full(2000, 0.2), functions, 0.03, 0.0)
+    true, stated = float(np.std(line.slope)), np.sqrt(found)
+    share = float(
+        np.mean(np.abs(line.slope - 0.8) < 1.96 * np.hypot(stated, np.sqrt(line.variance)))
+    )
+    print(
+        f"walk {walk} K: scatter {true:.4f}, stated {np.median(stated):.4f}, intervals {share:.3f}"
+    )
+    assert share > 0.92
+    assert np.median(stated) < 4.0 * true
+
+
+@pytest.mark.parametrize("drift", [-1.0, np.nan, np.inf])
+def test_bad_drift_is_a_clear_error(drift: float) -> None:
+    """A prior is zero or a positive number of kelvins."""
+    _, capture, response = experiments.simulate(GLASS, RIG, TIME, 2, seed=6)
+    with pytest.raises(ValueError, match=f"Invalid background_drift {drift} K"):
+        separation.solve(capture, response, settings=separation.SubspaceSettings(drift))

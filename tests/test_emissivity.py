@@ -1,0 +1,333 @@
+"""Band emissivities and the choice of a filter: closed forms, then the public libraries."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from dbthermal import emissivity, planck, readers, schema
+from dbthermal.bands import FILTERS, Band
+
+GLASS = "manmade.generalconstructionmaterial.glas.solid.all.0796uuugls.jhu.becknic.spectrum.txt"
+
+
+def spectrum(wavelength_um: object, values: object) -> xr.Dataset:
+    """Spectrum from wavelengths in micrometres."""
+    wavelength = np.asarray(wavelength_um, dtype=float) * 1e-6
+    return xr.Dataset(
+        {"emissivity": ("wavelength", np.asarray(values, dtype=float))},
+        coords={"wavelength": wavelength},
+    )
+
+
+def table(**rows: list[float]) -> xr.Dataset:
+    """Table of materials by name, in the bands 8-14 and 9.5, and 8.5 where there is a third."""
+    values = np.array(list(rows.values()))
+    dims = ("material", "band")
+    return xr.Dataset(
+        {"emissivity": (dims, values), "coverage": (dims, np.ones_like(values))},
+        coords={"material": list(rows), "band": ["8-14", "9.5", "8.5"][: values.shape[1]]},
+    )
+
+
+def library(mirror: Path) -> dict[str, xr.Dataset]:
+    """Every spectrum of the mirror, by the name that the embedded table gives as its source."""
+    paths = sorted((mirror / "ecostress").glob("*.spectrum.txt"))
+    spectra = {path.name: readers.ecostress(path) for path in paths}
+    slum = readers.slum(mirror / "slum" / "LUMA_SLUM_IR.csv")
+    spectra |= {f"LUMA_SLUM_IR.csv:{code}": sample for code, sample in slum.items()}
+    others = sorted({*(mirror / "ucsb").glob("*.csv")} - {mirror / "ucsb" / "MANIFEST.csv"})
+    return spectra | {path.name: readers.ucsb(path) for path in others}
+
+
+@pytest.fixture(scope="module")
+def spectra(mirror: Path) -> dict[str, xr.Dataset]:
+    """Every spectrum of the three libraries."""
+    return library(mirror)
+
+
+@given(st.floats(0.01, 1.0), st.floats(150.0, 1000.0))
+def test_gray_stays_gray(value: float, temperature: float) -> None:
+    """A gray body has its one emissivity in every band, at every temperature."""
+    made = emissivity.band_table({"gray": spectrum([7, 15], [value] * 2)}, FILTERS, temperature)
+    np.testing.assert_allclose(made["emissivity"], value, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(made["coverage"], 1.0)
+
+
+@pytest.mark.parametrize("band", FILTERS.values(), ids=FILTERS)
+def test_average_against_quadrature(band: Band) -> None:
+    """A kinked spectrum, its kinks off the band's edges, agrees with adaptive quadrature."""
+    made = spectrum(
+        [7.5, 8.31, 9.42, 10.07, 12.2, 13.3, 14.2], [0.9, 0.2, 0.8, 0.5, 0.95, 0.3, 0.7]
+    )
+    knots = made["wavelength"].values
+
+    def radiance(wavelength: float) -> float:
+        return float(planck.spectral_radiance(wavelength * 1e-6, 320.0)) * 1e-6
+
+    def emitted(wavelength: float) -> float:
+        return radiance(wavelength) * float(np.interp(wavelength * 1e-6, knots, made["emissivity"]))
+
+    edges = (band.lower * 1e6, band.upper * 1e6)
+    kinks = [knot for knot in knots * 1e6 if edges[0] < knot < edges[1]] or None
+    above, below = (
+        quad(f, *edges, points=kinks, epsabs=0, epsrel=1e-11)[0] for f in (emitted, radiance)
+    )
+    result = emissivity.band_table({"kinked": made}, [band], 320.0)
+    assert float(result["emissivity"][0, 0]) == pytest.approx(above / below, abs=1e-9)
+
+
+def test_weight_moves_with_temperature() -> None:
+    """A step at 10 um counts the share of the radiance beyond it, which falls as it gets hotter."""
+    step = {"step": spectrum([8, 10 - 1e-9, 10 + 1e-9, 14], [0, 0, 1, 1])}
+    for temperature in (250.0, 300.0, 600.0):
+        share = Band("upper", 10e-6, 14e-6).radiance(temperature) / FILTERS["8-14"].radiance(
+            temperature
+        )
+        result = emissivity.band_table(step, ["8-14"], temperature)["emissivity"]
+        assert float(result[0, 0]) == pytest.approx(float(share), abs=1e-8)
+
+
+@pytest.mark.parametrize("bands", [FILTERS, FILTERS.values(), list(FILTERS), tuple(FILTERS)])
+def test_bands_by_name_or_as_such(bands: list[str]) -> None:
+    """Bands come as a mapping, as objects or by name."""
+    made = emissivity.band_table({"gray": spectrum([8, 14], [0.5, 0.5])}, bands)
+    assert made["band"].values.tolist() == list(FILTERS)
+    assert schema.check(made, "emissivity_table") is made
+
+
+def test_short_spectrum_is_refused() -> None:
+    """A spectrum up to 12.5 um covers 0.7808 of the band, and the error says so."""
+    short = {"metal": spectrum([0.3, 12.5], [0.1, 0.1])}
+    message = (
+        "Invalid coverage 0.7808 of band '8-14' by the spectrum of 'metal', 3e-07 to 1.25e-05 m"
+    )
+    with pytest.raises(ValueError, match=re.escape(message)):
+        emissivity.band_table(short, FILTERS)
+
+
+def test_short_spectrum_is_averaged_if_asked() -> None:
+    """The average runs over what is covered, extrapolates nothing, and tells how much that is."""
+    short = {"metal": spectrum([8, 12.5], [0.1, 0.4]), "whole": spectrum([8, 14], [0.1, 0.5])}
+    made = emissivity.band_table(short, FILTERS, minimum_coverage=0.7)
+    alone = emissivity.band_table(short, [Band("part", 8e-6, 12.5e-6)])
+    radiances = [float(Band("", 8e-6, end).radiance(300.0)) for end in (12.5e-6, 14e-6)]
+    assert float(made["emissivity"][0, 0]) == pytest.approx(
+        float(alone["emissivity"][0, 0]), abs=1e-12
+    )
+    assert float(made["coverage"][0, 0]) == pytest.approx(radiances[0] / radiances[1], abs=1e-12)
+    np.testing.assert_array_equal(made["coverage"].sel(material="whole"), 1.0)
+
+
+def test_spectrum_beside_the_band() -> None:
+    """A spectrum that ends before the band begins has no average, whatever the minimum."""
+    with pytest.raises(ValueError, match=re.escape("Invalid coverage 0.0000 of band '12.1'")):
+        emissivity.band_table({"m": spectrum([8, 11], [1, 1])}, ["12.1"], minimum_coverage=1e-9)
+
+
+def test_unphysical_values_are_kept_and_counted() -> None:
+    """An emissivity of 1.02 enters as it is, and the table tells of it where it lies."""
+    odd = {"bark": spectrum([8, 9.4, 9.6, 14], [1.0, 1.02, 1.02, 1.0])}
+    made = emissivity.band_table(odd, ["9.5", "12.1"])
+    assert made["unphysical_values"].values.tolist() == [[2, 0]]
+    assert float(made["emissivity"][0, 0]) > 1.0
+
+
+def test_nan_is_refused_and_named() -> None:
+    """A gap in a spectrum is an error that names material, value and place."""
+    with pytest.raises(ValueError, match="Invalid emissivity nan of 'holed' at 9e-06 m"):
+        emissivity.band_table({"holed": spectrum([8, 9, 14], [1, np.nan, 1])}, FILTERS)
+
+
+def test_wrong_spectrum_is_named() -> None:
+    """The stage's own error carries the material's name."""
+    with pytest.raises(ValueError, match="Unordered 'wavelength'") as caught:
+        emissivity.band_table({"turned": spectrum([14, 8], [1, 1])}, FILTERS)
+    assert caught.value.__notes__ == ["In the spectrum of 'turned'."]
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"spectra": {}}, ValueError, "Empty spectra"),
+        ({"bands": []}, ValueError, "Invalid bands []"),
+        ({"bands": ["9.5", "9.5"]}, ValueError, "Invalid bands ['9.5', '9.5']"),
+        ({"bands": ["9.4"]}, KeyError, "Unknown band '9.4'"),
+        ({"bands": ["9.5", 8.5]}, TypeError, "Invalid band 8.5"),
+        ({"bands": "9.4"}, KeyError, "Unknown band '9.4'"),
+        ({"spectra": [1, 2]}, TypeError, "Invalid spectra of type list"),
+        (
+            {"spectra": {"percent": spectrum([8, 14], [86.0, 86.0])}},
+            ValueError,
+            "Invalid emissivity 86.0 of 'percent'",
+        ),
+        ({"temperature": 27.0}, ValueError, "Invalid temperature 27.0 K"),
+        ({"minimum_coverage": 0.0}, ValueError, "Invalid minimum_coverage 0.0"),
+        ({"minimum_coverage": 1.1}, ValueError, "Invalid minimum_coverage 1.1"),
+    ],
+)
+def test_bad_arguments(change: dict[str, object], error: type[Exception], message: str) -> None:
+    """Each argument's rule is said."""
+    arguments: dict[str, object] = {"spectra": {"m": spectrum([8, 14], [1, 1])}, "bands": FILTERS}
+    with pytest.raises(error, match=re.escape(message)):
+        emissivity.band_table(**(arguments | change))  # type: ignore[arg-type]
+
+
+def test_condition_number_of_glass() -> None:
+    """Emissivities of 0.86 and 0.72 give 9.58 either way round; a band and itself are singular."""
+    numbers = emissivity.condition_numbers(table(glass=[0.86, 0.72]))
+    np.testing.assert_allclose(numbers.values[0, [0, 1], [1, 0]], 9.58, rtol=0, atol=0.005)
+    np.testing.assert_array_equal(numbers.values[0, [0, 1], [0, 1]], np.inf)
+
+
+@given(*[st.floats(0.0, 1.0)] * 2)
+def test_condition_number_closed_form(first: float, second: float) -> None:
+    """The ratio of singular values follows from the Frobenius norm and the determinant."""
+    assume(abs(first - second) > 1e-4)
+    norm = first**2 + (1 - first) ** 2 + second**2 + (1 - second) ** 2
+    half = norm / (2 * abs(first - second))
+    expected = half + np.sqrt(half**2 - 1)
+    result = float(emissivity.condition_numbers(table(m=[first, second]))[0, 0, 1])
+    assert result == pytest.approx(expected, rel=1e-9)
+
+
+def test_pair_summary_leaves_gray_out_of_the_mean() -> None:
+    """A gray material is infinite in the median, not in the mean, and is counted."""
+    numbers = emissivity.condition_numbers(table(a=[0.9, 0.5], b=[0.8, 0.8], c=[0.9, 0.7]))
+    summary = emissivity.pair_summary(numbers)
+    values = np.sort(numbers.values[:, 0, 1])
+    assert summary["median"].values[0, 1] == values[1]
+    assert summary["mean"].values[0, 1] == pytest.approx(values[:2].mean(), abs=1e-12)
+    assert summary["finite"].values.tolist() == [[0, 2], [2, 0]]
+    np.testing.assert_array_equal(np.diag(summary["mean"]), np.inf)
+
+
+def test_noise_behind_filters() -> None:
+    """At 300 K a filter of half a micrometre at 9.5 um makes 30 mK ten times as much."""
+    noise = emissivity.filter_noise(0.03, FILTERS)
+    expected = [0.03, 0.279, 0.299, 0.113, 0.420]  # from the integral of dL/dT over each band
+    np.testing.assert_allclose(noise, expected, rtol=0, atol=0.0005)
+    assert noise.attrs["units"] == "K"
+    with pytest.raises(ValueError, match=re.escape("Invalid netd [K] -0.03")):
+        emissivity.filter_noise(-0.03, FILTERS)
+
+
+def test_single_frame_std_of_glass() -> None:
+    """Plate glass at 0.04 and 0.4 K of noise: 0.40 K, the figure of the closed form."""
+    noise = xr.DataArray([0.04, 0.4], coords={"band": ["8-14", "9.5"]}, dims="band")
+    result = emissivity._single_frame_std(table(glass=[0.86, 0.72], gray=[0.9, 0.9]), noise, "8-14")
+    np.testing.assert_allclose(result[0], [0.408], rtol=0, atol=0.001)
+    assert np.isinf(result[1, 0])
+    assert result["band"].values.tolist() == ["9.5"]
+
+
+def test_single_frame_std_against_draws() -> None:
+    """The closed form is the spread of the two equations' solution under drawn noise."""
+    noise = xr.DataArray([0.05, 0.2], coords={"band": ["8-14", "9.5"]}, dims="band")
+    mixing = np.array([[0.3, 0.7], [0.5, 0.5]])
+    drawn = np.random.default_rng(2).standard_normal((2, 200_000)) * [[0.05], [0.2]]
+    spread = np.linalg.solve(mixing, drawn)[0].std()
+    result = emissivity._single_frame_std(table(m=[0.3, 0.5]), noise, "8-14")
+    assert float(result[0, 0]) == pytest.approx(spread, rel=0.01)
+
+
+def test_choice_weighs_condition_against_noise() -> None:
+    """The best-conditioned filter comes first; a quieter one may still measure better."""
+    made = table(a=[0.90, 0.70, 0.75], b=[0.85, 0.60, 0.66])
+    noise = xr.DataArray([0.03, 0.6, 0.1], coords={"band": made["band"]}, dims="band")
+    choice = emissivity.choose_filter(made, noise)
+    assert choice["band"].values.tolist() == ["9.5", "8.5"]
+    assert choice["condition_number"].values[0] < choice["condition_number"].values[1]
+    assert choice.attrs["lowest_condition_number"] == "9.5"
+    assert choice.attrs["lowest_std"] == "8.5"
+
+
+@pytest.mark.parametrize(
+    ("bands", "values", "units", "message"),
+    [
+        (["8-14"], [0.03], "K", "Missing band '9.5' in the noise"),
+        (["8-14", "9.5"], [0.03, 0.0], "K", "Invalid noise [K] 0.0"),
+        (["8-14", "9.5"], [0.03, np.nan], "K", "Invalid noise [K] nan"),
+        (["8-14", "9.5"], [3.0, 3.0], "count", "Invalid noise ('band',) [count]"),
+    ],
+)
+def test_bad_noise(bands: list[str], values: list[float], units: str, message: str) -> None:
+    """Noise is a positive number of kelvin for every band."""
+    noise = xr.DataArray(values, coords={"band": bands}, dims="band", attrs={"units": units})
+    with pytest.raises(ValueError, match=re.escape(message)):
+        emissivity.choose_filter(table(glass=[0.86, 0.72]), noise)
+
+
+def test_one_band_is_no_pair() -> None:
+    """A pair needs two bands, and the choice the band that is given."""
+    alone = table(m=[0.9])
+    with pytest.raises(ValueError, match="Must be at least two"):
+        emissivity.condition_numbers(alone)
+    with pytest.raises(ValueError, match=re.escape("Must hold '10.6'")):
+        emissivity.choose_filter(
+            table(m=[0.9, 0.8]), emissivity.filter_noise(0.03, FILTERS), beside="10.6"
+        )
+
+
+def test_embedded_table_is_whole() -> None:
+    """The table that comes with the package has what its users count on."""
+    made = schema.check(emissivity.embedded_table(), "emissivity_table")
+    assert dict(made.sizes) == {"material": 25, "band": 5}
+    assert made["band"].values.tolist() == list(FILTERS)
+    assert len(set(made["material"].values)) == 25
+    assert ((made["emissivity"] > 0) & (made["emissivity"] < 1)).all()
+    assert {*made["library"].values} == {"ECOSTRESS 1.0", "SLUM 1.0", "MODIS UCSB"}
+    glass = made["emissivity"].sel(material="plate window glass", band=["8-14", "9.5"])
+    np.testing.assert_allclose(glass, [0.861, 0.718], rtol=0, atol=0.002)
+
+
+def test_embedded_table_cites_its_sources() -> None:
+    """The file names each library's papers and the credit line that one asks for."""
+    text = Path(emissivity.__file__).with_name("emissivity_table.csv").read_text("utf-8")
+    assert "courtesy of the Jet Propulsion Laboratory" in text
+    for doi in ("j.rse.2008.11.007", "j.rse.2019.05.015", "j.isprsjprs.2014.05.005"):
+        assert f"doi:10.1016/{doi}" in text
+
+
+@pytest.mark.data
+def test_embedded_table_from_the_libraries(spectra: dict[str, xr.Dataset]) -> None:
+    """Each row is what the libraries give, to its last decimal."""
+    made = emissivity.embedded_table()
+    sources = dict(zip(made["material"].values, made["source"].values, strict=True))
+    chosen = {material: spectra[source] for material, source in sources.items()}
+    again = emissivity.band_table(chosen, FILTERS, minimum_coverage=0.7)
+    for name in ("emissivity", "coverage"):
+        np.testing.assert_allclose(made[name], again[name], rtol=0, atol=5.01e-5)
+
+
+@pytest.mark.data
+def test_plate_glass(spectra: dict[str, xr.Dataset]) -> None:
+    """Plate window glass: 0.861 over 8-14 um and 0.718 at 9.5 um."""
+    made = emissivity.band_table({"glass": spectra[GLASS]}, ["8-14", "9.5"])["emissivity"]
+    np.testing.assert_allclose(made[0], [0.861, 0.718], rtol=0, atol=0.002)
+
+
+@pytest.mark.data
+def test_every_spectrum_of_the_libraries(spectra: dict[str, xr.Dataset]) -> None:
+    """All 993 spectra make a table; 224 of them differ by more than 0.05 between the two bands."""
+    made = emissivity.band_table(spectra, FILTERS, minimum_coverage=0.7)
+    short = made["coverage"].sel(band="8-14") < emissivity.MINIMUM_COVERAGE
+    difference = made["emissivity"].sel(band="8-14") - made["emissivity"].sel(band="9.5")
+    assert (made.sizes["material"], int(short.sum())) == (993, 22)
+    assert int((abs(difference) > 0.05).sum()) == 224
+    assert float(made["coverage"].drop_sel(band="8-14").min()) == 1.0
+
+
+@pytest.mark.data
+def test_filter_of_the_paper(spectra: dict[str, xr.Dataset]) -> None:
+    """By the condition number the filter at 9.5 um is chosen, as published."""
+    whole = {name: one for name, one in spectra.items() if one["wavelength"][-1] > 13e-6}
+    made = emissivity.band_table(whole, FILTERS)
+    choice = emissivity.choose_filter(made, emissivity.filter_noise(0.03, FILTERS))
+    assert choice.attrs["lowest_condition_number"] == "9.5"
+    assert float(choice["condition_number"][0]) == pytest.approx(98.9, abs=0.5)
