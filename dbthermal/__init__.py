@@ -1,20 +1,37 @@
 """Object temperature, emissivity and reflections from two bands of thermal video.
 
-Begin with `calibration.fit_response`, `correction.correct_capture` and `separation.solve`; README.md
-has the ten lines. What the functions exchange is an `xarray.Dataset` in kelvin and SI units, whose
-variables `schema` names. A module is imported when it is first used, so that ``import dbthermal`` is
-quick and needs no optional package.
+Begin with `calibration.fit_response`, `correction.correct_capture` and `separation.solve`. The
+functions exchange an `xarray.Dataset` in kelvin and SI units, whose variables `schema` names. A
+module is imported when it is first used, so that ``import dbthermal`` is quick and needs no optional
+package.
 """
 
 import importlib
-import pkgutil
 from types import ModuleType
 
 __version__ = "0.1.0"
 
-__all__ = sorted(
-    module.name for module in pkgutil.iter_modules(__path__) if not module.name.startswith("_")
-)
+__all__ = [
+    "acquire",
+    "alignment",
+    "bands",
+    "calibration",
+    "correction",
+    "emissivity",
+    "figures",
+    "instruments",
+    "limits",
+    "metrics",
+    "mixing",
+    "noise",
+    "planck",
+    "readers",
+    "response",
+    "schema",
+    "separation",
+    "simulation",
+    "store",
+]
 
 
 def __getattr__(name: str) -> ModuleType:

@@ -26,9 +26,9 @@ def test_the_ten_lines_run(
     store.save(counts(response, temperature).to_dataset(), tmp_path / "blackbody.zarr", {})
     store.save(corrected, tmp_path / "scene.zarr", {})
     monkeypatch.chdir(tmp_path)
-    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
+    (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     names: dict[str, xr.Dataset] = {}
-    exec(code, names)  # noqa: S102 - the README's own code
+    exec(code, names)
     error = names["result"]["object_temperature"] - scene["object_temperature"]
     assert float(abs(error).median()) < 0.25  # [K]
     assert simulation.Rig().bands == tuple(names["result"]["band"].values)

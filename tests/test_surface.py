@@ -16,9 +16,10 @@ RIDDLE = re.compile(r"^(What|Whether|How|That|Where|Which|None|Those)\b|\bthat t
 
 
 def public_modules(package: ModuleType = dbthermal) -> Iterator[ModuleType]:
-    """Yield the modules that a user may import: no part of their names has an underscore."""
+    """Yield the modules that a user may import: not the private ones, nor the emulated devices."""
     for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-        if module.name.rpartition(".")[2].startswith("_"):
+        name = module.name.rpartition(".")[2]
+        if name.startswith("_") or name == "emulated":
             continue
         loaded = importlib.import_module(module.name)
         yield loaded
@@ -38,6 +39,12 @@ def public_functions() -> dict[str, Any]:
             if inspect.isfunction(value) or inspect.isclass(value):
                 found[f"{value.__module__}.{value.__qualname__}"] = value
     return found
+
+
+def test_the_package_lists_its_modules() -> None:
+    """`dbthermal.<TAB>` shows every public module."""
+    modules = {module.name for module in pkgutil.iter_modules(dbthermal.__path__)}
+    assert {name for name in modules if not name.startswith("_")} == set(dbthermal.__all__)
 
 
 @pytest.mark.parametrize("name", MODULES)
