@@ -21,7 +21,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.devices import Devices, open_devices
-from dbthermal.instruments.emulated.frames import Picture
+from dbthermal.instruments.emulated.camera import Picture
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording import Preview, Summary
@@ -40,19 +40,9 @@ _FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)
 
 def ask_for_blackbody(name: str, temperature: float) -> None:
     """
-    Ask the user to set the blackbody, and wait for Enter.
+    Ask the user to set the blackbody to a temperature [K], and wait for Enter.
 
-    Parameters
-    ----------
-    name : str
-        Of the session.
-    temperature : float
-        Temperature to set [K].
-
-    Raises
-    ------
-    RuntimeError
-        If there is no keyboard, as under papermill.
+    RuntimeError if there is no keyboard, as under papermill.
     """
     celsius = f"{temperature - zero_Celsius:.2f} degC"
     question = (
@@ -68,20 +58,7 @@ def ask_for_blackbody(name: str, temperature: float) -> None:
 
 
 def plugged_in(session: Session) -> str:
-    """
-    Report of the USB bus; the devices may open even where it cannot be listed.
-
-    Parameters
-    ----------
-    session : Session
-        Its frame rate determines the bandwidth that is needed.
-
-    Returns
-    -------
-    str
-        See `dbthermal.instruments.inventory.describe`; for an emulated session, or without
-        libusb, that the bus was not looked at.
-    """
+    """Report of the USB bus, which an emulated session does not need; see `inventory.describe`."""
     if session.simulated:
         return f"Session '{session.name}' is emulated: the USB bus was not looked at."
     try:

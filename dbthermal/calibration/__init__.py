@@ -1,13 +1,16 @@
 """Calibration: the camera's response per band from blackbodies, and emissivities.
 
-The response is the four-parameter Sakuma-Hattori curve beside the paper's linear pair. The
-emissivity of a material follows from thermocouple readings and a reflected blackbody, or by the
-standards' reflector method, with its uncertainty.
+`fit_response` fits the four-parameter Sakuma-Hattori curve beside the paper's linear pair. The
+emissivity of a material, with its uncertainty, follows from thermocouple readings and a reflected
+blackbody (`fit_emissivity`), or by the standards' reflector method (`reflector_emissivity`).
 """
 
-from dbthermal.calibration._bias import NO_BIAS, Bias
-from dbthermal.calibration._contact import fit_emissivity
-from dbthermal.calibration._reflector import reflector_emissivity
+from dbthermal.calibration._emissivity import (
+    NO_BIAS,
+    Bias,
+    fit_emissivity,
+    reflector_emissivity,
+)
 from dbthermal.calibration._response import AMBIENT, MINIMUM_TEMPERATURES, fit_response
 
 __all__ = [
@@ -19,3 +22,7 @@ __all__ = [
     "fit_response",
     "reflector_emissivity",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,7 +1,4 @@
-"""The camera's response per band, from blackbodies.
-
-The four-parameter Sakuma-Hattori curve, beside the paper's linear pair.
-"""
+"""Response of a camera per band from blackbodies: Sakuma-Hattori curve and linear pair."""
 
 from typing import Final
 
@@ -80,6 +77,23 @@ def fit_response(
        Industry 5, 421-427
     .. [2] Golub, Pereyra (2003), Separable nonlinear least squares, Inverse Problems 19, R1,
        doi:10.1088/0266-5611/19/2/201
+
+    Examples
+    --------
+    Blackbodies from 10 to 70 degrees Celsius, seen in the band 8-14 um at 100 count W^-1 m^2 sr.
+
+    >>> import numpy as np, xarray as xr
+    >>> from dbthermal import bands, response
+    >>> temperature = np.linspace(283.15, 343.15, 7)
+    >>> counts = xr.DataArray(
+    ...     [15000 + 100 * bands.get("8-14").radiance(temperature)],
+    ...     dims=("band", "temperature"),
+    ...     coords={"band": ["8-14"], "temperature": temperature},
+    ... )
+    >>> noise = xr.DataArray([3.0], dims="band", coords={"band": ["8-14"]})
+    >>> fitted = fit_response(counts, noise)
+    >>> bool(np.abs(fitted.residual).max() < 0.5), round(float(fitted.netd[0]), 3)  # [count], [K]
+    (True, 0.038)
     """
     _check_blackbody(counts)
     names = [str(name) for name in counts["band"].values]
@@ -143,10 +157,10 @@ def _check_curvature(band: str, temperature: Array, counts: Array) -> None:
     """Refuse counts that bend downward by more than their scatter explains."""
     middle, half = temperature.mean(), 0.5 * (temperature[-1] - temperature[0])
     design = np.polynomial.legendre.legvander((temperature - middle) / half, 2)
-    found, *_ = np.linalg.lstsq(design, counts, rcond=None)
-    scatter = np.sqrt(np.sum((counts - design @ found) ** 2) / (counts.size - 3))
+    coefficients, *_ = np.linalg.lstsq(design, counts, rcond=None)
+    scatter = np.sqrt(np.sum((counts - design @ coefficients) ** 2) / (counts.size - 3))
     std = scatter * np.sqrt(np.linalg.inv(design.T @ design)[2, 2])
-    if -found[2] > _CURVATURE_SIGMAS * std + _CURVATURE * (counts[-1] - counts[0]):
+    if -coefficients[2] > _CURVATURE_SIGMAS * std + _CURVATURE * (counts[-1] - counts[0]):
         raise ValueError(
             f"Invalid counts in band '{band}': their slope falls with temperature. "
             "That of a blackbody grows."
@@ -174,6 +188,7 @@ def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) ->
     span = counts[-1] - counts[0]
 
     def linear_part(shape: Array) -> tuple[Array, Array]:
+        # Scale A T + B, and the Planckian 1 / (exp(c2 / scale) - 1) without overflow.
         scale = _SHAPE_UNIT * shape[0] * (1.0 + shape[1] * (temperature - middle) / middle)
         exponent = planck.SECOND_RADIATION_CONSTANT / scale
         planckian = np.exp(-exponent) / -np.expm1(-exponent)
@@ -183,7 +198,7 @@ def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) ->
         offset = counts.mean() - amplitude * planckian.mean()
         return np.array([amplitude, offset]), amplitude * planckian + offset - counts
 
-    found = least_squares(
+    fit = least_squares(
         lambda shape: linear_part(shape)[1] / span,
         _SHAPE_START,
         bounds=_SHAPE_BOUNDS,
@@ -192,12 +207,12 @@ def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) ->
         gtol=1e-15,
         max_nfev=1000,
     )
-    amplitude, offset = linear_part(found.x)[0]
+    amplitude, offset = linear_part(fit.x)[0]
     slope, intercept = (
         np.polynomial.Polynomial.fit(temperature[line], counts[line], 1).convert().coef[::-1]
     )
-    wavelength = _SHAPE_UNIT * found.x[0] * found.x[1] / middle
-    shift = _SHAPE_UNIT * found.x[0] * (1.0 - found.x[1])
+    wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle
+    shift = _SHAPE_UNIT * fit.x[0] * (1.0 - fit.x[1])
     return (amplitude, wavelength, shift, offset, slope, intercept)
 
 

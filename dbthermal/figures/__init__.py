@@ -1,47 +1,42 @@
-"""Figures that a thermographer expects. A function draws what it is given and returns the figure.
+"""Figures that a thermographer expects: a function draws its arguments and returns the figure.
 
-Nothing is computed here beyond units for the eye, nothing is saved. Temperatures are drawn in
+Nothing is computed here beyond units for display, nothing is saved. Temperatures are drawn in
 degrees Celsius. Every figure of data that are simulated or not radiometric says so in its title,
-from the `origin` and `radiometric` attributes of what it draws.
+from the `origin` and `radiometric` attributes of its data. `drawing` has the parts of a new figure.
 """
 
-from dbthermal.figures._accuracy import accuracy, error_bar_calibration, truth_and_estimate
-from dbthermal.figures._calibration import (
-    emissivity_by_contact,
-    emissivity_procedures,
-    gain_offset_maps,
-    response_fit,
-)
-from dbthermal.figures._canvas import provenance_note
-from dbthermal.figures._films import separated_film
-from dbthermal.figures._limits import error_over_bands, error_over_bound, plan, pooling
+from dbthermal.figures import drawing
+from dbthermal.figures._calibration import gain_offset_maps, response_fit
+from dbthermal.figures._emissivity import condition_matrix, emissivity_bars, emissivity_by_contact
+from dbthermal.figures._limits import plan
 from dbthermal.figures._live import LiveFigure, Panel
-from dbthermal.figures._materials import condition_matrix, emissivity_bars, pooled_materials
-from dbthermal.figures._scenes import compared_reflections, separated_frames, separated_temperatures
-from dbthermal.figures._validity import status, validity
+from dbthermal.figures._scenes import (
+    separated_film,
+    separated_frames,
+    separated_temperatures,
+    truth_and_estimate,
+)
+from dbthermal.figures._status import REASONS, first_reason, status
 
 __all__ = [
+    "REASONS",
     "LiveFigure",
     "Panel",
-    "accuracy",
-    "compared_reflections",
     "condition_matrix",
+    "drawing",
     "emissivity_bars",
     "emissivity_by_contact",
-    "emissivity_procedures",
-    "error_bar_calibration",
-    "error_over_bands",
-    "error_over_bound",
+    "first_reason",
     "gain_offset_maps",
     "plan",
-    "pooled_materials",
-    "pooling",
-    "provenance_note",
     "response_fit",
     "separated_film",
     "separated_frames",
     "separated_temperatures",
     "status",
     "truth_and_estimate",
-    "validity",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,13 +1,11 @@
-"""Figures of the calibration: gain and offset, response, emissivity by contact."""
-
-from collections.abc import Mapping
+"""Figures of the calibration: gain and offset of the pixels, response of the bands."""
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from scipy.constants import zero_Celsius
 
-from dbthermal.figures._canvas import (
+from dbthermal.figures.drawing import (
     COLORS,
     band_label,
     canvas,
@@ -24,7 +22,7 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
     Parameters
     ----------
     correction : Dataset
-        From `frames.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
+        From `correction.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
 
     Returns
     -------
@@ -89,96 +87,4 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
         for axis in (middle, bottom):
             axis.axhline(0.0, color="0.7", linewidth=0.8)
     figure.suptitle("Camera response" + provenance_note(response))
-    return figure
-
-
-def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
-    """
-    Emissivities from thermocouple and blackbody with their standard deviations.
-
-    Parameters
-    ----------
-    measured : Dataset
-        `emissivity`, `emissivity_std` (material, band) [1].
-    table : DataArray, optional
-        Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
-
-    Returns
-    -------
-    Figure
-        One point a band and material.
-    """
-    figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
-    place = np.arange(measured.sizes["material"])
-    bands = measured["band"].values
-    for index, band in enumerate(bands):
-        here = measured.sel(band=band)
-        shifted = place + 0.14 * (index - (len(bands) - 1) / 2)
-        axis.errorbar(
-            shifted,
-            here["emissivity"],
-            here["emissivity_std"],
-            fmt="o",
-            markersize=4,
-            capsize=3,
-            color=COLORS[index],
-            label=band_label(band),
-        )
-        if table is not None:
-            label = "table" if index == 0 else None
-            axis.plot(shifted, table.sel(band=band), "x", color="black", markersize=7, label=label)
-    axis.set_xticks(place, [str(name).replace(" ", "\n") for name in measured["material"].values])
-    axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
-    figure.legend(frameon=False, loc="outside right center", fontsize=8)
-    axis.set_title("Emissivity by contact, one standard deviation" + provenance_note(measured))
-    return figure
-
-
-def emissivity_procedures(
-    compared: xr.Dataset, published: Mapping[str, Mapping[str, float]], band: str
-) -> Figure:
-    """
-    Emissivity of several objects by each procedure, beside the truth and the published values.
-
-    Parameters
-    ----------
-    compared : Dataset
-        `true` (object, band), `mean` and `spread` (object, procedure, band) [1].
-    published : mapping
-        Label -> object -> the paper's value [1].
-    band : str
-        The band that is drawn.
-
-    Returns
-    -------
-    Figure
-        A group of marks an object, lines of one standard deviation, and the truth as a bar.
-    """
-    here = compared.sel(band=band)
-    objects, procedures = here["object"].values, here["procedure"].values
-    figure, ((axis,),) = canvas(1, 1, (8.5, 3.8))
-    place = np.arange(objects.size)
-    axis.bar(place, here["true"], 0.85, color="0.88", label="truth")
-    marks = len(procedures) + len(published)
-    shifts = iter(0.14 * (np.arange(marks) - (marks - 1) / 2))
-    for index, name in enumerate(procedures):
-        part = here.sel(procedure=name)
-        axis.errorbar(
-            place + next(shifts),
-            part["mean"],
-            part["spread"],
-            fmt="o",
-            markersize=4,
-            color=COLORS[index],
-            label=str(name),
-        )
-    for index, (label, values) in enumerate(published.items()):
-        shown = [values[str(name)] for name in objects]
-        axis.plot(
-            place + next(shifts), shown, "sD"[index], color="0.3", label=label, fillstyle="none"
-        )
-    axis.set_xticks(place, list(objects))
-    axis.set(ylabel=f"emissivity, {band_label(band)} [1]", ylim=(0, 1.05))
-    axis.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
-    axis.set_title("Emissivity by each procedure" + provenance_note(compared))
     return figure

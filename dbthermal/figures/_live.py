@@ -20,7 +20,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-from dbthermal.figures._canvas import band_label, canvas, draw_image
+from dbthermal.figures.drawing import band_label, canvas, draw_image
 
 _WIDTH: Final = 4.8  # of a band [inch]
 _TEXT_HEIGHT: Final = 1.15  # of title, lines and foot [inch]

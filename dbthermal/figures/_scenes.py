@@ -1,10 +1,18 @@
-"""Figures of separated scenes: frames, comparison with a published separation, status."""
+"""Figures and films of separated scenes, and of one pixel beside its truth."""
 
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
 import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.text import Text
 from scipy.constants import zero_Celsius
 
-from dbthermal.figures._canvas import (
+from dbthermal.figures.drawing import (
     COLORS,
     band_label,
     canvas,
@@ -12,6 +20,46 @@ from dbthermal.figures._canvas import (
     limits_of,
     provenance_note,
 )
+
+_WIDTH: Final = 3.2
+
+_DPI: Final = 100
+
+
+def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, int]) -> Figure:
+    """
+    Truth against estimate over time at one pixel, with two standard deviations.
+
+    Parameters
+    ----------
+    truth : Dataset
+        Scene with `object_temperature`, `background_temperature` (time, y, x) [K].
+    result : Dataset
+        From `separation.solve`.
+    pixel : tuple of int
+        Row and column.
+
+    Returns
+    -------
+    Figure
+        Object above, background below.
+    """
+    figure, axes = canvas(2, 1, (7.4, 5.6))
+    place = {"y": pixel[0], "x": pixel[1]}
+    known, found = truth.isel(place), result.isel(place)
+    for axis, name in zip(
+        axes[:, 0], ("object_temperature", "background_temperature"), strict=True
+    ):
+        value, std = found[name] - zero_Celsius, found[f"{name}_std"]
+        time = found["time"]
+        axis.fill_between(time, value - 2 * std, value + 2 * std, color=COLORS[0], alpha=0.25)
+        axis.plot(time, value, color=COLORS[0], linewidth=1)
+        axis.plot(known["time"], known[name] - zero_Celsius, "--", color="black", linewidth=1)
+        axis.set(ylabel=name.replace("_", " ") + " [\N{DEGREE SIGN}C]")
+    axes[0, 0].legend(["two standard deviations", "estimate", "truth"], frameon=False, fontsize=8)
+    axes[-1, 0].set_xlabel("time [s]")
+    figure.suptitle(f"Truth and estimate at pixel {pixel}" + provenance_note(truth))
+    return figure
 
 
 def separated_frames(
@@ -98,47 +146,65 @@ def separated_temperatures(
     return separated_frames(inputs, emission - zero_Celsius, change, title=title, labels=labels)
 
 
-def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.DataArray) -> Figure:
+def separated_film(
+    apparent: xr.DataArray, emission: xr.DataArray, change: xr.DataArray, *, title: str
+) -> Iterator[npt.NDArray[np.uint8]]:
     """
-    Our reflection beside the authors' published one, and their correlation frame by frame.
+    Frames of a film: the inputs, the emission and the mean-subtracted reflection side by side.
 
     Parameters
     ----------
-    ours, theirs : DataArray
-        Magnitude of the reflection at a few times (time, y, x), in units of their own.
-    scores : DataArray
-        Correlation of the two maps (time) [1], of the frames that were compared.
+    apparent : DataArray
+        Apparent temperature of the inputs (band, time, y, x) [K].
+    emission : DataArray
+        Object temperature (time, y, x) [K]; pixels without a value are gray.
+    change : DataArray
+        What the reflection changes, `separation.reflected_change` (time, y, x) [K].
+    title : str
+        What the scene is.
 
-    Returns
-    -------
-    Figure
-        Two maps a chosen time, and the correlations with their median.
+    Yields
+    ------
+    ndarray of uint8, shape (rows, columns, 3)
+        Colours; both sizes even, as video codecs want them.
     """
-    columns = ours.sizes["time"]
-    figure, axes = canvas(3, columns, (3.2 * columns, 8.0))
-    for index in range(columns):
-        moment = f"{float(ours['time'][index]):.1f} s"
-        for axis, movie, name in (
-            (axes[0, index], ours, "ours"),
-            (axes[1, index], theirs, "published"),
-        ):
-            image = movie.isel(time=index)
-            draw_image(
-                figure,
-                axis,
-                image,
-                f"{name}, {moment}",
-                "own unit",
-                cmap="magma",
-                limits=limits_of(image),
-            )
-    grid = axes[2, 0].get_gridspec()
-    for axis in axes[2]:
-        axis.remove()
-    bottom = figure.add_subplot(grid[2, :])
-    bottom.plot(scores["time"], scores, "o", color=COLORS[0], markersize=4)
-    bottom.axhline(float(scores.median()), color="0.5", linewidth=1)
-    bottom.set(xlabel="time [s]", ylabel="correlation [1]", ylim=(min(0.0, float(scores.min())), 1))
-    bottom.set_title(f"{scores.size} frames, median {float(scores.median()):.2f}", fontsize=9)
-    figure.suptitle("Magnitude of the reflection" + provenance_note(ours))
-    return figure
+    parts = [apparent.sel(band=band) - zero_Celsius for band in apparent["band"].values]
+    titles = [f"input {band_label(band)}" for band in apparent["band"].values]
+    parts += [emission - zero_Celsius, change]
+    titles += ["emission", "reflection less its mean"]
+    aspect = apparent.sizes["y"] / apparent.sizes["x"]
+    size = (_WIDTH * len(parts), round((0.8 * _WIDTH * aspect + 1.0) * _DPI / 2) * 2 / _DPI)
+    figure, axes = canvas(1, len(parts), size)
+    figure.set_dpi(_DPI)
+    for axis, part, name in zip(axes[0], parts, titles, strict=True):
+        last = part is parts[-1]
+        unit = "[K]" if last else "[\N{DEGREE SIGN}C]"
+        scale = limits_of(part, symmetric=last)
+        cmap = "RdBu_r" if last else "inferno"
+        draw_image(figure, axis, part.isel(time=0), name, unit, cmap=cmap, limits=scale)
+    heading = figure.suptitle(f"{title}, {' ' * 7}" + provenance_note(apparent))
+    images = [axis.images[0] for axis in axes[0]]
+    yield from _frames(FigureCanvasAgg(figure), images, parts, (heading, title, apparent))
+
+
+def _frames(
+    drawing: Any,  # FigureCanvasAgg, whose methods have no types
+    images: list[AxesImage],
+    parts: list[xr.DataArray],
+    heading: tuple[Text, str, xr.DataArray],
+) -> Iterator[npt.NDArray[np.uint8]]:
+    """Draw what stands still once, and over it the images of each time."""
+    text, title, data = heading
+    for artist in (*images, text):
+        artist.set_animated(True)
+    drawing.draw()
+    still = drawing.copy_from_bbox(drawing.figure.bbox)
+    note = provenance_note(data)
+    for index, moment in enumerate(data["time"].values):
+        drawing.restore_region(still)
+        text.set_text(f"{title}{note}, {moment:.1f} s")
+        for image, part in zip(images, parts, strict=True):
+            image.set_data(part.values[index])
+            image.axes.draw_artist(image)
+        drawing.figure.draw_artist(text)
+        yield np.asarray(drawing.buffer_rgba())[..., :3].copy()

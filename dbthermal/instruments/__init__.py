@@ -1,18 +1,43 @@
-"""The rig: cameras, filter wheel, thermocouples, and the recording of a capture.
+"""Recording with the rig: two cameras, a filter wheel and thermocouples, real or emulated.
 
-A device has one name like an address, ``serial:///dev/ttyACM0`` or ``sim://boson``, and a driver
-that speaks its protocol. What turns bytes into messages does no input or output at all, and below
-the real drivers `emulated` answers in place of the hardware, and says so:
+Begin with a `session`, a YAML file of the recording and its devices' addresses; `devices` opens
+them, `protocols` records a scene or a blackbody sweep, `live` shows it meanwhile, and `recording`
+opens it again. `inventory` lists what is on the USB bus. Below are the drivers: `boson` over `fslp`
+and its `telemetry`, with frames by `v4l2` (`camera` is the interface of any camera), `filterwheel`
+over `apt`, and `tc08`; `transport` opens their lines. `thermocouple` converts type T.
 
-- `boson` over `fslp`, `filterwheel` over `apt`: both on the byte streams of `transport`, which
-  `dialogue` notes and plays back; `tc08`, with `thermocouple` for type T;
-- `video`: the frames, by V4L2, with their telemetry;
-- `inventory`: what is plugged in, and what stands in the way;
-- `session` of `entries`: what is to be recorded; `devices` opens its `rig`, `protocols` use it;
-- `recording`: how that is written, and opened again.
-
-Each device, line and emulator is closed as `closing` says. The drivers were written from public
-descriptions of the protocols and tested against public byte vectors and emulators, never against
-hardware. The modules that talk to a device need the optional packages of
-``dbthermal[instruments]``; importing this package loads none of them.
+`emulated` devices stand behind ``sim://`` addresses, below the same drivers, and say what they are.
+The drivers were written from public descriptions of the protocols and tested against public byte
+vectors and emulators, never against hardware. Those that talk to a device need the optional
+packages of ``dbthermal[instruments]``; a module is imported when it is first used.
 """
+
+import importlib
+from types import ModuleType
+
+__all__ = [
+    "apt",
+    "boson",
+    "camera",
+    "devices",
+    "filterwheel",
+    "fslp",
+    "inventory",
+    "live",
+    "protocols",
+    "recording",
+    "session",
+    "tc08",
+    "thermocouple",
+]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import the module `name` of this package when it is first used (PEP 562)."""
+    if name in __all__:
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"Unknown module {name!r} in {__name__}. Must be one of {__all__}.")
+
+
+def __dir__() -> list[str]:
+    return __all__

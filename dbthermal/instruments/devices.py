@@ -1,44 +1,222 @@
 """The devices of a session, opened together: cameras, their command ports, wheel, thermocouples.
 
-Opening sends nothing that changes a camera, and moves nothing; what is opened is `Devices`. In an
-emulated session all emulators share one world, so that the wheel's place decides what the camera
-behind it sees.
+Opening sends nothing that changes a camera, and moves nothing; the result is `Devices`.
+`Devices.prepare` sets the cameras for a measurement and homes the wheel, `Devices.select` turns a
+filter into the beam. Both are called by the user, or by a protocol. In an emulated session all
+emulators share one world, so that the wheel's position decides what the camera behind it sees; they
+are imported only then.
 
 Nothing here was ever run on hardware.
 """
 
-from collections.abc import Iterator, Mapping
+import importlib
+import threading
+import time as system_time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import fields
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
 from typing import Any, Final
-from urllib.parse import urlsplit
 
-from dbthermal.instruments import filterwheel, telemetry
-from dbthermal.instruments.boson import Boson
-from dbthermal.instruments.camera import FrameSource, Stream
-from dbthermal.instruments.emulated import blackbody
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Picture
-from dbthermal.instruments.emulated.world import ROOM, World
-from dbthermal.instruments.filterwheel import FilterWheel
-from dbthermal.instruments.rig import Devices, ReadingError, Thermocouples
+from dbthermal.instruments import filterwheel
+from dbthermal.instruments.camera import (
+    CameraControl,
+    Counts,
+    FrameFlag,
+    FrameSource,
+    Identity,
+    NoFrameError,
+    Stream,
+    camera_kind,
+)
+from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
+from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import Session, check_one_of
-from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 
-__all__ = ["Devices", "ReadingError", "Thermocouples", "emulated_world", "open_devices"]
+__all__ = ["Devices", "ReadingError", "Thermocouples", "open_devices"]
 
-KIND: Final = "T"
+SCAN_AGE: Final = 1.0
+"""Longest time for which a scan of all thermocouples gives the readings of its channels [s]."""
+
+FLUSH_TIMEOUT: Final = 2.0
+"""Longest time in which the frames that a driver holds are read and discarded [s]."""
+
+WHEEL: Final = "filter_wheel"
+"""Name of the wheel, and of the reading of its slot."""
+
+THERMOCOUPLE: Final = "T"
 """Letter of the rig's thermocouples."""
 
-SERIAL_NUMBERS: Final = 93588
-"""Number of the first emulated camera of a session; the others follow."""
+
+class ReadingError(RuntimeError):
+    """An instrument gave no number; a recording notes it and goes on."""
+
+
+@dataclass
+class Thermocouples:
+    """
+    The logger's channels, of which one scan gives the readings of all.
+
+    `names` maps channel to the place of its tip; `clock` is the host's [s], that of the logger.
+    """
+
+    logger: TC08
+    names: Mapping[int, str]
+    clock: Callable[[], float] = system_time.monotonic
+
+    def __post_init__(self) -> None:
+        self._lock = threading.Lock()
+        self._scan: Scan | None = None
+        self._read: set[int] = set()
+
+    def read(self, channel: int) -> float:
+        """
+        Temperature of one channel [K]; each reading of a channel is a measurement of its own.
+
+        `ReadingError` if it is no temperature, or the logger fails.
+        """
+        with self._lock:
+            scan = self._current(channel)
+        if scan.flag[channel]:
+            raise ReadingError(
+                f"No temperature of thermocouple '{self.names[channel]}' in channel {channel}: "
+                f"{Flag(int(scan.flag[channel]))!r}. Must be connected, and within its range."
+            )
+        return float(scan.temperature[channel])
+
+    def _current(self, channel: int) -> Scan:
+        scan = self._scan
+        if scan is None or channel in self._read or self.clock() - scan.time > SCAN_AGE:
+            try:
+                self._scan = scan = self.logger.single()
+            except TC08Error as error:
+                raise ReadingError(f"No temperatures: {error}") from error
+            self._read.clear()
+        self._read.add(channel)
+        return scan
+
+
+@dataclass(frozen=True)
+class Devices:
+    """The open devices of a session; see `open_devices`."""
+
+    session: Session
+    sources: Mapping[str, FrameSource]  # frames by band, in the session's order
+    cameras: Mapping[str, CameraControl] = field(default_factory=dict)  # command ports by band
+    wheel: FilterWheel | None = None
+    logger: TC08 | None = None
+    world: Any = None  # emulated bench (`emulated.world.World`) of an emulated session
+    thermocouples: Thermocouples | None = None  # readings of the logger
+
+    def readings(self) -> dict[str, Reading]:
+        """
+        Instruments that are read beside the frames, for `recording.record`.
+
+        Each thermocouple by its name [K]; ``fpa <band>``, the temperature of the focal-plane array
+        [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam. They
+        raise RuntimeError or OSError where the instrument gives none.
+        """
+        readings: dict[str, Reading] = {}
+        if self.thermocouples is not None:
+            for channel, name in self.thermocouples.names.items():
+                readings[name] = Reading(partial(self.thermocouples.read, channel))
+        for band, camera in self.cameras.items():
+            readings[f"fpa {band}"] = Reading(camera.fpa_temperature)
+            readings[f"ffc {band}"] = Reading(camera.ffc_status, "1")
+        if self.wheel is not None:
+            readings[WHEEL] = Reading(self.wheel.position, "1")
+        return readings
+
+    def identities(self) -> dict[str, Identity]:
+        """
+        Names and numbers of the devices, for the record of a recording.
+
+        Keys are the bands, ``filter_wheel`` and ``thermocouples``; each says ``is_simulated``.
+        ValueError if frames and command port of a band are those of two cameras; RuntimeError or
+        OSError if a device does not answer.
+        """
+        identities: dict[str, Identity] = {}
+        for band, source in self.sources.items():
+            identity: Identity = {**source.identity, "is_simulated": source.is_simulated}
+            if band in self.cameras:
+                control = self.cameras[band].identity()
+                _require_same(band, identity, control)
+                identity = {**identity, **control}
+            identities[band] = identity
+        if self.wheel is not None:
+            identities[WHEEL] = _record(self.wheel.identity())
+        if self.logger is not None:
+            identities["thermocouples"] = _record(self.logger.identity())
+        return identities
+
+    def prepare(self) -> None:
+        """
+        Make the devices ready to measure: set the cameras, correct their offsets, turn the wheel.
+
+        Each camera gives 16-bit counts, corrects its offsets on command only, and gives telemetry
+        as the session says; each setting is read back. Then the offsets are corrected, and the
+        wheel is homed if it has to be, and turned to the session's band. ValueError if a camera
+        does not keep a setting, RuntimeError or OSError if a device refuses, fails or is gone.
+        """
+        for camera in self.cameras.values():
+            camera.prepare(self.session.telemetry_rows)
+        self.correct_offsets()
+        if self.wheel is not None and self.session.filtered is not None:
+            try:
+                self.wheel.select(self.session.filtered)
+            except NotHomedError:
+                self.wheel.home()
+                self.wheel.select(self.session.filtered)
+
+    def correct_offsets(self) -> None:
+        """Run a flat-field correction of each camera before its shutter, and wait for its end."""
+        for camera in self.cameras.values():
+            camera.run_ffc()
+
+    def select(self, band: str) -> "Devices":
+        """
+        Turn one of the session's filters into the beam; as `FilterWheel.select`.
+
+        Returns the same devices, of which the camera behind the wheel is that of this band;
+        ValueError if the session has no wheel, or no such filter.
+        """
+        before = self.session.filtered
+        if self.wheel is None or before is None:
+            raise ValueError(f"Invalid band '{band}' of a session without a wheel.")
+        self.wheel.select(band)
+
+        def renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
+            return {band if name == before else name: value for name, value in mapping.items()}
+
+        return replace(
+            self,
+            session=replace(self.session, cameras=renamed(self.session.cameras)),
+            sources=renamed(self.sources),
+            cameras=renamed(self.cameras),
+        )
+
+    def flush(self, clock: Callable[[], float] = system_time.monotonic) -> None:
+        """Discard the frames that the drivers hold, which show the scene as it was before.
+
+        `clock` is the host's, that of the frames [s]; `SourceLostError` if a camera is gone.
+        """
+        start = clock()
+        for source in self.sources.values():
+            while clock() - start < FLUSH_TIMEOUT:
+                try:
+                    frame = source.read(0.0)
+                except NoFrameError:
+                    break
+                if frame.device_time >= start and FrameFlag.FOREIGN_CLOCK not in frame.flags:
+                    break
 
 
 @contextmanager
 def open_devices(
     session: Session,
-    world: World | None = None,
-    pictures: Mapping[str, Picture] | None = None,
-    faults: Mapping[str, Faults] | None = None,
+    world: Any = None,
+    pictures: Mapping[str, Callable[[float], Counts]] | None = None,
 ) -> Iterator[Devices]:
     """
     Open the devices of a session: the real ones, or, by its one switch, the emulated ones.
@@ -50,14 +228,13 @@ def open_devices(
     Parameters
     ----------
     session : Session
-        What is opened.
-    world : World, optional
-        The emulated bench; by default `emulated_world` at room temperature.
+        Description of the devices.
+    world : `emulated.world.World`, optional
+        The emulated bench; by default one at room temperature.
     pictures : mapping, optional
-        Band to what the emulated cameras see in it; by default, with the default world, its
-        blackbody, see `dbthermal.instruments.emulated.blackbody`.
-    faults : mapping, optional
-        Band to what goes wrong with its emulated camera.
+        Band to the counts that an emulated camera sees in it, at a time of the scene [s]; by
+        default, with the default world, its blackbody, see
+        `dbthermal.instruments.emulated.blackbody`.
 
     Yields
     ------
@@ -67,7 +244,7 @@ def open_devices(
     Raises
     ------
     ValueError
-        If an address is of another kind, or there is a world, pictures or faults for hardware.
+        If an address or a camera is of another kind, or world or pictures are given for hardware.
     KeyError
         If the world has no such camera.
     OSError, WheelError, TC08Error
@@ -75,119 +252,97 @@ def open_devices(
     """
     if session.simulated:
         if world is None:
-            room = dict.fromkeys(session.thermocouples.values(), ROOM)
-            world = emulated_world(session, scene=lambda _: room, waits=True)
-            pictures = blackbody.pictures(session, world) if pictures is None else pictures
-    elif world is not None or pictures or faults:
+            world = _emulated("world").emulated_world(session, waits=True)
+            if pictures is None:
+                pictures = _emulated("blackbody").pictures(session, world)
+    elif world is not None or pictures:
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:
         sources: dict[str, FrameSource] = {}
-        cameras: dict[str, Boson] = {}
-        for band, camera in session.cameras.items():
-            fault = (faults or {}).get(band, Faults())
-            sources[band] = stack.enter_context(
-                _source(session, band, world, pictures or {}, fault)
-            )
-            if camera.control is not None:
-                cameras[band] = stack.enter_context(_control(session.url(camera.control), world))
+        cameras: dict[str, CameraControl] = {}
+        for band in session.bands:
+            sources[band] = stack.enter_context(_frames(session, band, world, pictures or {}))
+            control = _control(session, band, world)
+            if control is not None:
+                cameras[band] = stack.enter_context(control)
         wheel = stack.enter_context(_wheel(session, world)) if session.filters else None
         logger = stack.enter_context(_logger(session, world)) if session.thermocouples else None
         scans = None if logger is None else Thermocouples(logger, session.thermocouples)
         yield Devices(session, sources, cameras, wheel, logger, world, scans)
 
 
-def emulated_world(session: Session, **settings: Any) -> World:
-    """
-    Bench with the cameras, filters and thermocouples of an emulated session.
-
-    Parameters
-    ----------
-    session : Session
-        What is emulated; its thermocouples are at what they are named after.
-    **settings
-        As for `World`.
-
-    Returns
-    -------
-    World
-        For `open_devices`.
-    """
-    world = World(filters=session.filters, **settings)
-    furnish(world, session)
-    return world
+def _emulated(module: str) -> Any:
+    """A module of the emulators, which nothing imports before it is needed."""
+    return importlib.import_module(f"dbthermal.instruments.emulated.{module}")
 
 
-def furnish(world: World, session: Session) -> None:
-    """
-    Put the cameras and thermocouples of an emulated session on a bench.
-
-    Parameters
-    ----------
-    world : World
-        The bench.
-    session : Session
-        What is emulated; its thermocouples are at what they are named after.
-
-    Raises
-    ------
-    ValueError
-        If there is a camera of such a name.
-    """
-    world.thermocouples.update(session.thermocouples)
-    for number, camera in enumerate(session.cameras.values()):
-        world.add_camera(_name(session.url(camera.video)), SERIAL_NUMBERS + number)
-
-
-def _source(
-    session: Session,
-    band: str,
-    world: World | None,
-    pictures: Mapping[str, Picture],
-    faults: Faults,
+def _frames(
+    session: Session, band: str, world: Any, pictures: Mapping[str, Any]
 ) -> AbstractContextManager[FrameSource]:
-    url = session.url(session.cameras[band].video)
-    form = session.shape, session.frame_rate, session.telemetry_rows
-    if url.startswith("v4l2:///") and world is None:
-        from dbthermal.instruments.video import v4l2  # noqa: PLC0415 - Linux only
+    """Open the frames of a band's camera."""
+    camera = session.cameras[band]
+    kind, url = camera_kind(camera.kind), session.url(camera.video)
+    rows = session.telemetry_rows
+    check_one_of(f"telemetry_rows of camera kind '{camera.kind}'", [rows], kind.telemetry_rows)
+    stream = Stream(session.shape, session.frame_rate, rows)
+    if world is None:
+        return kind.open_frames(url, stream)
+    unfiltered = None if band == session.filtered else band
+    source: AbstractContextManager[FrameSource] = _emulated("camera").open_frames(
+        url, world, pictures, unfiltered, stream
+    )
+    return source
 
-        stream = Stream(*form)
-        return v4l2.Capture.open(urlsplit(url).path, stream, decode=telemetry.metadata)
-    if not url.startswith("sim://camera/") or world is None:
+
+def _control(
+    session: Session, band: str, world: Any
+) -> AbstractContextManager[CameraControl] | None:
+    """Open the command port of a band's camera, if it has one."""
+    camera = session.cameras[band]
+    if camera.control is None:
+        return None
+    open_control = camera_kind(camera.kind).open_control
+    if open_control is None:
         raise ValueError(
-            f"Invalid address '{url}' of the camera of band '{band}'. Must be 'v4l2:///dev/...', "
-            "or 'sim://camera/<name>' if simulated."
+            f"Invalid control of band '{band}'. Must be left out: a camera of kind "
+            f"'{camera.kind}' has no command port."
         )
-    own = None if band == session.filtered else band
-    return EmulatedCamera(world, _name(url), pictures, own, *form, faults)
+    return open_control(session.url(camera.control), world)
 
 
-def _control(url: str, world: World | None) -> Boson:
-    """Open a command port; the frames of an emulated camera are its frame source's to count."""
-    if world is not None and not url.startswith("pty:"):
-        if not url.startswith("sim://boson/"):
-            raise ValueError(f"Invalid address '{url}' of a camera. Must be 'sim://boson/<name>'.")
-        world.camera(_name(url))
-        url = f"{url}?frames=source"
-    return Boson.from_url(url, world=world)
-
-
-def _wheel(session: Session, world: World | None) -> FilterWheel:
+def _wheel(session: Session, world: Any) -> FilterWheel:
     known = {entry.name for entry in fields(filterwheel.Settings)} - {"filters"}
     check_one_of("setting of the wheel", session.wheel, sorted(known))
     settings = filterwheel.Settings(filters=session.filters, **session.wheel)
-    return FilterWheel.from_url(session.url(session.devices["filter_wheel"]), settings, world=world)
+    return FilterWheel.from_url(session.url(session.devices[WHEEL]), settings, world=world)
 
 
-def _logger(session: Session, world: World | None) -> TC08:
+def _logger(session: Session, world: Any) -> TC08:
     logger = TC08.from_url(session.url(session.devices["thermocouples"]), world=world)
     try:
-        logger.set_channels(dict.fromkeys(session.thermocouples, KIND))
+        logger.set_channels(dict.fromkeys(session.thermocouples, THERMOCOUPLE))
     except BaseException:
         logger.close()
         raise
     return logger
 
 
-def _name(url: str) -> str:
-    """Name of an emulated camera in its world."""
-    return urlsplit(url).path.lstrip("/")
+def _record(identity: Any) -> Identity:
+    """Text by name, and whether it is simulated."""
+    return {
+        name: value if isinstance(value, bool) else str(value)
+        for name, value in asdict(identity).items()
+    }
+
+
+def _require_same(band: str, source: Identity, control: Identity) -> None:
+    numbers = source.get("serial_number"), control["serial_number"]
+    if numbers[0] not in {None, numbers[1]}:
+        raise ValueError(
+            f"Invalid cameras {numbers} of band '{band}': frames come from the first, commands go "
+            "to the second. Must be one camera."
+        )
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -17,6 +17,18 @@ import struct
 from dataclasses import dataclass
 from typing import Final
 
+__all__ = [
+    "COMMAND_CHANNEL",
+    "MAXIMUM_DATA",
+    "MAXIMUM_FRAME",
+    "REQUEST",
+    "Decoder",
+    "Frame",
+    "checksum",
+    "encode",
+    "next_sequence",
+]
+
 COMMAND_CHANNEL: Final = 0x00
 """Channel of commands and their replies; a receiver discards the frames of all others."""
 
@@ -42,44 +54,17 @@ _CHECKSUM_START = 0x1D0F
 
 @dataclass(frozen=True)
 class Frame:
-    """
-    One undamaged frame.
+    """One undamaged frame."""
 
-    Attributes
-    ----------
-    channel : int
-        `COMMAND_CHANNEL`, or that of debug text and other traffic, 0 to 255.
-    sequence : int
-        Number of the request, echoed by its reply, unsigned, 32 bits.
-    command : int
-        Identifier of the function, unsigned, 32 bits.
-    status : int
-        `REQUEST`, or of a reply 0 for success, else an error code.
-    data : bytes
-        What the function takes or gives; empty in error replies.
-    """
-
-    channel: int
-    sequence: int
-    command: int
-    status: int
-    data: bytes = b""
+    channel: int  # `COMMAND_CHANNEL`, or that of debug text and other traffic, 0 to 255
+    sequence: int  # number of the request, echoed by its reply, unsigned, 32 bits
+    command: int  # identifier of the function, unsigned, 32 bits
+    status: int  # `REQUEST`, or of a reply 0 for success, else an error code
+    data: bytes = b""  # arguments or result of the function; empty in error replies
 
 
 def checksum(content: bytes) -> int:
-    """
-    Checksum of a frame, CRC-16/AUG-CCITT.
-
-    Parameters
-    ----------
-    content : bytes
-        Unescaped, from the channel to the last byte of data.
-
-    Returns
-    -------
-    int
-        16 bits; 0xE5CC for ``b"123456789"``.
-    """
+    """CRC-16/AUG-CCITT of an unescaped frame, from channel to data; 0xE5CC for "123456789"."""
     return binascii.crc_hqx(content, _CHECKSUM_START)
 
 
@@ -94,7 +79,7 @@ def encode(
     """
     Bytes of a frame, ready to send.
 
-    Header, data and checksum are all escaped, so that start and end stand nowhere else.
+    Header, data and checksum are all escaped, so that start and end bytes occur nowhere else.
 
     Parameters
     ----------
@@ -114,6 +99,11 @@ def encode(
     ------
     TypeError, ValueError
         If a number is not whole, or does not fit its field, or there are too many data.
+
+    Examples
+    --------
+    >>> encode(1, 0x00050002).hex(" ")  # serial number of a Boson
+    '8e 00 00 00 00 01 00 05 00 02 ff ff ff ff 01 0b ae'
     """
     for name, value, bits in (
         ("channel", channel, 8),
@@ -138,25 +128,15 @@ def _escaped(content: bytes) -> bytes:
 
 def next_sequence(sequence: int) -> int:
     """
-    Sequence number that follows another, none of whose bytes would be escaped.
+    Sequence number that follows another, with no byte that would be escaped.
 
     The vendor's software avoids such numbers too, perhaps because one of its receivers does not
-    unescape the header. The numbers increase, so none returns before 32 bits are through.
-
-    Parameters
-    ----------
-    sequence : int
-        In [0, 2^32).
-
-    Returns
-    -------
-    int
-        In [0, 2^32).
+    unescape the header. The numbers increase, so that none returns within 32 bits.
     """
     following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
-    for place, value in enumerate(following):
-        if value in _SPECIAL:  # the least number above: what stands behind starts from zero
-            raised = following[:place] + bytes([value + 1]) + bytes(3 - place)
+    for position, value in enumerate(following):
+        if value in _SPECIAL:  # the least number above: the bytes behind start from zero
+            raised = following[:position] + bytes([value + 1]) + bytes(3 - position)
             return int.from_bytes(raised, "big")
     return int.from_bytes(following, "big")
 
@@ -165,15 +145,9 @@ class Decoder:
     """
     Finds the frames in a stream of bytes, however it is cut into pieces.
 
-    What stands between frames is ignored. A start byte always begins anew. A frame that is cut
-    short, too long or too short, holds an illegal escape or has the wrong checksum is dropped and
-    counted: of all start bytes that came in, each began a frame that was returned, one that is
-    counted in `damaged`, or the one that is still open.
-
-    Attributes
-    ----------
-    damaged : int
-        Frames that were dropped so far.
+    Bytes between frames are ignored. A start byte always begins anew. A frame that is cut short,
+    too long or too short, holds an illegal escape or has the wrong checksum is dropped and counted
+    in `damaged`: each start byte began a frame that was returned, is counted, or is still open.
     """
 
     def __init__(self) -> None:
@@ -187,19 +161,7 @@ class Decoder:
         return self._content is not None
 
     def feed(self, received: bytes) -> list[Frame]:
-        """
-        Take in the next bytes of the stream.
-
-        Parameters
-        ----------
-        received : bytes
-            Any number, of any value.
-
-        Returns
-        -------
-        list of Frame
-            The undamaged frames that they complete, of every channel.
-        """
+        """Take in any number of bytes; return the undamaged frames that they complete."""
         return [frame for byte in received if (frame := self._step(byte)) is not None]
 
     def _step(self, byte: int) -> Frame | None:
@@ -240,3 +202,7 @@ class Decoder:
         """Give up the open frame."""
         self.damaged += 1
         self._content, self._escaping = None, False
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -19,6 +19,7 @@ import numpy as np
 
 from dbthermal import store
 from dbthermal.instruments.camera import SourceLostError
+from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import (
     Limits,
     Preview,
@@ -33,7 +34,6 @@ from dbthermal.instruments.recording._sweep import (
     require_filter,
     step_path,
 )
-from dbthermal.instruments.rig import Devices
 from dbthermal.instruments.session import Session
 
 __all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]
@@ -67,30 +67,11 @@ def wait_stable(
     sleep: Callable[[float], None] = system_time.sleep,
 ) -> float:
     """
-    Wait until a temperature is stable near its set point.
+    Wait until a temperature is stable near its set point [K], and return its mean [K].
 
-    Parameters
-    ----------
-    session : Session
-        With a blackbody: its `stability` and `tolerance` [K], `window` and `timeout` [s].
-    temperature : float
-        Set point [K].
-    read : callable
-        Reads it [K].
-    clock, sleep : callable
-        Time [s].
-
-    Returns
-    -------
-    float
-        Mean of the readings in the window [K].
-
-    Raises
-    ------
-    TimeoutError
-        If it is not stable within the session's `timeout`.
-    ValueError
-        If the session has no blackbody.
+    Within the session's `window` the readings must lie within its `stability` of one another, and
+    their mean within its `tolerance` of the set point. TimeoutError after its `timeout`, ValueError
+    if the session has no blackbody.
     """
     if session.blackbody is None:
         raise ValueError(f"Invalid session '{session.name}'. Must have a blackbody.")

@@ -14,6 +14,7 @@ One key, ``simulated``, switches the whole rig; every device has an address for 
         video: {simulated: "sim://camera/wide", hardware: "v4l2:///dev/video0"}
         control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
       "9.5":
+        kind: boson            # of dbthermal.instruments.camera.KINDS; boson by default
         video: {simulated: "sim://camera/narrow", hardware: "v4l2:///dev/video2"}
     devices:                   # whatever else is connected
       filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
@@ -47,6 +48,8 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
+from dbthermal.instruments.camera import KINDS
+
 __all__ = ["Blackbody", "Camera", "Device", "Session"]
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
@@ -78,10 +81,27 @@ class Device:
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
-    """Addresses of one camera's frames and of its command port, if it has one."""
+    """
+    One camera: addresses of its frames and of its command port, if it has one.
+
+    Attributes
+    ----------
+    video, control : Device
+        Addresses.
+    kind : str
+        One of `dbthermal.instruments.camera.KINDS`.
+    """
 
     video: Device
     control: Device | None = None
+    kind: str = "boson"
+
+    @field_validator("kind")
+    @classmethod
+    def _check_kind(cls, kind: str) -> str:
+        if kind not in KINDS:
+            raise ValueError(f"Must be one of {sorted(KINDS)}")
+        return kind
 
 
 @dataclass(frozen=True, config=_CHECKED)

@@ -22,15 +22,12 @@ from ctypes import POINTER, c_char, c_float, c_int8, c_int16
 from dataclasses import dataclass
 from enum import IntFlag
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments.closing import Closing
-
-if TYPE_CHECKING:
-    from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.transport import Closing
 
 __all__ = ["ERRORS", "TC08", "Flag", "Identity", "Scan", "TC08Error", "load"]
 
@@ -174,7 +171,7 @@ class TC08(Closing):
         self._has_channels = False
 
     @classmethod
-    def from_url(cls, url: str = "tc08:", *, world: "World | None" = None) -> Self:
+    def from_url(cls, url: str = "tc08:", *, world: object | None = None) -> Self:
         """
         Load the library and open the first free unit.
 
@@ -183,7 +180,7 @@ class TC08(Closing):
         url : str
             ``tc08:``, the library being found as by `load`, ``tc08:///path/of/library.so``, or
             ``sim://tc08`` for an emulated unit.
-        world : World, optional
+        world : object, optional
             Emulated bench, needed for ``sim://tc08`` alone.
 
         Raises

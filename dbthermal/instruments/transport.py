@@ -2,24 +2,29 @@
 
 ``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``pty:///dev/pts/3`` a
 pseudo-terminal on which somebody emulates a device, and ``sim://boson?sn=7`` an emulator that is
-started for the caller and ends with the transport. Nothing is sent when one is opened. Tested
-on pseudo-terminals, not on hardware.
+started for the caller and ends with the transport. Nothing is sent when one is opened. Tested on
+pseudo-terminals, not on hardware.
 """
 
 import errno
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, Protocol
+from types import MappingProxyType, TracebackType
+from typing import TYPE_CHECKING, Final, Protocol, Self
 from urllib.parse import parse_qsl, urlsplit
 
-import serial
-
-from dbthermal.instruments.closing import Closing
-
 if TYPE_CHECKING:
-    from dbthermal.instruments.emulated.world import World
+    import serial
+
+__all__ = [
+    "EMULATORS",
+    "Closing",
+    "SerialTransport",
+    "Transport",
+    "TransportError",
+    "open_serial",
+]
 
 WRITE_TIMEOUT: Final = 1.0
 """Longest wait until the operating system took the bytes to send [s]."""
@@ -30,11 +35,39 @@ EMULATORS: Final = MappingProxyType(
         "apt": "dbthermal.instruments.emulated.apt",
     }
 )
-"""Module of each emulator: its ``start(options, world)`` gives something with `path` and `close`.
-"""
+"""Module of each emulator, imported when it is started: its ``start(options, world)`` returns an
+object with `path` and `close`."""
 
 _SCHEMES = ("serial", "pty", "sim")
 _NO_LINE = (errno.ENOTTY, errno.EINVAL)
+
+
+class Closing:
+    """
+    Context manager that closes at its end, without hiding an error inside it.
+
+    A failure to close is raised if there was no other error, and else added to it as a note.
+    """
+
+    def close(self) -> None:
+        """Release what is held; a second time does nothing."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self.close()
+        except (OSError, RuntimeError) as closing:
+            if error is None:
+                raise
+            error.add_note(f"Closing failed too. {closing}")
 
 
 class TransportError(OSError):
@@ -42,46 +75,38 @@ class TransportError(OSError):
 
 
 class Transport(Protocol):
-    """What a driver needs of a line to its device; a context manager in each implementation."""
+    """A line to a device, as a driver needs it; a context manager in each implementation."""
 
     @property
     def is_simulated(self) -> bool:
-        """Whether no hardware is at the other end."""
+        """True if the device is emulated."""
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device is gone."""
 
     def read(self, size: int, timeout: float) -> bytes:
         """
-        Wait until something has come, or `timeout` [s] went by.
+        Wait until bytes came, or `timeout` [s] went by.
 
-        Return what is there, at most `size` bytes and often fewer; none only if `timeout` went by.
+        Return at most `size` bytes and often fewer; none only if `timeout` went by.
         `TransportError` if the device is gone.
         """
 
     def close(self) -> None:
-        """Give the line back; a second time does nothing. `TransportError` if it cannot."""
+        """Release the line; a second time does nothing. `TransportError` if it cannot."""
 
 
 class SerialTransport(Closing):
     """
     A serial port, or a pseudo-terminal, that is open already; see `open_serial`.
 
-    Parameters
-    ----------
-    port : Serial
-        Open, of pyserial.
-    url : str
-        Name for messages.
-    is_simulated : bool
-        Whether an emulator is at the other end.
-    after : callable, optional
-        Called once the port is closed, to end an emulator.
+    `port` is open, of pyserial; `url` is its name in messages; `after` is called once the port is
+    closed, to end an emulator.
     """
 
     def __init__(
         self,
-        port: serial.Serial,
+        port: "serial.Serial",
         url: str,
         *,
         is_simulated: bool,
@@ -93,45 +118,14 @@ class SerialTransport(Closing):
         self._after = after
 
     def write(self, data: bytes) -> None:
-        """
-        Send all bytes.
-
-        Parameters
-        ----------
-        data : bytes
-            To send.
-
-        Raises
-        ------
-        TransportError
-            If the device is gone or takes no bytes for `WRITE_TIMEOUT`, or the port is closed.
-        """
+        """Send all bytes; `TransportError` if the device takes none for `WRITE_TIMEOUT`."""
         try:
             self._port.write(data)
         except OSError as error:  # pyserial's errors are of this kind
             raise self._lost("write to", error) from error
 
     def read(self, size: int, timeout: float) -> bytes:
-        """
-        Wait until something has come, or `timeout` went by.
-
-        Parameters
-        ----------
-        size : int
-            Most bytes to return, at least 1.
-        timeout : float
-            Longest wait [s].
-
-        Returns
-        -------
-        bytes
-            Often fewer than `size`; none only if `timeout` went by.
-
-        Raises
-        ------
-        TransportError
-            If the device is gone, or the port is closed.
-        """
+        """Wait until bytes came, or `timeout` [s] went by; see `Transport.read`."""
         try:
             self._port.timeout = timeout
             first: bytes = self._port.read(1)
@@ -141,24 +135,7 @@ class SerialTransport(Closing):
             raise self._lost("read from", error) from error
 
     def set_rts(self, *, level: bool) -> bool:
-        """
-        Set the line RTS, where there is one.
-
-        Parameters
-        ----------
-        level : bool
-            True asserts it.
-
-        Returns
-        -------
-        bool
-            False if the port has no such line, as is true of every pseudo-terminal.
-
-        Raises
-        ------
-        TransportError
-            If the device is gone.
-        """
+        """Set the line RTS; False if the port has none, as is true of every pseudo-terminal."""
         try:
             self._port.rts = level
         except OSError as error:
@@ -168,14 +145,7 @@ class SerialTransport(Closing):
         return True
 
     def close(self) -> None:
-        """
-        Give the port back and end its emulator; a second time does nothing.
-
-        Raises
-        ------
-        TransportError
-            If the port does not close; its emulator is ended all the same.
-        """
+        """Release the port and end its emulator, also if the port does not close."""
         after, self._after = self._after, None
         try:
             self._port.close()
@@ -196,33 +166,28 @@ def open_serial(
     *,
     baudrate: int,
     rtscts: bool = False,
-    world: "World | None" = None,
+    world: object | None = None,
 ) -> SerialTransport:
     """
-    Open the line to a device by its name; nothing is sent.
+    Open the line to a device by its name, for this program alone; nothing is sent.
 
     Parameters
     ----------
     url : str
-        ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, where the emulator
-        says which options it takes; ``sim://boson/wide`` is ``sim://boson?name=wide``.
+        ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, with the options of
+        the emulator; ``sim://boson/wide`` is ``sim://boson?name=wide``.
     baudrate : int
         Speed of the line [bit/s].
     rtscts : bool
         Flow control by the lines RTS and CTS.
-    world : World, optional
-        What a ``sim://`` device is part of; by default one of its own.
-
-    Returns
-    -------
-    SerialTransport
-        Open, and no other program's.
+    world : object, optional
+        Emulated bench that a ``sim://`` device is part of; by default one of its own.
 
     Raises
     ------
     ValueError
-        If the name is none of these, says more than is understood, or gives a pseudo-terminal as a
-        serial port, which would let an emulator pass for hardware.
+        If the name is none of these, has options that are not understood, or gives a
+        pseudo-terminal as a serial port, which would let an emulator pass for hardware.
     TransportError
         If the port cannot be opened.
     """
@@ -241,7 +206,7 @@ def open_serial(
 
 
 def _open_emulated(
-    url: str, world: "World | None", *, baudrate: int, rtscts: bool
+    url: str, world: object | None, *, baudrate: int, rtscts: bool
 ) -> SerialTransport:
     """Start the emulator that `url` names, and open its end of the line."""
     parts = urlsplit(url)
@@ -269,8 +234,10 @@ def _options(url: str) -> dict[str, str]:
     return options
 
 
-def _open_port(path: str, *, baudrate: int, rtscts: bool) -> serial.Serial:
+def _open_port(path: str, *, baudrate: int, rtscts: bool) -> "serial.Serial":
     """Open a port for this program alone."""
+    import serial  # noqa: PLC0415 - an optional package, which drivers of other devices do without
+
     try:
         return serial.Serial(
             path, baudrate, rtscts=rtscts, exclusive=True, write_timeout=WRITE_TIMEOUT
@@ -280,3 +247,7 @@ def _open_port(path: str, *, baudrate: int, rtscts: bool) -> serial.Serial:
             f"Could not open '{path}': {error}. It must exist, be yours to use, and in no "
             "other program's use."
         ) from error
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -3,7 +3,6 @@
 import importlib
 import operator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
@@ -167,7 +166,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         blocks = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
         material = None
         if inputs.labels is not None:
-            selected = pooling.asked(inputs.labels)
+            selected = pooling.select(inputs.labels)
             surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), blocks)
             material = _pool(inputs, [part for found in surveys for part in found])
         for _ in threads.map(lambda block: _separate(inputs, block, material, result, bar), blocks):
@@ -252,10 +251,10 @@ def _pool(inputs: Inputs, surveys: list[tuple[Labels, Survey]]) -> Material | No
     if labels is None or not surveys:
         return None
     numbers = np.concatenate([number for number, _ in surveys])
-    survey = pooling.joined([part for _, part in surveys])
+    survey = pooling.join([part for _, part in surveys])
     noise = inputs.noise[inputs.bands]
-    materials = pooling.combine(labels[numbers], int(labels.max()) + 1, survey, noise)
-    return replace(materials, label=labels).shared(np.arange(labels.size))
+    materials = pooling.estimate(labels[numbers], int(labels.max()) + 1, survey, noise)
+    return pooling.expand(materials, labels)
 
 
 def _allocate(corrected: xr.Dataset) -> xr.Dataset:

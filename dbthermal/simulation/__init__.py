@@ -1,23 +1,35 @@
-"""Simulated captures with known truth: scenes, and the rig that records them.
+"""Simulated captures with known truth, to test a claim: scenes, cameras, nuisances, bench.
 
-Everything made here carries `origin = "simulated"`. What casts rays or needs meshes is imported by
-name: `simulation.twins` (the paper's scenes), `rays`, `surroundings`, `people`, `props`.
+Begin with `walkers` and `observe`: a scene, and the counts that a `Rig` records of it. Nuisances
+of real cameras are added one by one (`fire_shutter`, `spoil_pixels`, `lag`, ...). Imported by name:
+`simulation.heat` (transient temperatures), `simulation.rays` and `simulation.surroundings` (ray-
+traced reflections of moving bodies). Everything made here carries `origin = "simulated"`.
 """
 
-from dbthermal.simulation._bench import Bench, bench_series, contact_measurements, reflector_series
-from dbthermal.simulation._clocks import drop_frames, expose, repeat_frames
+from dbthermal.simulation._bench import (
+    OBJECTS,
+    Bench,
+    Sample,
+    band_emissivity,
+    bench_series,
+    contact_measurements,
+    reflector_series,
+)
 from dbthermal.simulation._nuisances import (
     SPOILED,
     drift_pattern,
+    drop_frames,
+    expose,
     fire_shutter,
     lag,
     lose_frames,
+    repeat_frames,
     spoil_pixels,
 )
-from dbthermal.simulation._rig import Rig, blackbody_movies, capture, observe, pattern
-from dbthermal.simulation._samples import OBJECTS, Sample, band_emissivity
+from dbthermal.simulation._rig import Rig, blackbody_movies, capture, digitise, observe, pattern
 from dbthermal.simulation._scenes import (
     Background,
+    heating,
     independent_pixels,
     scene,
     side_by_side,
@@ -36,10 +48,12 @@ __all__ = [
     "blackbody_movies",
     "capture",
     "contact_measurements",
+    "digitise",
     "drift_pattern",
     "drop_frames",
     "expose",
     "fire_shutter",
+    "heating",
     "independent_pixels",
     "lag",
     "lose_frames",
@@ -52,3 +66,7 @@ __all__ = [
     "spoil_pixels",
     "walkers",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

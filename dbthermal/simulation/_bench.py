@@ -2,11 +2,11 @@
 
 On the bench an object is heated in steps and reflects, like a mirror, a blackbody set to several
 temperatures; a thermocouple sits beside the reflection. By the reflector method the same heated
-object and a crumpled foil are looked at in the room. Both meet the errors of their kind.
+object and a crumpled foil are recorded in the room. Both are simulated with their typical errors.
 
-Where the reflector method fails at low emissivity, it is by one assumption, `Bench.direction`: that
-a smooth object mirrors something warmer than the mean of the room, which the foil gives. In a room
-of one temperature the method is right within 0.01 (`procedures.reflector_sensitivity`).
+The reflector method fails at low emissivity by one assumption, `Bench.mirrored_excess`: a smooth
+object reflects something warmer than the mean of the room, which the foil gives. In a room of one
+temperature the method is right within 0.01.
 """
 
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ import xarray as xr
 
 from dbthermal import calibration, mixing, planck, schema
 from dbthermal import response as responses
+from dbthermal.emissivity import embedded_table
 from dbthermal.response import Curve, require_range
-from dbthermal.simulation._samples import Sample, band_emissivity
 
 Array = npt.NDArray[np.float64]
 
@@ -40,9 +40,71 @@ _LIMITS: Final = {
     "foil_warming": 1.0,
     "least_excess": np.inf,
 }
-"""Attributes that are zero or more, and below what: [K] or [1]."""
-_RANGES: Final = {"contact": (0.0, 1.0), "direction": (-np.inf, np.inf)}
-"""Attributes that are ranges, and between what: [1] and [K]."""
+"""Attributes that are not negative, and their upper limits: [K] or [1]."""
+_RANGES: Final = {"contact": (0.0, 1.0), "mirrored_excess": (-np.inf, np.inf)}
+"""Attributes that are ranges, and their limits: [1] and [K]."""
+_CAMERA_BAND: Final = "8-14"
+
+
+@dataclass(frozen=True)
+class Sample:
+    """
+    An object on the bench.
+
+    Attributes
+    ----------
+    name : str
+        Name.
+    emissivity : float
+        Emissivity in the band 8-14 um, in (0, 1).
+    kin : str
+        Material of `emissivity.embedded_table` after which the other bands are scaled.
+    stray : float
+        Largest share of its reflection that is not mirror-like but comes from the whole room, in
+        [0, 1].
+    """
+
+    name: str
+    emissivity: float
+    kin: str
+    stray: float
+
+    def __post_init__(self) -> None:
+        """Check emissivity and share."""
+        if not 0 < self.emissivity < 1:
+            raise ValueError(
+                f"Invalid emissivity {self.emissivity} of '{self.name}'. Must lie in (0, 1)."
+            )
+        if not 0 <= self.stray <= 1:
+            raise ValueError(f"Invalid stray {self.stray} of '{self.name}'. Must lie in [0, 1].")
+
+
+OBJECTS: Final = (
+    Sample("chrome ball", 0.10, "brass plate", 0.02),
+    Sample("aluminium cup", 0.05, "aluminium, weathered", 0.04),
+    Sample("blue paint", 0.87, "black gloss paint", 0.20),
+    Sample("glass jar", 0.95, "plate window glass", 0.01),
+    Sample("wineglass", 0.95, "plate window glass", 0.01),
+)
+"""The five objects of the paper (its table of emissivities, doi:10.48550/arXiv.2509.11334), with
+its reference values for 8-14 um; the rest is this project's choice."""
+
+
+def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
+    """
+    True emissivity (band) [1] of a sample in bands of `bands.FILTERS`.
+
+    The sample's own value for 8-14 um times the ratio of its kin's: of the emissivities where the
+    value is below 0.5 as a metal's, of the reflectances above as a dielectric's, so that the
+    result stays between 0 and 1.
+    """
+    kin = embedded_table()["emissivity"].sel(material=sample.kin, drop=True)
+    if sample.emissivity < 0.5:
+        value = sample.emissivity * kin.sel(band=names) / float(kin.sel(band=_CAMERA_BAND))
+    else:
+        ratio = (1.0 - kin.sel(band=names)) / (1.0 - float(kin.sel(band=_CAMERA_BAND)))
+        value = 1.0 - (1.0 - sample.emissivity) * ratio
+    return value.assign_attrs(units="1")
 
 
 @dataclass(frozen=True)
@@ -55,7 +117,7 @@ class Bench:
     object_temperatures, blackbody_temperatures : tuple of float
         Steps [K]; every pair is measured.
     air_temperature : float
-        Of the room: its air, and its walls as a mean [K].
+        Temperature of the room: of its air, and of its walls as a mean [K].
     reading_std : float
         Scatter of a thermocouple's reading [K].
     probe_tolerance : float
@@ -68,20 +130,25 @@ class Bench:
     blackbody_std, blackbody_tolerance : float
         Scatter and offset of the blackbody's temperature [K].
     foil_emissivity : float
-        Of crumpled aluminium foil [1].
+        Emissivity of crumpled aluminium foil [1].
     foil_warming : float
         Fraction of the object's excess over the air that the foil before it takes on [1].
     foil_std : float
         Scatter of the foil's signal from one part of it to another [K].
-    direction : tuple of float
-        Least and largest excess over the room of what a smooth object mirrors where the foil gives
-        the room's mean [K]: the camera, and who stands beside it, fill part of that direction. 11 K
-        is a direction nearly filled by skin. The failure at low emissivity is this assumption: with
-        a room of one temperature, (0, 0), the method is right within 0.01; with (0, 5) and (0, 11)
-        a chrome ball of 0.10 seems to have 0.15 and 0.21.
+    mirrored_excess : tuple of float
+        Least and largest excess, over the mean of the room, of what a smooth object reflects [K]:
+        the camera, and who stands beside it, fill part of that direction. 11 K is a direction
+        nearly filled by skin. The failure at low emissivity is this assumption: with a room of one
+        temperature, (0, 0), the method is right within 0.01; with (0, 5) and (0, 11) a chrome ball
+        of 0.10 seems to have 0.15 and 0.21.
     least_excess : float
         Excess over the air from which the reflector method takes a step [K]; ASTM E1933 asks for
         10 K.
+
+    Raises
+    ------
+    ValueError
+        If a number is outside its range, or there is no step.
     """
 
     object_temperatures: tuple[float, ...] = (300.15, 313.15, 325.15, 338.15)
@@ -96,11 +163,11 @@ class Bench:
     foil_emissivity: float = 0.04
     foil_warming: float = 0.2
     foil_std: float = 0.3
-    direction: tuple[float, float] = (0.0, 11.0)
+    mirrored_excess: tuple[float, float] = (0.0, 11.0)
     least_excess: float = 10.0
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are no bench."""
+        """Check steps, tolerances and ranges."""
         for name in ("object_temperatures", "blackbody_temperatures"):
             if not getattr(self, name):
                 raise ValueError(f"Invalid {name} () of the bench. Must be one or more.")
@@ -120,19 +187,7 @@ class Bench:
                 )
 
     def bias(self, sample: Sample) -> calibration.Bias:
-        """
-        What an experimenter would state of the common errors.
-
-        Parameters
-        ----------
-        sample : Sample
-            The object.
-
-        Returns
-        -------
-        Bias
-            For `calibration.fit_emissivity`.
-        """
+        """Common errors that an experimenter would state, for `calibration.fit_emissivity`."""
         return calibration.Bias(
             object_tolerance=float(np.hypot(self.probe_tolerance, self.logger_tolerance)),
             contact=self.contact,
@@ -198,7 +253,7 @@ def bench_series(
     response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
 ) -> xr.Dataset:
     """
-    One series on the paper's bench, with all its errors.
+    One series of measurements on the paper's bench, with all its errors.
 
     Parameters
     ----------
@@ -242,7 +297,7 @@ def reflector_series(
     One series by the reflector method, with all its errors.
 
     The foil gives the mean of the room, and a little of its own emission. Of what the object
-    reflects all but the stray part comes from the mirror's direction, warmer by `bench.direction`.
+    reflects all but the stray part is mirror-like, of a temperature higher by `mirrored_excess`.
 
     Parameters
     ----------
@@ -275,13 +330,13 @@ def reflector_series(
     air = np.full_like(warm, bench.air_temperature)
     curves = _curves(response)
     stray = rng.uniform(0.0, sample.stray)
-    mirrored = _blackbody(curves, air + rng.uniform(*bench.direction))
+    mirrored = _blackbody(curves, air + rng.uniform(*bench.mirrored_excess))
     reflected = (1.0 - stray) * mirrored + stray * _blackbody(curves, air)
     share = band_emissivity(sample, [curve.band for curve in curves]).values[:, np.newaxis]
     counts = mixing.leaving(share, _blackbody(curves, warm), reflected)
     uneven = _blackbody(curves, air + rng.normal(0, bench.foil_std, air.size))
-    own = _blackbody(curves, air + bench.foil_warming * (warm - air))
-    foil = mixing.leaving(bench.foil_emissivity, own, uneven)
+    emitted = _blackbody(curves, air + bench.foil_warming * (warm - air))
+    foil = mixing.leaving(bench.foil_emissivity, emitted, uneven)
     return _dataset(
         response,
         {

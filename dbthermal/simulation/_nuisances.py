@@ -1,6 +1,7 @@
-"""What a real camera adds to a perfect capture, one nuisance a function, each with its truth."""
+"""Nuisances of real cameras added to a perfect capture: one function each, with its truth."""
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -8,14 +9,152 @@ import xarray as xr
 
 from dbthermal import planck, schema
 from dbthermal.correction import lag_coefficients
-from dbthermal.simulation._clocks import repeat_frames
+from dbthermal.simulation._rig import observe
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 SPOILED: Final = ("good", "noisy", "blinking", "stuck")
 """Kinds of pixel of `spoil_pixels`, by their number."""
 
-_MEANINGS = " ".join(SPOILED)
+_STAMP: Final = {"units": "s", "long_name": "time of exposure"}
+
+
+def expose(
+    scene: xr.Dataset,
+    response: xr.Dataset,
+    rng: np.random.Generator,
+    *,
+    every: int | Sequence[int],
+    offsets: Sequence[int],
+    frames: int,
+) -> xr.Dataset:
+    r"""
+    Capture of bands that expose at times of their own: the stage `corrected`, with time stamps.
+
+    The scene is on a fine clock. Frame n of band m is exposed at its step
+
+    .. math:: o_m + n \, q_m
+
+    Parameters
+    ----------
+    scene : Dataset
+        See `observe`; its times are finer than the frames'.
+    response : Dataset
+        With `noise`, e.g. from `Rig.response`.
+    rng : Generator
+        Source of the noise.
+    every : int or sequence of int
+        q, steps of the fine clock from frame to frame; of each band, or of all.
+    offsets : sequence of int
+        o, step of each band's first frame.
+    frames : int
+        Number of frames.
+
+    Returns
+    -------
+    Dataset
+        `counts` (band, time, y, x) [count], and `exposure_time` (band, time) [s], the true times
+        on the scene's clock: drop the variable for cameras without stamps. `time` is that of the
+        first band.
+
+    Raises
+    ------
+    ValueError
+        If there are not as many offsets and rates as bands, or a frame lies outside the scene.
+    """
+    bands, last = response.sizes["band"], scene.sizes["time"] - 1
+    rates = [every] * bands if isinstance(every, int) else list(every)
+    if not len(rates) == len(offsets) == bands:
+        raise ValueError(f"Invalid every {every} and offsets {offsets}. Must be one for each band.")
+    steps = np.array(
+        [offset + np.arange(frames) * rate for offset, rate in zip(offsets, rates, strict=True)]
+    )
+    if min(rates) < 1 or steps.min() < 0 or steps.max() > last:
+        raise ValueError(
+            f"Invalid frames at steps {steps.min()} to {steps.max()}, every {every}. Must increase "
+            f"and lie in [0, {last}], the steps of the scene."
+        )
+    stamps = scene["time"].values[steps]
+    parts = [
+        observe(scene.isel(time=row), response.isel(band=[place]), rng).assign_coords(
+            time=("time", stamps[0], scene["time"].attrs)
+        )
+        for place, row in enumerate(steps)
+    ]
+    together = xr.concat(parts, dim="band", combine_attrs="override")
+    return schema.check(
+        together.assign(exposure_time=(("band", "time"), stamps, _STAMP)), "corrected"
+    )
+
+
+def drop_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
+    """
+    Lost frames of a driver that stamps the others: they follow one another without a gap.
+
+    Of a capture with `exposure_time` (band, time) [s], see `expose`, and a mask (band, time):
+    counts and stamps with each band's remaining frames first, NaN behind them.
+    """
+    _check_lost(corrected, lost)
+    counts, stamps = (
+        corrected[name].values.astype(np.float64 if name == "exposure_time" else np.float32)
+        for name in ("counts", "exposure_time")
+    )
+    for band, gone in enumerate(lost):
+        kept = np.count_nonzero(~gone)
+        for values in (counts[band], stamps[band]):
+            values[:kept] = values[~gone]
+            values[kept:] = np.nan
+    return _replaced(corrected, counts=counts, exposure_time=stamps)
+
+
+def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
+    """
+    Lost frames of a driver that returns the previous one again, and stamps none.
+
+    Of a mask (band, time) that must spare the first frames (ValueError): counts in which a lost
+    frame is a copy of the one before, without `exposure_time`.
+    """
+    _check_lost(corrected, lost)
+    if lost[:, 0].any():
+        raise ValueError("Invalid lost frames: a first one. Must have one before to be repeated.")
+    counts = corrected["counts"].values.copy()
+    for band, gone in enumerate(lost):
+        for frame in np.flatnonzero(gone):
+            counts[band, frame] = counts[band, frame - 1]
+    return _replaced(corrected.drop_vars("exposure_time", errors="ignore"), counts=counts)
+
+
+def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
+    """
+    Frames lost at random in each band, each replaced by the one before, as by `repeat_frames`.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`.
+    share : float
+        Share of frames that are lost [1].
+    rng : Generator
+        Source of the losses.
+
+    Returns
+    -------
+    Dataset
+        The capture with frames repeated, and `repeated` (band, time), bool.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the capture is not as `schema` has it, or the share does not lie in [0, 1).
+    """
+    counts = schema.check(corrected, "corrected")["counts"]
+    if not 0 <= share < 1:
+        raise ValueError(f"Invalid share {share} of lost frames. Must lie in [0, 1).")
+    lost = rng.random(counts.shape[:2]) < share
+    lost[:, 0] = False  # no frame before it to be repeated
+    truth = {"units": "1", "long_name": "repeats the frame before"}
+    return repeat_frames(corrected, lost).assign(repeated=(("band", "time"), lost, truth))
 
 
 def fire_shutter(
@@ -28,22 +167,22 @@ def fire_shutter(
     bands: tuple[str, ...] | None = None,
 ) -> xr.Dataset:
     """
-    Close the shutter: a frozen image, then offsets that are new.
+    Shutter events: a frozen image while it is closed, new offsets of the pixels afterwards.
 
     Parameters
     ----------
     corrected : Dataset
         Stage `corrected` of `schema`.
     times : array_like, shape (event,)
-        When the shutter closes [s]; the last frame taken by then is repeated.
+        Times at which the shutter closes [s]; the last frame taken by then is repeated.
     rng : Generator
         Source of the offsets.
     duration : float
-        How long it stays closed [s].
+        Time for which it stays closed [s].
     offset_std : float
         Standard deviation of a pixel's step [count].
     bands : tuple of str, optional
-        Bands whose cameras fire; by default all.
+        Bands whose cameras close; by default all.
 
     Returns
     -------
@@ -74,38 +213,6 @@ def fire_shutter(
     return corrected.assign(counts=counts)
 
 
-def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
-    """
-    Lose frames on the way: the driver hands on the one before, in each band by itself.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`.
-    share : float
-        Share of frames that are lost [1].
-    rng : Generator
-        Source of the losses.
-
-    Returns
-    -------
-    Dataset
-        The capture with frames repeated, and `repeated` (band, time), bool.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not as `schema` has it, or the share does not lie in [0, 1).
-    """
-    counts = schema.check(corrected, "corrected")["counts"]
-    if not 0 <= share < 1:
-        raise ValueError(f"Invalid share {share} of lost frames. Must lie in [0, 1).")
-    lost = rng.random(counts.shape[:2]) < share
-    lost[:, 0] = False  # there is none before
-    truth = {"units": "1", "long_name": "repeats the frame before"}
-    return repeat_frames(corrected, lost).assign(repeated=(("band", "time"), lost, truth))
-
-
 def drift_pattern(
     corrected: xr.Dataset,
     rng: np.random.Generator,
@@ -114,7 +221,7 @@ def drift_pattern(
     pattern_std: float = 0.0,
 ) -> xr.Dataset:
     """
-    Let the offsets drift, in proportion to time from the first frame to the last.
+    Drift of the offsets, in proportion to time from the first frame to the last.
 
     Parameters
     ----------
@@ -161,7 +268,7 @@ def spoil_pixels(
     dwell: float = 3.0,
 ) -> xr.Dataset:
     """
-    Let pixels go bad: noisy, blinking between two levels (random telegraph signal), or stuck.
+    Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
 
     Parameters
     ----------
@@ -205,20 +312,21 @@ def spoil_pixels(
                 signal += (amplitude * _telegraph(time, dwell, rng)).astype(signal.dtype)
             case "stuck":
                 signal[:] = signal[0]
-    attrs = {"flag_values": np.arange(len(SPOILED), dtype=np.int8), "flag_meanings": _MEANINGS}
-    spoiled = (("band", "y", "x"), kind.astype(np.int8), {"units": "1", **attrs})
+    numbers = np.arange(len(SPOILED), dtype=np.int8)
+    attrs = {"units": "1", "flag_values": numbers, "flag_meanings": " ".join(SPOILED)}
+    spoiled = (("band", "y", "x"), kind.astype(np.int8), attrs)
     return corrected.assign(counts=counts, spoiled=spoiled)
 
 
 def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
     r"""
-    Let the pixels follow the scene with a first-order lag.
+    First-order thermal lag of the pixels behind the scene.
 
     .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
 
-    the exact solution of :math:`\tau \dot I = z - I` for a signal held from each frame to the
-    next, at rest before the first. What is given should be without noise: that of the read-out
-    does not pass through the pixel. `correction.undo_lag` is the inverse.
+    the exact solution of :math:`\tau \dot I = z - I` for a signal z held from each frame to the
+    next, at rest before the first. The input should be without noise: that of the read-out does
+    not pass through the pixel. `correction.undo_lag` is the inverse.
 
     Parameters
     ----------
@@ -257,7 +365,7 @@ def _floating(corrected: xr.Dataset) -> xr.DataArray:
 
 
 def _telegraph(time: Array, dwell: float, rng: np.random.Generator) -> Array:
-    """Random telegraph signal (time) of 0 and 1, that changes at least once."""
+    """Random telegraph signal (time) of 0 and 1 that changes at least once, at a mean dwell [s]."""
     chance = -np.expm1(-np.diff(time) / dwell)
     steps = np.flatnonzero(rng.random(chance.size) < chance)
     if steps.size == 0:
@@ -265,3 +373,18 @@ def _telegraph(time: Array, dwell: float, rng: np.random.Generator) -> Array:
     level = np.zeros(time.size)
     level[steps + 1] = 1.0
     return np.asarray(np.cumsum(level) % 2)
+
+
+def _check_lost(corrected: xr.Dataset, lost: Mask) -> None:
+    """Refuse a mask that is not of bool, (band, time)."""
+    expected = corrected["counts"].shape[:2]
+    if lost.shape != expected or lost.dtype != bool:
+        raise ValueError(
+            f"Invalid lost frames {lost.shape} of {lost.dtype}. Must be {expected} of bool."
+        )
+
+
+def _replaced(corrected: xr.Dataset, **values: npt.NDArray[Any]) -> xr.Dataset:
+    return corrected.assign(
+        {name: corrected[name].copy(data=part) for name, part in values.items()}
+    )

@@ -6,8 +6,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import bands, calibration, mixing, planck, schema
-from dbthermal import correction as frames
+from dbthermal import bands, calibration, correction, mixing, planck, schema
 from dbthermal import response as responses
 from dbthermal.response import require_range
 
@@ -18,7 +17,7 @@ _SLOPE_TEMPERATURE: Final = 300.0
 @dataclass(frozen=True)
 class Rig:
     """
-    Two cameras of which one looks through a filter, as counts.
+    Two cameras, one of which looks through a filter, in counts.
 
     The defaults are round figures for the camera of the paper: a 16-bit 640x512 microbolometer,
     about 115 counts/K near 300 K and NETD 20-40 mK without a filter; behind a filter the counts
@@ -40,6 +39,19 @@ class Rig:
         Fixed pattern from pixel to pixel: relative gain [1] and offset [count].
     bad_fraction : float
         Fraction of dead pixels [1].
+
+    Raises
+    ------
+    ValueError
+        If a band is unknown, the noise is not positive, one for each band, or the fraction of dead
+        pixels lies outside [0, 1).
+
+    Examples
+    --------
+    >>> from dbthermal import simulation
+    >>> response = simulation.Rig(noise=(0.04, 0.4)).response()
+    >>> response["netd"].values.round(3).tolist()
+    [0.04, 0.4]
     """
 
     bands: tuple[str, ...] = ("8-14", "9.5")
@@ -53,7 +65,7 @@ class Rig:
     bad_fraction: float = 0.001
 
     def __post_init__(self) -> None:
-        """Refuse bands that do not exist and numbers that are no rig."""
+        """Check bands, noise and fraction."""
         for name in self.bands:
             bands.get(name)
         if len(self.noise) != len(self.bands):
@@ -64,13 +76,10 @@ class Rig:
 
     def response(self) -> xr.Dataset:
         """
-        Response of the rig, from Planck's law in each band.
+        Response of the rig, from Planck's law in each band: the stage `response` with `noise`.
 
-        Returns
-        -------
-        Dataset
-            Stage `response` with `noise`: the Sakuma-Hattori curve through exact in-band
-            radiances, which it meets within 0.05 mK between -10 and 80 Celsius.
+        The Sakuma-Hattori curve through exact in-band radiances, which it meets within 0.05 mK
+        between -10 and 80 degrees Celsius.
         """
         temperature = np.linspace(self.lowest, self.highest, _CALIBRATION_POINTS)
         unit = self.counts_per_kelvin / bands.get("8-14").slope(_SLOPE_TEMPERATURE)
@@ -80,6 +89,7 @@ class Rig:
             coords={"band": list(self.bands), "temperature": temperature},
         )
         noiseless = calibration.fit_response(counts)
+        # Noise in counts: NETD times the slope of the response near 25 degrees Celsius.
         slopes = [responses.curve(noiseless, name).reference_slope for name in self.bands]
         noise = xr.DataArray(
             np.array(self.noise) * slopes, dims="band", coords={"band": list(self.bands)}
@@ -91,8 +101,11 @@ class Rig:
 def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
     """Counts of a blackbody in each band; a temperature may be one for each of the bands."""
     names = [str(name) for name in response["band"].values]
+    parts = [temperature] * len(names)
+    if "band" in temperature.dims:
+        places = schema.band_positions(temperature, names, str(temperature.name))
+        parts = [temperature.isel(band=place) for place in places]
     curves = [responses.curve(response, name) for name in names]
-    parts = _of_bands(temperature, names)
     checked = [
         require_range(part.values, curve, str(temperature.name))
         for part, curve in zip(parts, curves, strict=True)
@@ -100,26 +113,18 @@ def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarr
     return [curve.counts(values) for curve, values in zip(curves, checked, strict=True)]
 
 
-def _of_bands(temperature: xr.DataArray, names: list[str]) -> list[xr.DataArray]:
-    """Temperature in each band: its own where there is a dimension band, else the same in all."""
-    if "band" not in temperature.dims:
-        return [temperature] * len(names)
-    places = schema.band_positions(temperature, names, str(temperature.name))
-    return [temperature.isel(band=place) for place in places]
-
-
 def observe(
     scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator, dtype: str = "float32"
 ) -> xr.Dataset:
     r"""
-    What a perfectly corrected rig would see of a scene: the stage `corrected`.
+    Counts of a scene in a perfectly corrected rig: the stage `corrected`.
 
     .. math:: I_m = e_m U_m(x) + (1 - e_m) U_m(y) + \mathrm{noise}
 
     Parameters
     ----------
     scene : Dataset
-        From `scenes` or `twins`: object and background temperature (time, y, x) [K], emissivity
+        As from `scene`: object and background temperature (time, y, x) [K], emissivity
         (band, y, x) [1]. The background may be one for each band, (band, time, y, x), as two
         cameras see it that stand side by side.
     response : Dataset
@@ -138,6 +143,19 @@ def observe(
     ------
     ValueError
         If a temperature lies outside the response, or a band is missing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from dbthermal import simulation
+    >>> glass = xr.DataArray([0.86, 0.72], coords={"band": ["8-14", "9.5"]}, dims="band")
+    >>> time, still = np.arange(100) / 10.0, np.full((100, 1, 1), 300.0)
+    >>> truth = simulation.scene(time, still, still, glass)
+    >>> rng = np.random.default_rng(1)
+    >>> corrected = simulation.observe(truth, simulation.Rig().response(), rng)
+    >>> corrected["counts"].mean("time").squeeze().values.round().tolist()
+    [23040.0, 16182.0]
     """
     emitted = _blackbody(response, scene["object_temperature"])
     reflected = _blackbody(response, scene["background_temperature"])
@@ -149,16 +167,12 @@ def observe(
         clean = mixing.leaving(emissivity, emitted[index], reflected[index])
         noise = float(response["noise"].sel(band=name))
         movie[index] = clean + rng.normal(0.0, noise, clean.shape)
+    twin = {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
     return xr.Dataset(
         {"counts": (schema.STAGES["corrected"]["counts"].dims, movie)},
         coords={"band": names, **{name: scene[name] for name in ("time", "y", "x")}},
-        attrs={"origin": "simulated", **_twin(scene)},
-    ).pipe(_describe, "corrected")
-
-
-def _twin(scene: xr.Dataset) -> dict[str, str]:
-    """Attribute that names what a scene is a simulated twin of, if it is one."""
-    return {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
+        attrs={"origin": "simulated", **twin},
+    ).pipe(_described, "corrected")
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
@@ -227,7 +241,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
         counts[index] = digitise(movie.values, _of_band(detector, str(movie["band"].item())))
-    return corrected.assign(counts=(corrected["counts"].dims, counts)).pipe(_describe, "capture")
+    return corrected.assign(counts=(corrected["counts"].dims, counts)).pipe(_described, "capture")
 
 
 def blackbody_movies(
@@ -269,9 +283,9 @@ def blackbody_movies(
     level = xr.DataArray(temperatures, dims="temperature", name="temperature")
     movies = np.empty((len(rig.bands), len(temperatures), *shape), dtype=np.uint16)
     for index, counts in enumerate(_blackbody(response, level)):
-        noise, here = float(response["noise"][index]), _of_band(detector, rig.bands[index])
+        noise, of_band = float(response["noise"][index]), _of_band(detector, rig.bands[index])
         for place, mean in enumerate(counts):
-            movies[index, place] = digitise(mean + rng.normal(0.0, noise, shape), here)
+            movies[index, place] = digitise(mean + rng.normal(0.0, noise, shape), of_band)
     return xr.Dataset(
         {"counts": (("band", "temperature", "frame", "y", "x"), movies, {"units": "count"})},
         coords={
@@ -304,20 +318,22 @@ def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
         If a count does not fit into 16 bits.
     """
     raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
-    if not (raw.min() >= 0 and raw.max() <= frames.DETECTOR_MAXIMUM):  # a NaN fails it, too
+    if not (raw.min() >= 0 and raw.max() <= correction.DETECTOR_MAXIMUM):  # a NaN fails it, too
         raise ValueError(
             f"Invalid counts {raw.min()} to {raw.max()} in band '{detector['band'].item()}'. "
-            f"Must lie in [0, {frames.DETECTOR_MAXIMUM}]."
+            f"Must lie in [0, {correction.DETECTOR_MAXIMUM}]."
         )
     return np.where(detector["dead"].values, 0, raw).astype(np.uint16)
 
 
 def _of_band(detector: xr.Dataset, band: str) -> xr.Dataset:
+    """Pattern (y, x) of one band."""
     schema.band_positions(detector, [band], "the detector")
     return detector.sel(band=band)
 
 
-def _describe(dataset: xr.Dataset, stage: str) -> xr.Dataset:
+def _described(dataset: xr.Dataset, stage: str) -> xr.Dataset:
+    """Dataset with the attributes of a stage, checked."""
     dataset["counts"].attrs.update(schema.STAGES[stage]["counts"].attrs)
     dataset["time"].attrs.setdefault("units", "s")
     return schema.check(dataset, stage)

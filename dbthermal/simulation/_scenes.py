@@ -9,7 +9,6 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
-from dbthermal.simulation._times import increasing
 
 Array = npt.NDArray[np.float64]
 
@@ -20,13 +19,13 @@ BACKGROUNDS: Final = ("pulses", "random walk", "still")
 @dataclass(frozen=True)
 class Background:
     """
-    How the background moves.
+    Temporal variation of the background.
 
     Attributes
     ----------
     kind : {"pulses", "random walk", "still"}
-        Someone walking by now and then; a background that never rests (a first-order
-        autoregressive process); or none.
+        People who walk by now and then; a background that never rests (a first-order
+        autoregressive process); or a constant one.
     level : float
         Resting temperature [K].
     amplitude : float
@@ -39,6 +38,11 @@ class Background:
         Correlation time of the walk [s].
     drift : float
         Change of the resting temperature over the capture, linear in time [K].
+
+    Raises
+    ------
+    ValueError
+        If the kind is unknown, a range falls, or a time is not positive.
     """
 
     kind: str = "pulses"
@@ -50,7 +54,7 @@ class Background:
     drift: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse kinds that do not exist, and numbers that are no background."""
+        """Check the kind and the numbers."""
         if self.kind not in BACKGROUNDS:
             raise ValueError(f"Unknown background '{self.kind}'. Must be one of {BACKGROUNDS}.")
         if not 0 <= self.count[0] <= self.count[1]:
@@ -61,28 +65,7 @@ class Background:
             raise ValueError(f"Invalid memory {self.memory} s. Must be positive.")
 
     def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
-        """
-        Draw one realisation for each pixel.
-
-        Parameters
-        ----------
-        time : ndarray, shape (time,)
-            Times [s], two or more.
-        pixels : int
-            Number of pixels.
-        rng : Generator
-            Source of randomness.
-
-        Returns
-        -------
-        ndarray, shape (time, pixels)
-            Background temperature [K].
-
-        Raises
-        ------
-        ValueError
-            If there are fewer than two times, or they do not increase.
-        """
+        """Background temperature (time, pixel) [K], one realisation a pixel, at times [s]."""
         increasing(time, "a background")
         change = np.zeros((time.size, pixels))
         if self.kind == "pulses":
@@ -106,6 +89,7 @@ class Background:
         change = np.empty((time.size, pixels))
         change[0] = rng.standard_normal(pixels)
         for frame in range(1, time.size):
+            # AR(1) of unit variance: correlation exp(-dt / memory) from frame to frame.
             kept = np.exp(-(time[frame] - time[frame - 1]) / self.memory)
             fresh = np.sqrt(1.0 - kept**2) * rng.standard_normal(pixels)
             change[frame] = kept * change[frame - 1] + fresh
@@ -138,7 +122,7 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     Raises
     ------
     ValueError
-        If there are fewer than two times, they do not increase, or a time constant is not positive.
+        If the times do not increase, or a time constant is not positive.
     """
     increasing(time, "a heating")
     constant = planck.require_positive("time_constant [s]", time_constant)
@@ -151,12 +135,12 @@ def scene(
     time: Array, object_temperature: Array, background_temperature: Array, emissivity: xr.DataArray
 ) -> xr.Dataset:
     """
-    Put a scene together.
+    Scene of given temperatures and emissivity.
 
     Parameters
     ----------
     time : ndarray, shape (time,)
-        Times [s].
+        Times [s], two or more, increasing.
     object_temperature, background_temperature : ndarray, shape (time, y, x)
         Temperatures [K].
     emissivity : DataArray
@@ -167,48 +151,36 @@ def scene(
     Dataset
         The truth: names, dims and units of the stage `separated` without its deviations.
     """
+    increasing(time, "a scene")
     stage = schema.STAGES["separated"]
     height, width = object_temperature.shape[1:]
-    rows, columns = np.arange(height), np.arange(width)
-    spread = emissivity.values.reshape(emissivity.shape[0], *emissivity.shape[1:] or (1, 1))
-    spread = np.broadcast_to(spread, (emissivity.shape[0], height, width))
+    values = emissivity.values.reshape(emissivity.shape[0], *emissivity.shape[1:] or (1, 1))
+    values = np.broadcast_to(values, (emissivity.shape[0], height, width))
     return xr.Dataset(
         {
             "object_temperature": (("time", "y", "x"), object_temperature),
             "background_temperature": (("time", "y", "x"), background_temperature),
-            "emissivity": (("band", "y", "x"), spread),
+            "emissivity": (("band", "y", "x"), values),
         },
         coords={
             "band": emissivity["band"].values,
             "time": ("time", time, {"units": "s"}),
-            "y": rows,
-            "x": columns,
+            "y": np.arange(height),
+            "x": np.arange(width),
         },
         attrs={"origin": "simulated"},
     ).map(lambda variable: variable.assign_attrs(stage[str(variable.name)].attrs))
 
 
 def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArray:
-    """
-    Panels of several materials from left to right, of equal width.
+    """Emissivity (band, y, x) [1] of panels of equal width, one a material, from (material, band).
 
-    Parameters
-    ----------
-    emissivity : DataArray
-        (material, band) [1].
-    shape : tuple of int
-        Rows and columns of the image.
-
-    Returns
-    -------
-    DataArray
-        (band, y, x) [1].
+    The shape is that of the image: rows and columns.
     """
     panel = np.arange(shape[1]) * emissivity.sizes["material"] // shape[1]
     columns = emissivity.values[panel].T[:, np.newaxis, :]
-    spread = np.broadcast_to(columns, (emissivity.sizes["band"], *shape))
     return xr.DataArray(
-        spread,
+        np.broadcast_to(columns, (emissivity.sizes["band"], *shape)),
         dims=("band", "y", "x"),
         coords={"band": emissivity["band"].values},
         attrs={"units": "1"},
@@ -227,7 +199,7 @@ def independent_pixels(
     time_constant: tuple[float, float] = (8.0, 20.0),
 ) -> xr.Dataset:
     """
-    Many pixels of one material, each with a heating curve and a background of its own.
+    Scene of many pixels of one material, each with its own heating curve and background.
 
     Parameters
     ----------
@@ -236,7 +208,7 @@ def independent_pixels(
     emissivity : DataArray
         (band) [1].
     background : Background
-        How the background moves.
+        Variation of the background.
     pixels : int
         Number of pixels.
     rng : Generator
@@ -249,7 +221,7 @@ def independent_pixels(
     Returns
     -------
     Dataset
-        A scene one row high.
+        A scene one row high, see `scene`.
     """
     constants = rng.uniform(*time_constant, pixels)
     warm = heating(time, start, stop, constants)
@@ -268,7 +240,7 @@ def walkers(
     time_constant: float = 12.0,
 ) -> xr.Dataset:
     """
-    A plate heated in its middle, in which people who walk by are reflected: a simulated twin.
+    Simulated twin of a plate heated in its middle that reflects people who walk by.
 
     Each person is an upright ellipse with a head, warmer than the room, that crosses the view
     once at a steady pace. Along an edge of the silhouette the reflection is abrupt.
@@ -284,16 +256,28 @@ def walkers(
     rng : Generator
         Source of the paths.
     temperatures : sequence of float
-        Of the room, of people, and of the plate's middle at the end [K].
+        Temperatures of the room, of people, and of the plate's middle at the end [K].
     crossings : int
         Number of people.
     time_constant : float
-        Of the heating [s].
+        Time constant of the heating [s].
 
     Returns
     -------
     Dataset
-        The scene.
+        The scene, see `scene`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dbthermal import emissivity, simulation
+    >>> table = emissivity.embedded_table()["emissivity"]
+    >>> glass = table.sel(material="plate window glass", band=["8-14", "9.5"], drop=True)
+    >>> rng = np.random.default_rng(1)
+    >>> truth = simulation.walkers(np.arange(50) / 10.0, (24, 32), glass, rng)
+    >>> capture = simulation.observe(truth, simulation.Rig().response(), rng)
+    >>> dict(capture["counts"].sizes)
+    {'band': 2, 'time': 50, 'y': 24, 'x': 32}
     """
     level, skin, hottest = temperatures
     height, width = shape
@@ -310,8 +294,22 @@ def walkers(
     for start in starts:
         pace = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2)
         centre = np.sign(pace) * -1.6 + pace * (time - start)
-        apart = columns - centre[:, np.newaxis, np.newaxis]
-        body = (apart / 0.30) ** 2 + ((rows - 0.55) / 0.75) ** 2 < 1
-        head = (apart / 0.14) ** 2 + ((rows + 0.35) / 0.2) ** 2 < 1
+        distance = columns - centre[:, np.newaxis, np.newaxis]
+        body = (distance / 0.30) ** 2 + ((rows - 0.55) / 0.75) ** 2 < 1
+        head = (distance / 0.14) ** 2 + ((rows + 0.35) / 0.2) ** 2 < 1
         cold[body | head] = skin
     return scene(time, warm, cold, emissivity)
+
+
+def increasing(times: npt.ArrayLike, name: str) -> Array:
+    """Times (time,) [s] of what `name` says: two or more, finite, increasing; or a ValueError."""
+    array = np.asarray(times, dtype=np.float64)
+    if array.ndim != 1 or array.size < 2:
+        raise ValueError(f"Invalid times of shape {array.shape} of {name}. Must be two or more.")
+    # A NaN fails the comparison, too.
+    wrong = np.flatnonzero(~np.isfinite(array) | ~(np.diff(array, prepend=-np.inf) > 0))
+    if wrong.size:
+        raise ValueError(
+            f"Invalid time {array[wrong[0]]} s of {name}. Must be finite, and increase strictly."
+        )
+    return array

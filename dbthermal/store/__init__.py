@@ -6,7 +6,7 @@ chunks and survives a kill or a power loss. No other package opens or writes zar
 """
 
 from dbthermal.store._provenance import checksum, provenance
-from dbthermal.store._recording import Recording, recover
+from dbthermal.store._recording import Recording
 from dbthermal.store._results import (
     Number,
     open_dataset,
@@ -25,7 +25,6 @@ __all__ = [
     "open_dataset",
     "provenance",
     "read_numbers",
-    "recover",
     "save",
     "save_figure",
     "save_numbers",

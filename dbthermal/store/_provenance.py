@@ -29,7 +29,7 @@ def provenance(
     ----------
     parameters : mapping
         Name to value, as in the notebook's parameters cell: finite numbers, strings, booleans,
-        None, and lists and mappings of these.
+        None, and lists and mappings of these; TypeError or ValueError for any other.
     inputs : mapping, optional
         Name to path of each file, or folder such as a zarr store, that was read. Only its checksum
         is kept.
@@ -40,13 +40,6 @@ def provenance(
         ``parameters``; ``versions`` of Python, dbthermal and its core dependencies; ``commit``, 40
         hexadecimal digits, with ``-dirty`` if tracked files differ from it, or ``"unknown"``
         outside a git work tree; and ``inputs``, name to sha256.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a parameter is of another type, or not finite; the message names it.
-    FileNotFoundError
-        If an input does not exist.
 
     Examples
     --------
@@ -68,22 +61,9 @@ def provenance(
 
 def checksum(path: str | Path) -> str:
     """
-    SHA-256 of a file, or of a folder's file names and contents.
+    SHA-256 of a file, as of ``sha256sum``, or of a folder's file names and contents.
 
-    Parameters
-    ----------
-    path : str or Path
-        A file; or a folder, whose files are taken in the order of their names.
-
-    Returns
-    -------
-    str
-        64 hexadecimal digits. For a file, the output of ``sha256sum``.
-
-    Raises
-    ------
-    FileNotFoundError
-        If `path` does not exist.
+    FileNotFoundError if `path` does not exist.
     """
     path = Path(path)
     if not path.is_dir():

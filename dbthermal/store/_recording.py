@@ -59,24 +59,11 @@ class Recording:
         fills: Mapping[str, float] | None = None,
     ) -> Self:
         """
-        Make an empty recording in a new folder ``*.zarr``.
+        Make an empty recording in a new folder ``*.zarr``; FileExistsError if it exists.
 
-        Parameters
-        ----------
-        path : str or Path
-            Folder to make. FileExistsError if it exists: a recording is never overwritten.
-        variables : mapping
-            Name to `Variable` of dims (band, time, ...), frame by frame, or (log,), row by row.
-        sizes : mapping
-            Size of every other dim, such as ``y`` and ``x``.
-        bands : sequence of str
-            Names of the bands.
-        chunk : int
-            Frames of a chunk: a kill costs at most that many of a band.
-        attrs : mapping
-            JSON: identities, provenance.
-        fills : mapping, optional
-            Value of a variable behind a band's last frame, instead of NaN or 0.
+        `variables` are of dims (band, time, ...), frame by frame, or (log,), row by row, and
+        `sizes` has their other dims. `chunk` is the number of frames that a kill costs at most,
+        `attrs` are JSON, and `fills` are values behind a band's last frame, instead of NaN or 0.
         """
         path = Path(path)
         if path.suffix != ".zarr":
@@ -196,31 +183,8 @@ class Recording:
         tree_to_disk([self.path / name / chunk for name in names for chunk in chunks], self.path)
 
 
-def recover(path: str | Path) -> None:
-    """
-    Close a recording that was cut short, with all its frames; it stays incomplete.
-
-    Not needed for reading: `dbthermal.store.open_dataset` opens as many frames as all bands have.
-
-    Parameters
-    ----------
-    path : str or Path
-        Folder ``*.zarr`` that no program is writing. Attribute ``ended`` becomes ``"cut short"``.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    ValueError
-        If it is not a recording that was cut short.
-    """
-    attrs = attributes(path)
-    if attrs.get("complete", True) or attrs.get("closed", False):
-        raise ValueError(f"Invalid recording '{path}'. Must be one that was cut short.")
-    group = _open(path)
-    arrays = [array for array in dict(group.arrays()).values() if _is_movie(array)]
-    recording = Recording(Path(path), group, arrays[0].chunks[1], attrs)
-    recording.close(complete=False, ended="cut short")
+def _open(path: str | Path) -> zarr.Group:
+    return zarr.open_group(DurableStore(path), mode="r+", use_consolidated=False)
 
 
 def attributes(path: str | Path) -> dict[str, Any]:
@@ -280,7 +244,3 @@ def _grow(array: Any, axis: int, size: int) -> None:
         chunk = array.chunks[axis]
         room = max(2 * array.shape[axis], math.ceil(size / chunk) * chunk)
         array.resize((*array.shape[:axis], room, *array.shape[axis + 1 :]))
-
-
-def _open(path: str | Path) -> zarr.Group:
-    return zarr.open_group(DurableStore(path), mode="r+", use_consolidated=False)

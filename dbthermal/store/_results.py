@@ -49,23 +49,28 @@ def _chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
 
 
 def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """Write a dataset as zarr (format 3, not consolidated), in place of what the path held.
+    """
+    Save a dataset as zarr (format 3, not consolidated), in place of an earlier one.
 
     Parameters
     ----------
     dataset : Dataset
-        Of any stage; it is not changed. Encodings left from an earlier file are not used.
+        Of any stage; it is not changed.
     path : str or Path
-        Folder to write, ``*.zarr``. Its parents are made.
+        Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
     provenance : mapping
         From `dbthermal.store.provenance`; becomes ``attrs["provenance"]``.
 
-    Raises
-    ------
-    ValueError
-        If `path` does not end in ``.zarr``, or `provenance` holds a number that is not finite.
+    Examples
+    --------
+    >>> from dbthermal import store
+    >>> folder = getfixture("tmp_path")
+    >>> store.save(xr.Dataset({"counts": ("band", [3, 4])}), folder / "a.zarr", {})
+    >>> store.open_dataset(folder / "a.zarr").counts.values.tolist()
+    [3, 4]
     """
-    plain = _with_variable_length_strings(dataset.drop_encoding())
+    # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
+    plain = _with_text_as(dataset.drop_encoding(), "U", np.dtypes.StringDType())
     plain.attrs = {**dataset.attrs, "provenance": json.loads(_json(provenance))}
     encoding = {name: {"chunks": _chunks(variable)} for name, variable in plain.variables.items()}
     with _whole(path, ".zarr") as part:
@@ -73,26 +78,22 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
-    """Open what `save` or a `Recording` wrote; values are read when they are used.
+    """
+    Open a saved dataset or a recording; values are read when they are used.
 
     A recording that was cut short, or is being written, opens as far as all bands are valid; its
-    attributes say ``complete`` = False and, in ``frames_written``, where each band ends.
+    attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
 
     Parameters
     ----------
     path : str or Path
-        Folder ``*.zarr``.
+        Folder ``*.zarr`` (FileNotFoundError if it does not exist).
 
     Returns
     -------
     Dataset
         Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
         fixed-length kind.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no folder at `path`.
     """
     if not Path(path).is_dir():
         raise FileNotFoundError(
@@ -101,7 +102,7 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     attrs = recording.attributes(path)
     cut_short = not attrs.get("closed", True)
     dataset = _open_valid_part(Path(path), attrs) if cut_short else _open(path)
-    return _with_fixed_length_strings(dataset)
+    return _with_text_as(dataset, "T", np.dtype(str))
 
 
 def _open(path: str | Path, leave: Iterable[str] = ()) -> xr.Dataset:
@@ -126,22 +127,18 @@ def _open_valid_part(path: Path, attrs: Mapping[str, Any]) -> xr.Dataset:
 def save_numbers(
     numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
 ) -> None:
-    """Write a notebook's headline numbers as strict JSON, with sorted names.
+    """
+    Save headline numbers as strict JSON, with sorted names.
 
     Parameters
     ----------
     numbers : mapping
-        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean; NumPy
-        scalars too.
+        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean;
+        TypeError or ValueError for any other value.
     path : str or Path
-        File to write, ``*.json``. Its parents are made.
+        File ``*.json``. Its parents are made.
     provenance : mapping
         From `dbthermal.store.provenance`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a value is of another type or not finite, or `path` does not end in ``.json``.
     """
     content = {
         "numbers": {name: _number(name, value) for name, value in numbers.items()},
@@ -152,25 +149,7 @@ def save_numbers(
 
 
 def read_numbers(path: str | Path) -> dict[str, Number]:
-    """Read the headline numbers that `save_numbers` wrote.
-
-    Parameters
-    ----------
-    path : str or Path
-        File ``*.json``.
-
-    Returns
-    -------
-    dict
-        Name to value.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If the file is not strict JSON, or holds no numbers.
-    """
+    """Read a file of `save_numbers`: name to value. ValueError if it is not such a file."""
 
     def refuse(constant: str) -> NoReturn:
         raise ValueError(f"Invalid number {constant} in '{path}'. Must be finite.")
@@ -182,22 +161,7 @@ def read_numbers(path: str | Path) -> dict[str, Number]:
 
 
 def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """Write a text in Markdown, the record of what made it in a comment at its end.
-
-    Parameters
-    ----------
-    text : str
-        The text.
-    path : str or Path
-        File to write, ``*.md``. Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`.
-
-    Raises
-    ------
-    ValueError
-        If `path` does not end in ``.md``, or `provenance` holds a number that is not finite.
-    """
+    """Save a text in Markdown (``*.md``), with its provenance in a comment at its end."""
     comment = f"\n<!-- {_json(provenance)} -->\n"
     with _whole(path, ".md") as part:
         part.write_text(text + comment, encoding="utf-8")
@@ -206,23 +170,19 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
 def save_figure(
     figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
 ) -> None:
-    """Write a figure as PNG, the same bytes for the same figure.
+    """
+    Save a figure as PNG, the same bytes for the same figure.
 
     Parameters
     ----------
     figure : Figure
         Of matplotlib; it stays open.
     path : str or Path
-        File to write, ``*.png``. Its parents are made.
+        File ``*.png``. Its parents are made.
     provenance : mapping
         From `dbthermal.store.provenance`; becomes the text chunk ``Comment``, as JSON.
     dpi : int
-        Resolution [pixel/inch], for that of the figure depends on where it is shown.
-
-    Raises
-    ------
-    ValueError
-        If `path` does not end in ``.png``, or `provenance` holds a number that is not finite.
+        Resolution [pixel/inch].
     """
     metadata = {"Software": "dbthermal", "Comment": _json(provenance)}
     with _whole(path, ".png") as part:
@@ -236,23 +196,19 @@ def save_video(
     *,
     rate: float,
 ) -> None:
-    """Write a film as H.264 in MP4, as browsers play it.
+    """
+    Save a film as H.264 in MP4, as browsers play it.
 
     Parameters
     ----------
     frames : iterable of ndarray of uint8, shape (rows, columns, 3)
-        Colours; at least one frame, all of one size, both sizes even.
+        Colours; at least one frame, all of one size, both sizes even, else ValueError.
     path : str or Path
-        File to write, ``*.mp4``. Its parents are made.
+        File ``*.mp4``. Its parents are made.
     provenance : mapping
         From `dbthermal.store.provenance`; becomes the file's comment, as JSON.
     rate : float
         Frame rate [Hz].
-
-    Raises
-    ------
-    ValueError
-        If `path` does not end in ``.mp4``, there is no frame, or a size is odd or changes.
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 
@@ -277,7 +233,7 @@ def save_video(
 
 @contextmanager
 def _whole(path: str | Path, suffix: str) -> Iterator[Path]:
-    """Give a place beside `path` to write to; move it there if nothing was raised, else drop it."""
+    """Yield a place beside `path` to write to; move it to `path` unless an error is raised."""
     path = Path(path)
     if path.suffix != suffix:
         raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
@@ -295,7 +251,7 @@ def _json(content: Mapping[str, Any], indent: int | None = None) -> str:
 
 
 def _number(name: str, value: object) -> Number:
-    """Return a headline value as a plain Python one."""
+    """Headline value as a plain Python one."""
     plain = value.item() if isinstance(value, np.generic) else value
     if not isinstance(plain, (bool, int, float, str)):
         raise TypeError(f"Invalid {name!r} = {value!r}. Must be a number, a string or a boolean.")
@@ -304,17 +260,8 @@ def _number(name: str, value: object) -> Number:
     return plain
 
 
-def _with_variable_length_strings(dataset: xr.Dataset) -> xr.Dataset:
-    """Convert text to the only kind that zarr's format 3 specifies."""
-    return _with_text_as(dataset, "U", np.dtypes.StringDType())
-
-
-def _with_fixed_length_strings(dataset: xr.Dataset) -> xr.Dataset:
-    """Convert text to the kind that NumPy makes of Python's strings."""
-    return _with_text_as(dataset, "T", np.dtype(str))
-
-
 def _with_text_as(dataset: xr.Dataset, kind: str, dtype: np.dtype[Any]) -> xr.Dataset:
+    """Convert text of one of NumPy's kinds to another one."""
     texts = {
         name: (variable.dims, variable.to_numpy().astype(object).astype(dtype), variable.attrs)
         for name, variable in dataset.variables.items()

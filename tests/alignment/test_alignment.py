@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal import alignment, separation, simulation
-from dbthermal.simulation import Background, Rig
-from dbthermal.simulation._clocks import drop_frames, expose, repeat_frames
+from dbthermal.simulation import Background, Rig, drop_frames, expose, repeat_frames
 
 RIG = Rig()
 FRAMES, STEPS, START = 350, 20, 80

@@ -10,9 +10,16 @@ import xarray as xr
 
 from dbthermal import calibration, response, schema
 from dbthermal.calibration import Bias
-from dbthermal.simulation import Rig
-from dbthermal.simulation._bench import Bench, bench_series, contact_measurements, reflector_series
-from dbthermal.simulation._samples import OBJECTS, Sample, band_emissivity
+from dbthermal.simulation import (
+    OBJECTS,
+    Bench,
+    Rig,
+    Sample,
+    band_emissivity,
+    bench_series,
+    contact_measurements,
+    reflector_series,
+)
 from reproduction.experiments.procedures import compare_procedures, reflector_sensitivity
 
 STDS = (0.2, 0.3)  # of a contact reading and of the foil [K]
@@ -26,7 +33,7 @@ NO_ERRORS = Bench(
     blackbody_tolerance=0.0,
     foil_emissivity=0.0,
     foil_std=1e-9,
-    direction=(0.0, 0.0),
+    mirrored_excess=(0.0, 0.0),
 )
 
 
@@ -238,7 +245,7 @@ def test_deviations_grow_with_the_correction(known: xr.Dataset) -> None:
 
 def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """A fit that is stopped before it stands still names its band."""
-    monkeypatch.setattr("dbthermal.calibration._contact._ITERATIONS", 1)
+    monkeypatch.setattr("dbthermal.calibration._emissivity._ITERATIONS", 1)
     rng = np.random.default_rng(0)
     series = bench_series(known, OBJECTS[0], Bench(), rng)
     with pytest.raises(ArithmeticError, match=r"No convergence in band '8-14': emissivity 0\."):
@@ -265,8 +272,8 @@ def test_bad_bias(options: dict[str, object], message: str) -> None:
     [
         ({"contact": (0.1, 0.0)}, r"Invalid contact \(0\.1, 0\.0\) of the bench"),
         ({"contact": (0.0, 1.0)}, r"Invalid contact .* in \[0\.0, 1\.0\)"),
-        ({"direction": (0.0, np.nan)}, r"Invalid direction \(0\.0, nan\)"),
-        ({"direction": (-np.inf, 0.0)}, r"Invalid direction \(-inf, 0\.0\)"),
+        ({"mirrored_excess": (0.0, np.nan)}, r"Invalid mirrored_excess \(0\.0, nan\)"),
+        ({"mirrored_excess": (-np.inf, 0.0)}, r"Invalid mirrored_excess \(-inf, 0\.0\)"),
         ({"probe_tolerance": np.nan}, r"Invalid probe_tolerance nan of the bench"),
         ({"logger_tolerance": -0.5}, r"Invalid logger_tolerance -0\.5"),
         ({"blackbody_tolerance": np.inf}, r"Invalid blackbody_tolerance inf"),

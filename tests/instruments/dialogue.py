@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from types import TracebackType
 from typing import Final
 
-from dbthermal.instruments.closing import Closing
+from dbthermal.instruments.transport import Closing
 
 Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]
 """What a driver must write, or None, and what the device answers, in one piece or in several."""

@@ -5,13 +5,12 @@ from collections.abc import Callable
 
 import numpy as np
 from faulty_apt import FaultyApt
+from faulty_boson import Fault, FaultyBoson
 from faulty_tc08 import FaultyTC08
+from loop import Loop
 
 from dbthermal.instruments import apt, fslp
 from dbthermal.instruments.boson import Boson
-from dbthermal.instruments.emulated.boson import EmulatedBoson
-from dbthermal.instruments.emulated.boson_faults import Fault
-from dbthermal.instruments.emulated.port import Loop
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
@@ -64,7 +63,7 @@ class BosonBench:
         self.clock = Clock()
         self.world = World(clock=self.clock)
         self.state = self.world.add_camera("boson", serial_number)
-        self.device = EmulatedBoson(self.world, "boson")
+        self.device = FaultyBoson(self.world, "boson")
         self.loop = Loop(self.device, clock=self.clock, sleep=self.clock.sleep)
         self.camera = Boson(self.loop, first_sequence=1, clock=self.clock, sleep=self.clock.sleep)
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from rig_devices import Clock
 
-from dbthermal.instruments.closing import Closing
-from dbthermal.instruments.transport import TransportError
+from dbthermal.instruments.transport import Closing, TransportError
 
 Numbers = MutableSequence[Any]
 

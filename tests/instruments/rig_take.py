@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from faulty_camera import Faults, FaultyCamera
 
 from dbthermal import store
 from dbthermal.instruments.camera import (
@@ -18,7 +19,6 @@ from dbthermal.instruments.camera import (
     FrameFlag,
     FrameSource,
 )
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Reading, notes, record
 from dbthermal.instruments.session import Camera, Device, Session
@@ -42,7 +42,7 @@ def session(duration: float = 1.0) -> Session:
     return Session("faults", True, "scene", duration, dict.fromkeys(BANDS, camera), RATE, SHAPE)
 
 
-class Witness(EmulatedCamera):
+class Witness(FaultyCamera):
     """An emulated camera that keeps what it gave."""
 
     def __post_init__(self) -> None:

@@ -11,11 +11,10 @@ import pytest
 from dbthermal import store
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import DAMAGED, GOOD, MEANINGS, Frame, FrameFlag
-from dbthermal.instruments.emulated.frames import EmulatedCamera
+from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import notes
 from dbthermal.instruments.recording._capture_file import NOTES, CaptureFile, Note
-from dbthermal.instruments.telemetry import Telemetry
 
 SHAPE, RATE, BANDS = (4, 80), 100.0, ("8-14", "9.5")
 IMAGE = np.full(SHAPE, 5000, dtype=np.uint16)
@@ -43,8 +42,8 @@ def shot(number: int, **changes: Any) -> Frame:
 
 def rows(last_correction: int, number: int = 0) -> np.ndarray[Any, np.dtype[np.uint16]]:
     """Telemetry rows of a camera whose last correction was at a frame."""
-    fields = Telemetry(last_ffc_frame=last_correction, frame_counter=number, fpa_temperature=308.2)
-    return telemetry.encode(fields, SHAPE[1])
+    counts = {"last_ffc_frame": last_correction, "frame_counter": number}
+    return telemetry.encode({**counts, "fpa_temperature": 308.2}, SHAPE[1])
 
 
 @pytest.mark.parametrize("wrong", [500.0, -500.0])

@@ -5,12 +5,13 @@ import threading
 from pathlib import Path
 
 import pytest
+from loop import Loop
 from test_transport import Echo
 
 from dbthermal.instruments import transport
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated import boson as emulated_boson
-from dbthermal.instruments.emulated.port import EmulatedPort, Loop
+from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import TransportError, open_serial
 

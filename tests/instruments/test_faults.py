@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_boson import Fault, FaultyBoson
+from faulty_camera import Faults
 from rig_devices import BosonBench, LoggerBench, WheelBench
 from rig_take import Read, Take, session
 
@@ -21,9 +23,6 @@ from dbthermal import store
 from dbthermal.instruments.boson import Boson, BosonReplyError, BosonStatusError, BosonTimeoutError
 from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.devices import Devices, Thermocouples
-from dbthermal.instruments.emulated.boson import EmulatedBoson
-from dbthermal.instruments.emulated.boson_faults import Fault
-from dbthermal.instruments.emulated.frames import Faults
 from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
@@ -131,7 +130,7 @@ def correcting_camera() -> Boson:
     """A camera that corrects its offsets, and does not answer before it is through."""
     bench = BosonBench()
     bench.device.faults.ffc_stalls = True
-    bench.camera.start_ffc()
+    bench.world.start_ffc("boson")
     return bench.camera
 
 
@@ -280,23 +279,10 @@ def test_what_is_recorded(name: str, troubled: Take) -> None:
     np.testing.assert_allclose([read for _, read in found], value, rtol=0, atol=0.05)
 
 
-def test_a_camera_that_boots(tmp_path: Path) -> None:
-    """It is mute for longer than a question is asked; the next one after that is answered."""
-    bench = BosonBench()
-    bench.camera.reboot()
-    with pytest.raises(BosonTimeoutError, match="and the camera through with booting"):
-        bench.camera.fpa_temperature()
-    assert bench.camera.wait_until_booted() == 93588
-    bench.camera.reboot()
-    take = Take(tmp_path / "a.zarr").record(0.5, {"fpa": read_beside_frames(bench.camera)})
-    assert take.kinds("fpa")[0] == "reading_failed"
-    assert {*take.kinds("fpa")[1:]} == {"reading"}
-
-
 def test_a_correction_that_stalls_replies_and_freezes_frames(tmp_path: Path) -> None:
     """The camera answers after its shutter opened; its frames say that it was closed."""
     take = Take(tmp_path / "a.zarr", {"9.5": Faults(ffc=frozenset(range(8, 20)))})
-    device = EmulatedBoson(take.world, "9.5", free_running=False)
+    device = FaultyBoson(take.world, "9.5")
     device.faults.ffc_stalls = True
     with EmulatedPort(device) as port, Boson.from_url(f"pty://{port.path}", timeout=20) as boson:
         take.record(1.0, {"fpa": read_beside_frames(boson)})

@@ -1,13 +1,11 @@
 """The filter wheel: its places, its settings, and the emulated wheel in memory and on a line."""
 
 import pytest
-from dialogue import Dialogue
+from loop import Loop
 from rig_devices import FILTERS, QUICK, WheelBench
-from test_filterwheel_dialogue import _greeting
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.emulated.apt import EmulatedApt, start
-from dbthermal.instruments.emulated.port import Loop
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
@@ -21,7 +19,6 @@ from dbthermal.instruments.filterwheel._settings import BSC10X, BSC20X
 from dbthermal.instruments.transport import TransportError
 
 SETTINGS = Settings(filters=FILTERS)
-BANNER = b"Command error CMD_NOT_DEFINED\r\n> "
 
 
 def test_places_are_sixths_of_a_turn() -> None:
@@ -157,15 +154,11 @@ def test_motor_at_another_address() -> None:
 
 
 def test_wrong_devices() -> None:
-    """Another model, another number, and another language are each refused by name."""
+    """Another model and another number are each refused by name."""
     with pytest.raises(WrongDeviceError, match="Wrong device 'KDC101', number 40000000"):
         WheelBench("KDC101").wheel.connect()
     with pytest.raises(WrongDeviceError, match=r"Wrong controller 40000000. Must be 7"):
         WheelBench(serial_number=7).wheel.connect()
-    other = Dialogue([(_greeting(apt.UNIT), BANNER)])
-    chosen = Settings(addresses=((apt.UNIT, apt.UNIT),))
-    with other, pytest.raises(WrongDeviceError, match="33 bytes came that are no APT messages"):
-        FilterWheel(other, chosen).connect()
 
 
 @pytest.mark.parametrize(

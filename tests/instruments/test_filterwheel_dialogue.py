@@ -8,7 +8,7 @@ from rig_devices import FILTERS, Clock
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.apt import Id, command
-from dbthermal.instruments.filterwheel import FilterWheel, Settings, WheelError
+from dbthermal.instruments.filterwheel import FilterWheel, Settings, WheelError, WrongDeviceError
 
 SETTINGS = Settings(filters=FILTERS)
 
@@ -109,3 +109,14 @@ def test_neither_enabled_nor_not(bits: bytes) -> None:
     dialogue = Dialogue([*_connection()[:-1], (_connection()[-1][0], bits)])
     with dialogue, pytest.raises(WheelError, match="does not say what the motor does"):
         FilterWheel(dialogue, SETTINGS).connect()
+
+
+def test_another_language() -> None:
+    """A device that answers in text, such as an FW102C, is refused."""
+    banner = b"Command error CMD_NOT_DEFINED\r\n> "
+    chosen = Settings(addresses=((apt.UNIT, apt.UNIT),))
+    with (
+        Dialogue([(_greeting(apt.UNIT), banner)]) as device,
+        pytest.raises(WrongDeviceError, match="33 bytes came that are no APT messages"),
+    ):
+        FilterWheel(device, chosen).connect()

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from rig_devices import Clock, WheelBench
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
     NoReplyError,
@@ -20,7 +19,7 @@ from dbthermal.instruments.filterwheel import (
     WrongDeviceError,
 )
 from dbthermal.instruments.filterwheel._controller import MAXIMUM_UNSOLICITED
-from dbthermal.instruments.transport import TransportError
+from dbthermal.instruments.transport import Closing, TransportError
 
 
 def test_unset_speeds_make_homing_do_nothing() -> None:

@@ -12,7 +12,7 @@ import xarray as xr
 
 from dbthermal import store
 from dbthermal.instruments.camera import Counts, Frame
-from dbthermal.instruments.emulated.frames import EmulatedCamera
+from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import (
     Limits,
@@ -106,20 +106,6 @@ def test_kill_costs_the_last_chunk(tmp_path: Path, kills: int) -> None:
         assert all(note[1:] == ("reading", "plate", 300.0) for note in notes(path))
 
 
-def test_recovered(tmp_path: Path) -> None:
-    """Recovered, a recording that was killed has all frames that any band has, and says so."""
-    path = tmp_path / "a.zarr"
-    killed(path, 0.3)
-    written = store.open_dataset(path).attrs["frames_written"]
-    store.recover(path)
-    opened = store.open_dataset(path)
-    assert (opened.attrs["complete"], opened.attrs["closed"]) == (False, True)
-    assert opened.sizes["time"] == max(written.values())
-    check(opened, list(written.values()))
-    with pytest.raises(ValueError, match="Must be one that was cut short"):
-        store.recover(path)
-
-
 @pytest.mark.parametrize("kills", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_kill_while_it_is_closed(tmp_path: Path, kills: int) -> None:
     """Killed about its end, a recording opens, too, and is complete only if it says so."""
@@ -132,9 +118,6 @@ def test_kill_while_it_is_closed(tmp_path: Path, kills: int) -> None:
         assert opened.attrs["complete"] is closed
         assert opened.sizes["time"] == (max(written) if closed else min(written))
         check(opened, written if closed else 2 * [min(written)])
-        if not closed:
-            store.recover(path)
-            check(store.open_dataset(path), written)
 
 
 class Disk:

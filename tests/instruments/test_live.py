@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from faulty_camera import Faults, FaultyCamera, Movie
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
 from dbthermal.figures import LiveFigure, Panel
 from dbthermal.instruments import live, telemetry
 from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag, Metadata
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults, Movie
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Preview, Reading, Summary, record
 from dbthermal.instruments.session import Camera, Device, Session
@@ -79,8 +79,8 @@ def recording(path: Path, view: live.View) -> Summary:
     movie, faults = Movie(wide[None], 60.0, endless=True), Faults(ffc=frozenset(range(1, 6000)))
     for number, band in enumerate(BANDS):
         world.add_camera(band, number)
-        sources[band] = EmulatedCamera(
-            world, band, {band: movie}, band, wide.shape, 100.0, telemetry.ROWS, faults
+        sources[band] = FaultyCamera(
+            world, band, {band: movie}, band, wide.shape, 100.0, telemetry.ROWS, faults=faults
         )
 
     def show(shown: Preview) -> None:

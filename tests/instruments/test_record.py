@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from faulty_camera import Faults, FaultyCamera
 
 from dbthermal import alignment, store
 from dbthermal import correction as frames
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import (
     Limits,
@@ -51,7 +51,7 @@ def bench(
     world, sources = World(), {}
     for number, (band, faults) in enumerate(zip(BANDS, (first, second), strict=True)):
         world.add_camera(band, 100 + number)
-        sources[band] = EmulatedCamera(
+        sources[band] = FaultyCamera(
             world,
             band,
             dict.fromkeys(BANDS, picture),
@@ -59,7 +59,7 @@ def bench(
             SHAPE,
             RATE,
             telemetry_rows,
-            faults or Faults(),
+            faults=faults or Faults(),
         )
     return dict(sources)
 

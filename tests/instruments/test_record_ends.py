@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_camera import Faults, FaultyCamera
 from test_record import BANDS, CHUNK, SMALL, bench, session
 
 from dbthermal import store
 from dbthermal.instruments.camera import Frame, FrameFlag, FrameSource
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Faults
 from dbthermal.instruments.emulated.world import CameraState
 from dbthermal.instruments.recording import (
     Limits,
@@ -98,16 +98,16 @@ def test_keyboard_interrupt_keeps_everything(
     """Interrupted, while it draws or waits, all frames that came are written, and it says so."""
     slow_down(monkeypatch)
     came: list[int] = []
-    read = EmulatedCamera.read
+    read = FaultyCamera.read
 
-    def counting(camera: EmulatedCamera, timeout: float = 1.0) -> Frame:
+    def counting(camera: FaultyCamera, timeout: float = 1.0) -> Frame:
         frame = read(camera, timeout)
         came.append(frame.sequence)
         if len(came) == 40 and not drawing:
             interrupt()
         return frame
 
-    monkeypatch.setattr(EmulatedCamera, "read", counting)
+    monkeypatch.setattr(FaultyCamera, "read", counting)
     limits, path = Limits(chunk=CHUNK, reserve=0, preview_period=0.3), tmp_path / "a.zarr"
     with pytest.raises(KeyboardInterrupt):
         record(
@@ -127,7 +127,7 @@ def test_keyboard_interrupt_keeps_everything(
 def state(sources: dict[str, FrameSource], band: str) -> CameraState:
     """State of an emulated camera."""
     camera = sources[band]
-    assert isinstance(camera, EmulatedCamera)
+    assert isinstance(camera, FaultyCamera)
     return camera.world.camera(band)
 
 
@@ -145,8 +145,7 @@ def test_a_lost_camera_is_told_though_it_was_stopped(tmp_path: Path) -> None:
 
 def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
     """A band without a frame is no complete recording, and the log says how long it was mute."""
-    sources, path = bench(), tmp_path / "a.zarr"
-    state(sources, "9.5").streaming = False
+    sources, path = bench(None, Faults(mute=True)), tmp_path / "a.zarr"
     summary = record(session(), sources, path, limits=SMALL)
     assert (summary.ended, summary.totals["9.5"]["frames"]) == ("no frames", 0)
     assert store.open_dataset(path).attrs["complete"] is False
@@ -156,13 +155,13 @@ def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
 def test_wrong_stamps_cost_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A camera whose stamps are all of long ago is recorded, without times, once none is held."""
     monkeypatch.setattr(_recorder, "_HELD", 0.1)
-    read = EmulatedCamera.read
+    read = FaultyCamera.read
 
-    def stampless(camera: EmulatedCamera, timeout: float = 1.0) -> Frame:
+    def stampless(camera: FaultyCamera, timeout: float = 1.0) -> Frame:
         frame = read(camera, timeout)
         return replace(frame, device_time=0.0) if camera.name == "9.5" else frame
 
-    monkeypatch.setattr(EmulatedCamera, "read", stampless)
+    monkeypatch.setattr(FaultyCamera, "read", stampless)
     record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)
     opened = store.open_dataset(tmp_path / "a.zarr")
     frames = slice(0, opened.attrs["frames_written"]["9.5"])
@@ -197,7 +196,7 @@ def test_a_thread_that_exits_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def leave(*_: object) -> Frame:
         raise SystemExit("left")
 
-    monkeypatch.setattr(EmulatedCamera, "read", leave)
+    monkeypatch.setattr(FaultyCamera, "read", leave)
     with pytest.raises(SystemExit, match="left"):
         record(session(9.0), bench(), tmp_path / "a.zarr", limits=SMALL)
     assert store.open_dataset(tmp_path / "a.zarr").attrs["ended"] == "error"

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faulty_camera import Movie
 
-from dbthermal.instruments.emulated.frames import EmulatedCamera, Movie
+from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import record
 from dbthermal.instruments.session import Camera, Device, Session

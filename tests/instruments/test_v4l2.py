@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from faulty_camera import frames
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dbthermal.instruments.camera import FrameFlag, NoFrameError, SourceLostError, Stream, frames
-from dbthermal.instruments.video import v4l2, v4l2_calls
+from dbthermal.instruments import v4l2
+from dbthermal.instruments.camera import FrameFlag, NoFrameError, SourceLostError, Stream
 
 STREAM = Stream(shape=(4, 6), telemetry_rows=2)
 BYTES = 2 * 6 * 6
@@ -33,7 +34,7 @@ class Memory(bytearray):
 class Driver:
     """Stands in for the kernel: a node with a format, a rate and frames to give."""
 
-    formats: tuple[int, ...] = (0x32315559, v4l2_calls.Y16)
+    formats: tuple[int, ...] = (0x32315559, v4l2.Y16)
     capabilities: int = 0x04200001
     rows: int = 6
     rate: int = 60
@@ -43,12 +44,12 @@ class Driver:
     queued: list[int] = field(default_factory=list)
     open_files: int = 0
     lost: int = 0
-    lost_at: tuple[int, ...] = (v4l2_calls.DQBUF, v4l2_calls.STREAMOFF)
+    lost_at: tuple[int, ...] = (v4l2.DQBUF, v4l2.STREAMOFF)
     signals: int = 0
 
-    def kernel(self, platform: str = "linux") -> v4l2_calls.Kernel:
+    def kernel(self, platform: str = "linux") -> v4l2.Kernel:
         """Calls to this driver."""
-        return v4l2_calls.Kernel(
+        return v4l2.Kernel(
             open=self._open,
             close=self._close,
             ioctl=self._ioctl,
@@ -84,7 +85,7 @@ class Driver:
         return 0
 
     def _capability(self, argument: bytearray) -> None:
-        argument[:] = v4l2_calls.CAPABILITY.pack(
+        argument[:] = v4l2.CAPABILITY.pack(
             b"uvcvideo", b"Boson: FLIR Video", b"usb-1.2", 0x60C05, 0, self.capabilities
         )
 
@@ -92,20 +93,20 @@ class Driver:
         index = struct.unpack_from("=I", argument)[0]
         if index >= len(self.formats):
             raise OSError(errno.EINVAL, "Invalid argument")
-        argument[:] = v4l2_calls.FORMAT_ENTRY.pack(index, 1, 0, b"", self.formats[index])
+        argument[:] = v4l2.FORMAT_ENTRY.pack(index, 1, 0, b"", self.formats[index])
 
     def _format(self, argument: bytearray) -> None:
-        kind, columns, _, code, place, line, _, space = v4l2_calls.FORMAT.unpack(argument)
-        argument[:] = v4l2_calls.FORMAT.pack(
+        kind, columns, _, code, place, line, _, space = v4l2.FORMAT.unpack(argument)
+        argument[:] = v4l2.FORMAT.pack(
             kind, columns, self.rows, code, place, line, self.rows * line, space
         )
 
     def _rate(self, argument: bytearray) -> None:
-        argument[:] = v4l2_calls.PARAMETERS.pack(1, 0, 0, 1, self.rate, 0, 0)
+        argument[:] = v4l2.PARAMETERS.pack(1, 0, 0, 1, self.rate, 0, 0)
 
     def _query(self, argument: bytearray) -> None:
         index = struct.unpack_from("=I", argument)[0]
-        argument[:] = v4l2_calls.BUFFER.pack(index, 1, 0, 0, 0, 0, 0, 0, 1, 4096 * index, BYTES)
+        argument[:] = v4l2.BUFFER.pack(index, 1, 0, 0, 0, 0, 0, 0, 1, 4096 * index, BYTES)
 
     def _queue(self, argument: bytearray) -> None:
         self.queued.append(struct.unpack_from("=I", argument)[0])
@@ -117,19 +118,19 @@ class Driver:
         used, flags, micros, sequence = self.answers.pop(0)
         index = self.queued.pop(0)
         self.maps[index][:] = np.arange(sequence, sequence + BYTES // 2, dtype="<u2").tobytes()
-        argument[:] = v4l2_calls.BUFFER.pack(
+        argument[:] = v4l2.BUFFER.pack(
             index, 1, used, flags, 1, 7, micros, sequence, 1, 4096 * index, BYTES
         )
 
 
 REPLIES: dict[int, Callable[[Driver, bytearray], None]] = {
-    v4l2_calls.QUERYCAP: Driver._capability,
-    v4l2_calls.ENUM_FMT: Driver._enumerate,
-    v4l2_calls.S_FMT: Driver._format,
-    v4l2_calls.S_PARM: Driver._rate,
-    v4l2_calls.QUERYBUF: Driver._query,
-    v4l2_calls.QBUF: Driver._queue,
-    v4l2_calls.DQBUF: Driver._dequeue,
+    v4l2.QUERYCAP: Driver._capability,
+    v4l2.ENUM_FMT: Driver._enumerate,
+    v4l2.S_FMT: Driver._format,
+    v4l2.S_PARM: Driver._rate,
+    v4l2.QUERYBUF: Driver._query,
+    v4l2.QBUF: Driver._queue,
+    v4l2.DQBUF: Driver._dequeue,
 }
 
 
@@ -162,18 +163,18 @@ def test_calls_come_in_order() -> None:
     driver = Driver(answers=[(BYTES, GOOD, 0, number) for number in range(20)])
     with opened(driver) as capture:
         assert [frame.sequence for frame in frames(capture, 20)] == list(range(20))
-    enumerated = 3 * [v4l2_calls.ENUM_FMT]
-    buffers = v4l2_calls.BUFFERS * [v4l2_calls.QUERYBUF, v4l2_calls.QBUF]
+    enumerated = 3 * [v4l2.ENUM_FMT]
+    buffers = v4l2.BUFFERS * [v4l2.QUERYBUF, v4l2.QBUF]
     assert driver.calls == [
-        v4l2_calls.QUERYCAP,
+        v4l2.QUERYCAP,
         *enumerated,
-        v4l2_calls.S_FMT,
-        v4l2_calls.S_PARM,
-        v4l2_calls.REQBUFS,
+        v4l2.S_FMT,
+        v4l2.S_PARM,
+        v4l2.REQBUFS,
         *buffers,
-        v4l2_calls.STREAMON,
-        *(20 * [v4l2_calls.DQBUF, v4l2_calls.QBUF]),
-        v4l2_calls.STREAMOFF,
+        v4l2.STREAMON,
+        *(20 * [v4l2.DQBUF, v4l2.QBUF]),
+        v4l2.STREAMOFF,
     ]
 
 
@@ -244,9 +245,9 @@ def test_last_frame_before_unplugging_is_kept() -> None:
     """A camera that is gone when its buffer goes back: the frame comes, the next read tells."""
     driver = Driver(answers=[(BYTES, GOOD, 0, 5)])
     capture = opened(driver)
-    driver.lost, driver.lost_at = errno.ENODEV, (v4l2_calls.QBUF,)
+    driver.lost, driver.lost_at = errno.ENODEV, (v4l2.QBUF,)
     assert capture.read().sequence == 5
-    driver.lost_at = (v4l2_calls.DQBUF, v4l2_calls.STREAMOFF)
+    driver.lost_at = (v4l2.DQBUF, v4l2.STREAMOFF)
     with pytest.raises(SourceLostError, match="No such device"):
         capture.read()
     capture.close()
@@ -260,7 +261,7 @@ def test_buffer_goes_back_whatever_happens(monkeypatch: pytest.MonkeyPatch) -> N
             patch.setattr(v4l2, "_split", lambda *_: 1 / 0)
             with pytest.raises(ZeroDivisionError):
                 capture.read()
-        assert sorted(driver.queued) == list(range(v4l2_calls.BUFFERS))
+        assert sorted(driver.queued) == list(range(v4l2.BUFFERS))
         assert capture.read().sequence == 1
 
 
@@ -296,14 +297,6 @@ def test_other_streams_are_refused(driver: Driver, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         opened(driver)
     assert driver.open_files == 0
-
-
-def test_node_with_y16_is_found() -> None:
-    """The camera's other node, of metadata, lists no format."""
-    assert v4l2_calls.Y16 in v4l2_calls.formats("/dev/video0", Driver().kernel())
-    other = Driver(capabilities=0x04A00000)
-    assert v4l2_calls.formats("/dev/video1", other.kernel()) == []
-    assert other.open_files == 0
 
 
 def test_other_systems_are_refused() -> None:

@@ -4,7 +4,7 @@ import ctypes
 
 import pytest
 
-from dbthermal.instruments.video import v4l2_calls
+from dbthermal.instruments import v4l2
 
 
 class Buffer(ctypes.Structure):
@@ -23,16 +23,16 @@ class Buffer(ctypes.Structure):
 
 def test_layouts_have_the_kernels_sizes() -> None:
     """The structures are as large as on 64-bit Linux."""
-    assert (v4l2_calls.BUFFER.size, v4l2_calls.FORMAT.size) == (88, 208)
-    assert (v4l2_calls.CAPABILITY.size, v4l2_calls.PARAMETERS.size) == (104, 204)
+    assert (v4l2.BUFFER.size, v4l2.FORMAT.size) == (88, 208)
+    assert (v4l2.CAPABILITY.size, v4l2.PARAMETERS.size) == (104, 204)
 
 
 def test_buffer_has_the_kernels_layout() -> None:
     """Each number of a buffer is where a C compiler puts it, the 64-bit time stamp too."""
     left_out = {"timecode", "reserved2", "request_fd"}
     names = [field[0] for field in Buffer._fields_ if field[0] not in left_out]
-    buffer = Buffer.from_buffer_copy(v4l2_calls.BUFFER.pack(*range(1, 12)))
-    assert ctypes.sizeof(Buffer) == v4l2_calls.BUFFER.size
+    buffer = Buffer.from_buffer_copy(v4l2.BUFFER.pack(*range(1, 12)))
+    assert ctypes.sizeof(Buffer) == v4l2.BUFFER.size
     assert [getattr(buffer, name) for name in names] == list(range(1, 12))
 
 
@@ -54,4 +54,4 @@ def test_buffer_has_the_kernels_layout() -> None:
 def test_calls_have_the_kernels_numbers(name: str, direction: int, number: int, size: int) -> None:
     """A call's number is made of direction (1 write, 2 read), size, 'V' and its own number."""
     expected = direction << 30 | size << 16 | ord("V") << 8 | number
-    assert getattr(v4l2_calls, name) == expected
+    assert getattr(v4l2, name) == expected

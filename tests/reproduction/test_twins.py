@@ -5,24 +5,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from dbthermal import metrics, schema, separation, simulation
 from dbthermal.simulation import Rig
-from dbthermal.simulation._rays import Camera
-from dbthermal.simulation._surroundings import Actor, Pose, Room
+from dbthermal.simulation.rays import Camera
+from dbthermal.simulation.surroundings import Actor, Pose, Room
 from reproduction import twins
-from reproduction.twins import AMBIENT, TWINS, Capture, Stage, Vessel, clock, meshes, surfaces
+from reproduction.twins import TWINS, Capture, Stage, solids, surfaces, vessels
 from reproduction.twins.panes import WITHDRAWAL
 from reproduction.twins.props import Writing
+from reproduction.twins.stage import AMBIENT, clock
+from reproduction.twins.vessels import Vessel
 
 GLASS = xr.DataArray(
     [0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]}, attrs={"units": "1"}
 )
 SHORT = Capture(GLASS, shape=(24, 32), time=clock(12, rate=2.0))
 SLOW = Capture(GLASS, shape=(36, 48), time=clock(36, rate=1.0))
-COARSE = twins.Pane(spacing=0.006)
 PEAKS = {"wineglass": 63.6, "coffee_pot": 63.1}  # degrees Celsius
 FILLED = {"glass_plate", "fingers", "fingerprint"}  # whose plate is larger than the image
 
@@ -33,10 +35,9 @@ def rng(seed: int = 1) -> np.random.Generator:
 
 
 @pytest.fixture
-def scan(mirror: Path) -> surfaces.Surface:
+def scan(mirror: Path) -> trimesh.Trimesh:
     """The Stanford bunny."""
-    mesh = meshes.mesh(mirror / "meshes" / "stanford-bunny.obj")
-    return surfaces.Surface(mesh["vertices"].values, mesh["faces"].values)
+    return trimesh.load_mesh(mirror / "meshes" / "stanford-bunny.obj", process=False)
 
 
 @pytest.fixture(scope="module", params=TWINS)
@@ -95,37 +96,43 @@ def test_the_seed_makes_the_scene(scene: xr.Dataset) -> None:
 LONG = replace(SHORT, time=clock(70, rate=2.0))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("name", TWINS)
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        pytest.param(name, seed, marks=() if seed == 1 and name == "bunny" else pytest.mark.slow)
+        for name in TWINS
+        for seed in (1, 2, 3)
+    ],
+)
 def test_nothing_comes_before_the_object(name: str, seed: int) -> None:
     """No actor hides the object from the camera in 35 s, which a scene could not say."""
     assert not twins.obstructed(TWINS[name](LONG, rng(seed)), LONG.time).any()
 
 
 @pytest.mark.data
-def test_nothing_comes_before_the_scan(scan: surfaces.Surface) -> None:
+def test_nothing_comes_before_the_scan(scan: trimesh.Trimesh) -> None:
     """Nor is the scanned bunny hidden, whose ears reach higher."""
-    assert not twins.obstructed(twins.bunny(LONG, rng(), scan=scan), LONG.time).any()
+    assert not twins.obstructed(solids.bunny(LONG, rng(), scan=scan), LONG.time).any()
 
 
 def inside(stage: Stage) -> bool:
     """Whether every vertex of the object lies within the image."""
-    places = stage.camera.project(stage.surface.vertices)
+    places = stage.camera.project(stage.mesh.vertices)
     return bool(np.all((places > -0.5) & (places < np.array(stage.camera.shape) - 0.5)))
 
 
 def test_the_whole_rabbit_is_seen() -> None:
     """No vertex of the built-in rabbit lies beyond the image, ears and feet included."""
-    assert inside(twins.bunny(SHORT, rng()))
+    assert inside(solids.bunny(SHORT, rng()))
 
 
 @pytest.mark.data
-def test_the_whole_scan_is_seen(scan: surfaces.Surface) -> None:
+def test_the_whole_scan_is_seen(scan: trimesh.Trimesh) -> None:
     """No vertex of the scanned bunny does, and its head is in the left half."""
-    stage = twins.bunny(SHORT, rng(), scan=scan)
+    stage = solids.bunny(SHORT, rng(), scan=scan)
     assert inside(stage)
-    head = stage.surface.vertices[:, 2] > 0.11
-    assert stage.surface.vertices[head, 0].mean() < -0.01  # m
+    head = stage.mesh.vertices[:, 2] > 0.11
+    assert stage.mesh.vertices[head, 0].mean() < -0.01  # m
 
 
 @pytest.mark.parametrize(("name", "celsius"), PEAKS.items())
@@ -153,7 +160,7 @@ def test_vessels_can_be_separated(name: str, rig: xr.Dataset) -> None:
 
 def test_the_level_rises() -> None:
     """At the end of the pouring the wall is wet below the level, dry above, and was dry before."""
-    vessel = twins.WINEGLASS
+    vessel = vessels.WINEGLASS
     height = np.array([0.10, 0.14, 0.21])
     before, after = (vessel.wetted(height, vessel.start + t) for t in (0.0, vessel.duration))
     assert before.max() < 0.01
@@ -162,7 +169,7 @@ def test_the_level_rises() -> None:
 
 def test_prints_fade() -> None:
     """A print is warmest when the capture starts, by at least 1 K, and only fades from then on."""
-    scene = twins.twin("fingerprint", SLOW, rng(), pane=COARSE)
+    scene = twins.twin("fingerprint", SLOW, rng(), spacing=0.006)
     peak = scene["object_temperature"].max(("y", "x")).values - AMBIENT
     assert peak[0] > 1.0
     assert np.all(np.diff(peak) < 0)
@@ -173,7 +180,7 @@ def test_prints_fade() -> None:
 def test_a_visitor_moves_behind_a_print() -> None:
     """With somebody far away the plate's background moves, and the print is the same."""
     alone, visited = (
-        twins.twin("fingerprint", SLOW, rng(), pane=COARSE, visitor=visitor)
+        twins.twin("fingerprint", SLOW, rng(), spacing=0.006, visitor=visitor)
         for visitor in (False, True)
     )
     xr.testing.assert_equal(alone["object_temperature"], visited["object_temperature"])
@@ -211,10 +218,10 @@ def test_letters_stay_when_the_hand_has_left() -> None:
 
 def test_parallax_is_that_of_a_mirror_image() -> None:
     """The second camera sees a ball's mirror image through another point of a plate."""
-    plate = surfaces.moved(surfaces.plate(2.0, 2.0, 2.0), translation=(0, 0, -1))
+    plate = surfaces.plate(2.0, 2.0, 2.0).apply_translation((0, 0, -1))
     place, radius = np.array([0.1, -1.5, 0.05]), 0.05
-    surface = surfaces.sphere(radius, radius / 10)
-    ball = Actor(surface, np.full(len(surface.vertices), 310.0), lambda _: Pose(translation=place))
+    mesh = trimesh.creation.icosphere(4, radius)
+    ball = Actor(mesh, np.full(len(mesh.vertices), 310.0), lambda _: Pose(translation=place))
     camera = Camera((0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (90, 120))
     stage = Stage("ball", plate, np.full((2, len(plate.vertices)), AMBIENT), camera, [ball], Room())
     capture = Capture(GLASS, shape=(90, 120), time=clock(2), baseline=0.04)
@@ -247,9 +254,9 @@ def test_a_baseline_gives_a_background_for_each_band(rig: xr.Dataset) -> None:
 
 def test_a_scan_is_stood_on_the_table() -> None:
     """A rabbit scanned with y up, in millimetres, is 0.15 m high; its z faces the camera."""
-    upright = twins.rabbit()
+    upright = solids.rabbit()
     lying = surfaces.moved(upright, Rotation.from_euler("x", -90.0, degrees=True), scale=1e3)
-    stood = twins.bunny(SHORT, rng(), scan=lying).surface
+    stood = solids.bunny(SHORT, rng(), scan=lying).mesh
     np.testing.assert_allclose(stood.vertices[:, 2].min(), 0.0, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(np.ptp(stood.vertices[:, 2]), 0.15, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(stood.face_normals, upright.face_normals, rtol=0, atol=1e-9)
@@ -268,17 +275,15 @@ def test_thermocouples_read_the_mean_under_the_bead() -> None:
 
 
 def test_a_probe_is_on_its_ring() -> None:
-    """A probe has the height and the radius of a ring of vertices, the nearest one."""
-    ball = surfaces.sphere(0.05, 0.02)
-    place = np.array(twins.on_wall(ball, 0.013, 30.0))
-    np.testing.assert_allclose(np.linalg.norm(place), 0.05, rtol=0, atol=1e-12)  # m
-    assert place[2] in ball.vertices[:, 2]
-    assert place[2] != 0.013
+    """A probe is at its height and angle on a wall, halfway between two rings, too."""
+    cone = surfaces.revolved([(0.05, 0.0), (0.03, 0.1)], 0.005)
+    place = surfaces.on_wall(cone, 0.05, 30.0)
+    np.testing.assert_allclose(place, [0.02, -0.04 * np.sqrt(0.75), 0.05], rtol=0, atol=1e-12)  # m
 
 
 def vessel(**changes: object) -> Vessel:
     """A wineglass with changes."""
-    return replace(twins.WINEGLASS, **changes)  # type: ignore[arg-type]
+    return replace(vessels.WINEGLASS, **changes)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -287,8 +292,6 @@ def vessel(**changes: object) -> Vessel:
         (lambda: twins.twin("teapot", SHORT, rng()), "Unknown twin 'teapot'"),
         (lambda: vessel(level=0.05), "Invalid level 0.05 m. Must be above"),
         (lambda: vessel(duration=0.0), "Invalid duration 0.0 s of pouring"),
-        (lambda: Capture(GLASS, time=clock(1)), "of a capture. Must be two or more"),
-        (lambda: Capture(GLASS, time=clock(3)[::-1]), "Invalid time 0.1 s of a capture"),
         (lambda: Capture(GLASS[:1], baseline=0.04), "Must be two"),
         (lambda: Capture(GLASS.rename(band="filter")), "Must be .band,."),
         (

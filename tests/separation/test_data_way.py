@@ -49,7 +49,7 @@ def test_way_of_the_data_is_short(jump: float) -> None:
     rig, rng = simulation.Rig(), np.random.default_rng(1)
     emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
     scene = simulation.walkers(np.arange(200) / 10.0, (8, 16), emissivity, rng, crossings=3)
-    step = xr.where(scene["time"] > 10.0, jump, 0.0)
+    step = jump * (scene["time"] > 10.0)
     moved = scene.assign(object_temperature=scene["object_temperature"] + step)
     capture = simulation.observe(moved, rig.response(), rng)
     separation.solve(capture, rig.response())  # imports are not part of the way

@@ -14,10 +14,11 @@ from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 
 from dbthermal import schema
-from dbthermal.figures._validity import REASONS, status, validity
+from dbthermal.figures import REASONS, status
 from dbthermal.simulation import Background, Rig, independent_pixels
 from reproduction.experiments import stress
 from reproduction.experiments.cases import run_case
+from reproduction.figures import validity
 
 TIME = np.arange(350) / 10.0  # s
 GLASS: dict[str, Any] = {"case": "glass", "emissivity": [0.86, 0.72], "start": 20, "stop": 45}

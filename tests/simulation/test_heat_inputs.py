@@ -5,14 +5,14 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 import pytest
+import trimesh
 
 from dbthermal.simulation import heat
-from reproduction.twins import surfaces
 
 Array = npt.NDArray[np.float64]
 
 AMBIENT = 295.0
-SPOT = surfaces.sphere(0.01, 0.02)
+SPOT = trimesh.creation.icosphere(0, 0.01)
 BODY = heat.Shell(SPOT.vertices, SPOT.faces, 0.003, heat.GLASS)
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -1,13 +1,14 @@
 """Ray casting and moving surroundings: against closed forms of geometry."""
 
+from typing import cast
+
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
-from dbthermal.simulation._mesh import Surface
-from dbthermal.simulation._rays import Camera, Caster, mirror, unit
-from dbthermal.simulation._surroundings import Actor, Motion, Pose, Room, distance, incident
-from reproduction.twins import surfaces
+from dbthermal.simulation.rays import Camera, Caster, mirror, unit
+from dbthermal.simulation.surroundings import Actor, Motion, Pose, Room, distance, incident
 
 CAMERA = Camera(position=(0.1, -0.6, 0.3), target=(0.0, 0.0, 0.05), shape=(45, 60))
 FRONT = Camera(position=(0.0, -1.0, 0.0), target=(0.0, 0.0, 0.0), shape=(90, 120))
@@ -18,20 +19,20 @@ SKIN = 307.15  # K
 
 def sphere(radius: float = RADIUS, subdivisions: int = 4) -> Caster:
     """Sphere about the origin."""
-    return Caster(surfaces.sphere(radius, radius * 1.107 / 2**subdivisions))
+    return Caster(trimesh.creation.icosphere(subdivisions, radius))
 
 
-def wall(turn: float = 0.0) -> Surface:
+def wall(turn: float = 0.0) -> trimesh.Trimesh:
     """A plate 2 m wide and high, in the plane y = 0 unless turned about z [degrees]."""
-    flat = surfaces.plate(2.0, 2.0, 2.0)
-    rotation = Rotation.from_euler("z", turn, degrees=True)
-    return surfaces.moved(surfaces.moved(flat, translation=(0, 0, -1)), rotation)
+    corners = np.array([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
+    corners = Rotation.from_euler("z", turn, degrees=True).apply(corners)
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
 def ball(radius: float, temperature: float = SKIN, motion: Motion | None = None) -> Actor:
     """A ball of one temperature."""
-    surface = surfaces.sphere(radius, radius / 15)
-    return Actor(surface, np.full(len(surface.vertices), temperature), motion)
+    mesh = trimesh.creation.icosphere(4, radius)
+    return Actor(mesh, np.full(len(mesh.vertices), temperature), motion)
 
 
 def rays_of(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +149,8 @@ def test_hidden_points() -> None:
 
 def test_concave_surface_sees_itself() -> None:
     """A ray into a corner of two mirrors comes back along its way, and meets the other mirror."""
-    caster = Caster(surfaces.merge([wall(45.0), wall(-45.0)]))
+    corner = trimesh.util.concatenate([wall(45.0), wall(-45.0)])
+    caster = Caster(cast("trimesh.Trimesh", corner))
     origins, directions = rays_of(FRONT)
     hits = caster.cast(origins, directions)
     again = caster.cast(*caster.mirrored(hits, directions))
@@ -215,7 +217,7 @@ def test_the_nearest_actor_hides_the_others() -> None:
 
 def test_temperature_of_an_actor_may_change() -> None:
     """A body that stands still is seen at its temperature of the moment."""
-    still = ball(0.2).surface
+    still = ball(0.2).mesh
     warming = Actor(still, lambda now: np.full(len(still.vertices), 300 + now))
     ray = np.array([[0.0, -1.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
     seen = incident(*ray, np.arange(3.0), Room(ROOM), [warming])[:, 0]

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from dbthermal import bands, response, schema, simulation
 from dbthermal import correction as frames
-from dbthermal.simulation import Background, Rig
-from dbthermal.simulation._scenes import heating
+from dbthermal.simulation import Background, Rig, heating
 
 TIME = np.arange(120) / 10.0  # s
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})

@@ -1,24 +1,350 @@
-"""FLIR Boson: the driver of the camera's command port.
+"""FLIR Boson: driver of the camera's command port; `KIND` opens it for a session.
 
-`Boson` is the camera, `commands` says what can be read, set and done, and `link` exchanges requests
-and replies. Tested against public byte vectors and an emulator, not against hardware.
+A camera that is busy answers late, after its driver gave up; read naively, every later command then
+gets the reply of the one before (openmv/openmv, pull request 3265). Here each request has a
+sequence number of its own, and frames that do not carry it are discarded and counted. Connecting
+sends nothing and resets nothing, and nothing is ever written to the camera's flash memory.
+
+Written from public descriptions and tested against public byte vectors and an emulator, not against
+hardware.
 """
 
-from dbthermal.instruments.boson.camera import Boson, Identity
-from dbthermal.instruments.boson.link import (
-    BosonError,
-    BosonReplyError,
-    BosonStatusError,
-    BosonTimeoutError,
-    Statistics,
+import threading
+import time as system_time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Final, TypeVar
+
+from dbthermal.instruments import fslp, telemetry
+from dbthermal.instruments.boson import commands
+from dbthermal.instruments.boson.commands import (
+    Ir16Mode,
+    Reading,
+    Setting,
+    Switch,
+    TelemetryLocation,
 )
+from dbthermal.instruments.camera import (
+    CameraKind,
+    FfcMode,
+    FfcStatus,
+    FrameSource,
+    GainMode,
+    Identity,
+    Stream,
+)
+from dbthermal.instruments.transport import Closing, Transport, open_serial
 
 __all__ = [
+    "KIND",
     "Boson",
     "BosonError",
     "BosonReplyError",
     "BosonStatusError",
     "BosonTimeoutError",
-    "Identity",
-    "Statistics",
+    "commands",
 ]
+
+T = TypeVar("T")
+EnumT = TypeVar("EnumT", bound=IntEnum)
+
+BAUDRATE: Final = 921600
+"""Speed of the line [bit/s]; over USB probably without effect."""
+
+REPLY_TIMEOUT: Final = 1.0
+"""Longest wait for a reply [s], as in the vendor's own software."""
+
+REPEATS: Final = 2
+"""Repetitions of a reading without a reply; a command that changes the camera is sent once."""
+
+FFC_TIMEOUT: Final = 10.0
+"""Longest wait for a flat-field correction [s]."""
+
+POLL: Final = 0.05
+"""Time between two questions while waiting [s]."""
+
+MAXIMUM_RECEIVED: Final = 65536
+"""Most bytes to search for one reply: a line that talks without end is an error."""
+
+_READ_SIZE: Final = 4096
+
+
+class BosonError(RuntimeError):
+    """The camera did not carry out a command."""
+
+
+class BosonTimeoutError(BosonError, TimeoutError):
+    """No reply came in time; a command that changes the camera may have been carried out."""
+
+
+class BosonReplyError(BosonError):
+    """The reply is of another command, of the wrong size, or without meaning."""
+
+
+class BosonStatusError(BosonError):
+    """The camera refused; `status` is a key of `commands.STATUSES`."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+@dataclass
+class Statistics:
+    """Irregularities of the line so far; all zero on a good one."""
+
+    discarded: int = 0  # undamaged frames of other channels or requests: debug text, late replies
+    damaged: int = 0  # frames cut short, with a wrong checksum or an illegal escape
+    timeouts: int = 0  # requests that were not answered in time
+
+
+class Link(Closing):
+    """
+    One line to one camera; an exchange at a time, from any thread.
+
+    The first request's number comes from the time of day by default, so that replies to a program
+    that ended are not taken for this one's.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        *,
+        timeout: float = REPLY_TIMEOUT,
+        first_sequence: int | None = None,
+        clock: Callable[[], float] = system_time.monotonic,
+    ) -> None:
+        first = system_time.time_ns() // 1000 if first_sequence is None else first_sequence
+        self.statistics = Statistics()
+        self.timeout = timeout
+        self.is_simulated = transport.is_simulated
+        self._transport = transport
+        self._clock = clock
+        self._decoder = fslp.Decoder()
+        self._sequence = (first - 1) % (1 << 32)
+        self._lock = threading.Lock()
+
+    def exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
+        """Send a request, again if no reply comes, and return the data of its reply."""
+        for _ in range(repeats):
+            try:
+                return self._exchange(name, command, data)
+            except BosonTimeoutError:
+                continue
+        return self._exchange(name, command, data)
+
+    def close(self) -> None:
+        """Release the line, once an exchange of another thread is over; twice is as once."""
+        with self._lock:
+            self._transport.close()
+
+    def _exchange(self, name: str, command: int, data: bytes) -> bytes:
+        with self._lock:
+            self._sequence = fslp.next_sequence(self._sequence)
+            self._transport.write(fslp.encode(self._sequence, command, data))
+            reply = self._reply(name)
+        if reply.command != command:
+            raise BosonReplyError(
+                f"Invalid reply to '{name}', of command 0x{reply.command:08X}. "
+                f"Must be of command 0x{command:08X}."
+            )
+        if reply.status:
+            meaning = commands.STATUSES.get(reply.status, "unknown status")
+            raise BosonStatusError(
+                f"Refused '{name}' by the camera: status 0x{reply.status:X}, {meaning}. "
+                "Must be 0, OK.",
+                reply.status,
+            )
+        return reply.data
+
+    def _reply(self, name: str) -> fslp.Frame:
+        """Wait for the reply to the last request; discard all other frames."""
+        deadline = self._clock() + self.timeout
+        received = 0
+        while (remaining := deadline - self._clock()) > 0:
+            piece = self._transport.read(_READ_SIZE, remaining)
+            if not piece:
+                break
+            received += len(piece)
+            if received > MAXIMUM_RECEIVED:
+                raise BosonReplyError(
+                    f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. "
+                    "Must be a Boson's command port that no other program uses."
+                )
+            reply = self._matching(self._decoder.feed(piece))
+            if reply is not None:
+                return reply
+        self.statistics.timeouts += 1
+        raise BosonTimeoutError(
+            f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
+            "and the camera through with booting."
+        )
+
+    def _matching(self, frames: list[fslp.Frame]) -> fslp.Frame | None:
+        """Reply to the last request, if it is among the frames; the others are counted."""
+        key = (fslp.COMMAND_CHANNEL, self._sequence)
+        replies = [
+            frame
+            for frame in frames
+            if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
+        ]
+        self.statistics.discarded += len(frames) - len(replies[:1])
+        self.statistics.damaged = self._decoder.damaged
+        return replies[0] if replies else None
+
+
+class Boson(Closing):
+    """
+    One camera's command port, a `camera.CameraControl`; for any number of threads.
+
+    Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
+    `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is asked
+    for again if no reply comes; a command that changes the camera never is. Open it by `from_url`;
+    tests hand in a line, the number of the first request, clock and sleep [s].
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        *,
+        timeout: float = REPLY_TIMEOUT,
+        first_sequence: int | None = None,
+        clock: Callable[[], float] = system_time.monotonic,
+        sleep: Callable[[float], None] = system_time.sleep,
+    ) -> None:
+        self._link = Link(transport, timeout=timeout, first_sequence=first_sequence, clock=clock)
+        self._clock = clock
+        self._sleep = sleep
+        self.is_simulated = self._link.is_simulated
+        self.statistics = self._link.statistics
+
+    @classmethod
+    def from_url(
+        cls, url: str, *, timeout: float = REPLY_TIMEOUT, world: object | None = None
+    ) -> "Boson":
+        """Open ``serial:///dev/ttyACM0`` or ``sim://boson``, see `open_serial`; nothing is sent."""
+        return cls(open_serial(url, baudrate=BAUDRATE, world=world), timeout=timeout)
+
+    def close(self) -> None:
+        """Release the port; the camera goes on as it is. A second time does nothing."""
+        self._link.close()
+
+    def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
+        """Value of one of `commands.READINGS`, in the unit that its name says."""
+        reply = self._link.exchange(reading.name, reading.command, repeats=repeats)
+        try:
+            return reading.value(reply)
+        except ValueError as error:
+            raise BosonReplyError(f"Invalid reply to '{reading.name}': {error}") from error
+
+    def get(self, setting: Setting[EnumT]) -> EnumT:
+        """State of one of `commands.SETTINGS`."""
+        return self.read(setting.reading)
+
+    def set(self, setting: Setting[EnumT], value: EnumT) -> None:
+        """Set one of `commands.SETTINGS` until power-off; a wrong value is a ValueError."""
+        self._tell(f"set {setting.name}", setting.set_command, setting.data(value))
+
+    def serial_number(self) -> int:
+        """Serial number of the camera."""
+        return self.read(commands.SERIAL_NUMBER)
+
+    def identity(self) -> Identity:
+        """Numbers and versions of the camera, and whether it is emulated."""
+        return {
+            "serial_number": str(self.serial_number()),
+            "sensor_serial_number": str(self.read(commands.SENSOR_SERIAL_NUMBER)),
+            "part_number": self.read(commands.PART_NUMBER),
+            "software_revision": self.read(commands.SOFTWARE_REVISION),
+            "is_simulated": self.is_simulated,
+        }
+
+    def fpa_temperature(self) -> float:
+        """Temperature of the focal-plane array [K], in steps of 0.1 K."""
+        return self.read(commands.FPA_TEMPERATURE)
+
+    def ffc_status(self) -> FfcStatus:
+        """State of the flat-field correction."""
+        return self.read(commands.FFC_STATUS)
+
+    def ffc_mode(self) -> FfcMode:
+        """Trigger of a flat-field correction."""
+        return self.get(commands.FFC_MODE)
+
+    def gain_mode(self) -> GainMode:
+        """Sensitivity."""
+        return self.get(commands.GAIN_MODE)
+
+    def prepare(self, telemetry_rows: int) -> None:
+        """Set 16-bit counts, FFC on command only, and telemetry below the image; read all back."""
+        settings: list[tuple[Setting[Any], IntEnum]] = [
+            (commands.IR16_MODE, Ir16Mode.COUNTS_16),
+            (commands.FFC_MODE, FfcMode.MANUAL),
+            (commands.TELEMETRY, Switch.ON if telemetry_rows else Switch.OFF),
+        ]
+        if telemetry_rows:
+            settings.append((commands.TELEMETRY_LOCATION, TelemetryLocation.BOTTOM))
+        for setting, value in settings:
+            self.set(setting, value)
+            state = self.get(setting)
+            if state != value:
+                raise ValueError(
+                    f"Invalid {setting.name} {state!r} of camera {self.serial_number()}, set to "
+                    f"{value!r}. Must be as it was set."
+                )
+
+    def run_ffc(self, *, timeout: float = FFC_TIMEOUT) -> int:
+        """
+        Run a flat-field correction, wait until it is complete, return its frame number.
+
+        When it starts the camera still says "complete" of the one before. So another status has to
+        be seen, or the frame number of the last correction has to change. While the shutter is
+        closed the camera may not answer; `BosonTimeoutError` after `timeout` [s].
+        """
+        before = self.read(commands.LAST_FFC_FRAME)
+        changed = self.ffc_status() != FfcStatus.COMPLETE
+        self._tell("run FFC", commands.RUN_FFC)
+        deadline = self._clock() + timeout
+        while True:
+            try:
+                busy = bool(self.read(commands.FFC_IN_PROGRESS, repeats=0))
+                if busy or self.read(commands.FFC_STATUS, repeats=0) != FfcStatus.COMPLETE:
+                    changed = True
+                elif (last := self.read(commands.LAST_FFC_FRAME, repeats=0)) != before or changed:
+                    return last
+            except BosonTimeoutError:
+                pass  # mute while the shutter is closed: asked again until time is up
+            if self._clock() >= deadline:
+                raise BosonTimeoutError(f"No flat-field correction within {timeout:g} s.")
+            self._sleep(POLL)
+
+    def _tell(self, name: str, command: int, data: bytes = b"") -> None:
+        """Send a command that changes the camera, once; its reply must be empty."""
+        reply = self._link.exchange(name, command, data)
+        if reply:
+            raise BosonReplyError(
+                f"Invalid reply of {len(reply)} bytes to '{name}'. Must be empty."
+            )
+
+
+def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:
+    """Frames of a Boson on Linux, with its telemetry."""
+    from dbthermal.instruments import v4l2  # noqa: PLC0415 - Linux only
+
+    return v4l2.open_url(url, stream, decode=telemetry.metadata)
+
+
+def _open_control(url: str, world: object | None) -> Boson:
+    if url.startswith("sim:") and not url.startswith("sim://boson/"):
+        raise ValueError(f"Invalid address '{url}' of a camera. Must be 'sim://boson/<name>'.")
+    return Boson.from_url(url, world=world)
+
+
+KIND: Final = CameraKind(_open_frames, _open_control, telemetry_rows=(0, telemetry.ROWS))
+"""The kind of camera of a session's ``kind: boson``."""
+
+
+def __dir__() -> list[str]:
+    return __all__

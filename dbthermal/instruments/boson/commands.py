@@ -1,18 +1,16 @@
-"""What can be asked of a FLIR Boson: identifiers, layouts, ranges and the meaning of its answers.
+"""Commands of a FLIR Boson: identifiers, layouts and meanings of the answers.
 
-A `Reading` is asked for, a `Setting` is read and set, an `Action` is done; `Boson` takes any of
-them. Only the facts that driver and emulator need are here, none of the vendor's text or code.
+A `Reading` is asked for, a `Setting` is set and read; here are those that driver and emulator need,
+as facts, none of the vendor's text or code.
 
 References
 ----------
 Identifiers, enumerations and status codes: openmv/openmv, ``drivers/boson/include`` (commit
-cbbb877). What is marked uncertain comes from secondary sources: LJMUAstroecology/flirpy 0.6.2 and
-belivan/flir_stereo.
+cbbb877).
 """
 
-import operator
 import struct
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from types import MappingProxyType
@@ -21,29 +19,45 @@ from typing import Any, Final, Generic, TypeVar
 from scipy.constants import zero_Celsius
 
 from dbthermal.instruments.camera import FfcMode, FfcStatus, GainMode
-from dbthermal.instruments.fslp import REQUEST
+
+__all__ = [
+    "FFC_IN_PROGRESS",
+    "FFC_MODE",
+    "FFC_STATUS",
+    "FPA_TEMPERATURE",
+    "GAIN_MODE",
+    "IR16_MODE",
+    "LAST_FFC_FRAME",
+    "PART_NUMBER",
+    "READINGS",
+    "RUN_FFC",
+    "SENSOR_SERIAL_NUMBER",
+    "SERIAL_NUMBER",
+    "SETTINGS",
+    "SOFTWARE_REVISION",
+    "STATUSES",
+    "TELEMETRY",
+    "TELEMETRY_LOCATION",
+    "Ir16Mode",
+    "Reading",
+    "Setting",
+    "Switch",
+    "TelemetryLocation",
+]
 
 T = TypeVar("T")
-IntT = TypeVar("IntT", bound=int)
+EnumT = TypeVar("EnumT", bound=IntEnum)
 
 
 class Switch(IntEnum):
-    """Whether something is done."""
+    """State of a function that is either off or on."""
 
     OFF = 0
     ON = 1
 
 
-class SyncMode(IntEnum):
-    """Whether the camera gives the pulses that start frames, or takes them."""
-
-    DISABLED = 0
-    MASTER = 1
-    SLAVE = 2
-
-
 class Ir16Mode(IntEnum):
-    """What the 16-bit USB video carries: counts, counts of 14 bits, or scaled temperature."""
+    """Content of the 16-bit USB video: counts, counts of 14 bits, or scaled temperature."""
 
     COUNTS_16 = 0
     COUNTS_14 = 1
@@ -51,68 +65,23 @@ class Ir16Mode(IntEnum):
 
 
 class TelemetryLocation(IntEnum):
-    """Whether the telemetry rows come before the image or after it."""
+    """Place of the telemetry rows: before the image or after it."""
 
     TOP = 0
     BOTTOM = 1
 
 
-class TelemetryPacking(IntEnum):
-    """How a word of telemetry is laid out."""
-
-    WORDS_16 = 0
-    Y = 1
-    BYTES = 2
-
-
-class TelemetryOrder(IntEnum):
-    """Order of the bytes in a word of telemetry."""
-
-    DEFAULT = 0
-    SWAPPED = 1
-
-
 @dataclass(frozen=True)
 class Reading(Generic[T]):
-    """
-    Something to ask for.
+    """A value that the camera is asked for."""
 
-    Attributes
-    ----------
-    name : str
-        Name for messages.
-    command : int
-        Identifier.
-    layout : str
-        Data of the reply, as in `struct`, big-endian.
-    convert : callable
-        Gives the value, from what `struct` gives; raises ValueError if it is none.
-    """
-
-    name: str
-    command: int
-    layout: str
-    convert: Callable[..., T]
+    name: str  # for messages
+    command: int  # identifier
+    layout: str  # data of the reply, as in `struct`, big-endian
+    convert: Callable[..., T]  # value of the unpacked data; ValueError if they have no meaning
 
     def value(self, data: bytes) -> T:
-        """
-        Value that a reply holds.
-
-        Parameters
-        ----------
-        data : bytes
-            Of the reply.
-
-        Returns
-        -------
-        T
-            The value.
-
-        Raises
-        ------
-        ValueError
-            If the data have the wrong size or mean nothing.
-        """
+        """Value of the data of a reply; ValueError if they are of another size or meaning."""
         size = struct.calcsize(self.layout)
         if len(data) != size:
             raise ValueError(f"Invalid {self.name} of {len(data)} bytes. Must have {size}.")
@@ -120,71 +89,24 @@ class Reading(Generic[T]):
 
 
 @dataclass(frozen=True)
-class Setting(Generic[IntT]):
-    """
-    Something to read and to set.
-
-    Attributes
-    ----------
-    name : str
-        Name, and unit in brackets, for messages.
-    set_command, command : int
-        Identifiers: to set, and to read.
-    layout : str
-        Data of both, as in `struct`, big-endian: one number.
-    kind : type
-        An enumeration, or int.
-    allowed : container of int
-        The values that may be set.
-    """
+class Setting(Generic[EnumT]):
+    """A mode that is set by one command, as a 32-bit number, and read by the next identifier."""
 
     name: str
     set_command: int
-    command: int
-    layout: str
-    kind: type[IntT]
-    allowed: Container[int]
+    kind: type[EnumT]
 
     @property
-    def reading(self) -> Reading[IntT]:
+    def reading(self) -> Reading[EnumT]:
         """How it is read."""
-        return Reading(self.name, self.command, self.layout, self.kind)
+        return Reading(self.name, self.set_command + 1, ">i", self.kind)
 
-    def data(self, value: int) -> bytes:
-        """
-        Data of the command that sets it.
-
-        Parameters
-        ----------
-        value : int
-            One of `allowed`.
-
-        Returns
-        -------
-        bytes
-            To send.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the value is no whole number, or not allowed.
-        """
-        if operator.index(value) not in self.allowed:
-            raise ValueError(f"Invalid {self.name} {value}. Must be one of {self._choices()}.")
-        return struct.pack(self.layout, value)
-
-    def _choices(self) -> str:
-        if issubclass(self.kind, IntEnum):
-            return ", ".join(f"{member.value} ({member.name})" for member in self.kind)
-        return str(self.allowed)
-
-
-@dataclass(frozen=True)
-class Action:
-    """Something to do: its name for messages, and its identifier."""
-
-    name: str
-    command: int
+    def data(self, value: EnumT) -> bytes:
+        """Data of the command that sets it; ValueError if the value is not of its enumeration."""
+        if value not in {*self.kind}:
+            choices = ", ".join(f"{member.value} ({member.name})" for member in self.kind)
+            raise ValueError(f"Invalid {self.name} {value}. Must be one of {choices}.")
+        return struct.pack(">i", value)
 
 
 def _text(raw: bytes) -> str:
@@ -192,83 +114,56 @@ def _text(raw: bytes) -> str:
     return raw.split(b"\0", 1)[0].decode("ascii")
 
 
-def _tenths(raw: int) -> float:
-    return raw / 10.0
+def _kelvin(tenths: int) -> float:
+    """Temperature [K] of signed tenths of a degree Celsius."""
+    return float(tenths / 10.0 + zero_Celsius)
 
 
-def _tenths_celsius(raw: int) -> float:
-    return float(raw / 10.0 + zero_Celsius)
-
-
-def _revision(major: int, minor: int, patch: int) -> tuple[int, int, int]:
-    return major, minor, patch
-
-
-def _enumeration(name: str, set_command: int, kind: type[IntT]) -> Setting[IntT]:
-    """A setting of an enumeration: read by the next identifier, sent in 32 bits."""
-    values: Any = kind  # a type of enumeration is iterable, which `type[int]` does not say
-    return Setting(name, set_command, set_command + 1, ">i", kind, frozenset(map(int, values)))
+def _revision(*parts: int) -> str:
+    return ".".join(map(str, parts))
 
 
 SERIAL_NUMBER: Final = Reading("serial number", 0x00050002, ">I", int)
 PART_NUMBER: Final = Reading("part number", 0x00050004, ">20s", _text)
 SENSOR_SERIAL_NUMBER: Final = Reading("sensor serial number", 0x00050006, ">I", int)
-SENSOR_PART_NUMBER: Final = Reading("sensor part number", 0x0005003F, ">32s", _text)
 SOFTWARE_REVISION: Final = Reading("software revision", 0x00050022, ">III", _revision)
-FPA_TEMPERATURE: Final = Reading("FPA temperature [K]", 0x00050030, ">h", _tenths_celsius)
-FPA_TEMPERATURE_KELVIN: Final = Reading("FPA temperature [K]", 0x00050031, ">H", _tenths)
-FPA_COUNTS: Final = Reading("FPA temperature [count]", 0x00020001, ">H", int)
+FPA_TEMPERATURE: Final = Reading("FPA temperature [K]", 0x00050030, ">h", _kelvin)
 FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, ">h", Switch)
 FFC_STATUS: Final = Reading("FFC status", 0x00050054, ">i", FfcStatus)
-FFC_DESIRED: Final = Reading("FFC desired", 0x00050055, ">I", int)
 LAST_FFC_FRAME: Final = Reading("frame of the last FFC", 0x0005005D, ">I", int)
-LAST_FFC_TEMPERATURE: Final = Reading(
-    "FPA temperature of the last FFC [K]", 0x0005005E, ">H", _tenths
-)
-TABLE_SWITCH_DESIRED: Final = Reading("desired NUC table", 0x0005005F, ">H", int)
-RADIOMETRY_CAPABLE: Final = Reading("radiometry capable", 0x0042007D, ">i", Switch)
-FRAME_COUNT: Final = Reading("frame count of the sensor", 0x00020002, ">I", int)
-ISP_FRAME_COUNT: Final = Reading("frame count of the processor", 0x000500AC, ">I", int)
-FRAME_RATE: Final = Reading("frame rate [Hz]", 0x000E0007, ">I", int)
-UPTIME: Final = Reading("time since power-up [s]", 0x000E0008, ">I", int)
 
-READINGS: Final = tuple(value for value in list(globals().values()) if isinstance(value, Reading))
+READINGS: Final[tuple[Reading[Any], ...]] = (
+    SERIAL_NUMBER,
+    PART_NUMBER,
+    SENSOR_SERIAL_NUMBER,
+    SOFTWARE_REVISION,
+    FPA_TEMPERATURE,
+    FFC_IN_PROGRESS,
+    FFC_STATUS,
+    LAST_FFC_FRAME,
+)
 """All readings."""
 
-FFC_MODE: Final = _enumeration("FFC mode", 0x00050012, FfcMode)
-APPLY_FFC: Final = _enumeration("FFC applied", 0x00000003, Switch)
-GAIN_MODE: Final = _enumeration("gain mode", 0x00050014, GainMode)
-AVERAGER: Final = _enumeration("averager", 0x0000000B, Switch)
-SYNC_MODE: Final = _enumeration("external sync mode", 0x00050098, SyncMode)
-TELEMETRY: Final = _enumeration("telemetry", 0x00040001, Switch)
-TELEMETRY_LOCATION: Final = _enumeration("telemetry location", 0x00040003, TelemetryLocation)
-TELEMETRY_PACKING: Final = _enumeration("telemetry packing", 0x00040005, TelemetryPacking)
-TELEMETRY_ORDER: Final = _enumeration("telemetry order", 0x00040007, TelemetryOrder)
-IR16_MODE: Final = _enumeration("IR16 mode", 0x000E000D, Ir16Mode)
-TLINEAR: Final = _enumeration("TLinear", 0x003E0001, Switch)
-TEMPERATURE_STABLE: Final = _enumeration("temperature stable", 0x00420000, Switch)
-FFC_FRAMES: Final = Setting(
-    "number of FFC frames", 0x0000000D, 0x0000000E, ">H", int, (2, 4, 8, 16)
-)
-FFC_TEMPERATURE_STEP: Final = Setting(  # its scale is uncertain: flirpy's
-    "FFC temperature threshold [0.1 K]", 0x00050008, 0x00050009, ">H", int, range(1 << 16)
-)
-FFC_FRAME_STEP: Final = Setting(
-    "FFC frame threshold", 0x0005000A, 0x0005000B, ">I", int, range(1 << 32)
-)
+FFC_MODE: Final = Setting("FFC mode", 0x00050012, FfcMode)
+GAIN_MODE: Final = Setting("gain mode", 0x00050014, GainMode)
+IR16_MODE: Final = Setting("IR16 mode", 0x000E000D, Ir16Mode)
+TELEMETRY: Final = Setting("telemetry", 0x00040001, Switch)
+TELEMETRY_LOCATION: Final = Setting("telemetry location", 0x00040003, TelemetryLocation)
 
-SETTINGS: Final[tuple[Setting[Any], ...]] = tuple(
-    value for value in list(globals().values()) if isinstance(value, Setting)
+SETTINGS: Final[tuple[Setting[Any], ...]] = (
+    FFC_MODE,
+    GAIN_MODE,
+    IR16_MODE,
+    TELEMETRY,
+    TELEMETRY_LOCATION,
 )
 """All settings."""
 
-RUN_FFC: Final = Action("run FFC", 0x00050007)
-REBOOT: Final = Action("reboot", 0x00050010)
-SAVE_DEFAULTS: Final = Action("save power-on defaults to flash", 0x00050018)
+RUN_FFC: Final = 0x00050007
+"""Command that starts a flat-field correction."""
 
 STATUSES: Final = MappingProxyType(
     {
-        0x000: "OK",
         0x161: "bad command identifier",
         0x162: "bad status of the request",
         0x17D: "too few bytes of data",
@@ -291,27 +186,11 @@ STATUSES: Final = MappingProxyType(
         0x26F: "communication count error",
         0x281: "configuration error",
         0x283: "camera busy",
+        **dict.fromkeys(range(0x6A4, 0x6AE), "flash error"),
     }
 )
-"""Meaning of each status of a reply."""
-
-_FLASH = range(0x6A4, 0x6AE)
+"""Meaning of each status of a refusal."""
 
 
-def meaning(status: int) -> str:
-    """
-    Meaning of a status.
-
-    Parameters
-    ----------
-    status : int
-        Of a reply.
-
-    Returns
-    -------
-    str
-        A few words; "unknown status" if it is in no public list.
-    """
-    if status == REQUEST:
-        return "a request, not a reply"
-    return "flash error" if status in _FLASH else STATUSES.get(status, "unknown status")
+def __dir__() -> list[str]:
+    return __all__

@@ -19,8 +19,7 @@ from typing import Final, NamedTuple
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.apt import Id, StatusBits
-from dbthermal.instruments.emulated.options import number, require_known
-from dbthermal.instruments.emulated.port import EmulatedPort
+from dbthermal.instruments.emulated.port import EmulatedPort, number, require_known
 from dbthermal.instruments.emulated.world import World
 
 SERIAL_NUMBER: Final = 40_000_000

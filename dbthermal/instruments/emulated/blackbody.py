@@ -10,7 +10,6 @@ from dbthermal import simulation
 from dbthermal.bands import FILTERS
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.session import Session
-from dbthermal.simulation._rig import digitise
 
 NETD = 0.1
 """Noise of the emulated cameras near 25 degrees Celsius [K]."""
@@ -41,7 +40,7 @@ def pictures(session: Session, world: World) -> dict[str, Callable[[float], Coun
 
         def picture(_: float) -> Counts:
             level = float(curve.counts(np.array(world.blackbody_temperature)))
-            return digitise(level + rng.normal(0.0, noise, session.shape), own)
+            return simulation.digitise(level + rng.normal(0.0, noise, session.shape), own)
 
         return picture
 

@@ -1,21 +1,22 @@
-"""Where an emulated device meets a driver: a raw pseudo-terminal, or a loop in memory.
+"""The line between an emulated device and its driver: a raw pseudo-terminal in real time.
 
-The pseudo-terminal has a path that any program can open, and runs in real time. The loop is for
-tests: time is injected, so that waiting takes none.
+Its path can be opened by any program.
 """
 
 import os
 import pty
 import select
 import threading
-import time as system_time
 import tty
 from collections import deque
-from collections.abc import Callable
-from typing import Final, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Final, Protocol, TypeVar
 
-from dbthermal.instruments.closing import Closing
-from dbthermal.instruments.transport import TransportError
+from dbthermal.instruments.transport import Closing
+
+__all__ = ["TICK", "Device", "EmulatedPort", "number", "require_known"]
+
+Number = TypeVar("Number", bound=float)
 
 TICK: Final = 0.01
 """Longest time after which a port looks whether it is to end, or the device was pulled out [s]."""
@@ -24,7 +25,7 @@ _READ_SIZE = 4096
 
 
 class Device(Protocol):
-    """An emulated device: it takes bytes, and is asked what it has to say."""
+    """An emulated device: it takes bytes, and gives bytes when it is polled."""
 
     @property
     def plugged(self) -> bool:
@@ -34,32 +35,19 @@ class Device(Protocol):
         """Take in bytes from the driver."""
 
     def poll(self) -> list[bytes]:
-        """Give what is due to be sent now, each piece in a write of its own."""
+        """Give the bytes that are due, each piece in a write of its own."""
 
     def next_due(self) -> float:
-        """Time until something may be due [s]; infinite if nothing will unless bytes come."""
+        """Time until something may be due [s]; infinite if it waits for bytes."""
 
 
 class EmulatedPort(Closing):
     """
     A raw pseudo-terminal on which a thread lets an emulated device answer.
 
-    If the device is pulled out, or an error in it ends the thread, the terminal hangs up, as a real
-    one does. What a driver does not read is kept, without blocking the device.
-
-    Parameters
-    ----------
-    device : Device
-        Called from the thread only, once it is started.
-
-    Attributes
-    ----------
-    device : Device
-        The emulated device.
-    path : str
-        Of the end for the driver, as in ``/dev/pts/3``.
-    is_simulated : bool
-        True.
+    `path` is of the end for the driver, as in ``/dev/pts/3``. If the device is pulled out, or an
+    error in it ends the thread, the terminal hangs up, as a real one does. Bytes that a driver does
+    not read are kept, without blocking the device, which only the thread calls once it is started.
     """
 
     is_simulated: Final = True
@@ -103,63 +91,34 @@ class EmulatedPort(Closing):
                     waiting.appendleft(rest)
 
 
-class Loop(Closing):
+def require_known(options: Mapping[str, str], names: Sequence[str]) -> None:
+    """Raise ValueError for an option of an emulator's address that it does not have."""
+    for name in sorted(options.keys() - {*names}):
+        raise ValueError(f"Unknown option '{name}'. Must be one of {', '.join(names)}.")
+
+
+def number(
+    options: Mapping[str, str], name: str, default: Number, limits: tuple[Number, Number]
+) -> Number:
+    """Number that an option gives, as in ``sim://boson?sn=7``, within lowest and highest limit.
+
+    It is of the type of `default`; ValueError if it is no such number.
     """
-    A transport straight to an emulated device, in memory and on an injected clock.
+    if name not in options:
+        return default
+    lowest, highest = limits
+    try:
+        value = type(default)(options[name])
+        allowed = lowest <= value <= highest  # which NaN is not
+    except ValueError:
+        allowed = False
+    if not allowed:
+        raise ValueError(
+            f"Invalid option {name}={options[name]} of an emulator. "
+            f"Must be a number ({type(default).__name__}) in {lowest} to {highest}."
+        )
+    return value
 
-    Parameters
-    ----------
-    device : Device
-        The emulated device.
-    clock, sleep : callable
-        Give the time and wait [s]; the device must be on the same clock.
 
-    Attributes
-    ----------
-    is_simulated : bool
-        True.
-    """
-
-    is_simulated: Final = True
-
-    def __init__(
-        self,
-        device: Device,
-        *,
-        clock: Callable[[], float] = system_time.monotonic,
-        sleep: Callable[[float], None] = system_time.sleep,
-    ) -> None:
-        self._device = device
-        self._clock = clock
-        self._sleep = sleep
-        self._pieces: deque[bytes] = deque()
-        self._closed = False
-
-    def write(self, data: bytes) -> None:
-        """Give bytes to the device; see `Transport.write`."""
-        self._check()
-        self._device.receive(data)
-
-    def read(self, size: int, timeout: float) -> bytes:
-        """Give one piece of what the device says; see `Transport.read`."""
-        deadline = self._clock() + timeout
-        while True:
-            self._check()
-            self._pieces.extend(self._device.poll())
-            if self._pieces:
-                piece = self._pieces.popleft()
-                if piece[size:]:
-                    self._pieces.appendleft(piece[size:])
-                return piece[:size]
-            remaining = deadline - self._clock()
-            if remaining <= 0:
-                return b""
-            self._sleep(min(remaining, max(self._device.next_due(), TICK)))
-
-    def close(self) -> None:
-        """End; a second time does nothing."""
-        self._closed = True
-
-    def _check(self) -> None:
-        if self._closed or not self._device.plugged:
-            raise TransportError("Lost the emulated device. It must stay connected and open.")
+def __dir__() -> list[str]:
+    return __all__

@@ -1,10 +1,10 @@
 """The shared state of the emulated bench: one world that all emulators read and write.
 
-The wheel's emulator turns `World.wheel_position`, and what the camera behind it sees changes; the
+The wheel's emulator turns `World.wheel_position`, and the view of the camera behind it changes; the
 camera's emulator starts a flat-field correction, and the frame source freezes; a program sets
-`World.blackbody_temperature`, and the thermocouples and the frames follow. There is no physics
-here, only who is where and how warm. All temperatures are in kelvin, all times in seconds since
-the world began, on the clock that was injected; what happens in the scene has a time of its own,
+`World.blackbody_temperature`, and thermocouples and frames follow. There is no physics here, only
+positions and temperatures. All temperatures are in kelvin, all times in seconds since the world
+began, on the clock that was injected; events in the scene have a time of their own,
 `World.scene_time`, so that a recording can begin with it.
 """
 
@@ -13,102 +13,74 @@ import threading
 import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from dbthermal.instruments.session import Session
+
+__all__ = ["FFC_DURATION", "FPA", "POSITIONS", "ROOM", "CameraState", "World", "emulated_world"]
 
 POSITIONS: Final = 6
 """Slots of the wheel, numbered from 1."""
 
 ROOM: Final = 296.15
-"""Temperature of all that nobody set [K]."""
+"""Default temperature of the room [K]."""
 
 FPA: Final = 308.15
-"""Temperature of a focal-plane array that nobody set [K]."""
+"""Default temperature of a focal-plane array [K]."""
 
 FFC_DURATION: Final = 0.5
-"""How long an emulated flat-field correction takes [s]; the real one is not documented publicly."""
+"""Duration of an emulated flat-field correction [s]; the real one is not documented publicly."""
+
+SERIAL_NUMBERS: Final = 93588
+"""Number of the first emulated camera of a session; the others follow."""
 
 
 @dataclass
 class CameraState:
-    """
-    What one emulated camera is about; plain attributes, to be read and set by emulators.
-
-    Attributes
-    ----------
-    serial_number : int
-        Of the camera.
-    fpa_temperature : float
-        Of its focal-plane array [K].
-    plugged : bool
-        False once it was pulled out.
-    streaming : bool
-        False while its sensor takes no frames: it boots, or waits for pulses that do not come.
-    frame_count : int
-        Frames since its sensor started.
-    ffc_count : int
-        Flat-field corrections started.
-    ffc_until : float
-        When the last one ends [s]; in the past, or -inf, if none is in progress.
-    last_ffc_frame : int
-        `frame_count` at the start of the last one, 0 before the first.
-    last_ffc_temperature : float
-        `fpa_temperature` at the start of the last one [K].
-    """
+    """State of one emulated camera; plain attributes, read and set by emulators."""
 
     serial_number: int
-    fpa_temperature: float = FPA
-    plugged: bool = True
-    streaming: bool = True
-    frame_count: int = 0
-    ffc_count: int = 0
-    ffc_until: float = -math.inf
-    last_ffc_frame: int = 0
-    last_ffc_temperature: float = FPA
+    fpa_temperature: float = FPA  # of its focal-plane array [K]
+    plugged: bool = True  # False once it was pulled out
+    has_frames: bool = False  # whether an emulated frame source counts its frames
+    frame_count: int = 0  # frames since its sensor started
+    ffc_count: int = 0  # flat-field corrections started
+    ffc_until: float = -math.inf  # end of the last one [s]
+    last_ffc_frame: int = 0  # frame_count at its start, 0 before the first
+    last_ffc_temperature: float = FPA  # fpa_temperature at its start [K]
 
 
 class World:
     """
     One emulated bench: wheel, blackbody, scene and cameras, on one clock.
 
-    Single attributes may be read and set from any thread. Who changes several together holds
-    `lock`, which is re-entrant, or calls a method, which does.
+    Single attributes may be read and set from any thread. To change several together, hold `lock`,
+    which is re-entrant, or call a method, which does.
 
     Parameters
     ----------
     clock : callable
-        Gives the time [s]; injected by tests.
+        Gives the time [s]; injected by tests. The world begins at its `epoch`.
     filters : mapping, optional
         Band in each slot of the wheel, by its number 1 to 6. Slots left out hold no filter.
     wheel_position : int
         The slot in the beam at the start.
     blackbody_temperature : float
         Of the blackbody [K].
-    time_constant : float
-        With which the blackbody approaches what it is set to [s]; 0 is at once.
     scene : callable, optional
-        Temperatures of what is in the scene [K], by name, at a time of the scene [s]; by default
-        none.
+        Temperatures of the objects in the scene [K], by name, at a time of the scene [s].
     waits : bool
-        Whether the scene stands at its beginning until `begin`; else it begins with the world.
+        Whether the scene stands at its beginning until `begin` sets `scene_began` [s]; else it
+        begins with the world.
 
     Attributes
     ----------
     thermocouples : dict
-        What each channel, 1 to 8, of the thermocouple logger is at: a name in `scene`, or
+        Place of each channel, 1 to 8, of the thermocouple logger: a name in `scene`, or
         ``"blackbody"``, ``"room"`` or ``"open"``.
     cameras : dict
         `CameraState` of each camera by its name; see `add_camera`.
-    epoch : float
-        When the world began, on its clock [s].
-    scene_began : float
-        When the scene began, on the world's clock [s]; infinite before.
-    is_simulated : bool
-        True.
-
-    Raises
-    ------
-    ValueError
-        If a slot is not 1 to 6, or the time constant is negative.
     """
 
     is_simulated: Final = True
@@ -120,23 +92,19 @@ class World:
         filters: Mapping[int, str] | None = None,
         wheel_position: int = 1,
         blackbody_temperature: float = ROOM,
-        time_constant: float = 0.0,
         scene: Callable[[float], Mapping[str, float]] | None = None,
         waits: bool = False,
     ) -> None:
-        if not 0 <= time_constant < math.inf:
-            raise ValueError(f"Invalid time_constant {time_constant} s. Must be 0 or more.")
         self.lock = threading.RLock()
         self.clock = clock
         self.filters = {_slot(slot): name for slot, name in (filters or {}).items()}
         self.thermocouples: dict[int, str] = {}
         self.cameras: dict[str, CameraState] = {}
-        self._scene = scene
-        self._wheel: int | None = _slot(wheel_position)
+        self.blackbody_temperature = blackbody_temperature
         self.epoch = clock()
         self.scene_began = math.inf if waits else self.epoch
-        self._time_constant = time_constant
-        self._blackbody = blackbody_temperature, 0.0, self.epoch  # goal, distance from it, when
+        self._scene = scene
+        self._wheel: int | None = _slot(wheel_position)
 
     @property
     def time(self) -> float:
@@ -148,33 +116,9 @@ class World:
         self.scene_began = self.clock()
 
     def scene_time(self, time: float | None = None) -> float:
-        """
-        Time since the scene began.
-
-        Parameters
-        ----------
-        time : float, optional
-            When, since the world began [s]; now, unless given.
-
-        Returns
-        -------
-        float
-            [s]; 0 before it began.
-        """
+        """Time since the scene began [s], 0 before; at a time since the world began, or now."""
         now = self.time if time is None else time
         return max(0.0, self.epoch + now - self.scene_began)
-
-    @property
-    def blackbody_temperature(self) -> float:
-        """Temperature of the blackbody [K]; set, it goes there with the time constant."""
-        goal, distance, since = self._blackbody
-        if distance == 0 or self._time_constant == 0:
-            return goal
-        return goal + distance * math.exp((since - self.clock()) / self._time_constant)
-
-    @blackbody_temperature.setter
-    def blackbody_temperature(self, goal: float) -> None:
-        self._blackbody = goal, self.blackbody_temperature - goal, self.clock()
 
     @property
     def wheel_position(self) -> int | None:
@@ -192,40 +136,15 @@ class World:
         return None if position is None else self.filters.get(position)
 
     def scene_temperatures(self, time: float | None = None) -> dict[str, float]:
-        """
-        Temperatures of what is in the scene.
-
-        Parameters
-        ----------
-        time : float, optional
-            When, since the world began [s]; now, unless given.
-
-        Returns
-        -------
-        dict
-            Name to temperature [K]; always with ``"blackbody"`` and ``"room"``.
-        """
+        """Temperatures [K] in the scene by name, with ``"blackbody"`` and ``"room"``."""
         scene = {} if self._scene is None else self._scene(self.scene_time(time))
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:
         """
-        Temperature of the tip of one thermocouple.
+        Temperature of the tip of one thermocouple [K]; NaN if it is open or missing.
 
-        Parameters
-        ----------
-        channel : int
-            Of the logger, see `thermocouples`.
-
-        Returns
-        -------
-        float
-            Temperature [K]; NaN if it is open or there is none.
-
-        Raises
-        ------
-        KeyError
-            If it is at something that the scene does not have.
+        KeyError if its place is not in the scene.
         """
         place = self.thermocouples.get(channel, "open")
         if place == "open":
@@ -239,26 +158,7 @@ class World:
         return temperatures[place]
 
     def add_camera(self, name: str, serial_number: int) -> CameraState:
-        """
-        Put a camera on the bench.
-
-        Parameters
-        ----------
-        name : str
-            Its name.
-        serial_number : int
-            Its number.
-
-        Returns
-        -------
-        CameraState
-            Its state, also in `cameras`.
-
-        Raises
-        ------
-        ValueError
-            If there is one of this name.
-        """
+        """Put a camera on the bench; ValueError if one has this name."""
         with self.lock:
             if name in self.cameras:
                 raise ValueError(f"Repeated camera '{name}'. Each must have a name of its own.")
@@ -266,44 +166,20 @@ class World:
             return self.cameras[name]
 
     def camera(self, name: str) -> CameraState:
-        """
-        State of a camera.
-
-        Parameters
-        ----------
-        name : str
-            Its name.
-
-        Returns
-        -------
-        CameraState
-            Its state, shared by all emulators.
-
-        Raises
-        ------
-        KeyError
-            If there is none of this name.
-        """
+        """State of a camera, shared by all emulators; KeyError if none has this name."""
         if name not in self.cameras:
             raise KeyError(f"Unknown camera '{name}'. Must be one of {sorted(self.cameras)}.")
         return self.cameras[name]
 
+    def furnish(self, session: Session) -> None:
+        """Put the cameras and thermocouples of an emulated session on the bench."""
+        self.thermocouples.update(session.thermocouples)
+        for number, camera in enumerate(session.cameras.values()):
+            name = urlsplit(session.url(camera.video)).path.lstrip("/")
+            self.add_camera(name, SERIAL_NUMBERS + number)
+
     def start_ffc(self, name: str, duration: float = FFC_DURATION) -> None:
-        """
-        Start a flat-field correction: the shutter closes, the image freezes until it is over.
-
-        Parameters
-        ----------
-        name : str
-            Of the camera. If one is in progress, it begins anew.
-        duration : float
-            How long it takes [s].
-
-        Raises
-        ------
-        KeyError
-            If there is no such camera.
-        """
+        """Start a correction, maybe anew: the shutter closes, the image freezes until its end."""
         with self.lock:
             state = self.camera(name)
             state.ffc_count += 1
@@ -312,29 +188,29 @@ class World:
             state.last_ffc_temperature = state.fpa_temperature
 
     def ffc_in_progress(self, name: str) -> bool:
-        """
-        Whether a camera's shutter is closed.
-
-        Parameters
-        ----------
-        name : str
-            Of the camera.
-
-        Returns
-        -------
-        bool
-            True until its flat-field correction is over.
-
-        Raises
-        ------
-        KeyError
-            If there is no such camera.
-        """
+        """Whether a camera's shutter is closed."""
         return self.time < self.camera(name).ffc_until
 
 
+def emulated_world(session: Session, **settings: Any) -> World:
+    """
+    Bench with the cameras, filters and thermocouples of an emulated session.
+
+    The thermocouples are at the places that they are named after, all at room temperature but the
+    blackbody, unless the settings of the `World` say otherwise.
+    """
+    room = dict.fromkeys(session.thermocouples.values(), ROOM)
+    world = World(filters=session.filters, **{"scene": lambda _: room, **settings})
+    world.furnish(session)
+    return world
+
+
 def _slot(position: int) -> int:
-    """Return the position if it is one."""
+    """Return the position if it is a slot."""
     if position not in range(1, POSITIONS + 1):
         raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
     return position
+
+
+def __dir__() -> list[str]:
+    return __all__

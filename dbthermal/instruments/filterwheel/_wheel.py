@@ -9,10 +9,9 @@ import logging
 import time as system_time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.closing import Closing
 from dbthermal.instruments.filterwheel._controller import (
     Controller,
     NotHomedError,
@@ -21,10 +20,7 @@ from dbthermal.instruments.filterwheel._controller import (
     WheelTimeoutError,
 )
 from dbthermal.instruments.filterwheel._settings import FAULTS, Settings
-from dbthermal.instruments.transport import SerialTransport, Transport, open_serial
-
-if TYPE_CHECKING:
-    from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.transport import Closing, SerialTransport, Transport, open_serial
 
 BAUDRATE: Final = 115_200  # [bit/s]
 SETTLING: Final = 0.05  # [s] between taking RTS down and up, as in the maker's example
@@ -79,7 +75,7 @@ class FilterWheel(Closing):
         self._is_lost = False  # the counter may not be where the wheel is
 
     @classmethod
-    def from_url(cls, url: str, settings: Settings, *, world: "World | None" = None) -> Self:
+    def from_url(cls, url: str, settings: Settings, *, world: object | None = None) -> Self:
         """
         Open the line and `connect`; the wheel does not move.
 
@@ -89,7 +85,7 @@ class FilterWheel(Closing):
             ``serial:///dev/ttyUSB0``, ``pty:///dev/pts/3`` or ``sim://apt``.
         settings : Settings
             Properties of this wheel.
-        world : World, optional
+        world : object, optional
             Emulated bench of a ``sim://`` wheel.
 
         Raises

@@ -30,15 +30,15 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         `counts` (band, time, y, x) [count], read when used; `exposure_time` (band, time) [s], NaN
         for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
         ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
-        any. `time` is when the first band was exposed [s]. For the log see `notes`. If fitted,
-        attribute ``clock_rates`` has b of each band.
+        any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates``
+        has b of each band.
 
     Raises
     ------
     FileNotFoundError
         If the folder does not exist.
     ValueError
-        If a band has fewer than two frames with a time: too short, or a camera's own clock.
+        If a band has fewer than two frames with a time.
     """
     recording = store.open_dataset(path)
     opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
@@ -53,23 +53,10 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
 
 def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
     """
-    Log of a recording: readings, losses, shutter events, in the order of writing.
+    Log of a recording: time [s], kind, source and value of each note, in the order of writing.
 
-    Parameters
-    ----------
-    path : str or Path
-        Folder ``*.zarr``.
-
-    Returns
-    -------
-    list of tuple
-        Time [s], kind (such as ``"reading"`` or ``"frames_lost"``), source and value of each note;
-        the store's attributes explain the values.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
+    Kinds are ``"reading"``, ``"frames_lost"``, ``"shutter_closed"`` and others; the attributes of
+    the store explain their values. FileNotFoundError if the folder does not exist.
     """
     recording = store.open_dataset(path)
     kinds = {number: name for name, number in recording.attrs["log_kinds"].items()}
@@ -100,7 +87,7 @@ def overview(folder: str | Path) -> xr.Dataset:
     Parameters
     ----------
     folder : str or Path
-        With recordings; other files in it are passed over.
+        With recordings (ValueError if there is none); other files in it are passed over.
 
     Returns
     -------
@@ -109,11 +96,6 @@ def overview(folder: str | Path) -> xr.Dataset:
         driver, and `refused` by a full queue; `frame_rate` by the good frames' stamps [Hz], NaN
         without two; `complete`, whether the recording went to its planned end. Coordinates
         `recording` and `band`.
-
-    Raises
-    ------
-    ValueError
-        If there is no recording.
     """
     rows = [
         {"recording": path.stem, "band": band, **totals, **_rate_and_end(opened, band)}
@@ -123,8 +105,8 @@ def overview(folder: str | Path) -> xr.Dataset:
     ]
     if not rows:
         raise ValueError(f"Invalid folder '{folder}' without recordings. Must have one.")
-    found = xr.Dataset({name: ("row", [row[name] for row in rows]) for name in rows[0]})
-    return found.set_coords(["recording", "band"])
+    table = xr.Dataset({name: ("row", [row[name] for row in rows]) for name in rows[0]})
+    return table.set_coords(["recording", "band"])
 
 
 def _rate_and_end(recording: xr.Dataset, band: str) -> dict[str, float | bool]:

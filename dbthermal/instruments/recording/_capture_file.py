@@ -91,19 +91,27 @@ class _Explained(Variable):
 
     @property
     def attrs(self) -> dict[str, Any]:
-        """Attributes to write on the variable."""
         return {**super().attrs, **self.more}
 
 
-def _codes(meanings: Mapping[Any, str]) -> dict[str, Any]:
-    """Attributes of numbers with meanings, by the CF conventions, and a sentence for each."""
-    said = {str(code.name).lower(): text for code, text in meanings.items()}
+def _of_frames(dtype: str, units: str, long_name: str) -> Variable:
+    return Variable(("band", "time"), dtype, units, long_name)
+
+
+def _of_log(dtype: str, long_name: str, units: str = "1") -> Variable:
+    return Variable(("log",), dtype, units, long_name)
+
+
+def _coded(variable: Variable, meanings: Mapping[Any, str]) -> Variable:
+    """Variable with CF attributes of its codes, and a sentence for each."""
+    sentences = {str(code.name).lower(): text for code, text in meanings.items()}
     masks = all(isinstance(code, IntFlag) for code in meanings)
-    return {
+    attrs = {
         "flag_masks" if masks else "flag_values": [int(code) for code in meanings],
-        "flag_meanings": " ".join(said),
-        "comment": "; ".join(f"{name}: {text}" for name, text in said.items()),
+        "flag_meanings": " ".join(sentences),
+        "comment": "; ".join(f"{name}: {text}" for name, text in sentences.items()),
     }
+    return _Explained(variable.dims, variable.dtype, variable.units, variable.long_name, attrs)
 
 
 ABOUT: Final = (
@@ -135,24 +143,14 @@ VARIABLES: Final = MappingProxyType(
     {
         "counts": STAGES["capture"]["counts"],
         "exposure_time": EXPOSURE_TIME,
-        "device_time": Variable(
-            ("band", "time"), "float64", "s", "device's stamp of the frame, as it came"
-        ),
-        "host_time": Variable(
-            ("band", "time"), "float64", "s", "when the host had the frame, since clock_origin"
-        ),
-        "sequence": Variable(("band", "time"), "int64", "1", "number of the frame by its driver"),
-        "frame_flags": _Explained(
-            ("band", "time"), "uint16", "1", "flags of the frame, 0 is good", _codes(MEANINGS)
-        ),
-        "log_time": Variable(("log",), "float64", "s", "time of the note, since clock_origin"),
-        "log_kind": _Explained(("log",), "int16", "1", "what is noted", _codes(NOTES)),
-        "log_source": Variable(
-            ("log",), "int16", "1", "whose note it is: place in attribute log_sources"
-        ),
-        "log_value": Variable(
-            ("log",), "float64", "1", "value of the note by its kind; see attribute log_units"
-        ),
+        "device_time": _of_frames("float64", "s", "device's stamp of the frame, as it came"),
+        "host_time": _of_frames("float64", "s", "arrival at the host, since clock_origin"),
+        "sequence": _of_frames("int64", "1", "number of the frame by its driver"),
+        "frame_flags": _coded(_of_frames("uint16", "1", "flags, 0 for a good frame"), MEANINGS),
+        "log_time": _of_log("float64", "time of the note, since clock_origin", "s"),
+        "log_kind": _coded(_of_log("int16", "kind of the note"), NOTES),
+        "log_source": _of_log("int16", "source of the note: place in attribute log_sources"),
+        "log_value": _of_log("float64", "value by kind of the note; see attribute log_units"),
     }
 )
 """Variables of every recording; `ABOUT` explains them together."""
@@ -166,12 +164,8 @@ TELEMETRY: Final = MappingProxyType(
             "telemetry rows as they came",
             {"comment": _LAYOUT},
         ),
-        "fpa_temperature": Variable(
-            ("band", "time"), "float32", "K", "temperature of the focal-plane array"
-        ),
-        "frame_counter": Variable(
-            ("band", "time"), "int64", "1", "camera's own number of the frame, -1 if not known"
-        ),
+        "fpa_temperature": _of_frames("float32", "K", "temperature of the focal-plane array"),
+        "frame_counter": _of_frames("int64", "1", "camera's own number of the frame, or -1"),
     }
 )
 """Variables of a recording of cameras that give telemetry. Where `frame_counter` leaps and
@@ -230,7 +224,14 @@ class CaptureFile:
             self._sizes,
             list(sources),
             chunk=chunk,
-            attrs={**attrs, **_legend(self._names, readings, origin)},
+            attrs={
+                **attrs,
+                "comment": ABOUT,
+                "clock_origin": origin,
+                "log_sources": self._names,
+                "log_units": dict(readings),
+                "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
+            },
             fills=_FILLS,
         )
         self._bands = {band: _Band(self._new_block()) for band in sources}
@@ -292,7 +293,8 @@ class CaptureFile:
         for band in self._bands:
             self._write(band)
         self._write_notes()
-        time = self._times(next(iter(self._bands)))
+        stamps = self.recording.read("exposure_time", next(iter(self._bands)))
+        time = fill_times(stamps) if np.isfinite(stamps).sum() > 1 else None
         self.recording.close(complete=complete, time=time, ended=ended, totals=self.totals)
 
     def _compared(self, band: str, frame: Frame, refused: int) -> FrameFlag:
@@ -383,25 +385,9 @@ class CaptureFile:
             if variable.dims[0] == "band"
         }
 
-    def _times(self, band: str) -> npt.NDArray[np.float64] | None:
-        """Exposure times without holes; None where there are not two."""
-        stamps = self.recording.read("exposure_time", band)
-        return fill_times(stamps) if np.isfinite(stamps).sum() > 1 else None
-
 
 def _common_format(sources: Mapping[str, FrameSource]) -> tuple[tuple[int, int], int]:
     formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
     if len(set(formats.values())) != 1:
         raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
     return next(iter(formats.values()))
-
-
-def _legend(names: list[str], readings: Mapping[str, str], origin: float) -> dict[str, Any]:
-    """Attributes that explain the numbers in times and log."""
-    return {
-        "comment": ABOUT,
-        "clock_origin": origin,
-        "log_sources": names,
-        "log_units": dict(readings),
-        "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
-    }

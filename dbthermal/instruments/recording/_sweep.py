@@ -153,11 +153,8 @@ def bench_series(
 
     Raises
     ------
-    FileNotFoundError
-        If there is no recording of such a session.
-    ValueError
-        As `open_sweep`, also for the object's readings; or if a region has no pixel or a band no
-        good frame.
+    FileNotFoundError, ValueError
+        As `open_sweep`; or if a region has no pixel or a band no good frame.
     """
     sweep = _find(folder, name)
     columns: dict[str, list[dict[str, Any]]] = {material: [] for material in region}

@@ -1,4 +1,4 @@
-r"""Transient heat in thin shells: conduction along a surface, and what it exchanges.
+r"""Transient heat in thin shells: conduction along a surface, and exchange with its surroundings.
 
 The balance of a shell of thickness d, uniform through it, per area of its surface:
 
@@ -10,8 +10,15 @@ temperatures, and `simulate` steps through time.
 """
 
 from dbthermal.simulation.heat._exchange import Convection, Exchange, Heating, Held, Radiation
-from dbthermal.simulation.heat._shell import Shell
-from dbthermal.simulation.heat._solid import ALUMINIUM, BOROSILICATE, CERAMIC, GLASS, STEEL, Solid
+from dbthermal.simulation.heat._shell import (
+    ALUMINIUM,
+    BOROSILICATE,
+    CERAMIC,
+    GLASS,
+    STEEL,
+    Shell,
+    Solid,
+)
 from dbthermal.simulation.heat._transient import TOLERANCE, simulate
 
 __all__ = [
@@ -30,3 +37,7 @@ __all__ = [
     "Solid",
     "simulate",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

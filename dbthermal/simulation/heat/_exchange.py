@@ -1,4 +1,4 @@
-"""What a shell exchanges with its surroundings, per area and at a time.
+"""Heat exchange of a shell with its surroundings, per area and at a time.
 
 Every exchange is, at one time, a flux a - b T - s T^4 into the shell, so any number of them add
 up to three numbers a vertex.
@@ -43,17 +43,14 @@ class Balance:
 
 
 class Exchange(ABC):
-    """One way in which a shell gains or loses heat: convection, radiation or given heating."""
+    """Base of the heat exchanges of a shell: convection, radiation and heating."""
 
     @abstractmethod
     def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
         """
         Terms a, b, s of `Balance` at a time [s] for a number of vertices.
 
-        Raises
-        ------
-        ValueError
-            If an attribute does not fit the vertices or is not physical at that time.
+        Raises a ValueError if an attribute does not fit the vertices or is not physical.
         """
 
 
@@ -74,14 +71,7 @@ class Convection(Exchange):
     temperature: Varying
 
     def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
-        """
-        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
-
-        Raises
-        ------
-        ValueError
-            If an attribute does not fit the vertices, is not finite or negative.
-        """
+        """Terms a, b, s of `Balance` at a time [s]; see `Exchange.balance`."""
         coefficient = _not_negative("coefficient of convection", self.coefficient, time, vertices)
         temperature = _not_negative("temperature of convection", self.temperature, time, vertices)
         return coefficient * temperature, coefficient, np.zeros(vertices)
@@ -104,16 +94,8 @@ class Radiation(Exchange):
     temperature: Varying
 
     def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
-        """
-        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
-
-        Raises
-        ------
-        ValueError
-            If an attribute does not fit the vertices or is not finite, a temperature is
-            negative, or an emissivity outside [0, 1].
-        """
-        emissivity = evaluate("emissivity of radiation", self.emissivity, time, vertices)
+        """Terms a, b, s of `Balance` at a time [s]; see `Exchange.balance`."""
+        emissivity = _evaluate("emissivity of radiation", self.emissivity, time, vertices)
         outside = (emissivity < 0) | (emissivity > 1)
         if np.any(outside):
             raise ValueError(
@@ -128,7 +110,7 @@ class Radiation(Exchange):
 @dataclass(frozen=True, eq=False)
 class Heating(Exchange):
     """
-    A given flux into the shell, such as absorbed light; negative if it cools.
+    Prescribed flux into the shell, such as absorbed light; negative if it cools.
 
     Attributes
     ----------
@@ -139,27 +121,20 @@ class Heating(Exchange):
     flux: Varying
 
     def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
-        """
-        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
-
-        Raises
-        ------
-        ValueError
-            If the flux does not fit the vertices or is not finite.
-        """
+        """Terms a, b, s of `Balance` at a time [s]; see `Exchange.balance`."""
         nothing = np.zeros(vertices)
-        return evaluate("flux of heating", self.flux, time, vertices), nothing, nothing
+        return _evaluate("flux of heating", self.flux, time, vertices), nothing, nothing
 
 
 @dataclass(frozen=True, eq=False)
 class Held:
     """
-    Vertices whose temperature is given.
+    Vertices of prescribed temperature.
 
     Attributes
     ----------
     vertices : ndarray of int, shape (held,), or of bool, shape (vertex,)
-        Which vertices.
+        Numbers of the vertices, or a mask.
     temperature : float, ndarray (held,) or function of time
         Their temperature [K].
     """
@@ -168,23 +143,16 @@ class Held:
     temperature: Varying
 
     def indices(self, vertices: int) -> npt.NDArray[np.int64]:
-        """
-        Numbers of the held vertices of a shell that has so many, in the given order.
-
-        Raises
-        ------
-        ValueError
-            If a number does not exist or is repeated, or a mask has another size.
-        """
-        given = np.asarray(self.vertices)
-        if given.dtype == np.bool_ and given.shape == (vertices,):
-            return np.flatnonzero(given)
-        if given.ndim != 1 or not (np.issubdtype(given.dtype, np.integer) or given.size == 0):
+        """Numbers of the held vertices of a shell of so many; a ValueError if they do not fit."""
+        array = np.asarray(self.vertices)
+        if array.dtype == np.bool_ and array.shape == (vertices,):
+            return np.flatnonzero(array)
+        if array.ndim != 1 or not (np.issubdtype(array.dtype, np.integer) or array.size == 0):
             raise ValueError(
-                f"Invalid held vertices of shape {given.shape} and type {given.dtype}. "
+                f"Invalid held vertices of shape {array.shape} and type {array.dtype}. "
                 f"Must be numbers, or a mask of shape ({vertices},)."
             )
-        numbers = given.astype(np.int64)
+        numbers = array.astype(np.int64)
         bad = (numbers < 0) | (numbers >= vertices)
         if np.any(bad):
             raise ValueError(f"Invalid held vertex {numbers[bad][0]}. Must lie in [0, {vertices}).")
@@ -194,65 +162,21 @@ class Held:
 
     def at(self, time: float) -> Array:
         """Temperature of the held vertices at a time [s], (held,) [K]."""
-        given = np.asarray(self.vertices)
-        count = int(given.sum()) if given.dtype == np.bool_ else given.size
+        array = np.asarray(self.vertices)
+        count = int(array.sum()) if array.dtype == np.bool_ else array.size
         return _not_negative("temperature of held vertices", self.temperature, time, count)
 
 
 def combine(exchanges: Sequence[Exchange], time: float, vertices: int) -> Balance:
-    """
-    All exchanges at one time as one flux.
-
-    Parameters
-    ----------
-    exchanges : sequence of Exchange
-        Any number, none included.
-    time : float
-        Time [s].
-    vertices : int
-        Number of vertices.
-
-    Returns
-    -------
-    Balance
-        The sum.
-
-    Raises
-    ------
-    ValueError
-        If a value does not fit; see the exchanges.
-    """
+    """Sum of all exchanges at a time [s] as one flux."""
     total = np.zeros((3, vertices))
     for exchange in exchanges:
         total += np.stack(exchange.balance(time, vertices))
     return Balance(*total)
 
 
-def evaluate(name: str, value: Varying, time: float, vertices: int) -> Array:
-    """
-    A varying quantity at one time and for every vertex.
-
-    Parameters
-    ----------
-    name : str
-        What it is, for the error.
-    value : float, ndarray (vertex,) or function of time
-        The quantity.
-    time : float
-        Time [s].
-    vertices : int
-        Number of vertices.
-
-    Returns
-    -------
-    ndarray, shape (vertex,)
-        Finite values.
-
-    Raises
-    ------
-    ValueError
-        If the value is neither a number nor one for each vertex, or is not finite.
-    """
+def _evaluate(name: str, value: Varying, time: float, vertices: int) -> Array:
+    """Varying quantity at a time [s] and every vertex (vertex,), finite, or a ValueError."""
     array = np.asarray(value(time) if callable(value) else value, dtype=np.float64)
     if array.shape not in {(), (vertices,)}:
         raise ValueError(
@@ -267,8 +191,8 @@ def evaluate(name: str, value: Varying, time: float, vertices: int) -> Array:
 
 
 def _not_negative(name: str, value: Varying, time: float, vertices: int) -> Array:
-    """As `evaluate`, and refuse what is negative."""
-    array = evaluate(name, value, time, vertices)
+    """As `_evaluate`, and not negative."""
+    array = _evaluate(name, value, time, vertices)
     if np.any(array < 0):
         raise ValueError(
             f"Invalid {name} {array[array < 0][0]} at {time:g} s. Must not be negative."

@@ -1,6 +1,6 @@
-"""A thin shell: a surface mesh with a thickness and a solid, and its two operators."""
+"""Solids, and a thin shell: a surface mesh of a thickness and a solid, with its two operators."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Final
 
@@ -9,12 +9,68 @@ import numpy.typing as npt
 import robust_laplacian
 from scipy import sparse
 
-from dbthermal.simulation.heat._solid import Solid
-
 Array = npt.NDArray[np.float64]
 
 _FLATTEST: Final = 1e-9
 """A face whose area falls below this fraction of its longest edge squared is degenerate [1]."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """
+    Thermal properties of a solid, constant over the temperatures of a scene.
+
+    Attributes
+    ----------
+    conductivity : float
+        Thermal conductivity k [W m^-1 K^-1].
+    density : float
+        Density [kg m^-3].
+    specific_heat : float
+        Specific heat at constant pressure c [J kg^-1 K^-1].
+
+    Raises
+    ------
+    ValueError
+        If a property is not finite and positive.
+    """
+
+    conductivity: float
+    density: float
+    specific_heat: float
+
+    def __post_init__(self) -> None:
+        """Check the properties."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(
+                    f"Invalid {field.name} {value} of a solid. Must be finite and positive."
+                )
+
+    @property
+    def diffusivity(self) -> float:
+        r"""Thermal diffusivity :math:`\alpha = k / \rho c` [m^2 s^-1]."""
+        return self.conductivity / (self.density * self.specific_heat)
+
+
+# At 300 K, from tables A.1 (metals) and A.3 (glasses) of Bergman, Lavine, Incropera, DeWitt (2011),
+# Fundamentals of Heat and Mass Transfer, 7th edition, Wiley, ISBN 978-0-470-50197-9.
+
+GLASS: Final = Solid(conductivity=1.4, density=2500.0, specific_heat=750.0)
+"""Plate glass, soda-lime, at 300 K: table A.3 of Bergman et al. (2011)."""
+
+BOROSILICATE: Final = Solid(conductivity=1.4, density=2225.0, specific_heat=835.0)
+"""Pyrex at 300 K: table A.3 of Bergman et al. (2011)."""
+
+ALUMINIUM: Final = Solid(conductivity=237.0, density=2702.0, specific_heat=903.0)
+"""Pure aluminium at 300 K: table A.1 of Bergman et al. (2011)."""
+
+STEEL: Final = Solid(conductivity=14.9, density=7900.0, specific_heat=477.0)
+"""Stainless steel AISI 304 at 300 K: table A.1 of Bergman et al. (2011)."""
+
+CERAMIC: Final = Solid(conductivity=1.5, density=2400.0, specific_heat=1050.0)
+"""Porcelain near room temperature, round values: material-properties.org, page "Porcelain"."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +93,13 @@ class Shell:
     thickness : float
         Thickness d [m].
     solid : Solid
-        What it is made of.
+        Material.
 
     Raises
     ------
     ValueError
-        If a shape or a number is wrong, a vertex belongs to no face, a face appears twice or has
-        no area.
+        If a shape or a number is wrong, a vertex belongs to no face, or a face is repeated or
+        has no area.
     """
 
     vertices: Array
@@ -52,7 +108,7 @@ class Shell:
     solid: Solid
 
     def __post_init__(self) -> None:
-        """Copy, protect and check."""
+        """Copy, protect and check the arrays."""
         if not (np.isfinite(self.thickness) and self.thickness > 0):
             raise ValueError(
                 f"Invalid thickness {self.thickness} m of a shell. Must be finite and positive."
@@ -135,7 +191,7 @@ def _check_vertices(vertices: Array, faces: npt.NDArray[np.int64]) -> None:
 
 
 def _check_faces(vertices: Array, faces: npt.NDArray[np.int64]) -> None:
-    """Refuse faces without an area and faces that are given twice."""
+    """Refuse faces without an area and repeated faces."""
     corners = vertices[faces]
     edges = np.roll(corners, -1, axis=1) - corners
     area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)

@@ -17,16 +17,16 @@ from dbthermal.simulation.heat._shell import Shell
 Array = npt.NDArray[np.float64]
 
 TOLERANCE: Final = 1e-6
-"""Largest error that the iteration leaves in a stage of a step [K]."""
+"""Largest error of the iteration in a stage of a step [K]."""
 
 _GAMMA: Final = 1.0 - np.sqrt(0.5)
 """Diagonal of the two-stage scheme, the smaller root of 2 g^2 - 4 g + 1 = 0 [1]."""
 
 _CONTRACTION: Final = 0.5
-"""An iteration that shrinks the error less than this is given a new factorisation [1]."""
+"""Contraction of the error above which an iteration gets a new factorisation [1]."""
 
 _ITERATIONS: Final = 40
-"""Iterations of a stage before it is an error; each at least halves what is left."""
+"""Largest number of iterations of a stage; each at least halves the error."""
 
 _EVEN: Final = 1e-7
 """Relative difference below which two steps, or a step and its limit, are the same [1]."""
@@ -44,7 +44,7 @@ def simulate(
     progress: bool = False,
 ) -> Array:
     r"""
-    Temperature of a shell at given times.
+    Transient temperature of a thin shell.
 
     .. math:: \rho c d \, \dot T = \nabla \cdot (k d \, \nabla T) + \sum_i h_i (T_i - T)
               + \sum_j \varepsilon_j \sigma (T_j^4 - T^4) + q
@@ -64,14 +64,14 @@ def simulate(
     initial : float or array_like, shape (vertex,)
         Initial temperature [K].
     exchanges : sequence of Exchange
-        What the shell exchanges; one record for each side and cause, none for an insulated body.
+        Heat exchanges; one record for each side and cause, none for an insulated body.
     held : Held, optional
-        Vertices with a given temperature, at the first time too.
+        Vertices of prescribed temperature, at the first time too.
     step : float, optional
         Longest internal step [s]: every interval of `time` is cut evenly into as few steps as
         this allows. One step an interval if left out.
     tolerance : float
-        Largest error that the iteration leaves in a stage [K].
+        Largest error of the iteration in a stage [K].
     progress : bool
         Show a bar.
 
@@ -91,6 +91,20 @@ def simulate(
     ----------
     .. [1] Alexander (1977), Diagonally Implicit Runge-Kutta Methods for Stiff O.D.E.'s, SIAM
        Journal on Numerical Analysis 14(6), doi:10.1137/0714068
+
+    Examples
+    --------
+    A square of glass in air, without conduction, relaxes with the time constant
+    :math:`\rho c d / h`, here 562.5 s.
+
+    >>> import numpy as np
+    >>> from dbthermal.simulation import heat
+    >>> corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
+    >>> plate = heat.Shell(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0.003, heat.GLASS)
+    >>> air = heat.Convection(10.0, 293.15)
+    >>> temperature = heat.simulate(plate, [0.0, 562.5], 303.15, [air], step=5.0)
+    >>> (temperature[-1] - 293.15).round(2).tolist()
+    [3.68, 3.68, 3.68, 3.68]
     """
     times = _times(time)
     limit = np.inf if step is None else _positive("step [s]", step)
@@ -101,7 +115,7 @@ def simulate(
     for index in tqdm(range(1, times.size), desc="heat", unit="frame", disable=not progress):
         first, last = times[index - 1], times[index]
         count = max(1, int(np.ceil((last - first) / limit - _EVEN)))
-        # linspace ends exactly on the sample: no function is asked beyond the last time.
+        # linspace ends exactly on the sample: no function is called beyond the last time.
         for begin, end in itertools.pairwise(np.linspace(first, last, count + 1).tolist()):
             temperature = stepper.advance(temperature, begin, end)
         result[index] = temperature
@@ -126,7 +140,7 @@ class _Stepper:
     def __init__(
         self, shell: Shell, exchanges: Sequence[Exchange], held: Held | None, tolerance: float
     ) -> None:
-        """Take the shell, what it exchanges, what is held, and the tolerance [K]."""
+        """Keep the problem, and the tolerance [K]."""
         self.shell, self.exchanges, self.held, self.tolerance = shell, exchanges, held, tolerance
         count = len(shell.vertices)
         self.fixed = np.empty(0, dtype=np.int64) if held is None else held.indices(count)
@@ -137,7 +151,7 @@ class _Stepper:
         self.slope = np.zeros(count)
 
     def start(self, temperature: Array, time: float) -> Array:
-        """Initial temperature [K] with the held vertices at theirs; learn its rate of change."""
+        """Initial temperature [K] with the held vertices at theirs; keep its rate of change."""
         self._hold(temperature, time)
         balance = combine(self.exchanges, time, temperature.size)
         heat = self.shell.area * balance.flux(temperature) - self.shell.stiffness @ temperature

@@ -6,7 +6,6 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from dbthermal.instruments.devices import furnish
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.session import Session
 
@@ -76,7 +75,7 @@ class Bench(World):
         std = dict.fromkeys(session.thermocouples.values(), errors["thermocouple"])
         std["blackbody"] = errors["blackbody"]
         bench = cls(rng, std, samples, touched, filters=session.filters, waits=True)
-        furnish(bench, session)
+        bench.furnish(session)
         return bench
 
     def step(self, temperature: float) -> None:

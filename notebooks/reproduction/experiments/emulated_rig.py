@@ -20,7 +20,7 @@ from dbthermal import mixing, store
 from dbthermal import response as responses
 from dbthermal.instruments.emulated.world import World
 from dbthermal.response import Curve
-from dbthermal.simulation._rig import Rig, digitise
+from dbthermal.simulation import Rig, digitise
 
 Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.uint16]

@@ -11,7 +11,6 @@ import xarray as xr
 from dbthermal import alignment, separation, simulation
 from dbthermal import correction as frames
 from dbthermal.simulation import Background, Rig
-from dbthermal.simulation import _clocks as clocks
 from reproduction.experiments.cases import STEPS
 from reproduction.experiments.limits import on_clock
 from reproduction.experiments.stress import INTERVAL
@@ -121,7 +120,7 @@ def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
     rng, response = np.random.default_rng(seed), Rig().response()
     scene = kind.scene(rng, later=later, steps=STEPS)
     captures = [
-        clocks.expose(
+        simulation.expose(
             scene,
             response,
             np.random.default_rng(seed + 1),

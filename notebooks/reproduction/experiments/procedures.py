@@ -8,8 +8,14 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import calibration
-from dbthermal.simulation._bench import Bench, bench_series, reflector_series
-from dbthermal.simulation._samples import OBJECTS, Sample, band_emissivity
+from dbthermal.simulation import (
+    OBJECTS,
+    Bench,
+    Sample,
+    band_emissivity,
+    bench_series,
+    reflector_series,
+)
 
 PROCEDURES: Final = ("bench", "bench, plain fit", "reflector")
 """Procedures that `compare_procedures` compares: the paper's bench with the common errors in the
@@ -118,7 +124,7 @@ def reflector_sensitivity(
         If there is no sample, there are fewer than two repeats, or an excess is negative.
     """
     true = _true(response, samples, repeats)
-    benches = [replace(Bench(), direction=(0.0, float(excess))) for excess in excesses]
+    benches = [replace(Bench(), mirrored_excess=(0.0, float(excess))) for excess in excesses]
     mean = [
         [
             np.mean([_by_reflector(response, it, bench, rng)[0] for _ in range(repeats)], axis=0)

@@ -1,22 +1,40 @@
-"""Figures of the experiments."""
+"""Figures of the experiments: accuracy, error bars, limits, comparisons, nuisances, twins."""
 
+from reproduction.figures.accuracy import accuracy, error_bar_calibration, validity
 from reproduction.figures.comparison import (
+    compared_reflections,
     emissivity_errors,
+    emissivity_procedures,
     error_over_noise,
     reductions,
     sensitivity,
+)
+from reproduction.figures.limits import (
+    error_over_bands,
+    error_over_bound,
+    pooled_materials,
+    pooling,
 )
 from reproduction.figures.nuisances import disturbances, offsets, parallax
 from reproduction.figures.twins import error_maps, thermocouples
 
 __all__ = [
+    "accuracy",
+    "compared_reflections",
     "disturbances",
     "emissivity_errors",
+    "emissivity_procedures",
+    "error_bar_calibration",
     "error_maps",
+    "error_over_bands",
+    "error_over_bound",
     "error_over_noise",
     "offsets",
     "parallax",
+    "pooled_materials",
+    "pooling",
     "reductions",
     "sensitivity",
     "thermocouples",
+    "validity",
 ]

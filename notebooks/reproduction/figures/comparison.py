@@ -1,13 +1,20 @@
 """Figures that set methods beside one another: over noise, materials, emissivities, settings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dbthermal.figures._canvas import COLORS, band_label, canvas, draw_image, provenance_note
+from dbthermal.figures.drawing import (
+    COLORS,
+    band_label,
+    canvas,
+    draw_image,
+    limits_of,
+    provenance_note,
+)
 
 _MARKERS = "osD^vPX*"
 
@@ -174,4 +181,100 @@ def sensitivity(errors: xr.DataArray, base: float) -> Figure:
     axis.set_xlabel("median error of the object temperature [K]")
     axis.legend(frameon=False, fontsize=8)
     axis.set_title("Settings of the optimiser, one changed at a time" + provenance_note(errors))
+    return figure
+
+
+def emissivity_procedures(
+    compared: xr.Dataset, published: Mapping[str, Mapping[str, float]], band: str
+) -> Figure:
+    """
+    Emissivity of several objects by each procedure, beside the truth and the published values.
+
+    Parameters
+    ----------
+    compared : Dataset
+        `true` (object, band), `mean` and `spread` (object, procedure, band) [1].
+    published : mapping
+        Label -> object -> the paper's value [1].
+    band : str
+        The band that is drawn.
+
+    Returns
+    -------
+    Figure
+        A group of marks an object, lines of one standard deviation, and the truth as a bar.
+    """
+    here = compared.sel(band=band)
+    objects, procedures = here["object"].values, here["procedure"].values
+    figure, ((axis,),) = canvas(1, 1, (8.5, 3.8))
+    place = np.arange(objects.size)
+    axis.bar(place, here["true"], 0.85, color="0.88", label="truth")
+    marks = len(procedures) + len(published)
+    shifts = iter(0.14 * (np.arange(marks) - (marks - 1) / 2))
+    for index, name in enumerate(procedures):
+        part = here.sel(procedure=name)
+        axis.errorbar(
+            place + next(shifts),
+            part["mean"],
+            part["spread"],
+            fmt="o",
+            markersize=4,
+            color=COLORS[index],
+            label=str(name),
+        )
+    for index, (label, values) in enumerate(published.items()):
+        shown = [values[str(name)] for name in objects]
+        axis.plot(
+            place + next(shifts), shown, "sD"[index], color="0.3", label=label, fillstyle="none"
+        )
+    axis.set_xticks(place, list(objects))
+    axis.set(ylabel=f"emissivity, {band_label(band)} [1]", ylim=(0, 1.05))
+    axis.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
+    axis.set_title("Emissivity by each procedure" + provenance_note(compared))
+    return figure
+
+
+def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.DataArray) -> Figure:
+    """
+    Our reflection beside the authors' published one, and their correlation frame by frame.
+
+    Parameters
+    ----------
+    ours, theirs : DataArray
+        Magnitude of the reflection at a few times (time, y, x), in units of their own.
+    scores : DataArray
+        Correlation of the two maps (time) [1], of the frames that were compared.
+
+    Returns
+    -------
+    Figure
+        Two maps a chosen time, and the correlations with their median.
+    """
+    columns = ours.sizes["time"]
+    figure, axes = canvas(3, columns, (3.2 * columns, 8.0))
+    for index in range(columns):
+        moment = f"{float(ours['time'][index]):.1f} s"
+        for axis, movie, name in (
+            (axes[0, index], ours, "ours"),
+            (axes[1, index], theirs, "published"),
+        ):
+            image = movie.isel(time=index)
+            draw_image(
+                figure,
+                axis,
+                image,
+                f"{name}, {moment}",
+                "own unit",
+                cmap="magma",
+                limits=limits_of(image),
+            )
+    grid = axes[2, 0].get_gridspec()
+    for axis in axes[2]:
+        axis.remove()
+    bottom = figure.add_subplot(grid[2, :])
+    bottom.plot(scores["time"], scores, "o", color=COLORS[0], markersize=4)
+    bottom.axhline(float(scores.median()), color="0.5", linewidth=1)
+    bottom.set(xlabel="time [s]", ylabel="correlation [1]", ylim=(min(0.0, float(scores.min())), 1))
+    bottom.set_title(f"{scores.size} frames, median {float(scores.median()):.2f}", fontsize=9)
+    figure.suptitle("Magnitude of the reflection" + provenance_note(ours))
     return figure

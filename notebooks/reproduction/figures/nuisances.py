@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from dbthermal.figures._canvas import COLORS, canvas, provenance_note
+from dbthermal.figures.drawing import COLORS, canvas, provenance_note
 
 _MARKERS: Final = "osD^v"
 _RMSE: Final = "object_temperature_rmse"

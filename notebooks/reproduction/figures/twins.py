@@ -7,7 +7,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from scipy.constants import zero_Celsius
 
-from dbthermal.figures._canvas import COLORS, canvas, draw_image, limits_of, provenance_note
+from dbthermal.figures.drawing import COLORS, canvas, draw_image, limits_of, provenance_note
 
 
 def thermocouples(scores: xr.Dataset) -> Figure:

@@ -1,15 +1,15 @@
-"""Plates of glass: heated while a board is reflected in them, touched by fingers, or only near."""
+"""Plates of glass: heated while a board is reflected, touched by a hand, and before a hand."""
 
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from dbthermal.simulation import heat
-from dbthermal.simulation._mesh import Surface
-from dbthermal.simulation._rays import Array, Camera
-from dbthermal.simulation._surroundings import Actor, Motion, Pose, Room, gliding
+from dbthermal.simulation.rays import Array, Camera
+from dbthermal.simulation.surroundings import Actor, Motion, Pose, Room, gliding
 from reproduction.twins import surfaces
 from reproduction.twins.people import FINGERS, hand, imprint, pacing, person
 from reproduction.twins.props import Writing, board
@@ -43,20 +43,17 @@ class Pane:
     air: float = 5.0
     emissivity: float = 0.9
 
-    def surface(self) -> Surface:
+    def mesh(self) -> trimesh.Trimesh:
         """The plate, its middle at the origin."""
         upright = surfaces.plate(self.width, self.height, self.spacing)
         return surfaces.moved(upright, translation=(0.0, 0.0, -self.height / 2.0))
 
-    def exchanges(self) -> list[heat.Exchange]:
-        """What both sides exchange with the room."""
+    def temperature(
+        self, start: float, mesh: trimesh.Trimesh, time: Array, *sources: heat.Exchange
+    ) -> Array:
+        """Temperature (time, vertex) [K] with both sides to the room and sources from a start."""
         side = [heat.Convection(self.air, AMBIENT), heat.Radiation(self.emissivity, AMBIENT)]
-        return [*side, *side]
-
-    def shell(self) -> heat.Shell:
-        """The plate as a body."""
-        surface = self.surface()
-        return heat.Shell(surface.vertices, surface.faces, self.thickness, heat.GLASS)
+        return since(start, mesh, (self.thickness, heat.GLASS), time, [*side, *side, *sources])
 
 
 @dataclass(frozen=True)
@@ -67,14 +64,14 @@ class Gun:
     Attributes
     ----------
     temperature : float
-        Of the jet where it meets the plate [K].
+        Temperature of the jet where it meets the plate [K].
     coefficient : float
-        Of its heat transfer in the middle [W m^-2 K^-1]; 25 to 250 for forced convection in gases,
-        table 1.1 of Bergman et al. (2011).
+        Coefficient of its heat transfer in the middle [W m^-2 K^-1]; 25 to 250 for forced
+        convection in gases, table 1.1 of Bergman et al. (2011).
     radius : float
         Standard deviation of its Gaussian spot [m].
     start, rise : float
-        When it is brought near, and how long that takes [s].
+        Time at which it is half near, and time in which it is brought near [s].
     """
 
     temperature: float = 423.15
@@ -83,10 +80,10 @@ class Gun:
     start: float = -1.0
     rise: float = 1.5
 
-    def blast(self, surface: Surface) -> heat.Exchange:
-        """What it does to a plate about the origin."""
-        away = np.hypot(surface.vertices[:, 0], surface.vertices[:, 2])
-        spot = self.coefficient * np.exp(-(away**2) / (2.0 * self.radius**2))
+    def blast(self, mesh: trimesh.Trimesh) -> heat.Exchange:
+        """Convection to a plate about the origin."""
+        distance = np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 2])
+        spot = self.coefficient * np.exp(-(distance**2) / (2.0 * self.radius**2))
 
         def coefficient(time: float) -> Array:
             return np.asarray(0.5 * (1.0 + np.tanh((time - self.start) / self.rise)) * spot)
@@ -103,51 +100,29 @@ BOARD_DISTANCE: Final = 0.55
 BOARD_SPACING: Final = 0.004
 """Distance of the board's vertices [m]."""
 SLANT: Final = Rotation.from_euler("yx", (0.9, -0.6))
-"""How a hand is held that writes: slanted, so that its index is foremost, and tilted forward."""
+"""Orientation of a hand that writes: slanted, so that its index is foremost, and tilted forward."""
 AWAY: Final = (0.0, -0.5)
 """Where the hand comes from and goes to, from the stroke: x and z on the board [m]."""
 WITHDRAWAL: Final = 1.0
-"""How long it takes to come, and to go [s]."""
+"""Time in which it comes, and goes [s]."""
 
 
 def glass_plate(
-    capture: Capture,
-    rng: np.random.Generator,
-    *,
-    pane: Pane | None = None,
-    gun: Gun | None = None,
-    writing: Writing | None = None,
+    capture: Capture, rng: np.random.Generator, *, writing: Writing | None = None
 ) -> Stage:
     """
-    A plate heated by a hot-air gun, in which a board is seen while somebody writes on it.
+    Plate heated by a hot-air gun, in which a board is reflected while somebody writes on it.
 
-    Parameters
-    ----------
-    capture : Capture
-        How it is recorded.
-    rng : Generator
-        Source of the moment at which the writing begins, within 2 s.
-    pane : Pane, optional
-        The plate.
-    gun : Gun, optional
-        The gun.
-    writing : Writing, optional
-        What is written, and how; the letters CV with a cold, wet finger.
-
-    Returns
-    -------
-    Stage
-        For `take`.
+    By default the letters CV with a cold, wet finger, begun at a random moment within 2 s.
     """
-    pane, gun = pane or Pane(), gun or Gun()
+    pane, gun = Pane(), Gun()
     writing = writing or Writing(start=float(rng.uniform(2.0, 4.0)))
-    surface = pane.surface()
-    exchanges = [*pane.exchanges(), gun.blast(surface)]
+    mesh, start = pane.mesh(), gun.start - _BEFORE * gun.rise
     camera = Camera((0.24, -0.62, 0.0), (0.0, 0.0, 0.0), capture.shape)
     return Stage(
         "glass_plate",
-        surface,
-        since(gun.start - _BEFORE * gun.rise, pane.shell(), capture.time, exchanges),
+        mesh,
+        pane.temperature(start, mesh, capture.time, gun.blast(mesh)),
         camera,
         _written(writing, camera),
         Room(AMBIENT),
@@ -156,7 +131,7 @@ def glass_plate(
 
 
 def _written(writing: Writing, camera: Camera) -> list[Actor]:
-    """The board where the middle of the view is mirrored to, facing the plate, and the writer."""
+    """The board where the middle of the view is reflected to, facing the plate, and the writer."""
     away = np.array([-camera.position[0], camera.position[1], 0.0])
     away /= np.linalg.norm(away)
     turn = Rotation.from_euler("z", np.arctan2(-away[0], away[1]))
@@ -165,27 +140,17 @@ def _written(writing: Writing, camera: Camera) -> list[Actor]:
     flat = surfaces.moved(flat, translation=(0.0, 0.0, -height / 2.0))
     pose = Pose(turn, BOARD_DISTANCE * away)
     # Mirrored, the text reads from left to right.
-    places = flat.vertices[:, [0, 2]] * (-1.0, 1.0)
+    places = np.asarray(flat.vertices)[:, [0, 2]] * (-1.0, 1.0)
     strokes = board(flat, places, writing, AMBIENT, lambda _: pose)
     return [strokes, *hand(lambda now: pose @ pointing(writing, now))]
 
 
 def pointing(writing: Writing, time: float) -> Pose:
     """
-    Pose of a hand whose index writes on a board: it comes from below, writes, and goes.
+    Pose at a time [s] of a hand whose index writes on a board: it comes from below, writes, goes.
 
-    Parameters
-    ----------
-    writing : Writing
-        What is written.
-    time : float
-        Time [s].
-
-    Returns
-    -------
-    Pose
-        In the frame of the board, whose plane is y = 0, seen from negative y, mirrored in x. The
-        tip's middle is a finger's radius in front of the stroke.
+    In the frame of the board, whose plane is y = 0, seen from negative y, mirrored in x. The tip's
+    middle is a finger's radius in front of the stroke.
     """
     times, path = writing.path()
     times = np.concatenate([[times[0] - WITHDRAWAL], times, [times[-1] + WITHDRAWAL]])
@@ -200,54 +165,27 @@ NEAR: Final = 0.15
 """How far a hand is in front of the plate [m]."""
 
 
-def fingers(capture: Capture, rng: np.random.Generator, *, pane: Pane | None = None) -> Stage:
+def fingers(capture: Capture, rng: np.random.Generator) -> Stage:
     """
-    A plate at room temperature, in front of which fingers move: reflection only.
+    Plate at room temperature, in front of which fingers move: reflection only.
 
-    Parameters
-    ----------
-    capture : Capture
-        How it is recorded.
-    rng : Generator
-        Source of the hand's motion.
-    pane : Pane, optional
-        The plate.
-
-    Returns
-    -------
-    Stage
-        For `take`. The plate's temperature is constant, so no method can tell its emissivity.
+    The plate's temperature is constant, so no method can tell its emissivity.
     """
-    pane = pane or Pane()
-    surface = pane.surface()
+    mesh = Pane().mesh()
     camera = Camera((0.33, -0.39, 0.0), (0.0, 0.0, 0.0), capture.shape)
     return Stage(
         "fingers",
-        surface,
-        np.full((capture.time.size, len(surface.vertices)), AMBIENT),
+        mesh,
+        np.full((capture.time.size, len(mesh.vertices)), AMBIENT),
         camera,
-        hand(waving(capture.time, rng), flex=0.5),
+        hand(_waving(capture.time, rng), flex=0.5),
         Room(AMBIENT),
         [(0.0, 0.0, 0.03)],
     )
 
 
-def waving(time: Array, rng: np.random.Generator) -> Motion:
-    """
-    A hand before the plate that comes into view, moves about, and leaves, again and again.
-
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s].
-    rng : Generator
-        Source of the places and the times.
-
-    Returns
-    -------
-    function of time
-        The pose.
-    """
+def _waving(time: Array, rng: np.random.Generator) -> Motion:
+    """A hand before the plate that comes into view, moves about, and leaves, again and again."""
     view, out = (-NEAR * 0.85, -NEAR, -0.03), (-NEAR * 0.85, -NEAR, -0.40)
     times, places = [float(time[0])], [np.array(out)]
     while times[-1] < time[-1]:
@@ -260,12 +198,12 @@ def waving(time: Array, rng: np.random.Generator) -> Motion:
 @dataclass(frozen=True)
 class Touch:
     """
-    Skin pressed on something before the capture.
+    Skin pressed on an object before the capture.
 
     Attributes
     ----------
     start, duration : float
-        When it begins and how long it lasts [s]; over before the capture starts at 0.
+        Beginning and length of the contact [s]; over before the capture starts at 0.
     skin : float
         Temperature of the skin [K].
     contact : float
@@ -279,7 +217,7 @@ class Touch:
     contact: float = 250.0
 
     def press(self, share: Array) -> heat.Exchange:
-        """What it does to a body of which a share, in [0, 1], of each vertex is touched."""
+        """Contact with a body of which a share, in [0, 1], of each vertex is touched."""
 
         def contact(time: float) -> Array:
             return self.contact * share * (self.start <= time < self.start + self.duration)
@@ -288,51 +226,28 @@ class Touch:
 
 
 VISIT: Final = ((-2.2, -3.2), (2.6, -3.4))
-"""Way of somebody far away, x and y from the plate [m]."""
+"""Route of a visitor far away, x and y from the plate [m]."""
 
 
 def fingerprint(
-    capture: Capture,
-    rng: np.random.Generator,
-    *,
-    pane: Pane | None = None,
-    touch: Touch | None = None,
-    visitor: bool = False,
+    capture: Capture, rng: np.random.Generator, *, visitor: bool = False, spacing: float = 0.003
 ) -> Stage:
     """
-    Prints of a hand that dissipate on a plate, before a uniform background: emission only.
+    Prints of a hand that fade on a plate, before a uniform background: emission only.
 
-    Parameters
-    ----------
-    capture : Capture
-        How it is recorded.
-    rng : Generator
-        Source of the visitor's way.
-    pane : Pane, optional
-        The plate.
-    touch : Touch, optional
-        How it was touched.
-    visitor : bool
-        Whether somebody walks by, 3 m away. Without, nothing moves that is reflected, and the
-        direction of the reflection is undefined.
-
-    Returns
-    -------
-    Stage
-        For `take`.
+    With a visitor somebody walks by, 3 m away; without, nothing moves that is reflected, and the
+    reflection ratio is undefined.
     """
-    pane, touch = pane or Pane(spacing=0.003), touch or Touch()
-    surface = pane.surface()
-    share = imprint(surface.vertices[:, [0, 2]] + (0.0, 0.03))
-    exchanges = [*pane.exchanges(), touch.press(share)]
+    pane, touch = Pane(spacing=spacing), Touch()
+    mesh = pane.mesh()
+    share = imprint(np.asarray(mesh.vertices)[:, [0, 2]] + (0.0, 0.03))
+    floor = -TABLE - pane.height / 2
     return Stage(
         "fingerprint",
-        surface,
-        since(touch.start, pane.shell(), capture.time, exchanges),
+        mesh,
+        pane.temperature(touch.start, mesh, capture.time, touch.press(share)),
         Camera((0.12, -0.50, 0.02), (0.0, 0.0, 0.0), capture.shape),
-        person(pacing(VISIT, capture.time, rng), height=-TABLE - pane.height / 2)
-        if visitor
-        else [],
+        person(pacing(VISIT, capture.time, rng), height=floor) if visitor else [],
         Room(AMBIENT),
         [(0.0, 0.0, -0.03)],
     )

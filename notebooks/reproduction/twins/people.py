@@ -1,10 +1,9 @@
-"""People among the surroundings: how they walk, and how their bodies and hands are built.
+"""People among the surroundings: their routes, their bodies, and their hands.
 
 Temperatures are those that a thermal camera reads of skin and clothes indoors.
 """
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,11 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from dbthermal.simulation._mesh import Surface
-from dbthermal.simulation._rays import Array
-from dbthermal.simulation._surroundings import Actor, Motion, Pose, hinged, painted
-from dbthermal.simulation._times import increasing
-from reproduction.twins import surfaces
+from dbthermal.simulation.rays import Array
+from dbthermal.simulation.surroundings import Actor, Motion, Pose, hinged, painted
+from reproduction.twins.surfaces import capsule, ellipsoid
 
 _SPACING: Final = 0.03
 """Distance of the vertices of a body [m]."""
@@ -27,30 +24,21 @@ _FINE: Final = 0.004
 @dataclass(frozen=True)
 class Route:
     """
-    A way over the floor, walked in straight lines at a steady pace between its stops.
+    Walk over the floor in straight lines, at a steady pace between its stops.
 
     Attributes
     ----------
     times : ndarray, shape (stop,)
-        When each stop is passed [s], increasing; two or more.
+        Time at each stop [s], increasing; two or more.
     places : ndarray, shape (stop, 2)
-        Where it is: x and y [m].
+        x and y of each stop [m].
     stride : float
-        Way from one step to the next [m].
+        Length of a step [m].
     """
 
     times: Array
     places: Array
     stride: float = 0.7
-
-    def __post_init__(self) -> None:
-        """Refuse a way back in time, and places that are none or not one for each time."""
-        increasing(self.times, "a route")
-        if self.places.shape != (self.times.size, 2) or not np.all(np.isfinite(self.places)):
-            raise ValueError(
-                f"Invalid places of shape {self.places.shape} of a route. Must be finite, "
-                f"({self.times.size}, 2)."
-            )
 
     def place(self, time: float) -> Array:
         """Place (2,) at a time [s]: x and y [m]; before and after, that of the nearest stop."""
@@ -58,12 +46,12 @@ class Route:
 
     def phase(self, time: float) -> float:
         """Phase of the steps [rad], which grows by pi a stride."""
-        ways = np.linalg.norm(np.diff(self.places, axis=0), axis=1)
-        walked = np.interp(time, self.times, np.concatenate([[0.0], np.cumsum(ways)]))
+        lengths = np.linalg.norm(np.diff(self.places, axis=0), axis=1)
+        walked = np.interp(time, self.times, np.concatenate([[0.0], np.cumsum(lengths)]))
         return float(np.pi * walked / self.stride)
 
     def heading(self, time: float) -> float:
-        """Direction of the walk at a time [s], from x [rad]; who stands faces where he came to."""
+        """Direction of the walk at a time [s], from x [rad]; at a stop, that of the walk to it."""
         legs = np.diff(self.places, axis=0)
         walked = np.flatnonzero(np.any(legs != 0, axis=1))
         leg = np.searchsorted(self.times, time, side="right") - 1
@@ -72,7 +60,7 @@ class Route:
 
 
 def pacing(
-    way: npt.ArrayLike,
+    corners: npt.ArrayLike,
     time: Array,
     rng: np.random.Generator,
     *,
@@ -80,31 +68,16 @@ def pacing(
     pause: tuple[float, float] = (0.3, 2.0),
 ) -> Route:
     """
-    Back and forth along a way, with a pause at each of its corners.
+    Route back and forth along corners (stop, 2) [m] that covers the times [s].
 
-    Parameters
-    ----------
-    way : array_like, shape (stop, 2)
-        Its corners, x and y [m].
-    time : ndarray, shape (time,)
-        Times [s] that the route must cover.
-    rng : Generator
-        Source of the first end, the paces and the pauses.
-    pace : tuple of float
-        Slowest and fastest pace [m/s].
-    pause : tuple of float
-        Shortest and longest pause [s].
-
-    Returns
-    -------
-    Route
-        The way.
+    The first end, the pace of each leg, within its least and largest [m/s], and the pauses [s] are
+    random.
     """
-    corners = np.asarray(way, dtype=np.float64)[:: int(rng.choice([-1, 1]))]
-    there_and_back = itertools.cycle([*corners, *corners[-2:0:-1]])
-    times, places = [float(time[0])], [next(there_and_back)]
+    points = np.asarray(corners, dtype=np.float64)[:: int(rng.choice([-1, 1]))]
+    endless = itertools.cycle([*points, *points[-2:0:-1]])
+    times, places = [float(time[0])], [next(endless)]
     while times[-1] < time[-1]:
-        stop, start = next(there_and_back), times[-1] + rng.uniform(*pause)
+        stop, start = next(endless), times[-1] + rng.uniform(*pause)
         length = float(np.linalg.norm(stop - places[-1]))
         times += [start, start + length / rng.uniform(*pace)]
         places += [places[-1], stop]
@@ -123,7 +96,7 @@ class Build:
     breadth : float
         From shoulder to shoulder [m].
     skin, hand, clothes : float
-        Temperatures [K] of the face, the hands and the clothes.
+        Temperatures of the face, the hands and the clothes [K].
     swing : float
         Largest angle of legs and arms [rad].
     """
@@ -138,76 +111,41 @@ class Build:
     swing: float = 0.45
 
 
-def person(route: Route, build: Build | None = None, *, height: float = 0.0) -> list[Actor]:
-    """
-    A person who walks a route, with legs and arms that swing.
-
-    Parameters
-    ----------
-    route : Route
-        The way.
-    build : Build, optional
-        Measures and temperatures; an adult's.
-    height : float
-        Height of the floor [m].
-
-    Returns
-    -------
-    list of Actor
-        Trunk with head, two legs and two arms.
-    """
-    build = build or Build()
-    upper = painted([(_trunk(build), build.clothes), (_head(build), build.skin)])
+def person(route: Route, *, height: float = 0.0) -> list[Actor]:
+    """Adult who walks a route on a floor of a height [m]: trunk with head, two legs, two arms."""
+    build = Build()
+    middle, half = (build.hip + build.shoulder) / 2, (build.shoulder - build.hip) / 2 + 0.06
+    trunk = ellipsoid((0.13, build.breadth / 2, half), (0, 0, middle), _SPACING)
+    head = ellipsoid((0.10, 0.08, 0.13), (0, 0, build.crown - 0.13), _SPACING)
+    upper = painted([(trunk, build.clothes), (head, build.skin)])
     actors = [_walking(upper, route, height, 0.0, 0.0)]
     for side in (-1.0, 1.0):
-        leg = painted([(_leg(build, side), build.clothes)])
-        arm = painted([(_arm(build, side), build.clothes), (_fist(build, side), build.hand)])
+        x = side * 0.1
+        leg = painted([(capsule((0, x, build.hip), (0, x, 0.08), 0.08, _SPACING), build.clothes)])
+        y = side * (build.breadth / 2 + 0.02)
+        sleeve = capsule((0, y, build.shoulder), (0, y, build.hip - 0.02), 0.05, _SPACING)
+        fist = ellipsoid((0.05, 0.03, 0.08), (0, y, build.hip - 0.12), _SPACING)
+        arm = painted([(sleeve, build.clothes), (fist, build.hand)])
         actors.append(_walking(leg, route, height, build.hip, side * build.swing))
         actors.append(_walking(arm, route, height, build.shoulder, -side * build.swing))
     return actors
 
 
-def _ball(semi_axes: Sequence[float], place: npt.ArrayLike) -> Surface:
-    return surfaces.moved(surfaces.ellipsoid(semi_axes, _SPACING), translation=place)
-
-
-def _trunk(build: Build) -> Surface:
-    middle, half = (build.hip + build.shoulder) / 2, (build.shoulder - build.hip) / 2 + 0.06
-    return _ball((0.13, build.breadth / 2, half), (0, 0, middle))
-
-
-def _head(build: Build) -> Surface:
-    return _ball((0.10, 0.08, 0.13), (0, 0, build.crown - 0.13))
-
-
-def _leg(build: Build, side: float) -> Surface:
-    return surfaces.capsule((0, side * 0.1, build.hip), (0, side * 0.1, 0.08), 0.08, _SPACING)
-
-
-def _arm(build: Build, side: float) -> Surface:
-    y = side * (build.breadth / 2 + 0.02)
-    return surfaces.capsule((0, y, build.shoulder), (0, y, build.hip - 0.02), 0.05, _SPACING)
-
-
-def _fist(build: Build, side: float) -> Surface:
-    return _ball((0.05, 0.03, 0.08), (0, side * (build.breadth / 2 + 0.02), build.hip - 0.12))
-
-
 def _walking(part: Actor, route: Route, floor: float, joint: float, swing: float) -> Actor:
-    """The part on its way, swung about a joint at a height, in step."""
+    """Part of a body on its route, swinging in step about a joint at a height."""
 
     def motion(time: float) -> Pose:
         upright = Rotation.from_euler("z", route.heading(time))
         angle = Rotation.from_euler("y", swing * np.sin(route.phase(time)))
         return Pose(upright, (*route.place(time), floor)) @ hinged((0.0, 0.0, joint), angle)
 
-    return Actor(part.surface, part.temperature, motion)
+    return Actor(part.mesh, part.temperature, motion)
 
 
 @dataclass(frozen=True)
 class Finger:
     """
-    A finger of a flat hand in the plane y = 0.
+    Finger of a flat hand in the plane y = 0.
 
     Attributes
     ----------
@@ -240,55 +178,32 @@ def hand(
     motion: Motion, skin: float = 306.15, *, flex: float = 0.0, rate: float = 0.8
 ) -> list[Actor]:
     """
-    A hand on its forearm, flat in the plane y = 0, whose fingers may move one by one.
+    Hand on its forearm, flat in the plane y = 0: palm with forearm, and five fingers.
 
-    Parameters
-    ----------
-    motion : function of time
-        Pose of the palm.
-    skin : float
-        Temperature [K].
-    flex : float
-        Largest angle by which a finger bends at its root [rad].
-    rate : float
-        How often the first finger bends [1/s]; each of the others a little more often.
-
-    Returns
-    -------
-    list of Actor
-        Palm with forearm, and five fingers.
+    The motion is that of the palm, the skin's temperature in [K]. Each finger bends at its root by
+    up to `flex` [rad]: the first at `rate` [1/s], each of the others a little more often.
     """
-    bones = (surfaces.ellipsoid(PALM, _FINE), surfaces.capsule(*FOREARM, _SPACING))
+    bones = (ellipsoid(PALM, (0.0, 0.0, 0.0), _FINE), capsule(*FOREARM, _SPACING))
     palm = painted([(bone, skin) for bone in bones], motion)
     return [palm, *(_finger(n, motion, skin, flex, rate) for n in range(len(FINGERS)))]
 
 
 def _finger(number: int, motion: Motion, skin: float, flex: float, rate: float) -> Actor:
-    shape = FINGERS[number]
-    root, tip = ((x, 0.0, z) for x, z in (shape.root, shape.tip))
+    finger = FINGERS[number]
+    root, tip = ((x, 0.0, z) for x, z in (finger.root, finger.tip))
 
     def bent(time: float) -> Pose:
         phase = 2.0 * np.pi * rate * (1.0 + 0.13 * number) * time + number
         return motion(time) @ hinged(root, Rotation.from_euler("x", flex * np.sin(phase)))
 
-    return painted([(surfaces.capsule(root, tip, shape.radius, _FINE), skin)], bent)
+    return painted([(capsule(root, tip, finger.radius, _FINE), skin)], bent)
 
 
 def imprint(places: npt.ArrayLike, softness: float = 0.002) -> Array:
     """
-    Where a flat hand touches a surface.
+    Contact of a flat hand with a surface: 1 under the hand, 0 beyond it, smooth between.
 
-    Parameters
-    ----------
-    places : array_like, shape (place, 2)
-        x and z in the plane of the hand [m].
-    softness : float
-        Width of the edge [m].
-
-    Returns
-    -------
-    ndarray, shape (place,)
-        1 under the hand, 0 beyond it, smooth between.
+    Of places (place, 2), x and z in the plane of the hand [m]; the edge is `softness` wide [m].
     """
     places = np.asarray(places, dtype=np.float64)
     scale = np.linalg.norm(places / (PALM[0], PALM[2]), axis=1)
@@ -298,7 +213,7 @@ def imprint(places: npt.ArrayLike, softness: float = 0.002) -> Array:
 
 
 def _to_segment(places: Array, *ends: tuple[float, float]) -> Array:
-    """Distance of places (place, 2) from the segment between two points [m]."""
+    """Distance [m] of places (place, 2) from the segment between two points."""
     start, end = np.array(ends)
     along = end - start
     share = np.clip((places - start) @ along / (along @ along), 0.0, 1.0)

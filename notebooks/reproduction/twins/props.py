@@ -1,44 +1,29 @@
-"""Things among the surroundings: a toy, a cup that is uncovered, a board that is written on."""
+"""Objects among the surroundings: a toy car, a cup with a lid, a board that is written on."""
 
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import trimesh
 
-from dbthermal.simulation._mesh import Surface
-from dbthermal.simulation._rays import Array
-from dbthermal.simulation._surroundings import Actor, Motion, painted
-from reproduction.twins import surfaces
+from dbthermal.simulation.rays import Array
+from dbthermal.simulation.surroundings import Actor, Motion, painted
+from reproduction.twins.surfaces import ellipsoid, revolved
 
 _SPACING: Final = 0.006
 """Distance of the vertices of a toy or a cup [m]."""
 
 
 def toy(motion: Motion, *, body: float = 303.15, motor: float = 315.15) -> Actor:
-    """
-    A toy car that runs along x, with a warm motor under its bonnet.
-
-    Parameters
-    ----------
-    motion : function of time
-        Its pose; the wheels stand on z = 0.
-    body, motor : float
-        Temperatures [K].
-
-    Returns
-    -------
-    Actor
-        The toy, 0.16 m long.
-    """
-    frame = surfaces.moved(surfaces.box((0.16, 0.07, 0.04), _SPACING), translation=(0, 0, 0.015))
-    cabin = surfaces.moved(surfaces.box((0.08, 0.06, 0.04), _SPACING), translation=(-0.02, 0, 0.05))
-    bonnet = surfaces.ellipsoid((0.03, 0.03, 0.012), _SPACING)
-    bonnet = surfaces.moved(bonnet, translation=(0.05, 0, 0.055))
+    """Toy car, 0.16 m long, that runs along x on z = 0, body and bonnet at temperatures [K]."""
+    frame = trimesh.creation.box((0.16, 0.07, 0.04)).apply_translation((0, 0, 0.035))
+    cabin = trimesh.creation.box((0.08, 0.06, 0.04)).apply_translation((-0.02, 0, 0.07))
+    bonnet = ellipsoid((0.03, 0.03, 0.012), (0.05, 0, 0.055), _SPACING)
     return painted([(frame, body), (cabin, body), (bonnet, motor)], motion)
 
 
 CUP_PROFILE: Final = ((0.0, 0.0), (0.030, 0.0), (0.040, 0.095), (0.036, 0.095), (0.0, 0.088))
-"""Radius and height of a cup and what fills it, the bottom to the middle of the top [m]."""
+"""Radius and height of a cup and its content, the bottom to the middle of the top [m]."""
 
 
 def cup(
@@ -50,31 +35,18 @@ def cup(
     drink: float = 335.15,
 ) -> Actor:
     """
-    A cup with a hot drink, under a lid until it is uncovered.
+    Cup with a hot drink, standing on z = 0, under a lid until it is uncovered at a time [s].
 
-    Parameters
-    ----------
-    motion : function of time, optional
-        Its pose; the cup stands on z = 0.
-    uncovered : float
-        When the lid is taken off [s].
-    wall, lid, drink : float
-        Temperatures of the outer wall, the lid and the drink [K].
-
-    Returns
-    -------
-    Actor
-        The cup. Its top is at the lid's temperature before, at the drink's from then on.
+    Its top is at the lid's temperature [K] before, at the drink's from then on.
     """
-    radii, heights = np.transpose(CUP_PROFILE)
-    surface = surfaces.revolution(radii, heights, _SPACING)
-    radius, height = np.hypot(*surface.vertices[:, :2].T), surface.vertices[:, 2]
+    mesh = revolved(CUP_PROFILE, _SPACING)
+    radius, height = np.linalg.norm(mesh.vertices[:, :2], axis=1), mesh.vertices[:, 2]
     top = (height > CUP_PROFILE[-1][1] - 1e-9) & (radius < CUP_PROFILE[-2][0] + 1e-9)
 
     def temperature(time: float) -> Array:
         return np.where(top, drink if time >= uncovered else lid, wall)
 
-    return Actor(surface, temperature, motion)
+    return Actor(mesh, temperature, motion)
 
 
 LETTERS: Final = {
@@ -84,7 +56,7 @@ LETTERS: Final = {
     ),
     "V": ((0.0, 1.0), (0.5, 0.0), (1.0, 1.0)),
 }
-"""Letter -> the way of the pen, in a square of unit size."""
+"""Letter -> the path of the pen, in a square of unit size."""
 
 
 @dataclass(frozen=True)
@@ -97,13 +69,11 @@ class Writing:
     text : str
         Letters of `LETTERS`.
     start : float
-        When the first is begun [s].
-    pace : float
-        Pace of the finger [m/s]; it lifts off for `pause` [s] after each letter.
-    pause : float
-        See `pace`.
+        Beginning of the first letter [s].
+    pace, pause : float
+        Pace of the finger [m/s], and pause after each letter [s].
     size, gap : float
-        Height of the letters, and the way between two of them [m].
+        Height of the letters, and distance between two of them [m].
     stroke : float
         Width of a stroke [m].
     drop : float
@@ -130,7 +100,7 @@ class Writing:
     drying: float = 40.0
 
     def __post_init__(self) -> None:
-        """Refuse letters that nobody has drawn."""
+        """Check the letters."""
         unknown = [letter for letter in self.text if letter not in LETTERS]
         if unknown:
             raise ValueError(f"Unknown letter '{unknown[0]}'. Must be one of {[*LETTERS]}.")
@@ -140,8 +110,8 @@ class Writing:
         times, places, now = [], [], self.start
         for number, letter in enumerate(self.text):
             points = _dense(np.array(LETTERS[letter]) * self.size, self.stroke / 8.0)
-            ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
-            times.append(now + np.concatenate([[0.0], np.cumsum(ways)]) / self.pace)
+            lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+            times.append(now + np.concatenate([[0.0], np.cumsum(lengths)]) / self.pace)
             places.append(points + np.array([number * (self.size + self.gap), 0.0]))
             now = times[-1][-1] + self.pause
         width = len(self.text) * (self.size + self.gap) - self.gap
@@ -150,44 +120,29 @@ class Writing:
 
 def _dense(points: Array, step: float) -> Array:
     """A polyline with more points on it, at most a step apart."""
-    ways = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    along = np.linspace(0.0, ways[-1], int(np.ceil(ways[-1] / step)) + 1)
-    return np.stack([np.interp(along, ways, column) for column in points.T], axis=1)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    places = np.linspace(0.0, along[-1], int(np.ceil(along[-1] / step)) + 1)
+    return np.stack([np.interp(places, along, column) for column in points.T], axis=1)
 
 
 def board(
-    surface: Surface, places: Array, writing: Writing, temperature: float, motion: Motion
+    mesh: trimesh.Trimesh, places: Array, writing: Writing, temperature: float, motion: Motion
 ) -> Actor:
     r"""
-    A board with cold strokes that appear as they are written, and fade.
+    Board with cold strokes that appear as they are written, and fade.
 
     .. math:: T(t) = T_0 - d \, e^{-(t - t_w) / \tau} \quad (t \ge t_w)
 
-    Parameters
-    ----------
-    surface : Surface
-        The board.
-    places : ndarray, shape (vertex, 2)
-        Place of each vertex on the board, about the text's middle [m].
-    writing : Writing
-        What is written.
-    temperature : float
-        Temperature of the dry board [K].
-    motion : function of time
-        Its pose.
-
-    Returns
-    -------
-    Actor
-        The board.
+    The place (vertex, 2) of each vertex is about the text's middle [m], T_0 the temperature of the
+    dry board [K].
     """
     times, path = writing.path()
-    apart = np.linalg.norm(places[:, np.newaxis] - path, axis=2) < writing.stroke / 2.0
-    written = np.min(np.where(apart, times, np.inf), axis=1)
+    near = np.linalg.norm(places[:, np.newaxis] - path, axis=2) < writing.stroke / 2.0
+    written = np.min(np.where(near, times, np.inf), axis=1)
 
     def warmth(time: float) -> Array:
         fresh = np.where(written <= time, writing.drop, 0.0)
         age = np.where(written <= time, time - written, 0.0)
         return np.asarray(temperature - fresh * np.exp(-age / writing.drying))
 
-    return Actor(surface, warmth, motion)
+    return Actor(mesh, warmth, motion)

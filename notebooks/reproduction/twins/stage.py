@@ -1,4 +1,4 @@
-"""The stage of a twin: what is before the camera, and how a scene is taken of it."""
+"""Stage of a twin (object, camera, surroundings), the scene of it, and its thermocouples."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,19 +6,17 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+import trimesh
 import xarray as xr
 
-from dbthermal.simulation import _scenes as scenes
+from dbthermal import schema, simulation
 from dbthermal.simulation import heat
-from dbthermal.simulation._mesh import Surface
-from dbthermal.simulation._rays import Array, Camera, Caster, Hits, Mask
-from dbthermal.simulation._surroundings import Actor, Room, distance, incident, painted
-from dbthermal.simulation._times import increasing
-from reproduction.twins import surfaces
+from dbthermal.simulation.rays import Array, Camera, Caster, Hits, Mask, unit
+from dbthermal.simulation.surroundings import Actor, Room, distance, incident, painted
 from reproduction.twins.people import pacing, person
 
 AMBIENT: Final = 295.15
-"""Temperature of the room, of its air, and of whatever is not heated [K]."""
+"""Temperature of the room, of its air, and of all that is not heated [K]."""
 TABLE: Final = 0.75
 """Height of the table that the objects stand on [m]."""
 STEP: Final = 0.1
@@ -26,21 +24,7 @@ STEP: Final = 0.1
 
 
 def clock(frames: int = 350, rate: float = 10.0) -> Array:
-    """
-    Times of a capture.
-
-    Parameters
-    ----------
-    frames : int
-        Number of frames.
-    rate : float
-        Frames a second [1/s].
-
-    Returns
-    -------
-    ndarray, shape (time,)
-        Times from 0 [s].
-    """
+    """Times (frame,) of a capture from 0 on [s], at a frame rate [Hz]."""
     return np.arange(frames) / rate
 
 
@@ -69,8 +53,7 @@ class Capture:
     baseline: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse an emissivity that is no list of bands, a baseline without two, a single frame."""
-        increasing(self.time, "a capture")
+        """Check bands and baseline."""
         if self.emissivity.dims != ("band",):
             raise ValueError(f"Invalid dims {self.emissivity.dims} of emissivity. Must be (band,).")
         if self.baseline and self.emissivity.sizes["band"] != 2:
@@ -81,28 +64,28 @@ class Capture:
 @dataclass(frozen=True)
 class Stage:
     """
-    What is before the camera.
+    Object, camera and surroundings of a twin.
 
     Attributes
     ----------
     name : str
         Name of the twin.
-    surface : Surface
-        The object.
+    mesh : trimesh.Trimesh
+        The object [m].
     temperature : ndarray, shape (time, vertex)
         Its temperature [K].
     camera : Camera
         The first camera.
     actors : sequence of Actor
-        What moves, or stands, around it.
+        Bodies that move, or stand, around it.
     room : Room
-        What is behind all of it.
+        Walls behind all of it.
     thermocouples : ndarray, shape (thermocouple, 3)
         Points of the surface where thermocouples are [m].
     """
 
     name: str
-    surface: Surface
+    mesh: trimesh.Trimesh
     temperature: Array
     camera: Camera
     actors: Sequence[Actor]
@@ -112,12 +95,12 @@ class Stage:
 
 @dataclass(frozen=True)
 class _View:
-    """The object as one camera sees it: which pixels, where, and whether it is in the way."""
+    """The object as the first camera sees it: rays (pixel, 3) and their intersections."""
 
     caster: Caster
+    origins: Array
     directions: Array
     hits: Hits
-    temperature: Array
 
     @property
     def on_object(self) -> Mask:
@@ -128,125 +111,63 @@ class _View:
         return self.hits.of(self.hits.met)
 
 
+def _view(stage: Stage) -> _View:
+    """Cast the first camera's rays at the object."""
+    directions = stage.camera.directions()
+    origins = np.array(np.broadcast_to(np.asarray(stage.camera.position), directions.shape))
+    caster = Caster(stage.mesh)
+    return _View(caster, origins, directions, caster.cast(origins, directions))
+
+
 def take(stage: Stage, capture: Capture) -> xr.Dataset:
     """
-    Take a scene.
+    Scene of a stage, ray-traced.
 
     Parameters
     ----------
     stage : Stage
-        What is before the camera.
+        Object, camera and surroundings.
     capture : Capture
         How it is recorded.
 
     Returns
     -------
     Dataset
-        A scene as from `scenes.scene`, for `simulation.observe`, and in addition
-        `on_object` (y, x), and `thermocouple_y`, `thermocouple_x` (thermocouple): rows and
-        columns of the virtual thermocouples. Where the object is not, its temperature is that of
-        the background seen directly there, which makes the emissivity, given everywhere,
-        irrelevant. With a baseline `background_temperature` is (band, time, y, x), and
-        `hidden_from_second` (y, x) marks the points that the second camera does not see; its
-        background is that of the first there, and off the object. A concave object's reflection
-        in itself is of its own temperature (one bounce).
+        A scene for `simulation.observe`, and in addition `on_object` (y, x), and `thermocouple_y`,
+        `thermocouple_x` (thermocouple): rows and columns of the virtual thermocouples. Beside the
+        object, the object temperature is that of the background seen directly there, which makes
+        the emissivity, defined everywhere, irrelevant. With a baseline `background_temperature` is
+        (band, time, y, x), and `hidden_from_second` (y, x) marks the points that the second camera
+        does not see; its background is that of the first there, and off the object. A concave
+        object's reflection in itself is of its own temperature (one bounce).
 
     Raises
     ------
     ValueError
         If a thermocouple is not seen by the camera.
     """
-    directions = stage.camera.directions()
-    caster = Caster(stage.surface)
-    hits = caster.cast(_repeated(stage.camera.position, directions), directions)
-    view = _View(caster, directions, hits, stage.temperature)
-    background = _background(stage, capture, view)
+    view = _view(stage)
+    origins, directions, on = view.origins.copy(), view.directions.copy(), view.on_object
+    origins[on], directions[on] = view.caster.mirrored(view.seen, view.directions[on])
+    background = incident(origins, directions, capture.time, stage.room, stage.actors)
+    background[:, on] = _with_itself(stage, view, origins[on], directions[on], background[:, on])
     emitted = background.copy()
-    emitted[:, view.on_object] = caster.interpolate(view.seen, stage.temperature)
+    emitted[:, on] = view.caster.interpolate(view.seen, stage.temperature)
     warm, cold = (part.reshape(-1, *capture.shape) for part in (emitted, background))
-    scene = scenes.scene(capture.time, warm, cold, capture.emissivity)
-    scene["on_object"] = (("y", "x"), view.on_object.reshape(capture.shape), {"units": "1"})
+    scene = simulation.scene(capture.time, warm, cold, capture.emissivity)
+    scene["on_object"] = (("y", "x"), on.reshape(capture.shape), {"units": "1"})
     if capture.baseline:
         scene = _with_second(scene, stage, capture, view)
-    scene = _with_thermocouples(scene, stage, caster)
+    scene = _with_thermocouples(scene, stage, view.caster)
     return scene.assign_attrs(twin=stage.name, baseline=capture.baseline)
 
 
-def table(height: float = 0.0) -> Actor:
-    """A table at room temperature with its top at a height [m]; it hides what is below it."""
-    top = surfaces.box((1.2, 0.7, 0.03), 0.1)
-    return painted([(surfaces.moved(top, translation=(0.0, 0.0, height - 0.031)), AMBIENT)])
-
-
-WALKS: Final = (
-    ((-1.8, -1.1), (-0.2, -1.2), (1.8, -1.1)),
-    ((0.4, -1.6), (1.4, -1.4), (1.2, 1.2), (-1.3, 1.3)),
-)
-"""Ways of two people, x and y from the object [m]: one behind the camera, one all around."""
-
-
-def passers_by(time: Array, rng: np.random.Generator) -> list[Actor]:
-    """
-    Two people who walk back and forth near the object, on the floor below the table.
-
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s].
-    rng : Generator
-        Source of their ways.
-
-    Returns
-    -------
-    list of Actor
-        Their limbs.
-    """
-    routes = [pacing(way, time, rng) for way in WALKS]
-    return [part for route in routes for part in person(route, height=-TABLE)]
-
-
-def since(
-    start: float, shell: heat.Shell, time: Array, exchanges: Sequence[heat.Exchange]
+def _with_itself(
+    stage: Stage, view: _View, origins: Array, directions: Array, reflected: Array
 ) -> Array:
-    """
-    Temperature of an object during a capture that something happened to before.
-
-    Parameters
-    ----------
-    start : float
-        When all was still at the temperature of the room [s].
-    shell : heat.Shell
-        The object.
-    time : ndarray, shape (time,)
-        Times of the capture [s].
-    exchanges : sequence of heat.Exchange
-        What it exchanges from the start on.
-
-    Returns
-    -------
-    ndarray, shape (time, vertex)
-        Temperature [K].
-    """
-    before = np.array([start]) if start < time[0] else np.empty(0)
-    times = np.concatenate([before, time])
-    return heat.simulate(shell, times, AMBIENT, exchanges, step=STEP)[before.size :]
-
-
-def _background(stage: Stage, capture: Capture, view: _View) -> Array:
-    """Temperature (time, pixel) [K] that the first camera sees mirrored, or directly."""
-    origins, directions = _repeated(stage.camera.position, view.directions), view.directions.copy()
-    on = view.on_object
-    origins[on], directions[on] = view.caster.mirrored(view.seen, view.directions[on])
-    result = incident(origins, directions, capture.time, stage.room, stage.actors)
-    result[:, on] = _with_itself(view, origins[on], directions[on], result[:, on])
-    return result
-
-
-def _with_itself(view: _View, origins: Array, directions: Array, reflected: Array) -> Array:
-    """Reflection (time, ray) [K] with the object's own where a mirrored ray meets it."""
+    """Reflection (time, ray) [K] with the object's own where a reflected ray meets it."""
     again = view.caster.cast(origins, directions)
-    own = view.caster.interpolate(again.of(again.met), view.temperature)
-    reflected[:, again.met] = own
+    reflected[:, again.met] = view.caster.interpolate(again.of(again.met), stage.temperature)
     return reflected
 
 
@@ -254,12 +175,10 @@ def _with_second(scene: xr.Dataset, stage: Stage, capture: Capture, view: _View)
     """The scene with a background for each band, the second from a second camera."""
     other = stage.camera.beside(capture.baseline)
     points = view.caster.points(view.seen)
-    way = points - np.asarray(other.position)
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
     seen = view.caster.visible(points, other.position)
-    rays = view.caster.mirrored(view.seen, way)
+    rays = view.caster.mirrored(view.seen, unit(points - np.asarray(other.position)))
     reflected = incident(*rays, capture.time, stage.room, stage.actors)
-    reflected = _with_itself(view, *rays, reflected)
+    reflected = _with_itself(stage, view, *rays, reflected)
     first = scene["background_temperature"]
     second = first.values.copy().reshape(capture.time.size, -1)
     second[:, np.flatnonzero(view.on_object)[seen]] = reflected[:, seen]
@@ -276,13 +195,13 @@ def _with_thermocouples(scene: xr.Dataset, stage: Stage, caster: Caster) -> xr.D
     points = np.reshape(stage.thermocouples, (-1, 3)).astype(np.float64)
     rows, columns = np.rint(stage.camera.project(points)).astype(np.int64).T
     seen = caster.visible(points, stage.camera.position)
-    for row, column, lit in zip(rows, columns, seen, strict=True):
+    for row, column, visible in zip(rows, columns, seen, strict=True):
         if not (row in scene["y"] and column in scene["x"] and scene["on_object"][row, column]):
             raise ValueError(
                 f"Invalid thermocouple at row {row}, column {column}. Must be on the object, in "
                 f"an image of {stage.camera.shape}."
             )
-        if not lit:
+        if not visible:
             raise ValueError(
                 f"Invalid thermocouple at row {row}, column {column}, behind another part of the "
                 "object. Must be seen by the camera."
@@ -292,30 +211,117 @@ def _with_thermocouples(scene: xr.Dataset, stage: Stage, caster: Caster) -> xr.D
     return scene
 
 
-def _repeated(position: npt.ArrayLike, directions: Array) -> Array:
-    return np.array(np.broadcast_to(np.asarray(position, dtype=np.float64), directions.shape))
-
-
 def obstructed(stage: Stage, time: Array) -> Mask:
     """
-    Pixels of the object that an actor hides from the camera at some time.
+    Pixels (y, x) of the object that an actor hides from the camera at some time [s].
 
-    A scene has no place for what is between the object and the camera: a twin must have none.
+    A scene cannot hold a body between the object and the camera: a twin must have none.
+    """
+    view = _view(stage)
+    nearest = distance(view.origins, view.directions, time, stage.actors)
+    return np.asarray((view.on_object & (nearest < view.hits.distance)).reshape(stage.camera.shape))
+
+
+def thermocouple_readings(
+    scene: xr.Dataset,
+    rng: np.random.Generator,
+    *,
+    std: float = 0.05,
+    offset_std: float = 0.1,
+    bead: int = 3,
+) -> xr.DataArray:
+    """
+    Readings of the virtual thermocouples of a twin.
 
     Parameters
     ----------
-    stage : Stage
-        What is before the camera.
-    time : ndarray, shape (time,)
-        Times [s].
+    scene : Dataset
+        From `take`.
+    rng : Generator
+        Source of the errors.
+    std : float
+        Standard deviation of a single reading [K].
+    offset_std : float
+        Standard deviation of a probe's constant error [K]; 0.1 is a probe that was compared with
+        a reference, 0.5 one that was not.
+    bead : int
+        Pixels along a side of the square that a bead covers; odd.
 
     Returns
     -------
-    ndarray of bool, shape (y, x)
-        True where an actor is nearer than the object.
+    DataArray
+        Readings (thermocouple, time) [K]: the mean over the bead, with both errors.
+
+    Raises
+    ------
+    ValueError
+        If the bead is not odd and positive, or reaches beyond the object.
     """
-    directions = stage.camera.directions()
-    origins = _repeated(stage.camera.position, directions)
-    hits = Caster(stage.surface).cast(origins, directions)
-    nearest = distance(origins, directions, time, stage.actors)
-    return np.asarray((hits.met & (nearest < hits.distance)).reshape(stage.camera.shape))
+    if bead < 1 or bead % 2 == 0:
+        raise ValueError(f"Invalid bead {bead} pixels. Must be odd and positive.")
+    readings = [
+        _bead_mean(scene, int(row), int(column), bead // 2)
+        for row, column in zip(scene["thermocouple_y"], scene["thermocouple_x"], strict=True)
+    ]
+    size = (len(readings), scene.sizes["time"])
+    error = rng.normal(0.0, offset_std, (len(readings), 1)) + rng.normal(0.0, std, size)
+    return xr.DataArray(
+        np.reshape(readings, size) + error,
+        dims=("thermocouple", "time"),
+        coords={"time": scene["time"]},
+        attrs=schema.STAGES["separated"]["object_temperature"].attrs,
+        name="thermocouple_temperature",
+    )
+
+
+def _bead_mean(scene: xr.Dataset, row: int, column: int, reach: int) -> Array:
+    """Mean object temperature (time,) [K] over a square of pixels."""
+    square = {
+        "y": slice(row - reach, row + reach + 1),
+        "x": slice(column - reach, column + reach + 1),
+    }
+    on = scene["on_object"].isel(square)
+    if min(row, column) < reach or on.size < (2 * reach + 1) ** 2 or not on.all():
+        raise ValueError(
+            f"Invalid thermocouple at row {row}, column {column}: its bead reaches beyond the "
+            "object. Must lie on it."
+        )
+    return np.asarray(scene["object_temperature"].isel(square).mean(("y", "x")).values)
+
+
+def table(height: float = 0.0) -> Actor:
+    """A table at room temperature with its top at a height [m]; it hides all below it."""
+    top = trimesh.creation.box((1.2, 0.7, 0.03)).apply_translation((0.0, 0.0, height - 0.016))
+    return painted([(top, AMBIENT)])
+
+
+WALKS: Final = (
+    ((-1.8, -1.1), (-0.2, -1.2), (1.8, -1.1)),
+    ((0.4, -1.6), (1.4, -1.4), (1.2, 1.2), (-1.3, 1.3)),
+)
+"""Routes of two people, x and y from the object [m]: one behind the camera, one all around."""
+
+
+def passers_by(time: Array, rng: np.random.Generator) -> list[Actor]:
+    """Two people who walk back and forth near the object, on the floor below the table."""
+    routes = [pacing(corners, time, rng) for corners in WALKS]
+    return [part for route in routes for part in person(route, height=-TABLE)]
+
+
+def since(
+    start: float,
+    mesh: trimesh.Trimesh,
+    wall: tuple[float, heat.Solid],
+    time: Array,
+    exchanges: Sequence[heat.Exchange],
+) -> Array:
+    """
+    Temperature (time, vertex) [K] of a thin-walled object at the times [s] of a capture.
+
+    Until the start [s] all was at room temperature; from then on the wall, of a thickness [m] and
+    a solid, has its exchanges.
+    """
+    shell = heat.Shell(mesh.vertices, mesh.faces, *wall)
+    before = np.array([start]) if start < time[0] else np.empty(0)
+    times = np.concatenate([before, time])
+    return heat.simulate(shell, times, AMBIENT, exchanges, step=STEP)[before.size :]

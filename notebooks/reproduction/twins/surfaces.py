@@ -1,214 +1,146 @@
-"""The built-in surfaces: plates, boxes, balls, limbs, and vessels turned about the z axis.
+"""Meshes of the twins: plates, ellipsoids, limbs, and vessels turned about the z axis.
 
-Lengths are in metres, z is up, the normals point outward. Every shape takes the `spacing` of its
-vertices, and its triangles are close to even, so a mesh refines by halving one number.
+Lengths are in metres, z is up, the normals point outward. Most shapes are those of
+`trimesh.creation`; here they get vertices at a `spacing`, so that a mesh refines by one number.
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
-from scipy.spatial import ConvexHull
+import numpy.typing as npt
+import trimesh
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation
 
-from dbthermal.simulation._mesh import (
-    Array,
-    Indices,
-    Surface,
-    merge,
-    moved,
-    pieces,
-    positive_lengths,
-    pruned,
-    welded,
+from dbthermal.planck import require_positive
+from dbthermal.simulation.rays import Array
+
+Profile = tuple[tuple[float, float], ...]
+
+WINEGLASS_PROFILE: Final[Profile] = (
+    *((0.0370, 0.0000), (0.0250, 0.0040), (0.0100, 0.0080), (0.0050, 0.0150), (0.0040, 0.0300)),
+    *((0.0040, 0.0700), (0.0055, 0.0860), (0.0160, 0.0960), (0.0300, 0.1090), (0.0400, 0.1290)),
+    *((0.0420, 0.1450), (0.0400, 0.1700), (0.0355, 0.1950), (0.0330, 0.2100)),
 )
-from reproduction.twins.turned import (
-    BULB_PROFILE,
-    COFFEE_POT_CAVITY,
-    COFFEE_POT_PROFILE,
-    WINEGLASS_CAVITY,
-    WINEGLASS_PROFILE,
-    bulb,
-    capsule,
-    coffee_pot,
-    revolution,
-    wineglass,
+"""Radius and height of the outer wall of a wineglass, foot to rim, drawn for this project after
+glasses of some 0.4 l [m]."""
+
+COFFEE_POT_PROFILE: Final[Profile] = (
+    *((0.0480, 0.0000), (0.0560, 0.0040), (0.0630, 0.0150), (0.0680, 0.0400), (0.0680, 0.0600)),
+    *((0.0630, 0.0900), (0.0530, 0.1150), (0.0430, 0.1350), (0.0400, 0.1480), (0.0430, 0.1650)),
 )
+"""Radius and height of the outer wall of a glass coffee pot, bottom to rim, drawn for this
+project after pots of some 1.2 l [m]."""
 
-__all__ = [
-    "BULB_PROFILE",
-    "COFFEE_POT_CAVITY",
-    "COFFEE_POT_PROFILE",
-    "WINEGLASS_CAVITY",
-    "WINEGLASS_PROFILE",
-    "Surface",
-    "box",
-    "bulb",
-    "capsule",
-    "coffee_pot",
-    "ellipsoid",
-    "merge",
-    "moved",
-    "plate",
-    "pruned",
-    "revolution",
-    "sphere",
-    "wineglass",
-]
+BULB_PROFILE: Final[Profile] = (
+    *((0.0130, 0.0000), (0.0140, 0.0100), (0.0180, 0.0220), (0.0240, 0.0340), (0.0285, 0.0450)),
+    *((0.0300, 0.0550), (0.0285, 0.0648), (0.0240, 0.0735), (0.0170, 0.0802), (0.0090, 0.0841)),
+    (0.0, 0.0855),
+)
+"""Radius and height of the glass of a light bulb 60 mm wide, cap to top, drawn for this project
+after the common A60 shape [m]."""
 
 
-def _grid(columns: int, rows: int) -> tuple[Array, Indices]:
-    """Points of the unit square, (point, 2), and two faces a cell, counter-clockwise."""
-    across, up = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
-    number = np.arange(across.size).reshape(across.shape)
+def plate(width: float, height: float, spacing: float) -> trimesh.Trimesh:
+    """
+    Upright rectangle in the plane y = 0, centred in x, from z = 0 up, with its normal along -y.
+
+    The vertices form a regular grid, row by row from below, with all diagonals parallel: there
+    the Laplacian of the mesh is the five-point difference.
+    """
+    columns, rows = (_pieces(length, spacing) for length in (width, height))
+    x, z = np.meshgrid(
+        np.linspace(-width / 2.0, width / 2.0, columns + 1), np.linspace(0.0, height, rows + 1)
+    )
+    number = np.arange(x.size).reshape(x.shape)
     low, right = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
     above, far = number[1:, :-1].ravel(), number[1:, 1:].ravel()
     faces = np.concatenate([np.stack([low, right, far], 1), np.stack([low, far, above], 1)])
-    return np.stack([across.ravel(), up.ravel()], axis=1), faces
+    vertices = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def plate(width: float, height: float, spacing: float) -> Surface:
+def ellipsoid(semi_axes: Sequence[float], middle: npt.ArrayLike, spacing: float) -> trimesh.Trimesh:
+    """Stretched geodesic sphere about a point; along its longest axis `spacing` is the largest."""
+    edge = np.arctan(2.0) * max(semi_axes) / require_positive("spacing [m]", spacing)
+    ball = trimesh.creation.icosphere(max(0, int(np.ceil(np.log2(edge)))))
+    return trimesh.Trimesh(ball.vertices * semi_axes + middle, ball.faces, process=False)
+
+
+def capsule(
+    start: npt.ArrayLike, end: npt.ArrayLike, radius: float, spacing: float
+) -> trimesh.Trimesh:
+    """Cylinder with round ends, centred at two points: a finger, an arm, a leg."""
+    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    count = 2 * _pieces(np.pi * radius, spacing)
+    mesh = trimesh.creation.capsule(np.linalg.norm(end - start), radius, count=[count, count])
+    turn, _ = Rotation.align_vectors([end - start], [(0.0, 0.0, 1.0)])
+    return moved(mesh, turn, (start + end) / 2.0)
+
+
+def vessel(profile: Profile, spacing: float, *, floor: bool) -> trimesh.Trimesh:
+    """Smooth profile turned about the z axis, open at its top rim, with a flat floor or without."""
+    points = np.array(profile)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    places = np.linspace(0.0, along[-1], _pieces(along[-1], spacing) + 1)
+    wall = PchipInterpolator(along, points)(places)
+    wall[-1] = points[-1]  # a pole stays one, whatever the rounding of the interpolation
+    if floor:
+        radii = np.linspace(0.0, points[0, 0], _pieces(points[0, 0], spacing) + 1)[:-1]
+        wall = np.concatenate([np.stack([radii, np.full(radii.size, points[0, 1])], 1), wall])
+    return revolved(wall, spacing)
+
+
+def revolved(profile: npt.ArrayLike, spacing: float) -> trimesh.Trimesh:
+    """Profile of radius and height (point, 2) [m] turned about the z axis, outside to its right."""
+    profile = np.asarray(profile, dtype=np.float64)
+    sections = _pieces(2.0 * np.pi * profile[:, 0].max(), spacing)
+    return trimesh.creation.revolve(profile, sections=sections)
+
+
+def wineglass(spacing: float = 0.003) -> trimesh.Trimesh:
+    """Outer wall of a wineglass, 0.21 m high on a foot 74 mm wide, with a stem of 8 mm."""
+    return vessel(WINEGLASS_PROFILE, spacing, floor=True)
+
+
+def coffee_pot(spacing: float = 0.004) -> trimesh.Trimesh:
+    """Outer wall of a glass coffee pot, 0.165 m high and 0.136 m wide."""
+    return vessel(COFFEE_POT_PROFILE, spacing, floor=True)
+
+
+def bulb(spacing: float = 0.0015) -> trimesh.Trimesh:
+    """Glass of a light bulb, 60 mm wide and 86 mm high, open below, where its cap begins."""
+    return vessel(BULB_PROFILE, spacing, floor=False)
+
+
+def moved(
+    mesh: trimesh.Trimesh,
+    rotation: Rotation | None = None,
+    translation: npt.ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    scale: float = 1.0,
+) -> trimesh.Trimesh:
+    """Copy of a mesh, scaled and rotated about the origin, then translated [m]."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * (np.eye(3) if rotation is None else rotation.as_matrix())
+    matrix[:3, 3] = translation
+    return mesh.copy().apply_transform(matrix)
+
+
+def _pieces(length: float, spacing: float) -> int:
+    """Number of equal pieces of at most the spacing in a length; 1e-9 forgives rounding."""
+    require_positive("length and spacing [m]", (length, spacing))
+    return max(1, int(np.ceil(length / spacing - 1e-9)))
+
+
+def on_wall(mesh: trimesh.Trimesh, height: float, angle: float) -> tuple[float, float, float]:
     """
-    An upright rectangle in the plane y = 0, seen from the side of negative y.
+    Point on the wall of a mesh of revolution about the z axis.
 
-    The vertices form a regular grid with all diagonals parallel: there the Laplacian of the mesh
-    is the five-point difference.
-
-    Parameters
-    ----------
-    width, height : float
-        Extent in x, centred, and in z, from 0 [m].
-    spacing : float
-        Largest distance of neighbours along x and z [m].
-
-    Returns
-    -------
-    Surface
-        Normals along -y; vertices row by row from below, x increasing within a row.
-
-    Raises
-    ------
-    ValueError
-        If a length is not finite and positive.
+    The angle about the axis is from negative y towards positive x [degrees]; x, y and z are in [m].
     """
-    size = positive_lengths("size of a plate", (width, height))
-    columns, rows = pieces(size, positive_lengths("spacing", spacing))
-    points, faces = _grid(int(columns), int(rows))
-    across = (points[:, 0] - 0.5) * width
-    return Surface(np.stack([across, np.zeros(len(points)), points[:, 1] * height], 1), faces)
-
-
-def box(size: Sequence[float], spacing: float) -> Surface:
-    """
-    A closed box on the plane z = 0, centred in x and y.
-
-    Parameters
-    ----------
-    size : sequence of float
-        Extent in x, y and z [m].
-    spacing : float
-        Largest distance of neighbours along the edges [m].
-
-    Returns
-    -------
-    Surface
-        Six grids that share the vertices of their edges.
-
-    Raises
-    ------
-    ValueError
-        If a length is not finite and positive.
-    """
-    extent = positive_lengths("size of a box", size)
-    if extent.shape != (3,):
-        raise ValueError(f"Invalid size of a box {size} m. Must be three lengths.")
-    counts = pieces(extent, positive_lengths("spacing", spacing))
-    vertices, faces, start = [], [], 0
-    for axis in range(3):
-        first, second = (axis + 1) % 3, (axis + 2) % 3
-        points, cells = _grid(int(counts[first]), int(counts[second]))
-        for side in (0.0, 1.0):
-            place = np.full((len(points), 3), side)
-            place[:, [first, second]] = points
-            vertices.append((place - (0.5, 0.5, 0.0)) * extent)
-            faces.append(start + (cells if side else cells[:, ::-1]))
-            start += len(points)
-    return welded(np.concatenate(vertices), np.concatenate(faces), 1e-6 * float(spacing))
-
-
-def sphere(radius: float, spacing: float) -> Surface:
-    """
-    A geodesic sphere around the origin: an icosahedron whose faces are cut evenly.
-
-    Parameters
-    ----------
-    radius : float
-        Radius of the vertices [m].
-    spacing : float
-        Distance of neighbours, which the cut edges of the icosahedron do not exceed [m].
-
-    Returns
-    -------
-    Surface
-        10 n^2 + 2 vertices, where n is the number of pieces of an edge.
-
-    Raises
-    ------
-    ValueError
-        If a length is not finite and positive.
-    """
-    radius, spacing = (
-        float(positive_lengths("radius", radius)),
-        float(positive_lengths("spacing", spacing)),
-    )
-    ratio = (1.0 + np.sqrt(5.0)) / 2.0
-    corners = np.array([(0.0, s, t * ratio) for s in (-1.0, 1.0) for t in (-1.0, 1.0)])
-    corners = np.concatenate([np.roll(corners, shift, axis=1) for shift in range(3)])
-    corners /= np.hypot(1.0, ratio)
-    sides = corners[ConvexHull(corners).simplices]
-    inward = np.linalg.det(sides) < 0
-    sides[inward] = sides[inward][:, ::-1]
-    arc = radius * np.arctan(2.0)
-    weights, cells = _triangle(int(pieces(arc, spacing)))
-    points = np.einsum("pk,fkd->fpd", weights, sides)
-    points /= np.linalg.norm(points, axis=2, keepdims=True)
-    faces = cells + len(weights) * np.arange(len(sides))[:, None, None]
-    unit = welded(points.reshape(-1, 3), faces.reshape(-1, 3), 1e-6 * spacing / radius)
-    return Surface(radius * unit.vertices, unit.faces)
-
-
-def _triangle(pieces: int) -> tuple[Array, Indices]:
-    """Barycentric points of a triangle with cut edges, (point, 3), and its small faces."""
-    points = [(i, j) for i in range(pieces + 1) for j in range(pieces + 1 - i)]
-    number = {point: index for index, point in enumerate(points)}
-    up = [(p, (p[0] + 1, p[1]), (p[0], p[1] + 1)) for p in points if sum(p) < pieces]
-    down = [(q, (p[0] + 1, p[1] + 1), r) for p, q, r in up if sum(p) < pieces - 1]
-    faces = np.array([[number[corner] for corner in face] for face in up + down])
-    first, second = np.array(points, dtype=np.float64).T / pieces
-    return np.stack([1.0 - first - second, first, second], axis=1), faces
-
-
-def ellipsoid(semi_axes: Sequence[float], spacing: float) -> Surface:
-    """
-    An ellipsoid around the origin, as a stretched sphere.
-
-    Parameters
-    ----------
-    semi_axes : sequence of float
-        Half the extent in x, y and z [m].
-    spacing : float
-        Distance of neighbours along the longest axis; they are closer elsewhere [m].
-
-    Returns
-    -------
-    Surface
-        Closed.
-
-    Raises
-    ------
-    ValueError
-        If a length is not finite and positive.
-    """
-    axes = positive_lengths("semi-axes", semi_axes)
-    if axes.shape != (3,):
-        raise ValueError(f"Invalid semi-axes {semi_axes} m. Must be three lengths.")
-    unit = sphere(1.0, spacing / float(axes.max()))
-    return Surface(unit.vertices * axes, unit.faces)
+    levels, first = np.unique(mesh.vertices[:, 2], return_index=True)
+    radii: Array = np.linalg.norm(mesh.vertices[first, :2], axis=1)
+    radius, turn = float(np.interp(height, levels, radii)), np.radians(angle)
+    return radius * float(np.sin(turn)), -radius * float(np.cos(turn)), height

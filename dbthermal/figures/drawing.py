@@ -1,4 +1,4 @@
-"""What all figures share: a canvas that nobody else owns, colours, labels, images, limits."""
+"""Parts that all figures share: canvas, colours, labels, images, limits, plain ticks."""
 
 from typing import Final
 
@@ -8,11 +8,28 @@ import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+__all__ = [
+    "COLORS",
+    "band_label",
+    "canvas",
+    "draw_image",
+    "limits_of",
+    "percent",
+    "plain_decades",
+    "plain_ticks",
+    "provenance_note",
+]
 
 COLORS: Final = ("#1b6ca8", "#d1495b", "#66a182", "#edae49", "#6c4f77")
 """Colours of the bands, in their order."""
 
 _LABELS: Final = {"8-14": "8-14 \N{MICRO SIGN}m"}
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def canvas(
@@ -111,3 +128,22 @@ def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, f
         highest = max(abs(lowest), abs(highest))
         lowest = -highest
     return float(lowest), float(highest) if highest > lowest else float(lowest) + 1.0
+
+
+def plain_ticks(axis: Axes, places: xr.DataArray) -> None:
+    """Ticks at some places of a logarithmic axis, as plain numbers, and a grid."""
+    axis.set_xticks(places.values, [f"{place:g}" for place in places.values], fontsize=8)
+    axis.set_xticks([], minor=True)
+    axis.grid(visible=True, which="major", color="0.9")
+
+
+def plain_decades(axis: Axes) -> None:
+    """Ticks at 1, 2 and 5 of each decade of a logarithmic vertical axis, as plain numbers."""
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.yaxis.set_minor_locator(NullLocator())
+
+
+def percent(share: float) -> str:
+    """A share in percent, that is not 0.0 where there is a pixel."""
+    return "< 0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"

@@ -1,4 +1,4 @@
-"""Surroundings: a room in which bodies move, and the temperature that rays from an object meet.
+"""Surroundings of an object: a room, and bodies that move in it; what reflected rays meet.
 
 A ray carries the temperature of the first body that it meets, or that of the room. All are taken
 as blackbodies: skin, clothes, walls and hot drinks have emissivities of 0.95 and more.
@@ -7,20 +7,29 @@ as blackbodies: skin, clothes, walls and hot drinks have emissivities of 0.95 an
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
+import trimesh
 from scipy.spatial.transform import Rotation
 
-from dbthermal.simulation._mesh import Surface, merge
-from dbthermal.simulation._rays import Array, Caster, Hits, Index
-from dbthermal.simulation._times import increasing
+from dbthermal.simulation._scenes import increasing
+from dbthermal.simulation.rays import Caster, Hits
+
+__all__ = ["Actor", "Pose", "Room", "distance", "gliding", "hinged", "incident", "painted"]
+
+Array = npt.NDArray[np.float64]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 @dataclass(frozen=True)
 class Pose:
     """
-    Where a rigid body is: a point p of the body is at R p + t in the world.
+    Position and orientation of a rigid body: its point p is at R p + t in the world.
 
     Attributes
     ----------
@@ -34,7 +43,7 @@ class Pose:
     translation: npt.ArrayLike = (0.0, 0.0, 0.0)
 
     def __matmul__(self, inner: "Pose") -> "Pose":
-        """Pose of a body whose place within this one is the inner pose."""
+        """Pose in the world of a body whose pose within this one is the inner pose."""
         return Pose(self.rotation * inner.rotation, self.outwards(inner.translation))
 
     def outwards(self, points: npt.ArrayLike) -> Array:
@@ -54,21 +63,7 @@ Warmth = Callable[[float], Array]
 
 
 def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:
-    """
-    Pose of a body that is rotated about a point of itself.
-
-    Parameters
-    ----------
-    joint : array_like, shape (3,)
-        The point that stays [m].
-    rotation : scipy.spatial.transform.Rotation
-        The rotation.
-
-    Returns
-    -------
-    Pose
-        The pose.
-    """
+    """Pose of a body rotated about a joint (3,) [m] of its own."""
     joint = np.asarray(joint, dtype=np.float64)
     return Pose(rotation, joint - rotation.apply(joint))
 
@@ -80,7 +75,7 @@ def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
     Parameters
     ----------
     times : array_like, shape (stop,)
-        When each place is reached [s], increasing; two or more.
+        Time of arrival at each place [s], increasing; two or more.
     places : array_like, shape (stop, 3)
         Places [m].
 
@@ -110,8 +105,8 @@ class Actor:
 
     Attributes
     ----------
-    surface : Surface
-        Its mesh, in its own frame.
+    mesh : trimesh.Trimesh
+        Its mesh, in its own frame [m].
     temperature : ndarray, shape (vertex,), or function of time
         Temperature [K].
     motion : function of time, optional
@@ -120,28 +115,27 @@ class Actor:
     Raises
     ------
     ValueError
-        If a temperature is not finite, or there is not one for each vertex; of a function, when it
-        is asked.
+        If the temperatures are not finite, one for each vertex; of a function, when it is called.
     """
 
-    surface: Surface
+    mesh: trimesh.Trimesh
     temperature: Array | Warmth
     motion: Motion | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a temperature that is not one for each vertex."""
+        """Check a constant temperature."""
         if not callable(self.temperature):
             self._checked(self.temperature)
 
     def warmth(self, time: float) -> Array:
-        """Temperature of each vertex at a time [s], shape (vertex,) [K]."""
+        """Temperature of each vertex (vertex,) [K] at a time [s]."""
         if not callable(self.temperature):
             return self.temperature
         return self._checked(self.temperature(time))
 
     def _checked(self, temperature: Array) -> Array:
-        """Return the temperatures, if there is a finite one for each vertex."""
-        expected = (len(self.surface.vertices),)
+        """Temperatures that are finite, one for each vertex."""
+        expected = (len(self.mesh.vertices),)
         if np.shape(temperature) != expected or not np.all(np.isfinite(temperature)):
             raise ValueError(
                 f"Invalid temperature of shape {np.shape(temperature)} of an actor. "
@@ -153,7 +147,7 @@ class Actor:
 @dataclass(frozen=True)
 class Room:
     r"""
-    What is behind all bodies: walls that do not change, at :math:`T + g \cdot d` along d.
+    Walls of constant temperature behind all bodies, :math:`T + g \cdot d` along direction d.
 
     Attributes
     ----------
@@ -168,53 +162,38 @@ class Room:
     gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def seen(self, directions: Array) -> Array:
-        """Temperature (ray,) [K] that rays along some directions (ray, 3) meet."""
+        """Temperature (ray,) [K] of the walls along directions (ray, 3)."""
         return np.asarray(self.temperature + directions @ np.asarray(self.gradient))
 
 
-def painted(parts: Sequence[tuple[Surface, float]], motion: Motion | None = None) -> Actor:
-    """
-    One rigid actor of several surfaces, each of one temperature.
-
-    Parameters
-    ----------
-    parts : sequence of tuple
-        Surface, and its temperature [K].
-    motion : function of time, optional
-        Its pose.
-
-    Returns
-    -------
-    Actor
-        The parts, side by side.
-    """
-    whole = merge([surface for surface, _ in parts])
-    warmth = [np.full(len(surface.vertices), warm) for surface, warm in parts]
-    return Actor(whole, np.concatenate(warmth), motion)
+def painted(parts: Sequence[tuple[trimesh.Trimesh, float]], motion: Motion | None = None) -> Actor:
+    """Rigid actor of several meshes, each of one temperature [K], side by side."""
+    warmth = [np.full(len(mesh.vertices), temperature) for mesh, temperature in parts]
+    whole = trimesh.util.concatenate([mesh for mesh, _ in parts])
+    return Actor(cast("trimesh.Trimesh", whole), np.concatenate(warmth), motion)
 
 
-class _Stage:
-    """One actor, ready for rays from fixed origins along fixed directions."""
+class _Target:
+    """One actor, ready for rays of fixed origins and directions (ray, 3)."""
 
     def __init__(self, actor: Actor, origins: Array, directions: Array) -> None:
-        self.actor, self.caster = actor, Caster(actor.surface)
+        self.actor, self.caster = actor, Caster(actor.mesh)
         self.rays = (origins, directions)
-        vertices = actor.surface.vertices
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        low, high = actor.mesh.bounds
         self.middle = (low + high) / 2.0
-        self.radius = float(np.max(np.linalg.norm(vertices - self.middle, axis=1)))
+        self.radius = float(np.max(np.linalg.norm(actor.mesh.vertices - self.middle, axis=1)))
 
-    def at(self, time: float) -> tuple[Index, Hits]:
-        """Rays that meet the actor at a time, and where."""
+    def at(self, time: float) -> tuple[npt.NDArray[np.int64], Hits]:
+        """Numbers of the rays that meet the actor at a time [s], and their intersections."""
         motion = self.actor.motion
         return self._unmoved if motion is None else self._cast(motion(time))
 
     @cached_property
-    def _unmoved(self) -> tuple[Index, Hits]:
-        """Rays that meet an actor without motion: cast once for all frames."""
+    def _unmoved(self) -> tuple[npt.NDArray[np.int64], Hits]:
+        """Intersections with an actor without motion: cast once for all frames."""
         return self._cast(Pose())
 
-    def _cast(self, pose: Pose) -> tuple[Index, Hits]:
+    def _cast(self, pose: Pose) -> tuple[npt.NDArray[np.int64], Hits]:
         origins, directions = self.rays
         near = np.flatnonzero(self._near(pose.outwards(self.middle)))
         hits = self.caster.cast(*pose.inwards(origins[near], directions[near]))
@@ -234,7 +213,7 @@ def incident(
     origins: Array, directions: Array, time: Array, room: Room, actors: Sequence[Actor]
 ) -> Array:
     """
-    Temperature that rays meet, frame by frame.
+    Blackbody temperature (time, ray) [K] that rays meet, frame by frame.
 
     Parameters
     ----------
@@ -243,49 +222,28 @@ def incident(
     time : ndarray, shape (time,)
         Times [s].
     room : Room
-        What is behind all actors.
+        Walls behind all actors.
     actors : sequence of Actor
         Bodies; the nearest hides the others.
-
-    Returns
-    -------
-    ndarray, shape (time, ray)
-        Blackbody temperature [K].
     """
-    stages = [_Stage(actor, origins, directions) for actor in actors]
+    targets = [_Target(actor, origins, directions) for actor in actors]
     result = np.tile(room.seen(directions), (time.size, 1))
     for frame, now in zip(result, time, strict=True):
         nearest = np.full(frame.shape, np.inf)
-        for stage in stages:
-            rays, hits = stage.at(float(now))
+        for target in targets:
+            rays, hits = target.at(float(now))
             first = hits.distance < nearest[rays]
-            chosen, warmth = rays[first], stage.actor.warmth(float(now))
-            nearest[chosen] = hits.distance[first]
-            frame[chosen] = stage.caster.interpolate(hits.of(first), warmth)
+            selected, warmth = rays[first], target.actor.warmth(float(now))
+            nearest[selected] = hits.distance[first]
+            frame[selected] = target.caster.interpolate(hits.of(first), warmth)
     return result
 
 
 def distance(origins: Array, directions: Array, time: Array, actors: Sequence[Actor]) -> Array:
-    """
-    Way to the nearest actor, the shortest over all frames.
-
-    Parameters
-    ----------
-    origins, directions : ndarray, shape (ray, 3)
-        Origins [m] and unit vectors.
-    time : ndarray, shape (time,)
-        Times [s].
-    actors : sequence of Actor
-        Bodies.
-
-    Returns
-    -------
-    ndarray, shape (ray,)
-        Way [m], infinite where no actor ever is.
-    """
+    """Least distance (ray,) [m] to any actor over all frames; infinite where no actor is met."""
     nearest = np.full(len(origins), np.inf)
-    for stage in (_Stage(actor, origins, directions) for actor in actors):
+    for target in (_Target(actor, origins, directions) for actor in actors):
         for now in time:
-            rays, hits = stage.at(float(now))
+            rays, hits = target.at(float(now))
             nearest[rays] = np.minimum(nearest[rays], hits.distance)
     return nearest

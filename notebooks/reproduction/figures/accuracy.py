@@ -1,49 +1,91 @@
-"""Figures of validity: which pixels to trust, and for those not to trust, why, in words."""
+"""Figures of accuracy: errors and error bars case by case, and pixels to trust under stress."""
 
-from types import MappingProxyType
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
-from dbthermal import schema
-from dbthermal.figures._canvas import COLORS, band_label, canvas, provenance_note
-
-REASONS: Final = MappingProxyType(
-    {
-        "dead_pixel": ("dead pixel", "#000000"),
-        "saturated": ("saturated", "#4d4d4d"),
-        "invalid_samples": ("no samples, as outside a view", "#737373"),
-        "constant_signal": ("signal never changes", "#969696"),
-        "frozen_frames": ("frozen frames, as by a shutter", "#bdbdbd"),
-        "object_jump": ("object jumps", "#7f3b08"),
-        "bands_apart": ("bands see the reflection at different times", "#b35806"),
-        "object_not_smooth": ("object changes too fast, or noise is another", "#e08214"),
-        "roles_may_be_swapped": ("object and reflection may be swapped", "#fdb863"),
-        "no_background_motion": ("no motion reflected: nothing can be told", "#08306b"),
-        "gray": ("same emissivity in all bands: nothing can be told", "#00868b"),
-        "constant_object": ("object constant: emissivity unknown", "#6baed6"),
-        "nonphysical_emissivity": ("emissivity outside 0 to 1", "#6a51a3"),
-        "outside_response": ("outside the calibrated temperatures", "#9e9ac8"),
-        "not_converged": ("not converged", "#dadaeb"),
-        "background_never_rests": ("reflection never rests: emissivity doubtful", "#c7b299"),
-    }
-)
-"""Words and colour of each flag, causes before what follows: a pixel with several is drawn as its
-first."""
+from dbthermal.figures import REASONS, first_reason
+from dbthermal.figures.drawing import COLORS, band_label, canvas, percent, provenance_note
 
 _RIGHT: Final = "#a8d5b0"
+
 _WRONG: Final = "#e3000f"
+
 # What a 95 % interval should hold, and where the axis of the coverage begins [%].
 _SPAN: Final = (92.0, 98.0)
+
 _LOWEST: Final = 50.0
+
 _ARROW: Final = 48.5
+
 _DOTS: Final = (COLORS[0], COLORS[3], COLORS[4], COLORS[2])
+
+
+def accuracy(sweep: xr.Dataset) -> Figure:
+    """
+    Errors of the object temperature and of the emissivities, case by case.
+
+    Parameters
+    ----------
+    sweep : Dataset
+        `object_temperature_rmse` [K], `emissivity_error` (band) [1], over `case`.
+
+    Returns
+    -------
+    Figure
+        Two panels.
+    """
+    figure, axes = canvas(1, 2, (11.0, 0.34 * sweep.sizes["case"] + 1.8))
+    place = np.arange(sweep.sizes["case"])
+    left, right = axes[0]
+    left.barh(place, sweep["object_temperature_rmse"], color=COLORS[0])
+    bands = sweep["band"].values
+    for index, band in enumerate(bands):
+        shifted = place + 0.36 * (index - (len(bands) - 1) / 2)
+        values = sweep["emissivity_error"].sel(band=band)
+        right.barh(shifted, values, 0.34, color=COLORS[index], label=band_label(band))
+    for axis in (left, right):
+        axis.set_yticks(place, sweep["case"].values, fontsize=8)
+        axis.invert_yaxis()
+    right.legend(frameon=False, fontsize=8)
+    left.set_xlabel("median RMSE of the object temperature [K]")
+    right.set_xlabel("median error of the emissivity [1]")
+    right.set_yticklabels([])
+    figure.suptitle("Accuracy of the separation" + provenance_note(sweep))
+    return figure
+
+
+def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
+    """
+    Distribution of error over standard deviation; a true error bar gives the normal curve.
+
+    Parameters
+    ----------
+    scores : mapping of str to DataArray
+        Quantity, and its errors divided by their standard deviation [1]; the first one's
+        attributes say what the data are.
+
+    Returns
+    -------
+    Figure
+        Histograms over the standard normal density.
+    """
+    figure, axes = canvas(1, len(scores), (3.4 * len(scores), 3.0))
+    grid = np.linspace(-5, 5, 201)
+    normal = np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi)
+    for axis, (name, values) in zip(axes[0], scores.items(), strict=True):
+        axis.hist(values.values.ravel(), bins=50, range=(-5, 5), density=True, color=COLORS[0])
+        axis.plot(grid, normal, color="black", linewidth=1)
+        axis.set(title=name.replace("_", " "), xlabel="error / standard deviation [1]")
+    axes[0, 0].set_ylabel("density [1]")
+    data = next(iter(scores.values()))
+    figure.suptitle("Error bars against errors" + provenance_note(data))
+    return figure
 
 
 def validity(stress: xr.Dataset) -> Figure:
@@ -91,70 +133,9 @@ def validity(stress: xr.Dataset) -> Figure:
     return figure
 
 
-def status(result: xr.Dataset) -> Figure:
-    """
-    Map of one capture's status in words: which pixels to trust, and for the others why not.
-
-    Parameters
-    ----------
-    result : Dataset
-        From `separation.solve`: `status` (y, x), bits of `schema.FLAGS`.
-
-    Returns
-    -------
-    Figure
-        A map with a colour for each flag that is the first of a pixel's, in the order of `REASONS`,
-        and its share.
-
-    Raises
-    ------
-    ValueError
-        If a bit is none of `schema.FLAGS`.
-    """
-    first = _first_flag(result["status"])
-    shares = {name: float(np.mean(first == name)) for name in ("", *REASONS)}
-    shown = {name: share for name, share in shares.items() if share > 0}
-    image = np.zeros((*first.shape, 3))
-    for name in shown:
-        image[first == name] = to_rgb(REASONS[name][1] if name else _RIGHT)
-    height = 5.2 * first.shape[0] / first.shape[1]
-    figure, axes = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
-    left, right = axes[0]
-    left.get_gridspec().set_width_ratios([1.3, 1.0])
-    left.imshow(image, interpolation="nearest")
-    left.set(xticks=[], yticks=[])
-    right.set_axis_off()
-    patches = [_patch(name, share) for name, share in shown.items()]
-    right.legend(handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9)
-    good = f"{_percent(shares[''])} of the pixels have no flag"
-    figure.suptitle(f"Status: {good}" + provenance_note(result))
-    return figure
-
-
-def _percent(share: float) -> str:
-    """A share in percent, that is not 0.0 where there is a pixel."""
-    return "< 0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"
-
-
-def _patch(name: str, share: float) -> Patch:
-    """Legend of a flag, or of no flag, with its share."""
-    words, color = REASONS[name] if name else ("good", _RIGHT)
-    return Patch(facecolor=color, edgecolor="0.5", label=f"{_percent(share)}  {words}")
-
-
-def _first_flag(flags: xr.DataArray) -> npt.NDArray[np.str_]:
-    """Name of the most decisive flag of each pixel; empty where there is none."""
-    unknown = int(np.bitwise_or.reduce(flags.values, axis=None)) & ~sum(schema.FLAGS.values())
-    if unknown:
-        raise ValueError(f"Unknown bits {unknown} of a status. Must be of {dict(schema.FLAGS)}.")
-    names = sorted(schema.FLAGS, key=list(REASONS).index)
-    masks = [(flags.values & schema.FLAGS[name]) != 0 for name in names]
-    return np.select(masks, [np.array(name) for name in names], default=np.array(""))
-
-
 def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
     """Stacked bars (case): right, wrong, and each flag; the wrong ones as a number, too."""
-    first, wrong = _first_flag(flags.transpose("case", "pixel")), bad.transpose("case", "pixel")
+    first, wrong = first_reason(flags.transpose("case", "pixel")), bad.transpose("case", "pixel")
     parts = {
         "no flag and right": (_RIGHT, (first == "") & ~wrong.values),
         "no flag and wrong (error above 4 standard deviations)": (
@@ -177,7 +158,7 @@ def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
 def _count(axis: Axes, share: npt.NDArray[np.float64]) -> None:
     """Shares of wrong pixels [%] at the end of the bars, for some are too few to be seen."""
     for row in np.flatnonzero(share).tolist():
-        text = f"{_percent(share[row] / 100)} wrong"
+        text = f"{percent(share[row] / 100)} wrong"
         axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
 
 

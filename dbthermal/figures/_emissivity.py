@@ -1,17 +1,10 @@
-"""Figures of materials: band emissivities, condition numbers of band pairs."""
+"""Figures of emissivities: tabulated, measured by contact, condition numbers of band pairs."""
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from dbthermal.figures._canvas import (
-    COLORS,
-    band_label,
-    canvas,
-    draw_image,
-    limits_of,
-    provenance_note,
-)
+from dbthermal.figures.drawing import COLORS, band_label, canvas, limits_of, provenance_note
 
 
 def emissivity_bars(table: xr.Dataset) -> Figure:
@@ -80,40 +73,43 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
     return figure
 
 
-def pooled_materials(
-    single: xr.DataArray, pooled: xr.DataArray, labels: xr.DataArray, panels: xr.DataArray
-) -> Figure:
+def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
     """
-    The reflection ratio pixel by pixel, and pooled over the materials found.
+    Emissivities from thermocouple and blackbody with their standard deviations.
 
     Parameters
     ----------
-    single, pooled : DataArray
-        Reflection ratio (y, x) [1] without and with pooling.
-    labels : DataArray
-        Materials found (y, x), -1 for none.
-    panels : DataArray
-        True materials (y, x), whose borders are drawn.
+    measured : Dataset
+        `emissivity`, `emissivity_std` (material, band) [1].
+    table : DataArray, optional
+        Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
 
     Returns
     -------
     Figure
-        Three maps, with the true borders as lines.
+        One point a band and material.
     """
-    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.4))
-    limits = limits_of(single)
-    for axis, ratio, title in ((left, single, "pixel by pixel"), (middle, pooled, "pooled")):
-        draw_image(
-            figure, axis, ratio, title, "reflection ratio [1]", cmap="viridis", limits=limits
+    figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
+    place = np.arange(measured.sizes["material"])
+    bands = measured["band"].values
+    for index, band in enumerate(bands):
+        here = measured.sel(band=band)
+        shifted = place + 0.14 * (index - (len(bands) - 1) / 2)
+        axis.errorbar(
+            shifted,
+            here["emissivity"],
+            here["emissivity_std"],
+            fmt="o",
+            markersize=4,
+            capsize=3,
+            color=COLORS[index],
+            label=band_label(band),
         )
-    found = labels.where(labels >= 0)
-    title = f"materials found: {np.unique(found.values[found.notnull().values]).size}"
-    right.imshow(found % 10, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
-    right.set_facecolor("0.8")
-    right.set_title(title, fontsize=9)
-    for axis in (left, middle, right):
-        for one in np.unique(panels.values)[1:]:
-            axis.contour(panels.values >= one, levels=[0.5], colors="white", linewidths=0.8)
-        axis.set(xticks=[], yticks=[])
-    figure.suptitle("Pixels of one material share their ratio" + provenance_note(single))
+        if table is not None:
+            label = "table" if index == 0 else None
+            axis.plot(shifted, table.sel(band=band), "x", color="black", markersize=7, label=label)
+    axis.set_xticks(place, [str(name).replace(" ", "\n") for name in measured["material"].values])
+    axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
+    figure.legend(frameon=False, loc="outside right center", fontsize=8)
+    axis.set_title("Emissivity by contact, one standard deviation" + provenance_note(measured))
     return figure

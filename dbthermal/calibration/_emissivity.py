@@ -1,0 +1,415 @@
+"""Emissivity of a material by contact thermometry, with a reflected blackbody or a foil.
+
+Every method fits, by generalised least squares, :math:`I_i - W_{b,i} = e (W_{o,i} - W_{b,i})` with
+the counts I of the material, the signal :math:`W_o` of a blackbody at its temperature, and the
+reflected signal :math:`W_b`. Both sides have errors, some of them common to all measurements.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import planck, schema
+from dbthermal import response as responses
+from dbthermal.response import Curve, require_range
+
+Array = npt.NDArray[np.float64]
+
+_ITERATIONS: Final = 50
+_CONVERGED: Final = 1e-12
+
+
+@dataclass(frozen=True)
+class Bias:
+    r"""
+    Errors that all readings of one series have in common, each uniform in a range.
+
+    A range's middle is corrected for, and its standard deviation, the width over
+    :math:`\sqrt{12}`, is carried into the result: a rectangular distribution, clause 4.3.7 of the
+    Guide to the expression of uncertainty in measurement (JCGM 100:2008).
+
+    Attributes
+    ----------
+    object_tolerance : float
+        Largest offset of the thermocouple's readings, either way [K].
+    contact : tuple of float
+        Least and largest fraction of the object's excess over the air that the thermocouple
+        misses, because it conducts heat away [1].
+    air_temperature : float
+        Of the air, and of the room [K].
+    background_tolerance : float
+        Largest offset of the reflected body's temperature, either way [K].
+    stray : tuple of float
+        Least and largest fraction of the reflection that comes from the room and not from the
+        blackbody: a surface that is not quite smooth, a blackbody not quite black [1].
+    """
+
+    object_tolerance: float = 0.0
+    contact: tuple[float, float] = (0.0, 0.0)
+    air_temperature: float = 295.15
+    background_tolerance: float = 0.0
+    stray: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        for name in ("object_tolerance", "background_tolerance"):
+            value = getattr(self, name)
+            if not 0 <= value < np.inf:
+                raise ValueError(f"Invalid {name} {value} K. Must be zero or positive.")
+        for name in ("contact", "stray"):
+            least, largest = getattr(self, name)
+            if not 0 <= least <= largest < 1:
+                raise ValueError(
+                    f"Invalid {name} ({least}, {largest}). Must be a range within [0, 1)."
+                )
+        planck.require_positive("air_temperature [K]", self.air_temperature)
+
+    @property
+    def _felt(self) -> float:
+        """Mean fraction of the object's excess over the air that the thermocouple reads [1]."""
+        return 1.0 - 0.5 * (self.contact[0] + self.contact[1])
+
+    @property
+    def _mirrored(self) -> float:
+        """Mean fraction of the reflection that comes from the blackbody [1]."""
+        return 1.0 - 0.5 * (self.stray[0] + self.stray[1])
+
+    def corrected(self, reading: Array) -> Array:
+        """Object temperature [K], T = T_a + (R - T_a) / (1 - m), m the mean contact error."""
+        return self.air_temperature + (reading - self.air_temperature) / self._felt
+
+    def emitted(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
+        """
+        Errors of the object's signal [count]: independent (n), and common (2, n).
+
+        Of n measurements at corrected temperatures [K], for a standard deviation of one reading
+        [K]; the common ones by the offset and by the contact error.
+        """
+        # dT = dR / (1 - m) + (T - T_a) dm / (1 - m), and dW = U'(T) dT.
+        scale = curve.count_slope(temperature) / self._felt
+        contact = _uniform_std(self.contact) * (temperature - self.air_temperature)
+        offset = np.full_like(temperature, self.object_tolerance / 3.0**0.5)
+        return np.asarray(scale * std), np.asarray(scale * np.stack([offset, contact]))
+
+    def reflection(self, curve: Curve, temperature: Array) -> Array:
+        """Reflected signal [count], (1 - s) U(T_b) + s U(T_a), s the mean stray fraction."""
+        room = curve.counts(self.air_temperature)
+        return np.asarray(room + self._mirrored * (curve.counts(temperature) - room))
+
+    def reflected(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
+        """Errors of the reflected signal [count] as `emitted`; common: offset, stray fraction."""
+        # dW = (1 - s) U'(T_b) dT_b - (U(T_b) - U(T_a)) ds.
+        scale = self._mirrored * curve.count_slope(temperature)
+        offset = scale * self.background_tolerance / 3.0**0.5
+        excess = curve.counts(temperature) - curve.counts(self.air_temperature)
+        return np.asarray(scale * std), np.stack([offset, _uniform_std(self.stray) * excess])
+
+
+NO_BIAS: Final = Bias()
+"""Readings whose errors are independent."""
+
+
+@dataclass(frozen=True)
+class _Signals:
+    """
+    Signals of one band and their errors, n measurements.
+
+    `counts`, `emitted`, `reflected` (n): I, W_o, W_b [count]; `noise`: standard deviation of the
+    counts [count]; `..._std` (n): independent errors of the other two; `..._bias` (term, n): effect
+    on them of one standard deviation of each common error [count].
+    """
+
+    counts: Array
+    emitted: Array
+    reflected: Array
+    noise: float
+    emitted_std: Array
+    reflected_std: Array
+    emitted_bias: Array
+    reflected_bias: Array
+
+    @property
+    def x(self) -> Array:
+        """Abscissa of the line through the origin, W_o - W_b [count]."""
+        return self.emitted - self.reflected
+
+    @property
+    def y(self) -> Array:
+        """Ordinate of the line, I - W_b [count]."""
+        return self.counts - self.reflected
+
+    def weighted(self, emissivity: float, values: Array) -> Array:
+        """
+        Inverse covariance of the residual y - e x, times values (n).
+
+        The covariance is diagonal but for the few common errors F (term, n), which the Woodbury
+        identity inverts: (D + F'F)^-1 v = v/D - (F/D)' (1 + F (F/D)')^-1 F (v/D).
+        """
+        rest = 1.0 - emissivity
+        # D = s_I^2 + e^2 s_o^2 + (1 - e)^2 s_b^2.
+        readings = (emissivity * self.emitted_std) ** 2 + (rest * self.reflected_std) ** 2
+        variance = self.noise**2 + readings
+        common = np.concatenate([emissivity * self.emitted_bias, rest * self.reflected_bias])
+        inner = np.eye(len(common)) + common @ (common / variance).T
+        scaled = values / variance
+        return np.asarray(scaled - (common / variance).T @ np.linalg.solve(inner, common @ scaled))
+
+    def adjusted_x(self, emissivity: float, weighted: Array) -> Array:
+        """Abscissa (n) [count] as the fit adjusts it, from the weighted residual (n)."""
+        # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
+        by_object, by_reflection = (
+            std**2 * weighted + bias.T @ (bias @ weighted)
+            for std, bias in (
+                (self.emitted_std, self.emitted_bias),
+                (self.reflected_std, self.reflected_bias),
+            )
+        )
+        return np.asarray(self.x + emissivity * by_object - (1.0 - emissivity) * by_reflection)
+
+
+def fit_emissivity(
+    measured: xr.Dataset,
+    response: xr.Dataset,
+    reading_std: tuple[float, float],
+    bias: Bias = NO_BIAS,
+) -> xr.Dataset:
+    r"""
+    Emissivity of a material per band, by contact thermometry and a reflected blackbody.
+
+    Each measurement i has counts :math:`I_i`, the object's temperature by thermocouple and the
+    reflected blackbody's temperature (equation 10 of the paper [1]_, by least squares):
+
+    .. math:: I_i - U(T_{b,i}) = e \, (U(T_{o,i}) - U(T_{b,i}))
+
+    weighted by the covariance of both sides, of which the independent part is
+    :math:`s_i^2 = s_I^2 + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2` and every common error of the
+    readings adds the outer product of its effects [2]_; iterated in e. As both sides have errors,
+    the differences on the right are weighted as the fit adjusts them [3]_, or their scatter would
+    pass for contrast, and e be too low. Where the object is near the air's temperature and the
+    blackbody far from it, a thermocouple that conducts heat away does little harm: knowing the
+    bias, the fit leans on such measurements.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Stage `contact`: `counts` of the material (band, measurement) [count];
+        `object_temperature` by the thermocouple and `background_temperature` of the blackbody
+        (measurement) [K], within the response's range.
+    response : Dataset
+        From `fit_response`, with its noise.
+    reading_std : tuple of float
+        Standard deviation of one reading of the thermocouple and of the blackbody [K],
+        independent from reading to reading.
+    bias : Bias
+        Errors that all readings have in common; by default none.
+
+    Returns
+    -------
+    Dataset
+        `emissivity`, `emissivity_std` (band) [1]; `reduced_chi2` (band) [1], near 1 if the
+        uncertainties are realistic; `residual` (band, measurement) [count].
+
+    Raises
+    ------
+    ValueError
+        If dims or sizes differ, a temperature lies outside the response, the response has no
+        noise, a deviation is not positive, or object and background never differ by more than
+        three standard deviations of their difference.
+    ArithmeticError
+        If the fit does not converge.
+
+    References
+    ----------
+    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334
+    .. [2] Aitken (1936), On least squares and linear combination of observations, Proceedings of
+       the Royal Society of Edinburgh 55, 42, doi:10.1017/S0370164600014346
+    .. [3] York et al. (2004), Unified equations for the slope, intercept, and standard errors of
+       the best straight line, American Journal of Physics 72, 367, doi:10.1119/1.1632486
+    """
+    warm, stds = _readings(measured, "contact", reading_std, bias)
+    if measured.sizes["measurement"] < 2:
+        raise ValueError("Invalid number of measurements 1. Must be at least 2.")
+    cold = measured["background_temperature"].values.astype(np.float64)
+    _require_contrast(warm - cold, stds, "background")
+    signals = {}
+    for curve, noise, counts in _bands(measured, response, warm):
+        require_range(cold, curve, "background temperature")
+        emitted_std, emitted_bias = bias.emitted(curve, warm, float(stds[0]))
+        reflected_std, reflected_bias = bias.reflected(curve, cold, float(stds[1]))
+        signals[curve.band] = _Signals(
+            counts=counts,
+            emitted=curve.counts(warm),
+            reflected=bias.reflection(curve, cold),
+            noise=noise,
+            emitted_std=emitted_std,
+            reflected_std=reflected_std,
+            emitted_bias=emitted_bias,
+            reflected_bias=reflected_bias,
+        )
+    return _fit(signals)
+
+
+def reflector_emissivity(
+    measured: xr.Dataset,
+    response: xr.Dataset,
+    reading_std: tuple[float, float],
+    bias: Bias = NO_BIAS,
+) -> xr.Dataset:
+    r"""
+    Emissivity of a material per band by the reflector method of the standards.
+
+    A crumpled foil in the object's place gives the reflected signal :math:`W_r`, a contact
+    thermometer the object's own :math:`W_o = U(T_o)`, and the camera the object's W [1]_ [2]_:
+
+    .. math:: e = \frac{W - W_r}{W_o - W_r}, \qquad
+              s_e = \frac{\sqrt{s_W^2 + e^2 s_{W_o}^2 + (1 - e)^2 s_{W_r}^2}}{|W_o - W_r|}
+
+    Several measurements are combined by least squares with these weights. Its weak point is outside
+    the formula: a foil reflects the whole surroundings, a smooth object one direction of them, and
+    where the emissivity is low the difference is taken for emission.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Stage `reflector`: `counts` of the object and `reflected_counts` of the foil
+        (band, measurement) [count]; `object_temperature` by contact (measurement) [K], within the
+        response's range.
+    response : Dataset
+        From `fit_response`, with its noise, which both counts have.
+    reading_std : tuple of float
+        Standard deviation of one reading of the contact thermometer, and of the reflected
+        temperature beyond the camera's noise, as from one part of the foil to another [K].
+    bias : Bias
+        Errors that all contact readings have in common; by default none. Its terms of the
+        background are those of a blackbody, and are not used.
+
+    Returns
+    -------
+    Dataset
+        `emissivity`, `emissivity_std`, `reduced_chi2` (band) [1]; `residual` (band, measurement)
+        [count]. With one measurement the reduced chi-square is NaN.
+
+    Raises
+    ------
+    ValueError
+        If dims or sizes differ, a temperature lies outside the response, the response has no
+        noise, a deviation is not positive, or object and reflection never differ by more than
+        three standard deviations of their difference.
+    ArithmeticError
+        If the fit does not converge.
+
+    References
+    ----------
+    .. [1] ISO 18434-1:2008, Condition monitoring and diagnostics of machines, Thermography
+    .. [2] ASTM E1862, reflected temperature; ASTM E1933, emissivity, using infrared imaging
+       radiometers
+    """
+    warm, stds = _readings(measured, "reflector", reading_std, bias)
+    foils = dict(zip(_names(measured), measured["reflected_counts"].values, strict=True))
+    signals = {}
+    for curve, noise, counts in _bands(measured, response, warm):
+        foil = foils[curve.band].astype(np.float64)
+        cold = curve.inverse(foil)
+        _require_contrast(warm - cold, stds, f"reflection in band '{curve.band}'")
+        emitted_std, emitted_bias = bias.emitted(curve, warm, float(stds[0]))
+        signals[curve.band] = _Signals(
+            counts=counts,
+            emitted=curve.counts(warm),
+            reflected=foil,
+            noise=noise,
+            emitted_std=emitted_std,
+            reflected_std=np.hypot(noise, curve.count_slope(cold) * stds[1]),
+            emitted_bias=emitted_bias,
+            reflected_bias=np.zeros((0, warm.size)),
+        )
+    return _fit(signals)
+
+
+def _names(measured: xr.Dataset) -> list[str]:
+    return [str(name) for name in measured["band"].values]
+
+
+def _readings(
+    measured: xr.Dataset, stage: str, reading_std: tuple[float, float], bias: Bias
+) -> tuple[Array, Array]:
+    """Corrected object temperature (measurement) [K], and the two deviations of a reading [K]."""
+    schema.check(measured, stage)
+    for name, variable in measured.data_vars.items():
+        if not np.all(np.isfinite(variable.values)):
+            raise ValueError(f"Invalid {name}: NaN or infinite. Must be finite.")
+    stds = planck.require_positive("reading_std [K]", reading_std)
+    return bias.corrected(measured["object_temperature"].values.astype(np.float64)), stds
+
+
+def _bands(
+    measured: xr.Dataset, response: xr.Dataset, warm: Array
+) -> list[tuple[Curve, float, Array]]:
+    """Response, noise and counts (measurement) of each band."""
+    names = _names(measured)
+    bands = []
+    for name, noise, counts in zip(
+        names, responses.noise(response, names), measured["counts"].values, strict=True
+    ):
+        curve = responses.curve(response, name)
+        require_range(warm, curve, "object temperature")
+        bands.append((curve, float(noise), counts.astype(np.float64)))
+    return bands
+
+
+def _require_contrast(difference: Array, stds: Array, beside: str) -> None:
+    """Refuse temperatures that differ by less than the readings resolve, or are NaN."""
+    contrast, least = np.abs(difference).max(), 3.0 * float(np.hypot(*stds))
+    if not contrast > least:
+        raise ValueError(
+            f"Invalid contrast {contrast} K between object and {beside}. Must exceed {least} K, "
+            "three standard deviations of the difference, in some measurement."
+        )
+
+
+def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
+    """Emissivities of all bands; the reduced chi-square of a single measurement is NaN."""
+    fits = [_fit_band(band, name) for name, band in signals.items()]
+    value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
+    unit = {"units": "1"}
+    return xr.Dataset(
+        {
+            "emissivity": ("band", value, unit),
+            "emissivity_std": ("band", std, unit),
+            "reduced_chi2": ("band", chi2, unit),
+            "residual": (("band", "measurement"), residual, {"units": "count"}),
+        },
+        coords={"band": list(signals)},
+    )
+
+
+def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:
+    """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""
+    x, y = signals.x, signals.y
+    emissivity = float(x @ y / (x @ x))
+    for _ in range(_ITERATIONS):
+        # Scatter of the readings would pass for contrast and pull the slope down: York et al.
+        # (2004) weigh by the abscissa as the fit adjusts it.
+        adjusted = signals.adjusted_x(emissivity, signals.weighted(emissivity, y - emissivity * x))
+        weights = signals.weighted(emissivity, adjusted)
+        previous, emissivity = emissivity, float((weights @ y) / (weights @ x))
+        if abs(emissivity - previous) < _CONVERGED:
+            break
+    else:
+        raise ArithmeticError(
+            f"No convergence in band '{name}': emissivity {emissivity} after {_ITERATIONS} steps, "
+            f"{previous} before. Must change by less than {_CONVERGED}; readings of more contrast "
+            "converge."
+        )
+    residual = y - emissivity * x
+    squares = residual @ signals.weighted(emissivity, residual)
+    freedom = residual.size - 1
+    chi2 = float(squares / freedom) if freedom else float("nan")
+    return emissivity, float((weights @ adjusted) ** -0.5), chi2, residual
+
+
+def _uniform_std(span: tuple[float, float]) -> float:
+    """Standard deviation of a uniform distribution."""
+    return float((span[1] - span[0]) / np.sqrt(12.0))

@@ -1,0 +1,95 @@
+"""Figure of the status: pixels to trust, and the reason why others are not, in words."""
+
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from dbthermal import schema
+from dbthermal.figures.drawing import canvas, percent, provenance_note
+
+REASONS: Final = MappingProxyType(
+    {
+        "dead_pixel": ("dead pixel", "#000000"),
+        "saturated": ("saturated", "#4d4d4d"),
+        "invalid_samples": ("no samples, as outside a view", "#737373"),
+        "constant_signal": ("signal never changes", "#969696"),
+        "frozen_frames": ("frozen frames, as by a shutter", "#bdbdbd"),
+        "object_jump": ("object jumps", "#7f3b08"),
+        "bands_apart": ("bands see the reflection at different times", "#b35806"),
+        "object_not_smooth": ("object changes too fast, or noise is another", "#e08214"),
+        "roles_may_be_swapped": ("object and reflection may be swapped", "#fdb863"),
+        "no_background_motion": ("no motion reflected: nothing can be told", "#08306b"),
+        "gray": ("same emissivity in all bands: nothing can be told", "#00868b"),
+        "constant_object": ("object constant: emissivity unknown", "#6baed6"),
+        "nonphysical_emissivity": ("emissivity outside 0 to 1", "#6a51a3"),
+        "outside_response": ("outside the calibrated temperatures", "#9e9ac8"),
+        "not_converged": ("not converged", "#dadaeb"),
+        "background_never_rests": ("reflection never rests: emissivity doubtful", "#c7b299"),
+    }
+)
+"""Words and colour of each flag, causes before what follows: a pixel with several is drawn as its
+first."""
+
+_RIGHT: Final = "#a8d5b0"
+
+
+def status(result: xr.Dataset) -> Figure:
+    """
+    Map of one capture's status in words: which pixels to trust, and for the others why not.
+
+    Parameters
+    ----------
+    result : Dataset
+        From `separation.solve`: `status` (y, x), bits of `schema.FLAGS`.
+
+    Returns
+    -------
+    Figure
+        A map with a colour for each flag that is the first of a pixel's, in the order of `REASONS`,
+        and its share.
+
+    Raises
+    ------
+    ValueError
+        If a bit is none of `schema.FLAGS`.
+    """
+    first = first_reason(result["status"])
+    shares = {name: float(np.mean(first == name)) for name in ("", *REASONS)}
+    shown = {name: share for name, share in shares.items() if share > 0}
+    image = np.zeros((*first.shape, 3))
+    for name in shown:
+        image[first == name] = to_rgb(REASONS[name][1] if name else _RIGHT)
+    height = 5.2 * first.shape[0] / first.shape[1]
+    figure, axes = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
+    left, right = axes[0]
+    left.get_gridspec().set_width_ratios([1.3, 1.0])
+    left.imshow(image, interpolation="nearest")
+    left.set(xticks=[], yticks=[])
+    right.set_axis_off()
+    patches = [_patch(name, share) for name, share in shown.items()]
+    right.legend(handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9)
+    good = f"{percent(shares[''])} of the pixels have no flag"
+    figure.suptitle(f"Status: {good}" + provenance_note(result))
+    return figure
+
+
+def _patch(name: str, share: float) -> Patch:
+    """Legend of a flag, or of no flag, with its share."""
+    words, color = REASONS[name] if name else ("good", _RIGHT)
+    return Patch(facecolor=color, edgecolor="0.5", label=f"{percent(share)}  {words}")
+
+
+def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
+    """Name of the most decisive flag of each pixel; empty where there is none."""
+    unknown = int(np.bitwise_or.reduce(flags.values, axis=None)) & ~sum(schema.FLAGS.values())
+    if unknown:
+        raise ValueError(f"Unknown bits {unknown} of a status. Must be of {dict(schema.FLAGS)}.")
+    names = sorted(schema.FLAGS, key=list(REASONS).index)
+    masks = [(flags.values & schema.FLAGS[name]) != 0 for name in names]
+    return np.select(masks, [np.array(name) for name in names], default=np.array(""))

@@ -1,0 +1,189 @@
+"""Emulated cameras: frames of a `World`.
+
+The look of the scene is handed in: for each band a picture, a function of the scene's time that
+gives counts. The emulated camera adds a frame rate, a clock, buffers that overflow if nobody reads,
+a shutter that freezes the image, and telemetry. It is no model of a detector: noise and response
+are in the counts that are handed in. It never flags its shutter: as with a real camera, that
+follows from telemetry, serial line and frozen image, see `camera.next_shutter`.
+"""
+
+import math
+import time as system_time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+from urllib.parse import parse_qsl, urlsplit
+
+import numpy as np
+
+from dbthermal.instruments import telemetry
+from dbthermal.instruments.camera import (
+    FRAME_TIMEOUT,
+    GOOD,
+    Counts,
+    Frame,
+    NoFrameError,
+    SourceLostError,
+    Stream,
+)
+from dbthermal.instruments.emulated.port import number, require_known
+from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.transport import Closing
+
+__all__ = ["BUFFERS", "CLOSED", "FFC_PERIODS", "MODELS", "EmulatedCamera", "Picture", "open_frames"]
+
+Picture = Callable[[float], Counts]
+
+BUFFERS: Final = 32
+"""Frames that are held while nobody reads, as by the V4L2 driver; beyond, they are dropped."""
+
+CLOSED: Final = 10_000
+"""Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
+
+MODELS: Final = MappingProxyType({"camera": "emulated Boson", "y16": "emulated Y16 camera"})
+"""Model of the emulated camera by the name in its address, ``sim://camera/wide``."""
+
+FFC_PERIODS: Final = (1.0, math.inf)
+"""Shortest and longest time between corrections that a camera starts by itself [s]."""
+
+
+@dataclass
+class EmulatedCamera(Closing):
+    """
+    A `camera.FrameSource` without a camera; its frames begin with the first `read`.
+
+    It shows a camera of the world by its name: through a filter of its own, or, where `band` is
+    None, through the one in the beam of the wheel.
+    """
+
+    world: World
+    name: str
+    pictures: Mapping[str, Picture]  # band to the counts that are seen in it
+    band: str | None = None
+    shape: tuple[int, int] = (512, 640)
+    frame_rate: float = 60.0  # [Hz]
+    telemetry_rows: int = 0
+    sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
+    model: str = MODELS["camera"]
+    ffc_period: float = math.inf  # between corrections that the camera starts by itself [s]
+
+    is_simulated: Final = True
+
+    def __post_init__(self) -> None:
+        self._state = self.world.camera(self.name)
+        self._state.has_frames = True
+        self._number = 0
+        self._start: float | None = None
+        self._last: Counts = np.full(self.shape, CLOSED, dtype=np.uint16)
+        self._open = True
+
+    @property
+    def identity(self) -> Mapping[str, str]:
+        """Names that say that it is emulated."""
+        return {
+            "device": f"sim://camera/{self.name}",
+            "model": self.model,
+            "serial_number": str(self._state.serial_number),
+        }
+
+    def close(self) -> None:
+        """Give no more frames; a second call does nothing."""
+        self._open = False
+
+    def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
+        """Wait for the next frame; see `camera.FrameSource.read`."""
+        if self._start is None:
+            self._start = self.world.time
+        self._number = self.next_number(self._number, self.world.time - self._start)
+        due = self._start + self._number / self.frame_rate
+        wait = due - self.world.time
+        if wait > timeout:
+            self.sleep(timeout)
+            raise NoFrameError(f"No frame from emulated camera '{self.name}' in {timeout} s.")
+        if wait > 0:
+            self.sleep(wait)
+        if not (self._open and self._state.plugged):
+            state = "it is unplugged" if self._open else "it is closed"
+            raise SourceLostError(f"No more frames from emulated camera '{self.name}': {state}.")
+        number, self._number = self._number, self._number + 1
+        return self.frame(number, due)
+
+    def next_number(self, number: int, elapsed: float) -> int:
+        """Number of the next frame: if nobody read for too long [s], the buffers overflowed."""
+        latest = math.floor(elapsed * self.frame_rate)
+        return latest if latest - number >= BUFFERS else number
+
+    def frame(self, number: int, due: float) -> Frame:
+        """Frame of a number, exposed at a time since the world began [s]."""
+        with self.world.lock:
+            self._state.frame_count = number
+            if due >= max(self._state.ffc_until, 0.0) + self.ffc_period:
+                self.world.start_ffc(self.name)
+            frozen = self.world.ffc_in_progress(self.name)
+        if not frozen:
+            self._last = self.image(due)
+        rows = self._telemetry(due) if self.telemetry_rows else None
+        metadata = None if rows is None else telemetry.metadata(rows)
+        stamp, now = self.world.epoch + due, self.world.clock()
+        return Frame(self._last.copy(), stamp, now, number, GOOD, rows, metadata)
+
+    def image(self, time: float) -> Counts:
+        """Counts through the filter in the beam at a time since the world began [s]."""
+        band = self.band or self.world.filter_name
+        if band is None:
+            return np.full(self.shape, CLOSED, dtype=np.uint16)
+        if band not in self.pictures:
+            raise KeyError(f"Unknown band '{band}'. Must be one of {sorted(self.pictures)}.")
+        image = self.pictures[band](self.world.scene_time(time))
+        if image.shape != self.shape or image.dtype != np.uint16:
+            raise ValueError(
+                f"Invalid picture {image.shape} of {image.dtype} in band '{band}'. "
+                f"Must be {self.shape} of uint16."
+            )
+        return image
+
+    def _telemetry(self, time: float) -> Counts:
+        state = self._state
+        values = {
+            "camera_serial": state.serial_number,
+            "frame_rate": round(self.frame_rate),
+            "frame_counter": state.frame_count,
+            "last_ffc_frame": state.last_ffc_frame,
+            "fpa_temperature": state.fpa_temperature,
+            "last_ffc_temperature": state.last_ffc_temperature,
+            "uptime": time,
+        }
+        return telemetry.encode(values, self.shape[1], self.telemetry_rows)
+
+
+def open_frames(
+    url: str, world: World, pictures: Mapping[str, Picture], band: str | None, stream: Stream
+) -> EmulatedCamera:
+    """Open ``sim://camera/<name>``, a camera of the world; `band` None is behind the wheel.
+
+    Option of ``sim://y16/<name>?ffc=120``: `EmulatedCamera.ffc_period`.
+    """
+    parts = urlsplit(url)
+    options = dict(parse_qsl(parts.query, keep_blank_values=True))
+    require_known(options, ("ffc",) if parts.netloc == "y16" else ())
+    if parts.scheme != "sim" or parts.netloc not in MODELS:
+        raise ValueError(
+            f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
+            f"one of {sorted(MODELS)}."
+        )
+    return EmulatedCamera(
+        world,
+        parts.path.lstrip("/"),
+        pictures,
+        band,
+        stream.shape,
+        stream.frame_rate,
+        stream.telemetry_rows,
+        model=MODELS[parts.netloc],
+        ffc_period=number(options, "ffc", math.inf, FFC_PERIODS),
+    )
+
+
+def __dir__() -> list[str]:
+    return __all__

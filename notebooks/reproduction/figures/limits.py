@@ -1,0 +1,179 @@
+"""Figures of errors at their statistical limit: over noise, bands and pixels of one material."""
+
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from dbthermal.figures.drawing import (
+    COLORS,
+    canvas,
+    draw_image,
+    limits_of,
+    plain_decades,
+    plain_ticks,
+    provenance_note,
+)
+
+_MARKERS: Final = "osD^v"
+
+_MICRO: Final = "\N{MICRO SIGN}m"
+
+
+def error_over_bound(measured: xr.Dataset) -> Figure:
+    """
+    Errors of an estimate beside the bound that no estimate can beat, over the noise.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Over `noise` (that of the quieter band [K]): `reflection_ratio_error` [1] and
+        `object_temperature_error` [K], root mean square over the pixels, and their bounds
+        `reflection_ratio_bound` and `object_temperature_bound`. A further dimension `case` gives
+        lines of several colours; where the bounds alone have it, the errors are drawn once.
+
+    Returns
+    -------
+    Figure
+        Above, errors as markers and bounds as lines; below, errors in units of their bound.
+    """
+    cases = measured if "case" in measured.dims else measured.expand_dims(case=[""])
+    figure, axes = canvas(2, 2, (9.0, 6.2))
+    for (above, below), name, unit in zip(
+        axes.T, ("reflection_ratio", "object_temperature"), ("1", "K"), strict=True
+    ):
+        once = "case" not in cases[f"{name}_error"].dims
+        for index, case in enumerate(cases["case"].values):
+            here, color = cases.sel(case=case), COLORS[index % len(COLORS)]
+            error, bound = here[f"{name}_error"], here[f"{name}_bound"]
+            mark = {"color": color, "marker": _MARKERS[index % len(_MARKERS)], "markersize": 5}
+            label = f"{case}, " if str(case) else ""
+            above.plot(here["noise"], bound, color=color, linewidth=1, label=f"{label}bound")
+            below.plot(here["noise"], error / bound, linewidth=1, **mark)
+            if not once:
+                above.plot(here["noise"], error, linestyle="", label=f"{label}measured", **mark)
+        if once:
+            above.plot(cases["noise"], cases[f"{name}_error"], "ko", markersize=4, label="measured")
+        above.set(xscale="log", yscale="log", ylabel=f"error of the {_words(name)} [{unit}]")
+        below.set(xscale="log", ylabel="error / bound [1]", xlabel="noise of the quieter band [K]")
+        below.axhline(1.0, color="black", linewidth=0.6)
+        plain_decades(above)
+        for axis in (above, below):
+            plain_ticks(axis, cases["noise"])
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    figure.suptitle("Errors at the statistical limit" + provenance_note(measured))
+    return figure
+
+
+def pooling(measured: xr.Dataset) -> Figure:
+    """
+    What pixels gain that are known to be of one material.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Over `size`, pixels in a group: `reflection_ratio_error`, its bound
+        `reflection_ratio_bound` and the separation's own deviation `stated` [1];
+        `object_temperature_error` [K].
+
+    Returns
+    -------
+    Figure
+        Left, the error of the ratio beside its bound and what is stated; right, the object's.
+    """
+    figure, ((left, right),) = canvas(1, 2, (9.0, 3.6))
+    size = measured["size"]
+    left.plot(size, measured["reflection_ratio_bound"], color="black", linewidth=0.8, label="bound")
+    left.plot(size, measured["stated"], color=COLORS[3], linewidth=1.2, label="stated")
+    left.plot(size, measured["reflection_ratio_error"], "o", color=COLORS[0], label="measured")
+    right.plot(size, measured["object_temperature_error"], "o-", color=COLORS[1], linewidth=1)
+    left.set(ylabel="error of the reflection ratio [1]")
+    right.set(ylabel="error of the object temperature [K]")
+    for axis in (left, right):
+        axis.set(xscale="log", yscale="log", xlabel="pixels of one material [1]")
+        plain_ticks(axis, size)
+        plain_decades(axis)
+    left.legend(frameon=False, fontsize=8)
+    figure.suptitle("Pixels that share a material" + provenance_note(measured))
+    return figure
+
+
+def error_over_bands(measured: xr.Dataset) -> Figure:
+    """
+    What a third and a fourth band gain.
+
+    Parameters
+    ----------
+    measured : Dataset
+        Over `bands`, names of the bands in use: `object_temperature_error` [K] and, over `case`
+        too, `object_temperature_bound` [K].
+
+    Returns
+    -------
+    Figure
+        Left, the error beside its bounds; right, in units of them.
+    """
+    figure, ((left, right),) = canvas(1, 2, (9.0, 3.8))
+    error, place = measured["object_temperature_error"], np.arange(measured.sizes["bands"])
+    for index, case in enumerate(measured["case"].values):
+        bound = measured["object_temperature_bound"].sel(case=case)
+        mark = {"color": COLORS[index], "marker": _MARKERS[index], "markersize": 5, "linewidth": 1}
+        left.plot(place, bound, color=COLORS[index], linewidth=1, label=f"{case}, bound")
+        right.plot(place, error / bound, **mark)
+    left.plot(place, error, "ko", markersize=5, label="measured")
+    left.set(ylabel="error of the object temperature [K]")
+    left.set_ylim(bottom=0)
+    right.set(ylabel="error / bound [1]")
+    right.axhline(1.0, color="black", linewidth=0.6)
+    for axis in (left, right):
+        axis.set(xlabel=f"bands [{_MICRO}]")
+        names = [str(name).replace(" + ", "\n") for name in measured["bands"].values]
+        axis.set_xticks(place, names, fontsize=8)
+        axis.grid(visible=True, color="0.9")
+    left.legend(frameon=False, fontsize=8)
+    figure.suptitle("More bands" + provenance_note(measured))
+    return figure
+
+
+def pooled_materials(
+    single: xr.DataArray, pooled: xr.DataArray, labels: xr.DataArray, panels: xr.DataArray
+) -> Figure:
+    """
+    The reflection ratio pixel by pixel, and pooled over the materials found.
+
+    Parameters
+    ----------
+    single, pooled : DataArray
+        Reflection ratio (y, x) [1] without and with pooling.
+    labels : DataArray
+        Materials found (y, x), -1 for none.
+    panels : DataArray
+        True materials (y, x), whose borders are drawn.
+
+    Returns
+    -------
+    Figure
+        Three maps, with the true borders as lines.
+    """
+    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.4))
+    limits = limits_of(single)
+    for axis, ratio, title in ((left, single, "pixel by pixel"), (middle, pooled, "pooled")):
+        draw_image(
+            figure, axis, ratio, title, "reflection ratio [1]", cmap="viridis", limits=limits
+        )
+    found = labels.where(labels >= 0)
+    title = f"materials found: {np.unique(found.values[found.notnull().values]).size}"
+    right.imshow(found % 10, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
+    right.set_facecolor("0.8")
+    right.set_title(title, fontsize=9)
+    for axis in (left, middle, right):
+        for one in np.unique(panels.values)[1:]:
+            axis.contour(panels.values >= one, levels=[0.5], colors="white", linewidths=0.8)
+        axis.set(xticks=[], yticks=[])
+    figure.suptitle("Pixels of one material share their ratio" + provenance_note(single))
+    return figure
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")

@@ -1,0 +1,158 @@
+"""An emulated camera in which things go wrong, and a movie for it to see."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal.instruments.camera import (
+    FRAME_TIMEOUT,
+    Counts,
+    Frame,
+    FrameFlag,
+    FrameSource,
+    NoFrameError,
+)
+from dbthermal.instruments.emulated.camera import EmulatedCamera
+
+LIMITS = np.iinfo(np.uint16)
+
+
+@dataclass(frozen=True)
+class Movie:
+    """A picture from frames (time, y, x) [count] that were computed before, at a rate [Hz]."""
+
+    counts: Counts
+    rate: float
+    endless: bool = False
+
+    def __call__(self, time: float) -> Counts:
+        """Frame that is shown at a time of the scene [s]."""
+        # A time on the edge of a frame is that frame's, whatever its last bit.
+        number, frames = math.floor(time * self.rate + 1e-6), self.counts.shape[0]
+        frame: Counts = self.counts[number % frames if self.endless else number]
+        return frame
+
+
+@dataclass(frozen=True)
+class Faults:
+    """
+    Faults of an emulated camera; frames are counted from 0 at its opening.
+
+    Attributes
+    ----------
+    dropped : frozenset of int
+        Frames that never come; the sequence number leaps.
+    corrupt : frozenset of int
+        Frames whose lower half is not of this image; the driver says so.
+    unseen : frozenset of int
+        Corrupt frames of which the driver says nothing.
+    short : frozenset of int
+        Frames of which only the first half of the rows comes.
+    repeated : frozenset of int
+        Frames that show the image before once more, with a number and a time of their own.
+    ffc : frozenset of int
+        Frames at which the camera starts a flat-field correction of its own accord.
+    offset_step : float
+        RMS of the change of each pixel's offset by a flat-field correction [count].
+    clock_rate : float
+        Seconds of the camera's clock per second; other than 1 it is a clock of its own.
+    unplugged : int or None
+        Frame at which it is pulled out.
+    mute : bool
+        Gives no frame at all.
+    seed : int
+        Of the random numbers.
+    """
+
+    dropped: frozenset[int] = frozenset()
+    corrupt: frozenset[int] = frozenset()
+    unseen: frozenset[int] = frozenset()
+    short: frozenset[int] = frozenset()
+    repeated: frozenset[int] = frozenset()
+    ffc: frozenset[int] = frozenset()
+    offset_step: float = 0.0
+    clock_rate: float = 1.0
+    unplugged: int | None = None
+    mute: bool = False
+    seed: int = 0
+
+
+@dataclass
+class FaultyCamera(EmulatedCamera):
+    """An emulated camera with faults."""
+
+    faults: Faults = field(default_factory=Faults)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._repeats = False
+        self._offsets: tuple[int, npt.NDArray[np.int32]] = 0, np.zeros(self.shape, np.int32)
+
+    def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
+        """Give the next frame, unless mute."""
+        if self.faults.mute:
+            self.sleep(timeout)
+            raise NoFrameError(f"No frame from emulated camera '{self.name}': it is mute.")
+        return super().read(timeout)
+
+    def next_number(self, number: int, elapsed: float) -> int:
+        """Pass over the frames that never come; pull the plug."""
+        number = super().next_number(number, elapsed)
+        while number in self.faults.dropped:
+            number += 1
+        if self.faults.unplugged is not None and number >= self.faults.unplugged:
+            self.world.camera(self.name).plugged = False
+        return number
+
+    def frame(self, number: int, due: float) -> Frame:
+        """Damage a frame."""
+        self._repeats = number in self.faults.repeated
+        if number in self.faults.ffc:
+            with self.world.lock:
+                self.world.camera(self.name).frame_count = number
+                self.world.start_ffc(self.name)
+        frame = super().frame(number, due)
+        counts, flags = self._damaged(number, frame.counts)
+        own_clock = self.faults.clock_rate != 1
+        return replace(
+            frame,
+            counts=counts,
+            # Both clocks have the host's origin, so that rates alone differ.
+            device_time=self.faults.clock_rate * frame.device_time,
+            flags=flags | (FrameFlag.FOREIGN_CLOCK if own_clock else FrameFlag(0)),
+            metadata=None if flags else frame.metadata,
+        )
+
+    def image(self, time: float) -> Counts:
+        """Repeat an image, or add the offsets since the last correction."""
+        if self._repeats:
+            return self._last
+        image, count = super().image(time), self.world.camera(self.name).ffc_count
+        if count == 0 or self.faults.offset_step == 0:
+            return image
+        if self._offsets[0] != count:
+            serial_number = self.world.camera(self.name).serial_number
+            rng = np.random.default_rng([self.faults.seed, serial_number, count])
+            step = rng.normal(0.0, self.faults.offset_step, self.shape)
+            self._offsets = count, np.rint(step).astype(np.int32)
+        counts: Counts = np.clip(image + self._offsets[1], 0, LIMITS.max).astype(np.uint16)
+        return counts
+
+    def _damaged(self, number: int, counts: Counts) -> tuple[Counts, FrameFlag]:
+        faults, half = self.faults, self.shape[0] // 2
+        if number in faults.corrupt | faults.unseen:
+            rng = np.random.default_rng([faults.seed, number])
+            counts[half:] = rng.integers(0, LIMITS.max, counts[half:].shape, endpoint=True)
+        if number in faults.short:
+            counts[half:] = 0
+            return counts, FrameFlag.WRONG_SIZE
+        return counts, FrameFlag.DRIVER_ERROR if number in faults.corrupt else FrameFlag(0)
+
+
+def frames(source: FrameSource, number: int) -> Iterator[Frame]:
+    """Yield a number of frames."""
+    for _ in range(number):
+        yield source.read()
