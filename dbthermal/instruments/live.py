@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments.camera import Counts, FfcStatus, Frame, FrameFlag
+from dbthermal.instruments.camera import FfcStatus, Frame, FrameFlag, Metadata
 from dbthermal.instruments.recording import Preview
 
 if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it
@@ -112,12 +112,7 @@ class Watch:
         self._ffc_seen: dict[str, float] = {}
 
     def note(self, preview: Preview) -> bool:
-        """
-        Take the next preview.
-
-        Returns True if it is the first one, also of another recording: its bands are others, or its
-        time or a number of its frames is less than before.
-        """
+        """Take the next preview; return True if it is the first one of a recording."""
         before, self._last = self._last, preview
         if before is None or _is_other(before, preview):
             before = None
@@ -148,13 +143,19 @@ class Watch:
                 lost=totals["lost"],
                 refused=totals["refused"],
                 damaged=totals["damaged"],
-                fpa_temperature=_fpa(band, last),
+                fpa_temperature=self._fpa_temperature(band, last),
                 ffc=_ffc(band, last),
                 ffc_age=last.time - self._ffc_seen.get(band, math.nan),
                 **_levels(last.frames.get(band)),
             )
             for band, totals in last.totals.items()
         }
+
+    @staticmethod
+    def _fpa_temperature(band: str, preview: Preview) -> float:
+        """Temperature of the focal-plane array by its reading, else by the telemetry [K]."""
+        reading = preview.readings.get(_FPA + band, math.nan)
+        return reading if math.isfinite(reading) else _metadata(band, preview).fpa_temperature
 
     def _rate(self, band: str) -> float:
         """Rate by the times at which the frames came: they are written in bursts."""
@@ -177,20 +178,16 @@ def _is_other(before: Preview, now: Preview) -> bool:
     )
 
 
+def _metadata(band: str, preview: Preview | None) -> Metadata:
+    """Metadata of a band's last frame, empty without any."""
+    frame = preview.frames.get(band) if preview else None
+    return (frame and frame.metadata) or Metadata()
+
+
 def _corrected(band: str, before: Preview | None, now: Preview) -> bool:
     """Whether the telemetry says that the offsets were renewed between two previews."""
-    earlier, later = (shown.frames.get(band) if shown else None for shown in (before, now))
-    if not (earlier and later and earlier.metadata and later.metadata):
-        return False
-    return earlier.metadata.last_ffc_frame != later.metadata.last_ffc_frame
-
-
-def _fpa(band: str, preview: Preview) -> float:
-    reading = preview.readings.get(_FPA + band, math.nan)
-    frame = preview.frames.get(band)
-    if math.isfinite(reading) or frame is None or frame.metadata is None:
-        return reading
-    return frame.metadata.fpa_temperature
+    earlier, later = (_metadata(band, shown).last_ffc_frame for shown in (before, now))
+    return None not in {earlier, later} and earlier != later
 
 
 def _ffc(band: str, preview: Preview) -> str:
@@ -212,25 +209,17 @@ def _levels(frame: Frame | None) -> dict[str, Any]:
         "limits": (float(low), float(high)),
         "lowest": float(counts.min()),
         "highest": float(counts.max()),
-        "dead": _share(counts, _RANGE.min),
-        "saturated": _share(counts, _RANGE.max),
+        "dead": np.count_nonzero(counts == _RANGE.min) / counts.size,
+        "saturated": np.count_nonzero(counts == _RANGE.max) / counts.size,
     }
 
 
-def _share(counts: Counts, value: int) -> float:
-    return np.count_nonzero(counts == value) / counts.size
-
-
 class Display(Protocol):
-    """Display of a picture, such as IPython's ``DisplayHandle``."""
+    """Display of a picture, such as IPython's ``DisplayHandle``: shown first, then replaced."""
 
-    def display(self, obj: Any, /) -> Any:
-        """Show it where the cell's output is."""
-        ...
+    def display(self, obj: Any, /) -> Any: ...  # noqa: D102
 
-    def update(self, obj: Any, /) -> Any:
-        """Show it in place of the one before."""
-        ...
+    def update(self, obj: Any, /) -> Any: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +233,6 @@ class Picture:
         return self.text
 
     def _repr_png_(self) -> bytes:
-        """Give what IPython shows."""
         return self.png
 
 
@@ -312,41 +300,22 @@ class View:
             self._show(preview)
 
     def _show(self, preview: Preview) -> None:
-        from dbthermal.figures import Panel  # noqa: PLC0415 - loads matplotlib
+        from dbthermal.figures import LiveFigure, Panel  # noqa: PLC0415 - loads matplotlib
 
         status, frames = self._watch.status(), preview.frames
-        panels = {
-            band: Panel(
-                frames[band].counts if band in frames else None,
-                _apart(one.limits),
-                one.text,
-                one.warning,
-            )
-            for band, one in status.items()
-        }
+        bands, shape = tuple(preview.totals), next(iter(frames.values())).counts.shape
+        if self._drawn is None or (self._drawn.bands, self._drawn.shape) != (bands, shape):
+            self._drawn = LiveFigure(bands, shape)
+        panels = {}
+        for band, one in status.items():
+            image = frames[band].counts if band in frames else None
+            panels[band] = Panel(image, _apart(one.limits), one.text, one.warning)
         title, foot = f"{self._title}, {preview.time:.1f} s", _foot(preview)
-        drawn = self._figure_for(preview)
-        drawn.update(panels, title=title, foot=foot)
+        self._drawn.update(panels, title=title, foot=foot)
         if self._display is not None:
             lines = [f"{band}: {one.text}\n{one.warning}" for band, one in status.items()]
-            text = "\n".join((title, *lines, foot))
-            self._hand_over(self._display, Picture(_png(drawn), text))
-
-    def _figure_for(self, preview: Preview) -> "LiveFigure":
-        """Give the figure, another one only for other bands or another shape."""
-        from dbthermal.figures import LiveFigure  # noqa: PLC0415 - loads matplotlib
-
-        bands, drawn = tuple(preview.totals), self._drawn
-        shape = next(iter(preview.frames.values())).counts.shape
-        if drawn is None or (drawn.bands, drawn.shape) != (bands, shape):
-            drawn = self._drawn = LiveFigure(bands, shape)
-        return drawn
-
-    def _hand_over(self, display: Display, picture: Picture) -> None:
-        if self._is_shown:
-            display.update(picture)
-        else:
-            display.display(picture)
+            picture = Picture(_png(self._drawn), "\n".join((title, *lines, foot)))
+            (self._display.update if self._is_shown else self._display.display)(picture)
             self._is_shown = True
 
 

@@ -67,30 +67,11 @@ def wait_stable(
     sleep: Callable[[float], None] = system_time.sleep,
 ) -> float:
     """
-    Wait until a temperature is stable near its set point.
+    Wait until a temperature is stable near its set point [K], and return its mean [K].
 
-    Parameters
-    ----------
-    session : Session
-        With a blackbody: its `stability` and `tolerance` [K], `window` and `timeout` [s].
-    temperature : float
-        Set point [K].
-    read : callable
-        Reads it [K].
-    clock, sleep : callable
-        Time [s].
-
-    Returns
-    -------
-    float
-        Mean of the readings in the window [K].
-
-    Raises
-    ------
-    TimeoutError
-        If it is not stable within the session's `timeout`.
-    ValueError
-        If the session has no blackbody.
+    Within the session's `window` the readings must lie within its `stability` of one another, and
+    their mean within its `tolerance` of the set point. TimeoutError after its `timeout`, ValueError
+    if the session has no blackbody.
     """
     if session.blackbody is None:
         raise ValueError(f"Invalid session '{session.name}'. Must have a blackbody.")
@@ -206,6 +187,19 @@ def record_scene(
     -------
     Summary
         How it ended, and numbers of frames.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments.devices import open_devices
+    >>> from dbthermal.instruments.session import Camera, Device, Session
+    >>> camera = Camera(Device("sim://camera/wide", "v4l2:///dev/video0"))
+    >>> session = Session("demo", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
+    >>> folder, small = getfixture("tmp_path"), Limits(reserve=0)
+    >>> with open_devices(session) as devices:
+    ...     devices.prepare()
+    ...     summary = record_scene(devices, folder / "demo.zarr", limits=small)
+    >>> summary.ended, summary.totals["8-14"]["lost"]
+    ('duration', 0)
     """
     identities, expected = devices.identities(), devices.session.filtered
     if devices.wheel is not None and devices.wheel.band() != expected:

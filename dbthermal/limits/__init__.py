@@ -5,10 +5,9 @@ materials, filters and seconds of video; `ratio_variance` is the closed form of 
 """
 
 from dbthermal.limits._bounds import bounds, ratio_variance, reflection_ratio
-from dbthermal.limits._planner import NO_FILTER, CaptureDesign, plan, plan_durations
+from dbthermal.limits._planner import CaptureDesign, plan, plan_durations
 
 __all__ = [
-    "NO_FILTER",
     "CaptureDesign",
     "bounds",
     "plan",

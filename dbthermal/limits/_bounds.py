@@ -14,8 +14,6 @@ from dbthermal import response as responses
 from dbthermal.limits._fisher import QUANTITIES, Array, Mask, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
-# Difference [K] below which two background temperatures are one level.
-_LEVEL: Final = 1e-6
 _UNIFORM: Final = 1.0 / np.sqrt(12.0)
 """Standard deviation of a uniform number, over the width of its interval."""
 
@@ -79,7 +77,7 @@ def bounds(
     response: xr.Dataset,
     *,
     order: int | None = None,
-    resting: npt.ArrayLike | None = None,
+    resting: bool = True,
     emissivity_std: float = np.inf,
     response_kind: str = "exact",
 ) -> xr.Dataset:
@@ -91,12 +89,11 @@ def bounds(
 
     - every :math:`e_m`, from this pixel alone (pixels that share a material do better);
     - x, in a known smooth subspace of polynomials of time;
-    - y, one number a frame; in the frames at rest, one number for all of them. Which frames rest
-      is assumed to be known, the level is not. ``resting=False`` assumes nothing about y.
+    - y, one number a frame; in the frames at rest, one number for all of them.
 
-    Response and noise are known, nothing has a prior. The bound is the inverse Fisher information
-    [1]_ at the truth; y is eliminated frame by frame by a Schur complement, as an estimate by
-    variable projection [2]_ does.
+    Response and noise are known. The bound is the inverse Fisher information [1]_ at the truth; y
+    is eliminated frame by frame by a Schur complement, as an estimate by variable projection [2]_
+    does.
 
     Parameters
     ----------
@@ -108,9 +105,9 @@ def bounds(
     order : int, optional
         Size of the smooth subspace. If not given, for each pixel the smallest that leaves at most
         0.1 of the noise's variance.
-    resting : array_like of bool, optional
-        Frames at rest, (time) or (time, y, x), or one for all. If not given, those in which a
-        pixel's background has its most frequent temperature, where two or more share it.
+    resting : bool
+        The frames are known (the level is not) in which a pixel's background has its most frequent
+        temperature, where two or more share it; False assumes nothing about y.
     emissivity_std : float
         Prior standard deviation [1] of each emissivity: 0 if it is known, infinite for no prior. A
         finite one gives the Bayesian bound of van Trees.
@@ -134,18 +131,16 @@ def bounds(
     ValueError
         If a variable is missing or its dims or unit are others, there is one band only, an
         emissivity lies outside (0, 1), a temperature outside the response's range, the response
-        lacks a band or the noise, the background differs between frames at rest, or no smooth
-        subspace holds the object.
+        lacks a band or the noise, or no smooth subspace holds the object.
 
     Notes
     -----
     For the linear response and two bands, ``resting=False`` gives the reflection ratio the bound
     of `ratio_variance`, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down alike
-    changes no sample. Frames at rest determine the emissivities, and sharpen the ratio, too. The
-    exact response determines the emissivities without them, by its curvature, but hardly; and as
-    nothing then keeps y near the truth, where the bands' slopes have another ratio, the bound of
-    the reflection ratio is loose. An `emissivity_std` of 0.29, that of a uniform number in (0, 1),
-    tightens it.
+    changes no sample. Frames at rest determine the emissivities, and sharpen the ratio. The exact
+    response determines the emissivities without them, by its curvature, but hardly; as nothing then
+    keeps y near the truth, the bound of the ratio is loose. An `emissivity_std` of 0.29, that of a
+    uniform number in (0, 1), tightens it.
 
     References
     ----------
@@ -170,7 +165,7 @@ def bounds(
     """
     if not emissivity_std >= 0:
         raise ValueError(f"Invalid emissivity_std {emissivity_std}. Must not be negative.")
-    truth = _truth(scene, resting)
+    truth = _truth(scene, resting=resting)
     names = [str(name) for name in scene["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
     for name in ("object_temperature", "background_temperature"):
@@ -194,7 +189,7 @@ def bounds(
     return result.assign_attrs(reference_band=names[reference], response_kind=response_kind)
 
 
-def _truth(scene: xr.Dataset, resting: npt.ArrayLike | None) -> Truth:
+def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
     """Checked truth of a scene."""
     stage = schema.STAGES["separated"]
     names = ("object_temperature", "background_temperature", "emissivity")
@@ -214,10 +209,7 @@ def _truth(scene: xr.Dataset, resting: npt.ArrayLike | None) -> Truth:
             f"Invalid emissivity {emissivity[bad][0]} in band '{band}' of the scene. "
             "Must lie in (0, 1)."
         )
-    if resting is None:
-        rest = _most_frequent(background)
-    else:
-        rest = _checked_rest(resting, background, scene["object_temperature"].shape)
+    rest = _most_frequent(background) if resting else np.zeros(background.shape, dtype=bool)
     time = scene["time"].values.astype(np.float64)
     return Truth(time, temperature, background, emissivity, rest)
 
@@ -235,26 +227,6 @@ def _most_frequent(background: Array) -> Mask:
     longest = np.argmax(length, axis=0)[np.newaxis]
     level = np.take_along_axis(ordered, longest, axis=0)
     return np.asarray((background == level) & (length.max(axis=0) > 0))
-
-
-def _checked_rest(resting: npt.ArrayLike, background: Array, shape: tuple[int, ...]) -> Mask:
-    """Frames at rest (time, pixel), in all of which the background has one level."""
-    rest = np.asarray(resting)
-    if rest.dtype != bool or rest.shape not in {(), shape[:1], shape}:
-        raise ValueError(
-            f"Invalid resting {rest.shape} of {rest.dtype}. Must be bool, one for all or "
-            f"{shape[:1]} or {shape}."
-        )
-    mask = np.broadcast_to(rest.reshape(*rest.shape, *(1,) * (3 - rest.ndim)), shape)
-    mask = mask.reshape(background.shape)
-    least = np.min(background, axis=0, where=mask, initial=np.inf)
-    most = np.max(background, axis=0, where=mask, initial=-np.inf)
-    if np.any(most - least > _LEVEL):
-        raise ValueError(
-            f"Invalid resting: the background differs by {np.max(most - least)} K between frames "
-            "that are said to rest. Must be one level."
-        )
-    return mask
 
 
 def _identifiable(stds: dict[str, Array], emissivity: Array, reference: int, curve: Curve) -> Mask:

@@ -13,22 +13,19 @@ from dbthermal import mixing, planck, schema
 from dbthermal.bands import FILTERS, Band
 from dbthermal.limits._fisher import Array, Truth, deviations, smallest_order
 
-NO_FILTER: Final = "none"
-"""Best filter of a material whose temperature no filter determines."""
-
+# Best filter of a material whose temperature no filter determines.
+_NO_FILTER: Final = "none"
 # Time constant of the object's warming, as a share of the capture.
 _TIME_CONSTANT: Final = 1.0 / 3.0
 
 
 @dataclass(frozen=True)
 class CaptureDesign:
-    r"""
+    """
     Capture conditions: a warming object before a background of regular pulses.
 
     The object warms exponentially, with a time constant of a third of the capture. The background
-    rests, then is warmer for the end of each period, as if someone stood there; the standard
-    deviation of its rapid change is :math:`A \sqrt{d (1 - d)}` with A the amplitude and
-    d = duration / period.
+    rests, then is warmer for the end of each period, as if someone stood there.
 
     Attributes
     ----------
@@ -151,7 +148,10 @@ def plan(
     names = [str(name) for name in table["band"].values]
     sets = _combinations(names, beside, together)
     std = _noise(noise, names)
-    bodies = [_TopHat(_band(filters, name), temperature) for name in names]
+    for name in names:
+        if name not in filters:
+            raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
+    bodies = [_TopHat(filters[name], temperature) for name in names]
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
     parts = [
         _expected(truth, [bodies[band] for band in chosen], std[chosen])
@@ -176,18 +176,13 @@ def plan_durations(
     noise: xr.DataArray,
     seconds: Sequence[float],
     design: CaptureDesign | None = None,
-    *,
-    beside: str = "8-14",
-    together: int = 1,
-    filters: Mapping[str, Band] = FILTERS,
-    temperature: float = 300.0,
 ) -> xr.Dataset:
     """
-    Expected accuracy of captures of several lengths.
+    Expected accuracy of captures of several lengths, of one filter at a time.
 
     Parameters
     ----------
-    table, noise, beside, together, filters, temperature
+    table, noise
         See `plan`.
     seconds : sequence of float
         Lengths [s], strictly increasing. The object's rise and the pulses are the same in all.
@@ -208,18 +203,7 @@ def plan_durations(
     lengths = np.asarray(seconds, dtype=np.float64)
     if lengths.size == 0 or np.any(np.diff(lengths) <= 0):
         raise ValueError(f"Invalid seconds {lengths.tolist()}. Must increase strictly.")
-    plans = [
-        plan(
-            table,
-            noise,
-            replace(design, seconds=float(length)),
-            beside=beside,
-            together=together,
-            filters=filters,
-            temperature=temperature,
-        )
-        for length in lengths
-    ]
+    plans = [plan(table, noise, replace(design, seconds=float(length))) for length in lengths]
     coordinate = xr.DataArray(lengths, dims="seconds", name="seconds", attrs={"units": "s"})
     without_noise = [one.drop_vars("noise") for one in plans]
     result = xr.concat(without_noise, dim=coordinate, combine_attrs="drop_conflicts")
@@ -291,12 +275,6 @@ def _noise(noise: xr.DataArray, names: list[str]) -> Array:
     return planck.require_positive("noise [K]", noise.values[places])
 
 
-def _band(filters: Mapping[str, Band], name: str) -> Band:
-    if name not in filters:
-        raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
-    return filters[name]
-
-
 def _expected(truth: Truth, bodies: Sequence[_TopHat], noise: Array) -> dict[str, Array]:
     """Deviations of one combination: temperatures (material), the others (band, material)."""
     order = smallest_order(truth, truth.sensitivity(bodies, noise))
@@ -312,19 +290,18 @@ def _dataset(
 ) -> xr.Dataset:
     """Deviations of all combinations, side by side."""
     size = (table.sizes["material"], len(labels))
-    units = {"object_temperature": "K", "background_temperature": "K"}
     variables: dict[str, tuple[tuple[str, ...], Array, dict[str, str]]] = {}
-    for name in ("object_temperature", "background_temperature", "condition_number"):
-        values = np.stack([part[name] for part in parts], axis=1)
-        label = name if name == "condition_number" else f"{name}_std"
-        attrs = {"units": units.get(name, "1"), "long_name": f"expected {label.replace('_', ' ')}"}
-        variables[label] = (("material", "filter"), values, attrs)
-    for name in ("emissivity", "reflection_ratio"):
+    for name in ("object_temperature_std", "background_temperature_std", "condition_number"):
+        values = np.stack([part[name.removesuffix("_std")] for part in parts], axis=1)
+        units = "K" if "temperature" in name else "1"
+        attrs = {"units": units, "long_name": f"expected {name.replace('_', ' ')}"}
+        variables[name] = (("material", "filter"), values, attrs)
+    for name in ("emissivity_std", "reflection_ratio_std"):
         values = np.full((*size, table.sizes["band"]), np.nan)
         for place, (part, chosen) in enumerate(zip(parts, sets, strict=True)):
-            values[:, place, chosen] = part[name].T
-        attrs = {"units": "1", "long_name": f"expected {name.replace('_', ' ')} std"}
-        variables[f"{name}_std"] = (("material", "filter", "band"), values, attrs)
+            values[:, place, chosen] = part[name.removesuffix("_std")].T
+        attrs = {"units": "1", "long_name": f"expected {name.replace('_', ' ')}"}
+        variables[name] = (("material", "filter", "band"), values, attrs)
     coords = {"material": table["material"].values, "filter": labels, "band": table["band"].values}
     return xr.Dataset(variables, coords)
 
@@ -333,6 +310,6 @@ def _best(std: xr.DataArray, uniform: float) -> list[str]:
     """Filter of the smallest deviation for each material, if below that of a uniform number."""
     names = std["filter"].values
     return [
-        str(names[int(np.argmin(row))]) if np.min(row) < uniform else NO_FILTER
+        str(names[int(np.argmin(row))]) if np.min(row) < uniform else _NO_FILTER
         for row in std.values
     ]

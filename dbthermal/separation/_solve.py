@@ -24,6 +24,7 @@ from dbthermal.separation._tiles import (
     Bits,
     Estimate,
     Mask,
+    Material,
     Method,
     Parts,
     Survey,
@@ -176,7 +177,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     ):
         blocks = list(tiles.blocks(height, whole_image=module.whole_image))
         if checked.labels is not None:
-            selected = pooling.asked(checked.labels)
+            selected = pooling.select(checked.labels)
             run = run.pooled(threads.map(lambda rows: run.survey(rows, selected, bar), blocks))
         for _ in threads.map(lambda rows: run.separate(rows, result.isel(y=rows), bar), blocks):
             pass
@@ -248,7 +249,7 @@ class _Run:
     method: Method
     settings: Any
     seed: int
-    materials: pooling.Materials | None = None
+    materials: Material | None = None
 
     def separate(self, rows: slice, result: xr.Dataset, bar: "tqdm[Any]") -> None:
         """Separate a block of rows into its place in the result."""
@@ -283,10 +284,10 @@ class _Run:
         if not surveys or labels is None:
             return self
         numbers = np.concatenate([number for number, _ in surveys])
-        survey = pooling.joined([part for _, part in surveys])
+        survey = pooling.join([part for _, part in surveys])
         noise = self.inputs.noise[self.inputs.bands]
-        materials = pooling.combine(labels[numbers], int(labels.max()) + 1, survey, noise)
-        return replace(self, materials=replace(materials, label=labels))
+        materials = pooling.estimate(labels[numbers], int(labels.max()) + 1, survey, noise)
+        return replace(self, materials=materials)
 
     def _call(self, function: Callable[..., Any] | None, tile: Tile) -> Any:
         assert function is not None
@@ -339,7 +340,9 @@ class _Run:
             None if array is None else array[(slice(None), *place)].reshape(len(bands), -1)[bands]
             for array in (known.emissivity, known.emissivity_std)
         )
-        shared = self.materials
+        material = None
+        if self.materials is not None and known.labels is not None:
+            material = pooling.expand(self.materials, known.labels[self._numbers(window, rows)])
         return Tile(
             signals=np.stack(signals),
             time=part["time"].values.astype(np.float64),
@@ -348,7 +351,7 @@ class _Run:
             shape=(part.sizes["y"], part.sizes["x"]),
             rng=tiles.generator(self.seed, place),
             segment=part["segment"].values.astype(np.intp) if "segment" in part else None,
-            material=None if shared is None else shared.shared(self._numbers(window, rows)),
+            material=material,
             emissivity=emissivity,
             emissivity_std=std,
         )

@@ -1,9 +1,9 @@
 """Compare a run's headline numbers with the stored reference numbers.
 
-The references are those of a run with the outside files at hand, and of one without; which of the
-two a run is follows from its own numbers. Whole numbers and texts must be equal. Other numbers
-must agree within `TOLERANCE`: processors round differently, and where a pixel's choice hangs on
-the last digit, a median over pixels may move by a fraction of this.
+There is a reference of a run with the outside files and one of a run without; the run's own numbers
+decide which applies. Whole numbers and texts must be equal. Other numbers must agree within
+`TOLERANCE`: processors round differently, and where a pixel's choice depends on the last digit, a
+median over pixels may move by a fraction of this.
 """
 
 import argparse
@@ -19,45 +19,19 @@ from reproduction import paper, paths
 TOLERANCE: Final = 0.01
 """Largest difference of two numbers, relative to the larger of the two [1]."""
 
-_SOURCE: Final = ("02_emissivity", "libraries", "embedded")
-
 MARKS: Final = ("<!-- paper_vs_ours -->", "<!-- end of paper_vs_ours -->")
-"""What encloses the comparison with the paper in the README."""
+"""Marks around the comparison with the paper in the README."""
 
 Numbers = dict[str, store.Number]
 
 
 def reference_path() -> Path:
-    """
-    Return where the reference numbers are kept.
-
-    Returns
-    -------
-    Path
-        A JSON file: kind of run -> stem -> name -> number.
-    """
+    """Reference numbers, a JSON file: kind of run -> stem -> name -> number."""
     return paths.root() / "tests" / "reference_numbers.json"
 
 
 def read_run(run: str) -> dict[str, Numbers]:
-    """
-    Headline numbers of every notebook of a run.
-
-    Parameters
-    ----------
-    run : str
-        Folder below results/.
-
-    Returns
-    -------
-    dict
-        Stem -> name -> number.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the run has no numbers.
-    """
+    """Headline numbers of every notebook of a run, stem -> name -> number."""
     files = sorted(paths.results(run).glob("*.json"))
     if not files:
         raise FileNotFoundError(
@@ -67,87 +41,30 @@ def read_run(run: str) -> dict[str, Numbers]:
 
 
 def kind_of(numbers: Mapping[str, Numbers]) -> str:
-    """
-    Return which reference a run is to be compared with.
-
-    Parameters
-    ----------
-    numbers : mapping
-        From `read_run`.
-
-    Returns
-    -------
-    str
-        "with data" or "without data".
-    """
-    stem, name, embedded = _SOURCE
-    return "without data" if numbers.get(stem, {}).get(name) == embedded else "with data"
+    """Reference of a run, "with data" or "without data", by the libraries that it read."""
+    libraries = numbers.get("02_emissivity", {}).get("libraries")
+    return "without data" if libraries == "embedded" else "with data"
 
 
 def compare(
-    found: Mapping[str, Numbers], reference: Mapping[str, Numbers]
-) -> Iterator[tuple[str, object, object, bool]]:
-    """
-    Compare number by number.
-
-    Parameters
-    ----------
-    found, reference : mapping
-        Stem -> name -> number.
-
-    Yields
-    ------
-    tuple
-        Name with its stem, number found, reference, and whether they agree. A number that only
-        one of the two has is None in the other, and does not agree.
-    """
-    for stem in sorted({*found, *reference}):
-        here, there = found.get(stem, {}), reference.get(stem, {})
-        for name in sorted({*here, *there}):
-            value, expected = here.get(name), there.get(name)
-            yield f"{stem}: {name}", value, expected, agree(value, expected)
+    numbers: Mapping[str, Numbers], reference: Mapping[str, Numbers]
+) -> Iterator[tuple[str, object, object]]:
+    """Yield name with stem, number and reference; None for a number that one of them lacks."""
+    for stem in sorted({*numbers, *reference}):
+        values, expected = numbers.get(stem, {}), reference.get(stem, {})
+        for name in sorted({*values, *expected}):
+            yield f"{stem}: {name}", values.get(name), expected.get(name)
 
 
 def agree(value: object, expected: object) -> bool:
-    """
-    Whether two numbers agree, see `TOLERANCE`.
-
-    Parameters
-    ----------
-    value, expected : object
-        Numbers, texts or None.
-
-    Returns
-    -------
-    bool
-        True if equal, or two floats within the tolerance.
-    """
+    """True if equal and of one type, or two floats within `TOLERANCE`."""
     if isinstance(value, float) and isinstance(expected, float):
         return abs(value - expected) <= TOLERANCE * max(abs(value), abs(expected))
     return value == expected and type(value) is type(expected)
 
 
 def with_table(readme: str, numbers: Mapping[str, Numbers]) -> str:
-    """
-    Put the comparison with the paper into the README.
-
-    Parameters
-    ----------
-    readme : str
-        Its text, with the two marks that the table stands between.
-    numbers : mapping
-        From `read_run`.
-
-    Returns
-    -------
-    str
-        The text with the table of these numbers.
-
-    Raises
-    ------
-    ValueError
-        If a mark is missing.
-    """
+    """Text of the README with the comparison with the paper between its `MARKS`."""
     head, start, rest = readme.partition(MARKS[0])
     _, stop, tail = rest.partition(MARKS[1])
     if not (start and stop):
@@ -155,43 +72,35 @@ def with_table(readme: str, numbers: Mapping[str, Numbers]) -> str:
     return f"{head}{start}\n\n{paper.markdown(numbers)}\n{stop}{tail}"
 
 
+def record(numbers: Mapping[str, Numbers], reference: Mapping[str, object]) -> None:
+    """Keep a run's numbers as the reference of its kind; with data, in the README's table too."""
+    kind = kind_of(numbers)
+    text = json.dumps({**reference, kind: numbers}, indent=1, sort_keys=True)
+    reference_path().write_text(text + "\n", encoding="utf-8")
+    if kind == "with data":
+        readme = paths.root() / "README.md"
+        text = with_table(readme.read_text(encoding="utf-8"), numbers)
+        readme.write_text(text, encoding="utf-8")
+    print(f"kept {sum(map(len, numbers.values()))} numbers, {kind}")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """
-    Print the comparison, or keep a run's numbers as the reference.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Command line; ``--run NAME``, ``--record``.
-
-    Returns
-    -------
-    int
-        0 if all numbers agree, else 1.
-    """
+    """Print the comparison, or record the reference; exit status 1 if any number disagrees."""
     parser = argparse.ArgumentParser(prog="python -m reproduction.verify", description=__doc__)
     parser.add_argument("--run", default="full", help="folder below results/")
     parser.add_argument("--record", action="store_true", help="keep the numbers as the reference")
     options = parser.parse_args(arguments)
-    found, path = read_run(options.run), reference_path()
-    kind = kind_of(found)
+    numbers, path = read_run(options.run), reference_path()
     reference = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if options.record:
-        text = json.dumps({**reference, kind: found}, indent=1, sort_keys=True)
-        path.write_text(text + "\n", encoding="utf-8")
-        if kind == "with data":
-            readme = paths.root() / "README.md"
-            shown = with_table(readme.read_text(encoding="utf-8"), found)
-            readme.write_text(shown, encoding="utf-8")
-        print(f"kept {sum(map(len, found.values()))} numbers, {kind}")
+        record(numbers, reference)
         return 0
-    rows = list(compare(found, reference.get(kind, {})))
-    for name, value, expected, fits in rows:
-        print(
-            f"{'ok  ' if fits else 'FAIL'}  {name} = {value}"
-            + ("" if fits else f", not {expected}")
-        )
-    failed = sum(not fits for *_, fits in rows)
+    kind, failed = kind_of(numbers), 0
+    rows = list(compare(numbers, reference.get(kind, {})))
+    for name, value, expected in rows:
+        agrees = agree(value, expected)
+        failed += not agrees
+        print(f"ok    {name} = {value}" if agrees else f"FAIL  {name} = {value}, not {expected}")
     print(f"{len(rows) - failed} of {len(rows)} numbers agree within {TOLERANCE:.0%}, {kind}")
     return 1 if failed or not rows else 0
 

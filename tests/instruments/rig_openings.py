@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,11 +15,13 @@ from test_v4l2 import BYTES, GOOD, STREAM, Driver
 from dbthermal.instruments import v4l2
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import Stream
+from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated.apt import start as start_wheel
 from dbthermal.instruments.emulated.boson import start as start_camera
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
+from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
 
 
@@ -124,6 +127,15 @@ def emulated_video(_: ExitStack) -> Opened:
     return Opened(camera, True)
 
 
+def y16_video(stack: ExitStack) -> Opened:
+    """The emulated Y16 camera of a session, as `open_devices` opens it."""
+    session = Session.load(
+        Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml",
+        {"shape": [4, 6], "frame_rate": 60},
+    )
+    return Opened(stack.enter_context(open_devices(session)).sources["8-14"], True)
+
+
 def real_video(_: ExitStack) -> Opened:
     """A camera's node."""
     path = address("DBTHERMAL_VIDEO")
@@ -135,4 +147,4 @@ Opening = Callable[[ExitStack], Opened]
 CAMERAS: list[Opening] = [stub_camera, loop_camera, port_camera, real_camera]
 WHEELS: list[Opening] = [stub_wheel, loop_wheel, port_wheel, real_wheel]
 LOGGERS: list[Opening] = [stub_logger, emulated_logger, real_logger]
-VIDEOS: list[Opening] = [stub_video, emulated_video, real_video]
+VIDEOS: list[Opening] = [stub_video, emulated_video, y16_video, real_video]

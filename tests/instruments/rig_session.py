@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 
@@ -38,7 +39,7 @@ devices:
   filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
   thermocouples: {simulated: "sim://tc08", hardware: "tc08:"}
 filters: {1: 9.5, 3: "11"}
-wheel: {velocity: 10.0, home_velocity: 10.0, acceleration: 100.0, addresses: [[17, 33]]}
+wheel: {velocity: 50.0, home_velocity: 50.0, acceleration: 2000.0, addresses: [[17, 33]]}
 sweep: [9.5, 11]
 thermocouples: {1: blackbody, 4: plate}
 blackbody: {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, timeout: 20}
@@ -60,8 +61,10 @@ def scene_text() -> str:
 
 
 def bench(session: Session, **settings: float) -> World:
-    """World of a session, with a plate at 330 K."""
-    return emulated_world(session, scene=lambda _: {"plate": 330.0}, **settings)
+    """World of a session, with a plate at 330 K and quick flat-field corrections."""
+    world = emulated_world(session, scene=lambda _: {"plate": 330.0}, **settings)
+    vars(world)["start_ffc"] = partial(world.start_ffc, duration=0.05)
+    return world
 
 
 def pictures(world: World) -> dict[str, Picture]:

@@ -18,8 +18,11 @@ from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording import Preview, open_capture
 from dbthermal.instruments.session import Session
 
-TWO = replaced(
-    ("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("window: 3", "window: 0.1"), ("0.15", "0.5")
+ONE = replaced(
+    ("[300.0, 290.0, 310.0]", "[290.0]"),
+    ("sweep: [9.5, 11]", "sweep: [11]"),
+    ("window: 3", "window: 0.1"),
+    ("0.15", "0.4"),
 )
 
 
@@ -43,18 +46,18 @@ def written(path: Path, text: str) -> str:
 
 def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every device is named as emulated, the progress is told, and the movies are of the sweep."""
-    file, folder = written(tmp_path / "a.yaml", TWO), tmp_path / "recorded"
-    assert acquire.main([file, str(folder)], *emulated(TWO)) == 0
+    file, folder = written(tmp_path / "a.yaml", ONE), tmp_path / "recorded"
+    assert acquire.main([file, str(folder)], *emulated(ONE)) == 0
     said = capsys.readouterr().out
     assert said.startswith("Session 'plate': every device is emulated, nothing is measured.")
     assert "filter_wheel: model BSC201" in said
     assert "Setting the emulated blackbody to 16.85 degC." in said
     assert "11: " in said
     assert "FPA 35.0 \N{DEGREE SIGN}C, FFC complete" in said
-    assert f"{folder / 'plate_01_11.zarr'}: duration" in said
+    assert f"{folder / 'plate_00_11.zarr'}: duration" in said
     movies = recording.open_sweep(folder, "plate", frames=8)
-    exact = np.add.outer(list(LEVELS.values()), [2900, 3000])
-    np.testing.assert_array_equal(movies["counts"][:, :, 0, 0, 0], exact)
+    levels = [LEVELS["8-14"] + 2900, LEVELS["11"] + 2900]
+    np.testing.assert_array_equal(movies["counts"][:, 0, 0, 0, 0], levels)
 
 
 def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:

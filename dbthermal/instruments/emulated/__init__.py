@@ -1,11 +1,24 @@
-"""Emulated devices: what stands in for the rig where there is none.
+"""Emulated devices: the other end of the real drivers' lines, for ``sim://`` addresses.
 
-Each module here answers below a real driver, byte for byte where the protocol is public, and reads
-and writes one shared `dbthermal.instruments.emulated.world.World`. Nothing here is hardware, and
-all of it says so: `is_simulated` is True, and every name and identity holds "emulated". The
-emulators were built from public descriptions and checked against public byte vectors; what a real
-device does beyond these, they do not know.
-
-The emulators know nothing of how a scene looks: the frame source is handed the pictures, so that
-the physics stays below and a program chooses what the emulated cameras see.
+Begin with `world`, the one bench that all of them share: `boson`, `apt` and `tc08` answer as the
+devices do, byte for byte where the protocol is public, on the line of a `port`; `camera` gives the
+frames, of pictures that a program hands it, such as those of `blackbody`. All say that they are
+emulated: `is_simulated` is True, and so do names and identities. They were built from public
+descriptions and checked against public byte vectors; real devices may do more than these say.
 """
+
+import importlib
+from types import ModuleType
+
+__all__ = ["apt", "blackbody", "boson", "camera", "port", "tc08", "world"]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import the module `name` of this package when it is first used (PEP 562)."""
+    if name in __all__:
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"Unknown module {name!r} in {__name__}. Must be one of {__all__}.")
+
+
+def __dir__() -> list[str]:
+    return __all__

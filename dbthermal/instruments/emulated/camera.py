@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
 
@@ -27,10 +27,11 @@ from dbthermal.instruments.camera import (
     SourceLostError,
     Stream,
 )
+from dbthermal.instruments.emulated.port import number, require_known
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import Closing
 
-__all__ = ["BUFFERS", "CLOSED", "MODELS", "EmulatedCamera", "Picture", "open_frames"]
+__all__ = ["BUFFERS", "CLOSED", "FFC_PERIODS", "MODELS", "EmulatedCamera", "Picture", "open_frames"]
 
 Picture = Callable[[float], Counts]
 
@@ -40,8 +41,11 @@ BUFFERS: Final = 32
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
 
-MODELS: Final = MappingProxyType({"camera": "emulated Boson"})
+MODELS: Final = MappingProxyType({"camera": "emulated Boson", "y16": "emulated Y16 camera"})
 """Model of the emulated camera by the name in its address, ``sim://camera/wide``."""
+
+FFC_PERIODS: Final = (1.0, math.inf)
+"""Shortest and longest time between corrections that a camera starts by itself [s]."""
 
 
 @dataclass
@@ -49,37 +53,20 @@ class EmulatedCamera(Closing):
     """
     A `camera.FrameSource` without a camera; its frames begin with the first `read`.
 
-    Attributes
-    ----------
-    world : World
-        The bench it is on; it must have a camera of this name.
-    name : str
-        Of the camera in the world.
-    pictures : mapping
-        Band to the counts that are seen in it.
-    band : str or None
-        Band of a camera without a wheel; None for the one behind the wheel.
-    shape : tuple of int
-        Rows and columns [pixel].
-    frame_rate : float
-        [Hz].
-    telemetry_rows : int
-        0, or `telemetry.ROWS`.
-    sleep : callable
-        Waits so many seconds; injected by tests, together with the world's clock.
-    model : str
-        Name of the model, which says that it is emulated.
+    It shows a camera of the world by its name: through a filter of its own, or, where `band` is
+    None, through the one in the beam of the wheel.
     """
 
     world: World
     name: str
-    pictures: Mapping[str, Picture]
+    pictures: Mapping[str, Picture]  # band to the counts that are seen in it
     band: str | None = None
     shape: tuple[int, int] = (512, 640)
-    frame_rate: float = 60.0
+    frame_rate: float = 60.0  # [Hz]
     telemetry_rows: int = 0
-    sleep: Callable[[float], None] = system_time.sleep
+    sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
     model: str = MODELS["camera"]
+    ffc_period: float = math.inf  # between corrections that the camera starts by itself [s]
 
     is_simulated: Final = True
 
@@ -131,6 +118,8 @@ class EmulatedCamera(Closing):
         """Frame of a number, exposed at a time since the world began [s]."""
         with self.world.lock:
             self._state.frame_count = number
+            if due >= max(self._state.ffc_until, 0.0) + self.ffc_period:
+                self.world.start_ffc(self.name)
             frozen = self.world.ffc_in_progress(self.name)
         if not frozen:
             self._last = self.image(due)
@@ -171,8 +160,13 @@ class EmulatedCamera(Closing):
 def open_frames(
     url: str, world: World, pictures: Mapping[str, Picture], band: str | None, stream: Stream
 ) -> EmulatedCamera:
-    """Open ``sim://camera/<name>``, a camera of the world; `band` None is behind the wheel."""
+    """Open ``sim://camera/<name>``, a camera of the world; `band` None is behind the wheel.
+
+    Option of ``sim://y16/<name>?ffc=120``: `EmulatedCamera.ffc_period`.
+    """
     parts = urlsplit(url)
+    options = dict(parse_qsl(parts.query, keep_blank_values=True))
+    require_known(options, ("ffc",) if parts.netloc == "y16" else ())
     if parts.scheme != "sim" or parts.netloc not in MODELS:
         raise ValueError(
             f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
@@ -187,6 +181,7 @@ def open_frames(
         stream.frame_rate,
         stream.telemetry_rows,
         model=MODELS[parts.netloc],
+        ffc_period=number(options, "ffc", math.inf, FFC_PERIODS),
     )
 
 

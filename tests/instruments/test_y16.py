@@ -1,0 +1,69 @@
+"""A generic 16-bit camera: its frames, and a session in which they alone tell its shutter."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_v4l2 import BYTES, GOOD, Driver
+
+from dbthermal import correction
+from dbthermal.instruments import v4l2, y16
+from dbthermal.instruments.camera import FrameFlag, Stream
+from dbthermal.instruments.devices import open_devices
+from dbthermal.instruments.emulated.world import FFC_DURATION
+from dbthermal.instruments.protocols import record_scene
+from dbthermal.instruments.recording import Limits, open_capture
+from dbthermal.instruments.session import Device, Session
+
+SESSION = Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml"
+
+
+def session(**changes: object) -> Session:
+    """The session of the parameters, with few pixels."""
+    return Session.load(SESSION, {"shape": [16, 24], **changes})
+
+
+def test_hardware_gives_frames_without_telemetry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All rows of the frame are image, and the kernel is the only one who says who it is."""
+    kernel = Driver(answers=[(BYTES, GOOD, 1000, 7)]).kernel()
+    monkeypatch.setattr(v4l2, "Kernel", lambda: kernel)
+    with y16.KIND.open_frames("v4l2:///dev/video0", Stream((6, 8))) as source:
+        frame = source.read()
+    assert (frame.counts.shape, frame.telemetry, frame.metadata) == ((6, 8), None, None)
+    assert (frame.sequence, {*source.identity}) == (7, {"device", "model", "bus", "driver"})
+    with pytest.raises(ValueError, match=r"Invalid address 'serial:///dev/ttyACM0' of frames"):
+        y16.KIND.open_frames("serial:///dev/ttyACM0", Stream())
+
+
+def test_it_has_neither_telemetry_nor_command_port() -> None:
+    """A session that asks for one is refused before a device is opened."""
+    with (
+        pytest.raises(ValueError, match=r"telemetry_rows of camera kind 'y16' 2\. Must be one of"),
+        open_devices(session(telemetry_rows=2)),
+    ):
+        pass
+    plain = session()
+    control = Device("sim://boson/wide", "serial:///dev/ttyACM0")
+    cameras = {band: replace(camera, control=control) for band, camera in plain.cameras.items()}
+    with (
+        pytest.raises(ValueError, match="a camera of kind 'y16' has no command port"),
+        open_devices(replace(plain, cameras=cameras)),
+    ):
+        pass
+
+
+def test_its_shutter_is_told_by_frozen_images(tmp_path: Path) -> None:
+    """A correction of its own is flagged from the third copy on, and found whole afterwards."""
+    video = {"simulated": "sim://y16/wide?ffc=1", "hardware": "v4l2:///dev/video0"}
+    camera = {"kind": "y16", "video": video}
+    short = session(cameras={"8-14": camera}, duration=1.8, frame_rate=50.0)
+    with open_devices(short) as devices:
+        record_scene(devices, tmp_path / "a.zarr", limits=Limits(reserve=0))
+    capture = open_capture(tmp_path / "a.zarr")
+    frozen = round(FFC_DURATION * short.frame_rate)
+    closed = (capture["frame_flags"] & int(FrameFlag.SHUTTER_CLOSED)) != 0
+    assert np.count_nonzero(closed) == pytest.approx(frozen - 2, abs=1)
+    events = correction.find_shutter(capture, closed=closed)
+    assert events["renewed"].values.tolist() == [True]
+    assert events["frames"].item() == pytest.approx(frozen, abs=1)

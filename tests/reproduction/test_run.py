@@ -1,0 +1,77 @@
+"""A notebook's results lie under its stem, and say what made them."""
+
+import json
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import figures, store
+from reproduction import manifest
+from reproduction.run import Run
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run of a notebook with two parameters, in a project of its own."""
+    (tmp_path / "data_manifest.yaml").touch()
+    (tmp_path / "params").mkdir()
+    (tmp_path / "params" / "03_simulation.yaml").write_text("results: full\nseed: 1\n")
+    monkeypatch.chdir(tmp_path)
+    return Run("03_simulation", {"results": "smoke", "seed": 2, "other": object()})
+
+
+@pytest.fixture
+def dataset() -> xr.Dataset:
+    """Dataset of three values."""
+    return xr.Dataset({"value": ("n", np.arange(3.0))})
+
+
+def doubled(value: float) -> xr.Dataset:
+    """Experiment."""
+    return xr.Dataset({"value": 2 * value})
+
+
+def test_parameters_of_the_run(run: Run) -> None:
+    """The provenance holds the values that the notebook has, of the names in the YAML file."""
+    assert run.provenance["parameters"] == {"results": "smoke", "seed": 2}
+    with pytest.raises(KeyError, match="Missing parameter 'seed' of '03_simulation'"):
+        Run("03_simulation", {"results": "smoke"})
+
+
+def test_results_lie_under_the_stem(run: Run, dataset: xr.Dataset, tmp_path: Path) -> None:
+    """Datasets, figures, texts and numbers are saved; figures and numbers are handed back."""
+    figure, _ = figures.drawing.canvas(1, 1, (2.0, 2.0))
+    run.save(dataset)
+    run.text("# Table", "_table")
+    assert run.figure(figure, "_scene") is figure
+    assert run.finish({"rmse_K": 0.2}) == {"rmse_K": 0.2}
+    endings = sorted(path.name for path in (tmp_path / "results" / "smoke").iterdir())
+    suffixes = (".json", ".zarr", "_scene.png", "_table.md")
+    assert endings == [f"03_simulation{suffix}" for suffix in suffixes]
+    saved = json.loads((tmp_path / "results/smoke/03_simulation.json").read_text())
+    assert saved["provenance"] == run.provenance
+
+
+def test_an_opened_result_is_an_input(run: Run, dataset: xr.Dataset, tmp_path: Path) -> None:
+    """What another notebook saved is noted with its checksum."""
+    path = tmp_path / "results" / "smoke" / "01_calibration_response.zarr"
+    store.save(dataset, path, {})
+    assert run.open("01_calibration", "_response").equals(dataset)
+    assert run.provenance["inputs"] == {"01_calibration_response": store.checksum(path)}
+
+
+def test_missing_files_are_no_error(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A collection that is not at hand is empty, and no input."""
+    monkeypatch.setattr(manifest, "available", lambda _: False)
+    assert run.data("scenes") == {}
+    assert run.provenance["inputs"] == {}
+
+
+def test_experiment_is_cached(run: Run, tmp_path: Path) -> None:
+    """Its results are kept in the notebook's own folder."""
+    twice = run.cached(doubled)
+    assert [float(part["value"]) for part in joblib.Parallel(1)([twice(3.0)])] == [6.0]
+    assert len(list((tmp_path / "results" / "cells" / "03_simulation").rglob("output.pkl"))) == 1
