@@ -83,3 +83,17 @@ def test_importing_the_package_is_light() -> None:
     code = "import sys, dbthermal; print({'torch', 'usb', 'serial', 'matplotlib'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_drivers_import_no_emulator() -> None:
+    """Emulators are named by their addresses, and imported when one of them is opened."""
+    drivers = (PACKAGE / "instruments").rglob("*.py")
+    texts = {path: path.read_text(encoding="utf-8") for path in drivers}
+    named = ("import dbthermal.instruments.emulated", "from dbthermal.instruments.emulated")
+    found = {
+        path.name
+        for path, text in texts.items()
+        if "emulated" not in path.parts
+        and any(line.strip().startswith(named) for line in text.splitlines())
+    }
+    assert found == set()

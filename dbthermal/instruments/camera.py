@@ -9,7 +9,7 @@ and says so in its flags: to hide or mend it is not the driver's task.
 
 import importlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
@@ -43,7 +43,6 @@ __all__ = [
     "SourceLostError",
     "Stream",
     "camera_kind",
-    "frames",
     "next_shutter",
 ]
 
@@ -157,22 +156,11 @@ class SourceLostError(ConnectionError):
 
 @dataclass(frozen=True)
 class Metadata:
-    """
-    What a camera says of one frame besides its image.
+    """What a camera says of one frame besides its image."""
 
-    Attributes
-    ----------
-    frame_counter : int
-        Camera's own number of the frame, -1 if not known.
-    last_ffc_frame : int or None
-        `frame_counter` at the last flat-field correction.
-    fpa_temperature : float
-        Of the focal-plane array [K].
-    """
-
-    frame_counter: int = -1
-    last_ffc_frame: int | None = None
-    fpa_temperature: float = math.nan
+    frame_counter: int = -1  # camera's own number of the frame, -1 if not known
+    last_ffc_frame: int | None = None  # frame_counter at the last flat-field correction
+    fpa_temperature: float = math.nan  # of the focal-plane array [K]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,54 +168,27 @@ class Frame:
     """
     One frame as it came.
 
-    Attributes
-    ----------
-    counts : ndarray of uint16, shape (y, x)
-        Raw signal [count]; the frame's own, no driver writes to it again.
-    device_time : float
-        When the frame was exposed, by the camera's or the kernel's stamp [s]; NaN if not known.
-    host_time : float
-        When the host had it, on its monotonic clock [s].
-    sequence : int
-        Number that the driver gives each frame; a leap is a loss.
-    flags : FrameFlag
-        Damage, and kind of its clock; 0 is good.
-    telemetry : ndarray of uint16, shape (row, x), or None
-        Telemetry rows as they came; see `dbthermal.instruments.telemetry.decode`.
-    metadata : Metadata or None
-        Decoded from the telemetry; None without telemetry, or if the frame is damaged.
+    The counts are the frame's own: no driver writes to them again. A leap of the sequence number is
+    a loss. Metadata are missing without telemetry, or if the frame is damaged.
     """
 
-    counts: Counts
-    device_time: float
-    host_time: float
-    sequence: int
-    flags: FrameFlag = GOOD
-    telemetry: Counts | None = None
-    metadata: Metadata | None = None
+    counts: Counts  # raw signal (y, x) [count]
+    device_time: float  # exposure, by the camera's or the kernel's stamp [s]; NaN if not known
+    host_time: float  # arrival, on the host's monotonic clock [s]
+    sequence: int  # number that the driver gives each frame
+    flags: FrameFlag = GOOD  # damage, and kind of its clock
+    telemetry: Counts | None = None  # rows (row, x) as they came, see `telemetry.decode`
+    metadata: Metadata | None = None  # decoded from the telemetry
 
 
 @dataclass(frozen=True)
 class Stream:
-    """
-    Format of a stream of frames.
+    """Format of a stream of frames."""
 
-    Attributes
-    ----------
-    shape : tuple of int
-        Rows and columns of the image, without telemetry [pixel].
-    frame_rate : float
-        Rate [Hz].
-    telemetry_rows : int
-        Rows of telemetry besides: 2 for a Boson with telemetry on.
-    telemetry_first : bool
-        Whether these are above the image, as the camera is set.
-    """
-
-    shape: tuple[int, int] = (512, 640)
-    frame_rate: float = 60.0
-    telemetry_rows: int = 0
-    telemetry_first: bool = False
+    shape: tuple[int, int] = (512, 640)  # rows and columns of the image, without telemetry [pixel]
+    frame_rate: float = 60.0  # [Hz]
+    telemetry_rows: int = 0  # besides: 2 for a Boson with telemetry on
+    telemetry_first: bool = False  # whether these are above the image, as the camera is set
 
     @property
     def rows(self) -> int:
@@ -301,26 +262,19 @@ class CameraControl(Protocol):
         """Release the port; a second call does nothing."""
 
 
+OpenFrames = Callable[[str, Stream], AbstractContextManager[FrameSource]]
+OpenControl = Callable[[str, object | None], AbstractContextManager[CameraControl]]
+
+
 @dataclass(frozen=True)
 class CameraKind:
-    """
-    One kind of camera, as its module names it in ``KIND``.
+    """One kind of camera, as its module names it in ``KIND``."""
 
-    Attributes
-    ----------
-    open_frames : callable
-        Opens the frames of a hardware address in a format.
-    open_control : callable or None
-        Opens the command port of an address, given the emulated bench or None.
-    telemetry_rows : tuple of int
-        Numbers of telemetry rows that it can give.
-    """
-
-    open_frames: Callable[[str, Stream], AbstractContextManager[FrameSource]]
-    open_control: Callable[[str, object | None], AbstractContextManager[CameraControl]] | None = (
-        None
+    open_frames: OpenFrames  # opens the frames of a hardware address in a format
+    open_control: OpenControl | None = (
+        None  # opens a command port, given the emulated bench or None
     )
-    telemetry_rows: tuple[int, ...] = (0,)
+    telemetry_rows: tuple[int, ...] = (0,)  # numbers of telemetry rows that it can give
 
 
 def camera_kind(name: str) -> CameraKind:
@@ -333,22 +287,11 @@ def camera_kind(name: str) -> CameraKind:
 
 @dataclass(frozen=True)
 class Shutter:
-    """
-    State of one camera's shutter after a frame; see `next_shutter`.
+    """State of one camera's shutter after a frame; see `next_shutter`."""
 
-    Attributes
-    ----------
-    closed : bool
-        Whether the frame is flagged `FrameFlag.SHUTTER_CLOSED`.
-    copies : int
-        Frames in a row, up to this one, that repeat the image before.
-    last_ffc_frame : int or None
-        Number of the last flat-field correction's frame, as far as telemetry told it.
-    """
-
-    closed: bool = False
-    copies: int = 0
-    last_ffc_frame: int | None = None
+    closed: bool = False  # whether the frame is flagged `FrameFlag.SHUTTER_CLOSED`
+    copies: int = 0  # frames in a row, up to this one, that repeat the image before
+    last_ffc_frame: int | None = None  # frame of the last correction, as far as telemetry told it
 
 
 def next_shutter(
@@ -403,7 +346,5 @@ def next_shutter(
     return Shutter(closed, copies, known)
 
 
-def frames(source: FrameSource, number: int, timeout: float = FRAME_TIMEOUT) -> Iterator[Frame]:
-    """Yield a number of frames, waiting at most `timeout` [s] for each."""
-    for _ in range(number):
-        yield source.read(timeout)
+def __dir__() -> list[str]:
+    return __all__

@@ -99,45 +99,23 @@ class Thermocouples:
 
 @dataclass(frozen=True)
 class Devices:
-    """
-    The open devices of a session; see `open_devices`.
-
-    Attributes
-    ----------
-    session : Session
-        Their description.
-    sources : mapping
-        Band to the camera's frames, in the session's order.
-    cameras : mapping
-        Band to the camera's command port, of the cameras that have one.
-    wheel : FilterWheel or None
-        The filter wheel.
-    logger : TC08 or None
-        The thermocouple logger.
-    world : `emulated.world.World` or None
-        The emulated bench of an emulated session.
-    thermocouples : Thermocouples or None
-        The logger's readings.
-    """
+    """The open devices of a session; see `open_devices`."""
 
     session: Session
-    sources: Mapping[str, FrameSource]
-    cameras: Mapping[str, CameraControl] = field(default_factory=dict)
+    sources: Mapping[str, FrameSource]  # frames by band, in the session's order
+    cameras: Mapping[str, CameraControl] = field(default_factory=dict)  # command ports by band
     wheel: FilterWheel | None = None
     logger: TC08 | None = None
-    world: Any = None
-    thermocouples: Thermocouples | None = None
+    world: Any = None  # emulated bench (`emulated.world.World`) of an emulated session
+    thermocouples: Thermocouples | None = None  # readings of the logger
 
     def readings(self) -> dict[str, Reading]:
         """
         Instruments that are read beside the frames, for `recording.record`.
 
-        Returns
-        -------
-        dict
-            Each thermocouple by its name [K]; ``fpa <band>``, the temperature of the focal-plane
-            array [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam.
-            They raise RuntimeError or OSError where the instrument gives none.
+        Each thermocouple by its name [K]; ``fpa <band>``, the temperature of the focal-plane array
+        [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam. They
+        raise RuntimeError or OSError where the instrument gives none.
         """
         readings: dict[str, Reading] = {}
         if self.thermocouples is not None:
@@ -154,18 +132,9 @@ class Devices:
         """
         Names and numbers of the devices, for the record of a recording.
 
-        Returns
-        -------
-        dict
-            Band, or ``filter_wheel``, ``thermocouples``, to names and numbers of the device and
-            ``is_simulated``.
-
-        Raises
-        ------
-        ValueError
-            If frames and command port of a band are those of two cameras.
-        RuntimeError, OSError
-            If a device does not answer.
+        Keys are the bands, ``filter_wheel`` and ``thermocouples``; each says ``is_simulated``.
+        ValueError if frames and command port of a band are those of two cameras; RuntimeError or
+        OSError if a device does not answer.
         """
         identities: dict[str, Identity] = {}
         for band, source in self.sources.items():
@@ -187,14 +156,8 @@ class Devices:
 
         Each camera gives 16-bit counts, corrects its offsets on command only, and gives telemetry
         as the session says; each setting is read back. Then the offsets are corrected, and the
-        wheel is homed if it has to be, and turned to the session's band.
-
-        Raises
-        ------
-        ValueError
-            If a camera does not keep a setting.
-        RuntimeError, OSError
-            If a device refuses, fails or is gone.
+        wheel is homed if it has to be, and turned to the session's band. ValueError if a camera
+        does not keep a setting, RuntimeError or OSError if a device refuses, fails or is gone.
         """
         for camera in self.cameras.values():
             camera.prepare(self.session.telemetry_rows)
@@ -213,24 +176,10 @@ class Devices:
 
     def select(self, band: str) -> "Devices":
         """
-        Turn a filter into the beam.
+        Turn one of the session's filters into the beam; as `FilterWheel.select`.
 
-        Parameters
-        ----------
-        band : str
-            One of the session's filters.
-
-        Returns
-        -------
-        Devices
-            The same devices, of which the camera behind the wheel is that of this band.
-
-        Raises
-        ------
-        ValueError
-            If the session has no wheel, or no such filter.
-        WheelError, TransportError
-            As `FilterWheel.select`.
+        Returns the same devices, of which the camera behind the wheel is that of this band;
+        ValueError if the session has no wheel, or no such filter.
         """
         before = self.session.filtered
         if self.wheel is None or before is None:

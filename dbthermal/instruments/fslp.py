@@ -54,28 +54,13 @@ _CHECKSUM_START = 0x1D0F
 
 @dataclass(frozen=True)
 class Frame:
-    """
-    One undamaged frame.
+    """One undamaged frame."""
 
-    Attributes
-    ----------
-    channel : int
-        `COMMAND_CHANNEL`, or that of debug text and other traffic, 0 to 255.
-    sequence : int
-        Number of the request, echoed by its reply, unsigned, 32 bits.
-    command : int
-        Identifier of the function, unsigned, 32 bits.
-    status : int
-        `REQUEST`, or of a reply 0 for success, else an error code.
-    data : bytes
-        Arguments or result of the function; empty in error replies.
-    """
-
-    channel: int
-    sequence: int
-    command: int
-    status: int
-    data: bytes = b""
+    channel: int  # `COMMAND_CHANNEL`, or that of debug text and other traffic, 0 to 255
+    sequence: int  # number of the request, echoed by its reply, unsigned, 32 bits
+    command: int  # identifier of the function, unsigned, 32 bits
+    status: int  # `REQUEST`, or of a reply 0 for success, else an error code
+    data: bytes = b""  # arguments or result of the function; empty in error replies
 
 
 def checksum(content: bytes) -> int:

@@ -35,28 +35,13 @@ _WORD_BITS: Final = 16
 
 @dataclass(frozen=True)
 class Field:
-    """
-    Position and scale of a number in the row: value = number / steps + zero.
+    """Position and scale of a number in the row: value = number / steps + zero."""
 
-    Attributes
-    ----------
-    word : int
-        First 16-bit word.
-    words : int
-        Number of words.
-    signed : bool
-        Two's complement.
-    steps : int
-        Steps per unit; 0 for a plain whole number.
-    zero : float
-        Value of the number 0.
-    """
-
-    word: int
+    word: int  # first 16-bit word
     words: int = 1
-    signed: bool = False
-    steps: int = 0
-    zero: float = 0.0
+    signed: bool = False  # two's complement
+    steps: int = 0  # per unit; 0 for a plain whole number
+    zero: float = 0.0  # value of the number 0
 
     @property
     def span(self) -> slice:

@@ -169,13 +169,13 @@ def open_serial(
     world: object | None = None,
 ) -> SerialTransport:
     """
-    Open the line to a device by its name; nothing is sent.
+    Open the line to a device by its name, for this program alone; nothing is sent.
 
     Parameters
     ----------
     url : str
-        ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, where the emulator
-        says which options it takes; ``sim://boson/wide`` is ``sim://boson?name=wide``.
+        ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, with the options of
+        the emulator; ``sim://boson/wide`` is ``sim://boson?name=wide``.
     baudrate : int
         Speed of the line [bit/s].
     rtscts : bool
@@ -183,16 +183,11 @@ def open_serial(
     world : object, optional
         Emulated bench that a ``sim://`` device is part of; by default one of its own.
 
-    Returns
-    -------
-    SerialTransport
-        Open, and no other program's.
-
     Raises
     ------
     ValueError
-        If the name is none of these, says more than is understood, or gives a pseudo-terminal as a
-        serial port, which would let an emulator pass for hardware.
+        If the name is none of these, has options that are not understood, or gives a
+        pseudo-terminal as a serial port, which would let an emulator pass for hardware.
     TransportError
         If the port cannot be opened.
     """

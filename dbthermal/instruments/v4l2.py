@@ -85,16 +85,7 @@ Decode = Callable[[Counts], Metadata]
 
 @dataclass(frozen=True)
 class Kernel:
-    """
-    The calls to the kernel; tests hand in others.
-
-    Attributes
-    ----------
-    open, close, ioctl, map, select, clock : callable
-        As `os.open`, `os.close`, `fcntl.ioctl`, `mmap.mmap`, `select.select`, `time.monotonic`.
-    platform : str
-        As `sys.platform`.
-    """
+    """The calls to the kernel, as in `os`, `fcntl`, `mmap` and `select`; tests hand in others."""
 
     open: Callable[[str, int], int] = os.open
     close: Callable[[int], None] = os.close
@@ -130,11 +121,8 @@ class Capture(Closing):
     """
     A camera's node that streams Y16 frames, a `camera.FrameSource`; see `Capture.open`.
 
-    Attributes
-    ----------
-    identity : mapping
-        ``device``, the node, and, once open, ``model``, the driver's name of the camera, ``bus``,
-        where it is plugged in, and ``driver`` with its version, on which a stamp's meaning depends.
+    Its identity is the node, the driver's name of the camera, the bus it is plugged in, and the
+    driver with its version, on which a stamp's meaning depends.
     """
 
     is_simulated: Final = False
@@ -162,28 +150,9 @@ class Capture(Closing):
         """
         Open a node, agree on format and rate, and start the stream; nothing is reset.
 
-        Parameters
-        ----------
-        path : str
-            Such as ``"/dev/video0"``.
-        stream : Stream, optional
-            Format; 640 x 512 pixels at 60 Hz, without telemetry.
-        kernel : Kernel, optional
-            Calls to the kernel.
-        decode : callable, optional
-            Reads the metadata of a frame from its telemetry rows.
-
-        Returns
-        -------
-        Capture
-            Streaming.
-
-        Raises
-        ------
-        OSError
-            If the node cannot be opened, is busy, or this is not Linux.
-        ValueError
-            If the node gives no Y16, or the driver agrees to another format or rate.
+        `decode` reads the metadata of a frame from its telemetry rows. OSError if the node cannot
+        be opened, is busy, or this is not Linux; ValueError if it gives no Y16, or the driver
+        agrees to another format or rate.
         """
         capture = cls(path, stream or Stream(), kernel, decode)
         capture._start()

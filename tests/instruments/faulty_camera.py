@@ -1,12 +1,20 @@
 """An emulated camera in which things go wrong, and a movie for it to see."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments.camera import FRAME_TIMEOUT, Counts, Frame, FrameFlag, NoFrameError
+from dbthermal.instruments.camera import (
+    FRAME_TIMEOUT,
+    Counts,
+    Frame,
+    FrameFlag,
+    FrameSource,
+    NoFrameError,
+)
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 
 LIMITS = np.iinfo(np.uint16)
@@ -142,3 +150,9 @@ class FaultyCamera(EmulatedCamera):
             counts[half:] = 0
             return counts, FrameFlag.WRONG_SIZE
         return counts, FrameFlag.DRIVER_ERROR if number in faults.corrupt else FrameFlag(0)
+
+
+def frames(source: FrameSource, number: int) -> Iterator[Frame]:
+    """Yield a number of frames."""
+    for _ in range(number):
+        yield source.read()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from faulty_camera import frames
 from rig_devices import FILTERS
 from rig_openings import CAMERAS, LOGGERS, VIDEOS, WHEELS, Opened, Opening
 
@@ -22,7 +23,6 @@ from dbthermal.instruments.camera import (
     FrameSource,
     NoFrameError,
     SourceLostError,
-    frames,
 )
 from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.tc08 import TC08, Flag

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from faulty_camera import Faults, FaultyCamera, Movie
+from faulty_camera import Faults, FaultyCamera, Movie, frames
 
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import (
@@ -11,7 +11,6 @@ from dbthermal.instruments.camera import (
     FrameFlag,
     NoFrameError,
     SourceLostError,
-    frames,
 )
 from dbthermal.instruments.emulated import camera as emulated
 from dbthermal.instruments.emulated.world import World

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from faulty_camera import frames
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal.instruments import v4l2
-from dbthermal.instruments.camera import FrameFlag, NoFrameError, SourceLostError, Stream, frames
+from dbthermal.instruments.camera import FrameFlag, NoFrameError, SourceLostError, Stream
 
 STREAM = Stream(shape=(4, 6), telemetry_rows=2)
 BYTES = 2 * 6 * 6

@@ -93,22 +93,11 @@ class BosonStatusError(BosonError):
 
 @dataclass
 class Statistics:
-    """
-    Irregularities of the line so far; all zero on a good one.
+    """Irregularities of the line so far; all zero on a good one."""
 
-    Attributes
-    ----------
-    discarded : int
-        Undamaged frames of other channels or other requests: debug text, and late replies.
-    damaged : int
-        Frames that were cut short or had a wrong checksum or an illegal escape.
-    timeouts : int
-        Requests that were not answered in time.
-    """
-
-    discarded: int = 0
-    damaged: int = 0
-    timeouts: int = 0
+    discarded: int = 0  # undamaged frames of other channels or requests: debug text, late replies
+    damaged: int = 0  # frames cut short, with a wrong checksum or an illegal escape
+    timeouts: int = 0  # requests that were not answered in time
 
 
 class Link(Closing):
@@ -212,18 +201,8 @@ class Boson(Closing):
 
     Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
     `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is asked
-    for again if no reply comes; a command that changes the camera never is.
-
-    Parameters
-    ----------
-    transport : Transport
-        Open; closed with the camera. See `from_url`.
-    timeout : float
-        Longest wait for a reply [s].
-    first_sequence : int, optional
-        Number of the first request; by default from the time of day.
-    clock, sleep : callable
-        Give the time and wait [s].
+    for again if no reply comes; a command that changes the camera never is. Open it by `from_url`;
+    tests hand in a line, the number of the first request, clock and sleep [s].
     """
 
     def __init__(

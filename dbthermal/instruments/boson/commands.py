@@ -73,25 +73,12 @@ class TelemetryLocation(IntEnum):
 
 @dataclass(frozen=True)
 class Reading(Generic[T]):
-    """
-    A value that the camera is asked for.
+    """A value that the camera is asked for."""
 
-    Attributes
-    ----------
-    name : str
-        Name for messages.
-    command : int
-        Identifier.
-    layout : str
-        Data of the reply, as in `struct`, big-endian.
-    convert : callable
-        Value from the unpacked data; raises ValueError if they have no meaning.
-    """
-
-    name: str
-    command: int
-    layout: str
-    convert: Callable[..., T]
+    name: str  # for messages
+    command: int  # identifier
+    layout: str  # data of the reply, as in `struct`, big-endian
+    convert: Callable[..., T]  # value of the unpacked data; ValueError if they have no meaning
 
     def value(self, data: bytes) -> T:
         """Value of the data of a reply; ValueError if they are of another size or meaning."""

@@ -156,25 +156,9 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     """
     Start an emulated camera for ``sim://boson``, on a pseudo-terminal of its own.
 
-    Parameters
-    ----------
-    options : mapping
-        ``name``, its name in the world (``"boson"`` by default); without a world also ``sn``, its
-        serial number, and ``fpa``, the temperature of its focal-plane array [K].
-    world : World or None
-        Bench with a camera of this name; None for a bench of its own.
-
-    Returns
-    -------
-    EmulatedPort
-        Close it to end the camera.
-
-    Raises
-    ------
-    ValueError
-        If an option is not known, is no number, or disagrees with the world.
-    KeyError
-        If the world has no such camera.
+    Options are ``name``, its name in the world (``"boson"`` by default), and without a world also
+    ``sn``, its serial number, and ``fpa``, the temperature of its focal-plane array [K]. ValueError
+    if an option is not known or disagrees with the world, KeyError if it has no such camera.
     """
     require_known(options, ("name", "sn", "fpa"))
     name = options.get("name", "boson")

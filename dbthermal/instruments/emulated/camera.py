@@ -53,40 +53,20 @@ class EmulatedCamera(Closing):
     """
     A `camera.FrameSource` without a camera; its frames begin with the first `read`.
 
-    Attributes
-    ----------
-    world : World
-        The bench it is on; it must have a camera of this name.
-    name : str
-        Of the camera in the world.
-    pictures : mapping
-        Band to the counts that are seen in it.
-    band : str or None
-        Band of a camera without a wheel; None for the one behind the wheel.
-    shape : tuple of int
-        Rows and columns [pixel].
-    frame_rate : float
-        [Hz].
-    telemetry_rows : int
-        0, or `telemetry.ROWS`.
-    sleep : callable
-        Waits so many seconds; injected by tests, together with the world's clock.
-    model : str
-        Name of the model, which says that it is emulated.
-    ffc_period : float
-        Time between flat-field corrections that the camera starts by itself [s].
+    It shows a camera of the world by its name: through a filter of its own, or, where `band` is
+    None, through the one in the beam of the wheel.
     """
 
     world: World
     name: str
-    pictures: Mapping[str, Picture]
+    pictures: Mapping[str, Picture]  # band to the counts that are seen in it
     band: str | None = None
     shape: tuple[int, int] = (512, 640)
-    frame_rate: float = 60.0
+    frame_rate: float = 60.0  # [Hz]
     telemetry_rows: int = 0
-    sleep: Callable[[float], None] = system_time.sleep
+    sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
     model: str = MODELS["camera"]
-    ffc_period: float = math.inf
+    ffc_period: float = math.inf  # between corrections that the camera starts by itself [s]
 
     is_simulated: Final = True
 

@@ -38,40 +38,17 @@ SERIAL_NUMBERS: Final = 93588
 
 @dataclass
 class CameraState:
-    """
-    State of one emulated camera; plain attributes, read and set by emulators.
-
-    Attributes
-    ----------
-    serial_number : int
-        Of the camera.
-    fpa_temperature : float
-        Of its focal-plane array [K].
-    plugged : bool
-        False once it was pulled out.
-    has_frames : bool
-        Whether an emulated frame source counts its frames.
-    frame_count : int
-        Frames since its sensor started.
-    ffc_count : int
-        Flat-field corrections started.
-    ffc_until : float
-        End of the last one [s]; in the past, or -inf, if none is in progress.
-    last_ffc_frame : int
-        `frame_count` at the start of the last one, 0 before the first.
-    last_ffc_temperature : float
-        `fpa_temperature` at the start of the last one [K].
-    """
+    """State of one emulated camera; plain attributes, read and set by emulators."""
 
     serial_number: int
-    fpa_temperature: float = FPA
-    plugged: bool = True
-    has_frames: bool = False
-    frame_count: int = 0
-    ffc_count: int = 0
-    ffc_until: float = -math.inf
-    last_ffc_frame: int = 0
-    last_ffc_temperature: float = FPA
+    fpa_temperature: float = FPA  # of its focal-plane array [K]
+    plugged: bool = True  # False once it was pulled out
+    has_frames: bool = False  # whether an emulated frame source counts its frames
+    frame_count: int = 0  # frames since its sensor started
+    ffc_count: int = 0  # flat-field corrections started
+    ffc_until: float = -math.inf  # end of the last one [s]
+    last_ffc_frame: int = 0  # frame_count at its start, 0 before the first
+    last_ffc_temperature: float = FPA  # fpa_temperature at its start [K]
 
 
 class World:
@@ -84,7 +61,7 @@ class World:
     Parameters
     ----------
     clock : callable
-        Gives the time [s]; injected by tests.
+        Gives the time [s]; injected by tests. The world begins at its `epoch`.
     filters : mapping, optional
         Band in each slot of the wheel, by its number 1 to 6. Slots left out hold no filter.
     wheel_position : int
@@ -92,10 +69,10 @@ class World:
     blackbody_temperature : float
         Of the blackbody [K].
     scene : callable, optional
-        Temperatures of the objects in the scene [K], by name, at a time of the scene [s]; by
-        default none.
+        Temperatures of the objects in the scene [K], by name, at a time of the scene [s].
     waits : bool
-        Whether the scene stands at its beginning until `begin`; else it begins with the world.
+        Whether the scene stands at its beginning until `begin` sets `scene_began` [s]; else it
+        begins with the world.
 
     Attributes
     ----------
@@ -104,15 +81,6 @@ class World:
         ``"blackbody"``, ``"room"`` or ``"open"``.
     cameras : dict
         `CameraState` of each camera by its name; see `add_camera`.
-    epoch : float
-        When the world began, on its clock [s].
-    scene_began : float
-        When the scene began, on the world's clock [s]; infinite before.
-
-    Raises
-    ------
-    ValueError
-        If a slot is not 1 to 6.
     """
 
     is_simulated: Final = True
@@ -211,10 +179,7 @@ class World:
             self.add_camera(name, SERIAL_NUMBERS + number)
 
     def start_ffc(self, name: str, duration: float = FFC_DURATION) -> None:
-        """Start a flat-field correction: the shutter closes, the image freezes until its end [s].
-
-        If one is in progress, it begins anew.
-        """
+        """Start a correction, maybe anew: the shutter closes, the image freezes until its end."""
         with self.lock:
             state = self.camera(name)
             state.ffc_count += 1
@@ -231,17 +196,8 @@ def emulated_world(session: Session, **settings: Any) -> World:
     """
     Bench with the cameras, filters and thermocouples of an emulated session.
 
-    Parameters
-    ----------
-    session : Session
-        Its thermocouples are at the places that they are named after.
-    **settings
-        As for `World`; by default all places but the blackbody are at room temperature.
-
-    Returns
-    -------
-    World
-        For `dbthermal.instruments.devices.open_devices`.
+    The thermocouples are at the places that they are named after, all at room temperature but the
+    blackbody, unless the settings of the `World` say otherwise.
     """
     room = dict.fromkeys(session.thermocouples.values(), ROOM)
     world = World(filters=session.filters, **{"scene": lambda _: room, **settings})
