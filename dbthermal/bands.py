@@ -66,85 +66,41 @@ class Band:
         return self.upper - self.lower
 
     def nodes(self) -> tuple[Array, Array]:
-        r"""
-        Gauss-Legendre nodes and weights for integrals over the band.
+        """
+        Gauss-Legendre nodes (node) [m], increasing, and weights (node) [m], over the band.
 
-        Returns
-        -------
-        tuple of ndarray
-            Wavelengths (node) [m], increasing, and weights (node) [m]; the weights add up to
-            the band's width. With 40 nodes the integral of Planck's law over 8-14 um is exact
-            to rounding.
+        The weights add up to the band's width. With 40 nodes the integral of Planck's law over 8-14
+        um is exact to rounding.
         """
         return self.centre + 0.5 * self.width * _NODES, 0.5 * self.width * _WEIGHTS
 
     def radiance(self, temperature: npt.ArrayLike) -> Array:
         r"""
-        In-band radiance of a blackbody.
+        In-band radiance [W m^-2 sr^-1] of blackbodies at temperatures [K] of any shape.
 
         .. math:: B(T) = \int_{\lambda_l}^{\lambda_u} L(\lambda, T) \, d\lambda
 
-        Parameters
-        ----------
-        temperature : array_like
-            Temperature [K], any shape.
-
-        Returns
-        -------
-        ndarray
-            Radiance [W m^-2 sr^-1], same shape.
-
-        Raises
-        ------
-        ValueError
-            If a temperature lies outside `TEMPERATURE_RANGE`.
+        Raises ValueError for a temperature outside `TEMPERATURE_RANGE`.
         """
         temperature = self._within_range(np.asarray(temperature, dtype=np.float64))
         return self._integral(planck.spectral_radiance, temperature)
 
     def slope(self, temperature: npt.ArrayLike) -> Array:
-        r"""
-        Derivative of the in-band radiance, :math:`dB/dT`.
+        """
+        Derivative dB/dT [W m^-2 sr^-1 K^-1] of the in-band radiance at temperatures [K].
 
-        Parameters
-        ----------
-        temperature : array_like
-            Temperature [K].
-
-        Returns
-        -------
-        ndarray
-            Slope [W m^-2 sr^-1 K^-1], same shape.
-
-        Raises
-        ------
-        ValueError
-            If a temperature lies outside `TEMPERATURE_RANGE`.
+        Raises ValueError for a temperature outside `TEMPERATURE_RANGE`.
         """
         temperature = self._within_range(np.asarray(temperature, dtype=np.float64))
         return self._integral(planck.spectral_radiance_slope, temperature)
 
     def temperature(self, radiance: npt.ArrayLike) -> Array:
         r"""
-        Temperature of the blackbody of an in-band radiance, the inverse of `radiance`.
+        Temperature [K] of blackbodies of in-band radiances [W m^-2 sr^-1]: inverse of `radiance`.
 
-        Newton's method on :math:`\ln B` as a function of :math:`1/T`, nearly a straight line,
-        run until the temperature no longer changes.
-
-        Parameters
-        ----------
-        radiance : array_like
-            In-band radiance [W m^-2 sr^-1], any shape.
-
-        Returns
-        -------
-        ndarray
-            Temperature [K], same shape.
-
-        Raises
-        ------
-        ValueError
-            If a radiance is not that of a temperature within `TEMPERATURE_RANGE`.
+        Newton's method on :math:`\ln B` as a function of :math:`1/T`, nearly a straight line, run
+        until the temperature no longer changes. Raises ValueError for a radiance that is not of a
+        temperature within `TEMPERATURE_RANGE`.
         """
         radiance = np.asarray(radiance, dtype=np.float64)
         lowest, highest = self.radiance(np.array(TEMPERATURE_RANGE))

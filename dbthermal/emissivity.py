@@ -180,11 +180,6 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
     DataArray
         Condition numbers (material, first, second) [1], symmetric; infinite on the diagonal and
         where the two emissivities are equal. See `mixing.condition_number`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the table is not as `schema` has it or holds a single band.
     """
     values = schema.check(table, "emissivity_table")["emissivity"]
     names = values["band"].values
@@ -213,9 +208,9 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
     -------
     Dataset
         `median` and `mean` (first, second) [1], and `finite` (first, second), the number of
-        materials in the mean. A gray material counts in the median as infinite and not in the
-        mean, which a few nearly gray ones govern: the median is the one to choose by. Both are
-        infinite where every material is gray, as on the diagonal.
+        materials in the mean. A gray material counts in the median as infinite and not in the mean,
+        which a few nearly gray ones govern: choose by the median. Both are infinite where every
+        material is gray, as on the diagonal.
     """
     finite = numbers.copy(data=np.isfinite(numbers.values))
     count = finite.sum("material")
@@ -246,19 +241,12 @@ def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.Da
     bands : mapping or iterable of Band or str
         Bands, or names of `bands.FILTERS`; the first is the one that `netd` belongs to.
     temperature : float
-        Temperature at which the noise is meant [K].
+        Temperature of the object [K].
 
     Returns
     -------
     DataArray
         Noise (band) [K].
-
-    Raises
-    ------
-    KeyError
-        If a band's name is unknown.
-    ValueError
-        If there is no band, a band repeats, or a number is not finite and positive.
     """
     chosen = _require_bands(bands)
     netd = float(planck.require_positive("netd [K]", netd))
@@ -280,9 +268,8 @@ def choose_filter(
 
     The paper takes the filter of the lowest condition number (its section 5 says highest, a slip;
     its supplement says lowest) and notes the trade-off with the noise that a narrow filter brings.
-    The second criterion settles that trade-off: the standard deviation of the object temperature
-    from one frame. Both are medians over the materials, for a few nearly gray materials govern
-    any mean.
+    The second criterion settles it: the standard deviation of the object temperature from one
+    frame. Both are medians over the materials, for a few nearly gray materials govern any mean.
 
     Parameters
     ----------
@@ -303,8 +290,8 @@ def choose_filter(
     Raises
     ------
     TypeError, ValueError
-        If the table is not as `schema` has it, lacks the band `beside` or has no other, or the
-        noise lacks a band, is in another unit, or is not finite and positive.
+        If the table is not as `schema` has it or has no band `beside` and another, or the noise
+        lacks a band, is in another unit, or is not finite and positive.
     """
     std = _single_frame_std(table, noise, beside).median("material", skipna=False)
     pairs = pair_summary(condition_numbers(table)).sel(first=beside, drop=True)

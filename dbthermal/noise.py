@@ -41,19 +41,9 @@ def __dir__() -> list[str]:
 
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """
-    Each sample less the line through its neighbours, scaled so that white noise keeps its variance.
+    Samples (time, pixel) less the line through their neighbours, (time - 2, pixel).
 
-    Parameters
-    ----------
-    signal : ndarray, shape (time, pixel)
-        Signal, in any unit.
-    time : array_like, shape (time,)
-        Times [s], evenly spaced or not.
-
-    Returns
-    -------
-    ndarray, shape (time - 2, pixel)
-        Scaled second difference, in the same unit.
+    Scaled so that white noise keeps its variance; times [s] need not be even.
     """
     time = np.asarray(time, dtype=np.float64)
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
@@ -130,25 +120,10 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 
 def of_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
     """
-    Noise of two bands or more: each beside the quietest, see `estimate`.
+    Noise (band) of two bands or more, each estimated beside the quietest; see `estimate`.
 
-    Parameters
-    ----------
-    signals : sequence of ndarray, shape (time, pixel)
-        Signals of the bands; of more than two all in one unit, for the quietest to be found.
-    time : array_like, shape (time,)
-        Times [s].
-
-    Returns
-    -------
-    ndarray, shape (band,)
-        Standard deviations, in the signals' units; that of the quietest band, the median of
-        those beside each other band.
-
-    Raises
-    ------
-    ValueError
-        As `estimate`.
+    Signals (time, pixel) of more than two bands are all in one unit. The noise of the quietest band
+    is the median of the estimates beside each other band.
     """
     if len(signals) == 2:
         return np.array(estimate(signals[0], signals[1], time))

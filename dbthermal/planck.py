@@ -35,24 +35,9 @@ def __dir__() -> list[str]:
 
 def require_positive(name: str, value: npt.ArrayLike) -> Array:
     """
-    Check that every element of a value is finite and positive.
+    Value as a float array, of which every element must be finite and positive.
 
-    Parameters
-    ----------
-    name : str
-        Name of the value, for the error.
-    value : array_like
-        The value, in any unit.
-
-    Returns
-    -------
-    ndarray
-        The value as float64, same shape.
-
-    Raises
-    ------
-    ValueError
-        If an element is NaN, infinite, zero or negative; the error names the first such element.
+    Raises ValueError with the name and the first element that is not.
     """
     array = np.asarray(value, dtype=np.float64)
     bad = ~(np.isfinite(array) & (array > 0))
@@ -110,27 +95,12 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
 
 def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
     r"""
-    Derivative of the blackbody's spectral radiance with temperature.
+    Derivative [W m^-2 sr^-1 m^-1 K^-1] of the blackbody's spectral radiance with temperature.
 
     .. math:: \frac{\partial L}{\partial T} = L \, \frac{x}{T (1 - e^{-x})}, \quad
               x = c_2 / \lambda T
 
-    Parameters
-    ----------
-    wavelength : array_like
-        Wavelength [m].
-    temperature : array_like
-        Temperature [K].
-
-    Returns
-    -------
-    ndarray
-        Slope [W m^-2 sr^-1 m^-1 K^-1].
-
-    Raises
-    ------
-    ValueError
-        As `spectral_radiance`.
+    Wavelength [m], temperature [K] and errors as `spectral_radiance`.
     """
     radiance = spectral_radiance(wavelength, temperature)
     temperature = np.asarray(temperature, dtype=np.float64)

@@ -48,18 +48,9 @@ def __dir__() -> list[str]:
 @dataclass(frozen=True)
 class Variable:
     """
-    Definition of a variable of a stage.
+    Definition of a variable: dimensions in order, type as written, unit, and meaning.
 
-    Attributes
-    ----------
-    dims : tuple of str
-        Dimensions in their order.
-    dtype : str
-        Type as written by this project; read, any real type of the same kind passes.
-    units : str
-        Unit as in the attribute `units`.
-    long_name : str
-        Meaning, for people and axis labels.
+    Read, any real type of the same kind passes.
     """
 
     dims: Dims
@@ -281,8 +272,8 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     Parameters
     ----------
     flags : DataArray
-        `status` or `frame_flags`, of whole numbers of any size, with the attributes
-        ``flag_masks`` and ``flag_meanings``.
+        `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
+        ``flag_meanings``.
     names : str
         Names of flags, in lower case.
 
@@ -294,7 +285,7 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     Raises
     ------
     ValueError
-        If the attributes are missing, or a name is not among them.
+        If a name is not among the attributes.
 
     Examples
     --------
@@ -315,10 +306,10 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
 
 def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     """
-    Check a dataset against its stage.
+    Check a dataset against its stage, and return it unchanged.
 
-    A missing `units` attribute is taken as the agreed unit; a different one is an error.
-    Values are not read, except those of coordinates and of variables without pixels.
+    A missing `units` attribute is taken as the agreed unit; a different one is an error. Values are
+    not read, except those of coordinates and of variables without pixels.
 
     Parameters
     ----------
@@ -326,11 +317,6 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
         Data of a stage.
     stage : str
         One of `STAGES`.
-
-    Returns
-    -------
-    Dataset
-        The dataset itself, unchanged.
 
     Raises
     ------
@@ -353,112 +339,72 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     return dataset
 
 
-def check_variable(array: xr.DataArray, variable: Variable, what: str) -> None:
-    """
-    Check one array against its definition; see `check`.
-
-    Parameters
-    ----------
-    array : DataArray
-        The array.
-    variable : Variable
-        Its definition.
-    what : str
-        Name of the array, for the error.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `check`.
-    """
+def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
+    """Check one array against its definition, as `check`; the label names it in the error."""
     if array.dims != variable.dims:
-        raise ValueError(f"Invalid dims {array.dims} of {what}. Must be {variable.dims}.")
+        raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
     if array.size == 0:
-        raise ValueError(f"Empty {what}: sizes {dict(array.sizes)}. Must hold at least one value.")
+        raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
     if array.dtype.kind not in "fui":
-        raise TypeError(f"Invalid dtype {array.dtype} of {what}. Must be a real number.")
+        raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be a real number.")
     units = array.attrs.get("units", variable.units)
     if units != variable.units:
-        raise ValueError(f"Invalid units '{units}' of {what}. Must be '{variable.units}'.")
+        raise ValueError(f"Invalid units '{units}' of {label}. Must be '{variable.units}'.")
     for dim in array.dims:
         if dim == "band":
-            _check_bands(array, what)
+            _check_bands(array, label)
         elif dim in COORDINATES:
-            _check_coordinate(array, str(dim), what)
+            _check_coordinate(array, str(dim), label)
 
 
-def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], what: str) -> list[int]:
+def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
     """
-    Positions of bands on the dimension `band`, by name.
+    Positions of bands on the dimension `band`, by name as text; the label names the array.
 
-    Parameters
-    ----------
-    array : DataArray or Dataset
-        With a dimension `band`.
-    wanted : list of str
-        Names.
-    what : str
-        Name of the array, for the error.
-
-    Returns
-    -------
-    list of int
-        Positions on `band`, in the order of the names.
-
-    Raises
-    ------
-    ValueError
-        If there is no coordinate `band`, or a band is missing.
+    Raises ValueError if there is no coordinate `band`, or a band is missing.
     """
     if "band" not in array.coords:
-        raise ValueError(f"Missing coordinate 'band' of {what}. Must name each band.")
+        raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
     names = [str(name) for name in np.atleast_1d(array["band"].values)]
     missing = [name for name in wanted if name not in names]
     if missing:
-        raise ValueError(f"Missing band '{missing[0]}' in {what}. Has {names}.")
+        raise ValueError(f"Missing band '{missing[0]}' in {label}. Has {names}.")
     return [names.index(name) for name in wanted]
 
 
-def _check_bands(array: xr.DataArray, what: str) -> None:
+def _check_bands(array: xr.DataArray, label: str) -> None:
     if "band" not in array.coords:
-        raise ValueError(f"Missing coordinate 'band' of {what}. Must name each band.")
+        raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
     names = [str(name) for name in array["band"].values]
     if len(set(names)) != len(names):
-        raise ValueError(f"Repeated band in {names} of {what}. Each band must occur once.")
+        raise ValueError(f"Repeated band in {names} of {label}. Each band must occur once.")
 
 
-def _check_coordinate(array: xr.DataArray, dim: str, what: str) -> None:
+def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
     if dim not in array.coords:
-        raise ValueError(f"Missing coordinate '{dim}' of {what}. Must be given.")
+        raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
     coordinate, units = array[dim], COORDINATES[dim].units
     found = coordinate.attrs.get("units", units)
     if found != units:
-        raise ValueError(f"Invalid units '{found}' of '{dim}' of {what}. Must be '{units}'.")
+        raise ValueError(f"Invalid units '{found}' of '{dim}' of {label}. Must be '{units}'.")
     if coordinate.dtype.kind not in "fui":
         raise TypeError(
-            f"Invalid dtype {coordinate.dtype} of '{dim}' of {what}. Must be numbers in {units}."
+            f"Invalid dtype {coordinate.dtype} of '{dim}' of {label}. Must be numbers in {units}."
         )
     values = coordinate.values.astype(np.float64)
     steps = np.diff(values)
     if not np.all(np.isfinite(values)):
-        raise ValueError(f"Invalid '{dim}' of {what}: not finite. Must be finite.")
+        raise ValueError(f"Invalid '{dim}' of {label}: not finite. Must be finite.")
     if np.any(steps <= 0):
         place = int(np.argmax(steps <= 0))
         raise ValueError(
-            f"Unordered '{dim}' of {what}: {values[place]} {units} is followed by "
+            f"Unordered '{dim}' of {label}: {values[place]} {units} is followed by "
             f"{values[place + 1]} {units}. Must increase strictly."
         )
 
 
 def nomenclature() -> str:
-    """
-    Glossary as Markdown: coordinates, a table for each stage, and the bits of `status`.
-
-    Returns
-    -------
-    str
-        Text of docs/nomenclature.md.
-    """
+    """Glossary as Markdown, the text of docs/nomenclature.md."""
     parts = [_PREFACE, "## Coordinates", _table(COORDINATES)]
     for stage, variables in STAGES.items():
         parts += [f"## Stage `{stage}`", _table({**variables, **OPTIONAL.get(stage, {})}, stage)]

@@ -86,24 +86,11 @@ class Interpolation:
 
 def exposure_times(corrected: xr.Dataset) -> Array:
     """
-    Exposure times of each band's frames.
+    Exposure times (band, time) [s] of each band's frames, NaN where there is no frame.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `capture` or `corrected` of `schema`, optionally with `exposure_time` (band, time)
-        [s].
-
-    Returns
-    -------
-    ndarray, shape (band, time)
-        Times [s], NaN where there is no frame; without `exposure_time`, `time` in every band.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the times have other dims or another unit, fewer than two of a band are finite, or
-        they do not increase.
+    From `exposure_time` of a capture; without it `time`, in every band. Raises TypeError or
+    ValueError if the times have other dims or another unit, fewer than two of a band are finite, or
+    they do not increase.
     """
     counts = corrected["counts"]
     if "exposure_time" not in corrected:
@@ -118,18 +105,9 @@ def exposure_times(corrected: xr.Dataset) -> Array:
 
 def fill_times(stamps: Array) -> Array:
     """
-    Exposure times with those of missing frames interpolated.
+    Exposure times (time) [s] of one camera, with those of missing frames (NaN) interpolated.
 
-    Parameters
-    ----------
-    stamps : ndarray, shape (time,)
-        Exposure times of one camera [s], NaN where there is no frame.
-
-    Returns
-    -------
-    ndarray, shape (time,)
-        Times [s], strictly increasing; before the first and after the last frame, a frame period
-        apart.
+    They increase strictly; before the first and after the last frame by a frame period.
     """
     slots, step = np.arange(stamps.size), frame_period(stamps)
     recorded = np.flatnonzero(np.isfinite(stamps))

@@ -85,25 +85,24 @@ def time_offset(
     corrected: xr.Dataset, *, band: str | None = None, search: int = 5, precision: float = 0.1
 ) -> float:
     """
-    Time by which a band is exposed later than the first.
+    Estimate the time by which a band is exposed later than the first.
 
-    Positive: frame n of this band was exposed that much **later** than frame n of the first.
-    Where the capture has the cameras' own stamps, it is the lag beyond them: this band's stamps
-    are to be raised by it.
+    Positive: frame n of this band was exposed that much **later** than frame n of the first. Where
+    the capture has the cameras' own stamps, it is the lag beyond them.
 
     Parameters
     ----------
     corrected : Dataset
-        Stage `corrected` of `schema`; optionally `status` (y, x), of which dead and saturated
-        pixels are left out, `exposure_time` (band, time) [s], and `segment` (time), which counts
-        shutter events: their steps are no motion. Missing frames are NaN or copies of the frame
-        before. Frames dropped with neither stamp nor copy are not noticed.
+        Stage `corrected` of `schema`, of registered views; optionally `status` (y, x), of which
+        dead and saturated pixels are left out, `exposure_time` (band, time) [s], and `segment`
+        (time): the steps of shutter events are no motion. Missing frames are NaN or copies of the
+        frame before. Frames dropped with neither stamp nor copy are not noticed.
     band : str, optional
         Name of the band; by default the second.
     search : int
         Largest lag to search, either way [frame].
     precision : float
-        Largest standard deviation of the offset [frame].
+        Largest standard deviation of the offset [frame], by jackknife over 16 groups of pixels.
 
     Returns
     -------
@@ -113,21 +112,16 @@ def time_offset(
     Raises
     ------
     TypeError, ValueError
-        If the capture is not as `schema` has it, the band is missing, the search does not fit
-        the capture's length, or there are fewer than 16 usable pixels; if nothing moves in both
-        bands, their covariance is greatest at an end of the search, or the offset is less well
-        known than `precision`.
+        If the band is missing, the search does not fit the capture's length, there are fewer than
+        16 usable pixels, nothing moves in both bands, their covariance is greatest at an end of the
+        search, or the offset is less well known than `precision`.
 
     Notes
     -----
-    The standard deviation is a jackknife's, over 16 groups of pixels.
-
-    The views must show the same at the same pixel: `align` registers them before it calls this.
-    The standard deviation says nothing of it, for all pixels err alike.
-
     Cameras side by side see a reflection at different pixels. Where most of what is reflected moves
-    one way, it comes to a pixel of one view earlier, and this looks like an offset; what moves
-    either way cancels. Where there is such a parallax, measure the offset otherwise and give it.
+    one way, it comes to a pixel of one view earlier, and this looks like an offset; motion either
+    way cancels. Where there is such a parallax, measure the offset otherwise. The standard
+    deviation says nothing of it, for all pixels err alike.
 
     Examples
     --------

@@ -37,9 +37,9 @@ def register(
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
-    A plane is registered exactly by a homography. What it reflects lies behind it, and is seen by
-    side-by-side cameras at different places of the plane: no transform brings object and
-    reflection together.
+    A plane is registered exactly by a homography. Its reflections lie behind it, and are seen by
+    side-by-side cameras at different places of the plane: no transform brings object and reflection
+    together.
 
     Parameters
     ----------
@@ -52,17 +52,17 @@ def register(
     Returns
     -------
     DataArray
-        (band, row, column) [1], for `align`: for each band H, which takes the homogeneous
-        position (x, y, 1) of a pixel of the first view to that of the same point in this one.
-        Pixels count from 0 at the centre of the first; the identity in the first band.
+        (band, row, column) [1], for `align`: for each band H, which takes the homogeneous position
+        (x, y, 1) of a pixel of the first view to that of the same point in this one. Pixels count
+        from 0 at the centre of the first; the identity in the first band.
 
     Raises
     ------
     ImportError
         If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
-        If the capture is not as `schema` has it, the model is unknown, the image is smaller than
-        16 pixels either way, a mean is not finite, or the correlation of two views is below 0.5.
+        If the model is unknown, the image is smaller than 16 pixels either way, a mean is not
+        finite, or the correlation of two views is below 0.5.
 
     References
     ----------

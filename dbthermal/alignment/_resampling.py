@@ -37,18 +37,20 @@ def align(
     transform: xr.DataArray | None = None,
     clock: str | None = None,
 ) -> xr.Dataset:
-    r"""
+    """
     Resample all bands onto one clock, and onto the first band's grid.
 
-    The samples of one band are not touched in time, and its noise stays white: the noisiest, by
-    its noise relative to its signal, unless `clock` names another. The other bands are
-    interpolated at its exposure times, on the line between the frames before and after, which for
-    a background that moves in steps or at random is the expected value. An offset of whole frames
-    is a pure shift.
+    The samples of one band are not touched in time, and its noise stays white: the noisiest, by its
+    noise relative to its signal, unless `clock` names another. The other bands are interpolated at
+    its exposure times, on the line between the frames before and after, which for a background that
+    moves in steps or at random is the expected value. An offset of whole frames is a pure shift.
 
     Frames are NaN in a band where the line would reach over a gap, over a change of `segment`, or
     past an end, and where its camera gave none: NaN, or a copy of the frame before. Nothing is
-    extrapolated.
+    extrapolated. Where a signal steps between two frames, by five standard deviations of noise, the
+    sample is NaN, too: when it changed is not known. Interpolation makes the noise of a band
+    smaller, by up to 0.7, and correlates neighbouring frames; in the quieter of two bands it hardly
+    counts.
 
     Parameters
     ----------
@@ -57,12 +59,12 @@ def align(
         own stamps, which need be neither even nor of one rate, NaN behind the last frame; `segment`
         (time), which counts shutter events; `status` (y, x).
     offset : float or DataArray, optional
-        How much later than the first band the others were exposed, beyond what stamps say [s]: a
-        number for two bands, or (band), 0 in the first. By default `time_offset` of
-        the views as registered by `transform`.
+        How much later than the first band the others were exposed, beyond their stamps [s]: a
+        number for two bands, or (band), 0 in the first. By default `time_offset` of the registered
+        views.
     transform : DataArray, optional
-        (band, row, column), from `register`: the views are warped by bilinear
-        interpolation. Pixels outside a view are NaN.
+        (band, row, column), from `register`: the views are warped by bilinear interpolation. Pixels
+        outside a view are NaN.
     clock : str, optional
         Band whose samples are not touched in time.
 
@@ -71,22 +73,15 @@ def align(
     Dataset
         Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
         exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
-        `status` is that of all the pixels that it may be made of. Attributes tell what was done:
-        `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band), `transform` (the
-        matrices, row by row). `exposure_time` and other variables over `time` on the clocks before,
-        as `drift`, are dropped; other maps are handed on, not warped.
+        `status` is that of all the pixels that it may be made of. Attributes: `clock`,
+        `time_offset` (of each band) [s], `frames_lost` (of each band), `transform` (the matrices,
+        row by row). `exposure_time` and other variables over `time` on the clocks before, as
+        `drift`, are dropped.
 
     Raises
     ------
     TypeError, ValueError
         If an argument is not as described, or `time_offset` finds no offset.
-
-    Notes
-    -----
-    Interpolation makes the noise of a band smaller, by up to 0.7, and correlates neighbouring
-    frames; in the quieter of two bands it hardly counts. Where a signal steps between two
-    frames, by five standard deviations of noise, nothing is interpolated: when it changed is not
-    known. Such a sample is NaN.
 
     Examples
     --------

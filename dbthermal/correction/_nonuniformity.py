@@ -62,8 +62,7 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     TypeError, ValueError
-        If the movies are not as `schema` has them, have fewer than two frames, hold NaN, or do not
-        vary from frame to frame.
+        If there are fewer than two frames, or they hold NaN or do not vary.
     """
     counts = schema.check(movies, "blackbody_movies")["counts"]
     frames = counts.sizes["frame"]
@@ -92,7 +91,7 @@ def fit_correction(
     blackbody: xr.Dataset, *, threshold: float = OUTLIER, maximum: int = DETECTOR_MAXIMUM
 ) -> xr.Dataset:
     r"""
-    Gain, offset and bad pixels from frames of a blackbody that fills the view.
+    Fit gain and offset of each pixel to frames of a blackbody that fills the view.
 
     For each pixel, g and f minimise
 
@@ -100,9 +99,9 @@ def fit_correction(
 
     with :math:`\bar I` the frame's mean over the good pixels. Bad is a pixel whose mean is not
     finite or at the detector's limits at a temperature, whose counts do not rise with the mean, or
-    whose gain, or RMS of residuals, lies more than `threshold` robust standard deviations
-    (1.48 times the median absolute deviation) off the median of the others. Mean, fit and outliers
-    are determined twice, then the fit is made with the remaining pixels.
+    whose gain, or RMS of residuals, lies more than `threshold` robust standard deviations (1.48
+    times the median absolute deviation) off the median of the others. Mean, fit and outliers are
+    determined twice, then the fit is made with the remaining pixels.
 
     Parameters
     ----------
@@ -117,18 +116,17 @@ def fit_correction(
     Returns
     -------
     Dataset
-        Stage `correction`: `gain` (band, y, x) [1] and `offset` (band, y, x) [count]; `bad`
-        (band, y, x), bool; `residual` (band) [count], RMS over good pixels and temperatures;
-        `level` (band, temperature) [count], the means that the pixels are brought to, for
-        `calibration.fit_response`. Bad pixels have gain 1 and offset 0: their counts
-        pass unchanged.
+        Stage `correction`: `gain` (band, y, x) [1] and `offset` (band, y, x) [count]; `bad` (band,
+        y, x), bool; `residual` (band) [count], RMS over good pixels and temperatures; `level`
+        (band, temperature) [count], the means that the pixels are brought to, for
+        `calibration.fit_response`. Bad pixels have gain 1 and offset 0: their counts pass
+        unchanged.
 
     Raises
     ------
     TypeError, ValueError
-        If the frames are not as `schema` has them, are of fewer than two temperatures, or the
-        threshold is not positive; if in a band no more than half of the pixels are usable, or the
-        mean does not rise with the temperature.
+        If there are fewer than two temperatures, the threshold is not positive, no more than half
+        of the pixels of a band are usable, or the mean does not rise with the temperature.
     """
     counts = schema.check(blackbody, "blackbody_frames")["counts"]
     if counts.sizes["temperature"] < 2:
@@ -179,14 +177,13 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     Returns
     -------
     Dataset
-        The correction with other `offset` [count], bad pixels unchanged, and the attribute
-        ``offset_renewed`` = 1.
+        The correction with other `offset` [count], and the attribute ``offset_renewed`` = 1.
 
     Raises
     ------
     TypeError, ValueError
-        If the correction is not as `schema` has it or has no `bad`, a band is missing, the
-        pixels are not the same, or a good pixel of the image is not finite.
+        If the correction has no `bad`, a band is missing, the pixels are not the same, or a good
+        pixel of the image is not finite.
     """
     schema.check(correction, "correction")
     if "bad" not in correction:

@@ -54,20 +54,17 @@ def mark_bad(
     that never changes is bad.
 
     Jumps. A pixel is bad that changes from one frame to the next by more than `jump` standard
-    deviations of a difference, :math:`\sqrt 2 m`, while none of its eight neighbours changes in
-    the same direction by 0.3 of it within 0.2 s or five frames, the longer. Someone walking by is
-    seen by neighbours, be it a little later, and on both sides of an edge between materials; a
-    detector that blinks is alone. Frames that are NaN, the steps between segments of
-    `mark_shutter`, and 0.2 s or five frames at either end do not count.
-
-    A scene's detail that is one pixel wide, such as a wire that reflects more than what is around
-    it, is marked, too: it cannot be told from a pixel that blinks.
+    deviations of a difference, :math:`\sqrt 2 m`, while none of its eight neighbours changes in the
+    same direction by 0.3 of it within 0.2 s or five frames, the longer. Someone walking by is seen
+    by neighbours, be it a little later; a detector that blinks is alone. Frames that are NaN, the
+    steps between segments, and 0.2 s or five frames at either end do not count. A scene's detail
+    that is one pixel wide, such as a wire, cannot be told from a pixel that blinks, and is marked,
+    too.
 
     Parameters
     ----------
     corrected : Dataset
-        Stage `corrected` of `schema`, after `mark_shutter` if there were shutter events; read in
-        blocks of rows.
+        Stage `corrected` of `schema`, after `mark_shutter`; read in blocks of rows.
     threshold : float
         Limit of the robust z-score of the noise [1].
     jump : float
@@ -77,14 +74,14 @@ def mark_bad(
     -------
     Dataset
         The dataset with the bit `Status.DEAD_PIXEL` set in `status` (y, x), other bits as they
-        were, the counts unchanged; and the attributes ``noisy_pixels`` and
-        ``jumping_pixels``, their numbers, ``bad_threshold`` and ``bad_jump``.
+        were, the counts unchanged; and the attributes ``noisy_pixels`` and ``jumping_pixels``,
+        their numbers, ``bad_threshold`` and ``bad_jump``.
 
     Raises
     ------
     TypeError, ValueError
-        If the dataset is not as `schema` has it, a limit is not positive, or a band has fewer than
-        16 frames that are not NaN, or than 0.5 s have.
+        If a limit is not positive, or a band has fewer than 16 frames that are not NaN, or than 0.5
+        s have.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     for name, value in (("threshold", threshold), ("jump", jump)):

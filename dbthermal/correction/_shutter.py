@@ -6,12 +6,11 @@ of its own that differs from the one before. A frame that was lost on the way is
 once, and the offsets stay.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.special import ndtri
 
 from dbthermal import schema
 
@@ -21,29 +20,24 @@ Mask = npt.NDArray[np.bool_]
 
 # Fewest pixels that must change in a capture for an unchanged image to be a copy.
 _MINIMUM_PIXELS: Final = 16
-# About as many pixels, evenly spread, are compared first.
+# Copies from which a run is taken for the shutter's; a shorter one is of lost frames. A shutter
+# event that is missed biases the separation, lost frames that are counted as one cost it one degree
+# of freedom a band.
+_FEWEST_COPIES: Final = 3
+# About as many pixels, on an even grid, are compared first.
 _SAMPLE = 4096
-# Median absolute deviation -> standard deviation of a normal distribution.
-_MAD = 1.0 / float(ndtri(0.75))
 # Most samples of a block of rows that is read at once.
 _BLOCK = 4_000_000
 _EVENT = ("band", "first_frame", "frames", "renewed")
 
 
-def find_shutter(
-    corrected: xr.Dataset,
-    *,
-    closed: xr.DataArray | None = None,
-    stillness: float = 0.0,
-    fewest: int = 3,
-) -> xr.Dataset:
+def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -> xr.Dataset:
     """
     Find the runs of frames in which a band repeats its image.
 
     A frame is a copy if no pixel differs from the frame before. Some thousands of pixels are
     compared first, then the whole of the remaining frames, in blocks of rows, so that a lazy
-    dataset is never read at once. The search is exact only before anything is interpolated in
-    time: call it before `alignment.align`.
+    dataset is never read at once. The search is exact only before anything is interpolated in time.
 
     Parameters
     ----------
@@ -51,43 +45,30 @@ def find_shutter(
         Stage `corrected` of `schema`, or a raw `capture`: `counts` (band, time, y, x) [count].
     closed : DataArray, optional
         True in frames in which the shutter is known to be closed, (time) or (band, time), bool:
-        from the camera's telemetry, or because they show the shutter itself. A run of copies that
-        includes or touches one is part of its event.
-    stillness : float
-        Largest RMS change of a copy, relative to the noise of a change (robust, over the frames
-        that change at all) [1]. With 0 a copy is exact; 0.2 takes in images that were rescaled or
-        compressed after they were frozen.
-    fewest : int
-        Copies from which a run is taken for the shutter's; shorter ones are lost frames. A
-        shutter event that is missed biases the separation, a lost pair of frames that is counted
-        as one costs it one degree of freedom a band.
+        from the camera, or because they show the shutter itself. A run of copies that includes or
+        touches one is part of its event.
 
     Returns
     -------
     Dataset
         A row for each run, (event): `band`; `first_frame`, position of the first frame that is no
-        measurement (the frame before it is real), and `frames`, their number; `start` and `stop`,
-        times of the first and the last of them [s]; `renewed`, true where the shutter was closed
-        and the offsets are new, false for a lost frame.
+        measurement, and `frames`, their number; `start` and `stop`, times of the first and the last
+        of them [s]; `renewed`, true where the shutter was closed and the offsets are new, false for
+        a lost frame.
 
     Raises
     ------
     TypeError, ValueError
-        If the dataset is not as `schema` has it, `closed` is no boolean of its frames, `stillness`
-        does not lie in [0, 1), `fewest` is below 1, or in a band fewer than 16 of the pixels
-        compared ever change.
+        If `closed` is no boolean of the frames, or in a band fewer than 16 of the pixels compared
+        ever change.
     """
     counts = schema.check(corrected, "corrected")["counts"]
-    if not 0 <= stillness < 1:
-        raise ValueError(f"Invalid stillness {stillness} of a copy. Must lie in [0, 1).")
-    if fewest < 1:
-        raise ValueError(f"Invalid fewest {fewest} copies of a shutter event. Must be 1 or more.")
     known = _closed_frames(counts, closed)
     runs = []
     for index, name in enumerate(counts["band"].values):
-        marked = known[index] | _copies(counts.isel(band=index), stillness)
+        marked = known[index] | _copies(counts.isel(band=index))
         for first, after in _runs(marked):
-            renewed = bool(known[index, first:after].any()) or after - first >= fewest
+            renewed = bool(known[index, first:after].any()) or after - first >= _FEWEST_COPIES
             runs.append((str(name), first, after - first, renewed))
     return _events(runs, counts["time"].values.astype(np.float64))
 
@@ -98,22 +79,20 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
 
     After an event every pixel of the band has an offset step of its own, of tens of counts, which
     no camera reports. It is left in the counts: `separation.solve` keeps it out of the object, by a
-    free step of each pixel and band wherever `segment` changes; in the background it stays. Mark
-    before `alignment.align`, whose interpolation leaves no copies. Where stamps tell that a band
-    lost frames, its slots lie at other times than the other band's, and one event of both may count
-    as two: the frames between are then lost in `align`. Events of two bands that
-    overlap, or follow without a frame between, are counted as one, so that cameras that fire
-    together cost one step. An event before the first or after the last valid frame makes none.
+    free step of each pixel and band wherever `segment` changes; in the background it stays. Events
+    of two bands that overlap, or follow without a frame between, are counted as one, so that
+    cameras that fire together cost one step. An event before the first or after the last valid
+    frame makes none.
 
-    Undone or not, an event costs accuracy: nothing ties the level after it to the one before but
-    the object's smoothness. Beside five functions over 35 s, one step in the middle raises the
-    standard deviation of the smooth part by 1.9, two, at 11 and 24 s, by 2.7. Between two shutter
-    events a capture is at its best.
+    An event costs accuracy: only the object's smoothness ties the level after it to the one before.
+    Beside five functions over 35 s, one step in the middle raises the standard deviation of the
+    smooth part by 1.9, two, at 11 and 24 s, by 2.7.
 
     Parameters
     ----------
     corrected : Dataset
-        Stage `corrected` of `schema`, not yet marked. `counts` may be lazy.
+        Stage `corrected` of `schema`, not yet marked, before `alignment.align`. `counts` may be
+        lazy.
     events : Dataset, optional
         From `find_shutter`, or rows of it; by default `find_shutter(corrected)`.
 
@@ -126,11 +105,9 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
 
     Raises
     ------
-    TypeError
-        If the counts are whole numbers, which have no NaN.
-    ValueError
-        If the dataset is not as `schema` has it or was marked before, or an event lacks a variable,
-        is of no band or of frames that the dataset does not have.
+    TypeError, ValueError
+        If the counts are whole numbers, which have no NaN, the dataset was marked before, or an
+        event lacks a variable, is of no band or of frames outside the dataset.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if "segment" in corrected:
@@ -177,52 +154,40 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
     return np.broadcast_to(closed.values, shape)
 
 
-def _copies(counts: xr.DataArray, stillness: float) -> Mask:
+def _copies(counts: xr.DataArray) -> Mask:
     """Frames (time) of one band, counts (time, y, x), that repeat the frame before."""
     step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / _SAMPLE)))
     sample = counts.isel(y=slice(None, None, step), x=slice(None, None, step)).values
-    change = _change(sample[:-1], sample[1:])
-    squares, number = _energy(change)
-    moving = (np.abs(change) > 0).any(axis=0)  # false for NaN
+    changed, valid = _changed(sample[:-1], sample[1:])
+    moving = changed.any(axis=0)
     if moving.sum() < _MINIMUM_PIXELS:
         raise ValueError(
             f"Invalid counts of band '{counts['band'].item()}': {moving.sum()} of the "
             f"{moving.size} pixels looked at change. Must be at least {_MINIMUM_PIXELS}."
         )
-    # Pixel by pixel over time: where someone walks by, most pixels are quiet in most frames.
-    usual = _MAD * np.nanmedian(np.abs(change[squares > 0][:, moving]), axis=0)
-    limit = stillness**2 * float(np.mean(usual**2))
     copies = np.zeros(counts.sizes["time"], dtype=bool)
-    candidates = 1 + np.flatnonzero((number > 0) & (squares <= limit * number))
+    candidates = 1 + np.flatnonzero(valid.any(axis=(1, 2)) & ~changed.any(axis=(1, 2)))
     if candidates.size:
-        copies[candidates] = _whole_copies(counts, candidates, limit)
+        copies[candidates] = _whole_copies(counts, candidates)
     return copies
 
 
-def _whole_copies(counts: xr.DataArray, candidates: Integers, limit: float) -> Mask:
+def _whole_copies(counts: xr.DataArray, candidates: Integers) -> Mask:
     """Candidates that repeat the frame before in all of the image, read in blocks of rows."""
     needed = np.union1d(candidates, candidates - 1)
     here, before = (np.searchsorted(needed, part) for part in (candidates, candidates - 1))
     rows = max(1, _BLOCK // (needed.size * counts.sizes["x"]))
-    squares, number = np.zeros(candidates.size), np.zeros(candidates.size)
+    copies = np.ones(candidates.size, dtype=bool)
     for top in range(0, counts.sizes["y"], rows):
         block = counts.isel(time=needed, y=slice(top, top + rows)).values
-        energy = _energy(_change(block[before], block[here]))
-        squares, number = squares + energy[0], number + energy[1]
-    return np.asarray((number > 0) & (squares <= limit * number))
+        copies &= ~_changed(block[before], block[here])[0].any(axis=(1, 2))
+    return copies
 
 
-def _change(before: npt.NDArray[np.generic], after: npt.NDArray[np.generic]) -> Array:
-    """Changes [count], NaN where a sample is NaN."""
-    # Signed before the difference: unsigned counts wrap around.
-    return after.astype(np.float64) - before.astype(np.float64)
-
-
-def _energy(change: Array) -> tuple[Array, Array]:
-    """Sum of squares of each frame's changes [count^2], and the number of pixels that have one."""
-    finite = np.isfinite(change)
-    known = np.where(finite, change, 0.0)
-    return np.einsum("tyx,tyx->t", known, known), finite.sum(axis=(1, 2)).astype(np.float64)
+def _changed(before: npt.NDArray[Any], after: npt.NDArray[Any]) -> tuple[Mask, Mask]:
+    """Samples that differ between two frames, and those that are finite in both."""
+    valid = np.isfinite(before) & np.isfinite(after)
+    return (before != after) & valid, valid
 
 
 def _runs(marked: Mask) -> Integers:

@@ -12,18 +12,17 @@ Array = npt.NDArray[np.float64]
 
 def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
     r"""
-    Signal that pixels of first-order lag would have shown without it.
+    Undo the thermal lag of the pixels, bodies with a time constant of their own.
 
-    A pixel of a microbolometer is a small body that follows :math:`\tau \dot I = z - I`. For z held
-    from each frame to the next, exactly,
+    A pixel follows :math:`\tau \dot I = z - I`. For z held from each frame to the next, exactly,
 
     .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad
               z_n = \frac{I_n - a_n I_{n-1}}{1 - a_n}, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
 
-    The first frame becomes NaN, for the one before it is not known; so does a frame after one that
-    is NaN. White noise is raised by :math:`\sqrt{1 + a^2} / (1 - a)` (1.00005 at 10 Hz, 1.25 at 60
-    Hz for 10 ms), and successive frames then have the correlation :math:`-a / (1 + a^2)`: undo a
-    lag that matters, not one that does not.
+    The first frame becomes NaN, and so does a frame after one that is NaN. White noise is raised by
+    :math:`\sqrt{1 + a^2} / (1 - a)` (1.00005 at 10 Hz, 1.25 at 60 Hz for 10 ms), and successive
+    frames then have the correlation :math:`-a / (1 + a^2)`: undo a lag that matters, not one that
+    does not.
 
     Parameters
     ----------
@@ -42,8 +41,8 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     Raises
     ------
     TypeError, ValueError
-        If the dataset is not as `schema` has it, has fewer than two frames, was undone before or
-        holds whole numbers, or a time constant is not finite and positive or a band has none.
+        If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
+        or a time constant is not finite and positive or a band has none.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if "lag_time_constant" in corrected.attrs:
@@ -72,24 +71,11 @@ def lag_coefficients(
     time_constant: float | xr.DataArray, counts: xr.DataArray
 ) -> tuple[Array, Array]:
     r"""
-    Weights of the frame before and of the new signal in a pixel of first-order lag.
+    Weights of the frame before and of the new signal in a pixel that lags, each (band, time - 1).
 
-    Parameters
-    ----------
-    time_constant : float or DataArray
-        Time constant of the pixels [s], of all bands or (band), by name.
-    counts : DataArray
-        Signal (band, time, ...).
-
-    Returns
-    -------
-    tuple of ndarray, each (band, time - 1)
-        :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a` [1], both to full precision.
-
-    Raises
-    ------
-    ValueError
-        If a time constant is not finite and positive, or a band has none.
+    They are :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a` [1], both to full precision, for the
+    time constant :math:`\tau` [s] of all bands or (band), and counts (band, time, ...). Raises
+    ValueError if a time constant is not finite and positive, or a band has none.
     """
     interval = np.diff(counts["time"].values.astype(np.float64))
     ratio = interval / _time_constants(time_constant, counts)[:, np.newaxis]
@@ -114,27 +100,24 @@ def undo_drift(corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5
     Parameters
     ----------
     corrected : Dataset
-        Stage `corrected` of `schema`; with `segment` (time) of `mark_shutter` where there were
-        shutter events.
+        Stage `corrected` of `schema`, after `mark_shutter` if there were shutter events.
     reference : DataArray
-        True on the patch, (y, x), bool: a blackbody, a wall. Its pixels that are flagged in
-        `status` are left out.
+        True on the patch, (y, x), bool: a blackbody, a wall. Pixels with a `status` are left out.
     order : int
-        Number of polynomials in a segment, the constant included; in one that has fewer frames,
-        as many as frames.
+        Number of polynomials in a segment, the constant included.
 
     Returns
     -------
     Dataset
-        The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted,
-        NaN in frames that are; and the attributes ``drift_order`` and ``drift_pixels``.
+        The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted;
+        and the attributes ``drift_order`` and ``drift_pixels``.
 
     Raises
     ------
     TypeError, ValueError
-        If the dataset is not as `schema` has it or its drift was undone before, the reference is
-        no boolean of its pixels or marks no good pixel, `order` is below 2 (a constant is no
-        drift), or a pixel of the patch is NaN in a frame in which others are not.
+        If the drift was undone before, the reference is no boolean of its pixels or marks no good
+        pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are
+        not.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if "drift" in corrected:

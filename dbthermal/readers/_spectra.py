@@ -46,11 +46,12 @@ _HEADER_RULES: Final = {
 
 
 def ecostress(path: str | Path) -> xr.Dataset:
-    """Spectrum of an ECOSTRESS (or ASTER) library file, ``*.spectrum.txt``.
+    """
+    Spectrum of an ECOSTRESS (or ASTER) library file, ``*.spectrum.txt``.
 
     The file gives the hemispherical reflectance R [%] of an opaque sample, so that by Kirchhoff's
-    law its emissivity is 1 - R / 100. Header and values are held against one another: units, kind
-    of measurement, number of values, first and last wavelength.
+    law its emissivity is 1 - R / 100. Header and values are compared: units, kind of measurement,
+    number of values, first and last wavelength.
 
     Parameters
     ----------
@@ -60,20 +61,21 @@ def ecostress(path: str | Path) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `emissivity` (wavelength) [1] over wavelength [m]; attributes as in this module's text.
+        `emissivity` (wavelength) [1] over wavelength [m]; attributes: what the library says of the
+        sample (``name``, ``class``, ...), ``source`` and ``unphysical_values``.
 
     Raises
     ------
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
     ValueError
-        If the file is truncated or longer than declared, is no hemispherical reflectance in
-        percent over micrometres, or breaks a rule of this module's text.
+        If it is truncated or longer than declared, is no hemispherical reflectance in percent over
+        micrometres, or holds a value that is no spectrum's.
 
     References
     ----------
-    Meerdink, S. K., Hook, S. J., Roberts, D. A., Abbott, E. A. (2019). The ECOSTRESS spectral
-    library version 1.0. Remote Sensing of Environment 230, 111196. doi:10.1016/j.rse.2019.05.015
+    Meerdink et al. (2019), The ECOSTRESS spectral library version 1.0, Remote Sensing of
+    Environment 230, 111196, doi:10.1016/j.rse.2019.05.015
     """
     path = Path(path)
     lines = path.read_text(encoding="latin-1").split("\n")
@@ -87,7 +89,8 @@ def ecostress(path: str | Path) -> xr.Dataset:
 
 
 def slum(path: str | Path) -> dict[str, xr.Dataset]:
-    """Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
+    """
+    Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
 
     Parameters
     ----------
@@ -97,21 +100,20 @@ def slum(path: str | Path) -> dict[str, xr.Dataset]:
     Returns
     -------
     dict of str to Dataset
-        Sample code, such as ``"A001"``, to `emissivity` (wavelength) [1] over wavelength [m].
+        Sample code, such as ``"A001"``, to a spectrum as `ecostress`.
 
     Raises
     ------
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
     ValueError
-        If the columns are others, a row is short, or a spectrum breaks a rule of this module's
-        text.
+        If the columns are others, a row is short, or a value is no spectrum's.
 
     References
     ----------
-    Kotthaus, S., Smith, T. E. L., Wooster, M. J., Grimmond, C. S. B. (2014). Derivation of an urban
-    materials spectral library through emittance and reflectance spectroscopy. ISPRS Journal of
-    Photogrammetry and Remote Sensing 94, 194-212. doi:10.1016/j.isprsjprs.2014.05.005
+    Kotthaus et al. (2014), Derivation of an urban materials spectral library through emittance and
+    reflectance spectroscopy, ISPRS Journal of Photogrammetry and Remote Sensing 94, 194-212,
+    doi:10.1016/j.isprsjprs.2014.05.005
     """
     path = Path(path)
     titles, rows = _table(path)
@@ -129,7 +131,8 @@ def slum(path: str | Path) -> dict[str, xr.Dataset]:
 
 
 def ucsb(path: str | Path) -> xr.Dataset:
-    """Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
+    """
+    Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
 
     Parameters
     ----------
@@ -140,15 +143,15 @@ def ucsb(path: str | Path) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `emissivity` (wavelength) [1] over wavelength [m].
+        A spectrum as `ecostress`.
 
     Raises
     ------
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
     ValueError
-        If the columns are others, wavelength and wavenumber disagree by more than 0.1 %, or the
-        spectrum breaks a rule of this module's text.
+        If the columns are others, wavelength and wavenumber disagree by more than 0.1 %, or a value
+        is no spectrum's.
     """
     path = Path(path)
     titles, rows = _table(path)
@@ -177,13 +180,13 @@ def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
 
 
 def _check_extent(header: Mapping[str, str], wavelength: Floats, path: Path) -> None:
-    """Hold the values against the number and the ends that the header declares."""
-    found = {
+    """Compare the values with the number and the ends that the header declares."""
+    actual = {
         "Number of X Values": wavelength.size,
         "First X Value": wavelength[0],
         "Last X Value": wavelength[-1],
     }
-    for key, value in found.items():
+    for key, value in actual.items():
         declared = header.get(key, "")
         if not re.fullmatch(r"[0-9.]+", declared) or abs(float(declared) - value) > 1e-3:
             raise ValueError(

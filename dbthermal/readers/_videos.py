@@ -18,15 +18,12 @@ from dbthermal import schema
 
 Floats = NDArray[np.float64]
 
-PALETTE_LIMIT: Final = 20.0
-"""Largest RMS distance of a video's pixels from its palette [0-255 per channel].
-
-Measured on published videos in plasma: 4 to 10 from plasma, 39 or more from other palettes."""
-
-MASKED_LIMIT: Final = 35.0
-"""Largest median distance of a video's coloured pixels from its palette [0-255 per channel].
-
-Measured on published videos in turbo: 3 to 31 from turbo, 39 or more from other palettes."""
+# Largest RMS distance of a video's pixels from its palette [0-255 per channel]. Published videos in
+# plasma are 4 to 10 from plasma, 39 or more from other palettes.
+_PALETTE_LIMIT: Final = 20.0
+# Largest median distance of a video's coloured pixels. Published videos in turbo are 3 to 31 from
+# turbo, 39 or more from other palettes.
+_MASKED_LIMIT: Final = 35.0
 
 _YCC: Final = np.array(
     [
@@ -40,13 +37,14 @@ _COLOURED: Final = 30  # least difference between the channels of a coloured pix
 
 
 def palette_video(path: str | Path, palette: str = "plasma") -> xr.DataArray:
-    """Video drawn in a palette, as positions in the palette.
+    """
+    Video drawn in a palette, as positions in the palette.
 
     Each pixel gets the position of the nearest point on the line through the palette's colours in
     Y'CbCr, finer than its steps. Luma counts whole and chroma half: in these videos four pixels
     share a chroma sample. Measured on synthetic H.264 videos, the RMS error is 6-28 % (plasma) and
     7-15 % (turbo) below that of the nearest of 256 colours in RGB. Luma alone is no better, and not
-    unique in turbo.
+    unique in turbo. A palette and its reverse fit alike and cannot be told apart.
 
     Parameters
     ----------
@@ -65,18 +63,17 @@ def palette_video(path: str | Path, palette: str = "plasma") -> xr.DataArray:
     Raises
     ------
     FileNotFoundError
-        If there is no such file.
+        If the file does not exist.
     ValueError
-        If the palette is unknown or does not fit (see `PALETTE_LIMIT`), if the file cannot be
-        decoded to its end, or frames are fewer or more than its header declares. A palette and its
-        reverse fit alike; which one it is cannot be told.
+        If the palette is unknown or does not fit, the file cannot be decoded to its end, or the
+        number of frames is not the declared one.
     """
     path = Path(path)
     colours = _palette(palette)
     video = _decode(path)
     position, _, distance = _nearest(video.colours, colours)
     residual = float(np.sqrt(np.average(distance**2, weights=video.share)))
-    _check_fit(path, palette, residual, PALETTE_LIMIT)
+    _check_fit(path, palette, residual, _PALETTE_LIMIT)
     attrs = _attrs(path, palette, residual)
     return xr.DataArray(position[video.index], video.coords, attrs=attrs, name="movie")
 
@@ -84,7 +81,8 @@ def palette_video(path: str | Path, palette: str = "plasma") -> xr.DataArray:
 def masked_palette_video(
     path: str | Path, palette: str = "turbo", width: int | None = None
 ) -> xr.Dataset:
-    """Video whose object is drawn in a palette while the rest is gray.
+    """
+    Video whose object is drawn in a palette while the rest is gray.
 
     A pixel is valid where its colour is nearer to the palette than to gray, in the measure of
     `palette_video`. Compression pulls single pixels between strong colours over that line, so the
@@ -97,7 +95,7 @@ def masked_palette_video(
     palette : str
         Name of a continuous colour map of matplotlib.
     width : int, optional
-        Columns to keep [pixel]; what lies to the right of them is a printed colour bar.
+        Columns to keep [pixel], left of a printed colour bar.
 
     Returns
     -------
@@ -108,11 +106,8 @@ def masked_palette_video(
 
     Raises
     ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        As `palette_video` (with `MASKED_LIMIT`); also if the video is narrower than `width`, or
-        holds no coloured pixel.
+    FileNotFoundError, ValueError
+        As `palette_video`; also if the video is narrower than `width`, or has no coloured pixel.
     """
     path = Path(path)
     colours = _palette(palette)
@@ -122,7 +117,7 @@ def masked_palette_video(
     if not coloured.any():
         raise ValueError(f"No coloured pixel in '{path.name}'. Must show an object in a palette.")
     residual = _median(distance[coloured], video.share[coloured])
-    _check_fit(path, palette, residual, MASKED_LIMIT)
+    _check_fit(path, palette, residual, _MASKED_LIMIT)
     valid = from_palette < np.linalg.norm(_ycc(video.colours)[:, 1:], axis=1)
     dims, attrs = tuple(video.coords), _attrs(path, palette, residual)
     mask_attrs = {"units": "1", "long_name": "nearer to the palette than to gray"}
@@ -195,17 +190,19 @@ def _coords(times: Sequence[float | None], shape: tuple[int, ...], path: Path) -
 
 def _distinct(codes: NDArray[np.uint32], coords: dict[str, Any]) -> _Video:
     """Replace each code, in place, by its place among the distinct ones."""
-    seen = np.zeros(2**24, dtype=bool)
+    present = np.zeros(2**24, dtype=bool)
     for frame in codes:
-        seen[frame] = True
-    found = np.flatnonzero(seen)
+        present[frame] = True
+    distinct = np.flatnonzero(present)
     place = np.zeros(2**24, dtype=np.uint32)
-    place[found] = np.arange(found.size)
-    count = np.zeros(found.size)
+    place[distinct] = np.arange(distinct.size)
+    count = np.zeros(distinct.size)
     for frame in codes:
         frame[...] = place[frame]
-        count += np.bincount(frame.ravel(), minlength=found.size)
-    colours = np.stack([found >> 16, found >> 8 & 255, found & 255], axis=1).astype(np.float64)
+        count += np.bincount(frame.ravel(), minlength=distinct.size)
+    colours = np.stack([distinct >> 16, distinct >> 8 & 255, distinct & 255], axis=1).astype(
+        np.float64
+    )
     return _Video(colours, count / count.sum(), codes, coords)
 
 
