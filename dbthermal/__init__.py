@@ -2,8 +2,8 @@
 
 Begin with `calibration.fit_response`, `correction.correct_capture` and `separation.solve`. The
 functions exchange an `xarray.Dataset` in kelvin and SI units, whose variables `schema` names. A
-module is imported when it is first used, so that ``import dbthermal`` is quick and needs no optional
-package.
+module is imported when it is first used, so that ``import dbthermal`` is quick and asks for no
+optional package.
 """
 
 import importlib
