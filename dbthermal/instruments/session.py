@@ -52,6 +52,11 @@ from dbthermal.instruments.camera import KINDS
 
 __all__ = ["Blackbody", "Camera", "Device", "Session"]
 
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
@@ -81,20 +86,11 @@ class Device:
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
-    """
-    One camera: addresses of its frames and of its command port, if it has one.
-
-    Attributes
-    ----------
-    video, control : Device
-        Addresses.
-    kind : str
-        One of `dbthermal.instruments.camera.KINDS`.
-    """
+    """One camera: addresses of its frames and of its command port, if any, and its kind."""
 
     video: Device
     control: Device | None = None
-    kind: str = "boson"
+    kind: str = "boson"  # one of `dbthermal.instruments.camera.KINDS`
 
     @field_validator("kind")
     @classmethod

@@ -36,7 +36,7 @@ from dbthermal.instruments.camera import (
     Shutter,
     next_shutter,
 )
-from dbthermal.schema import EXPOSURE_TIME, STAGES, Variable
+from dbthermal.schema import EXPOSURE_TIME, FRAME_FLAGS, STAGES, Variable
 
 CHUNK: Final = 30
 """Frames of a chunk: half a second at 60 Hz, the most that a kill may cost."""
@@ -146,7 +146,7 @@ VARIABLES: Final = MappingProxyType(
         "device_time": _of_frames("float64", "s", "device's stamp of the frame, as it came"),
         "host_time": _of_frames("float64", "s", "arrival at the host, since clock_origin"),
         "sequence": _of_frames("int64", "1", "number of the frame by its driver"),
-        "frame_flags": _coded(_of_frames("uint16", "1", "flags, 0 for a good frame"), MEANINGS),
+        "frame_flags": _coded(FRAME_FLAGS, MEANINGS),
         "log_time": _of_log("float64", "time of the note, since clock_origin", "s"),
         "log_kind": _coded(_of_log("int16", "kind of the note"), NOTES),
         "log_source": _of_log("int16", "source of the note: place in attribute log_sources"),
