@@ -267,7 +267,7 @@ def status_attrs() -> dict[str, object]:
 
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """
-    Where any of some flags is set, by the CF attributes of the variable that holds them.
+    Mask of the places where any of some flags is set, by the CF attributes of the variable.
 
     Parameters
     ----------

@@ -156,7 +156,7 @@ class SourceLostError(ConnectionError):
 
 @dataclass(frozen=True)
 class Metadata:
-    """A camera's report on one frame besides its image."""
+    """Metadata that a camera gives with one frame, besides its image."""
 
     frame_counter: int = -1  # camera's own number of the frame, -1 if not known
     last_ffc_frame: int | None = None  # frame_counter at the last flat-field correction

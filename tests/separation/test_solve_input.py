@@ -184,7 +184,7 @@ BAD: dict[str, tuple[Callable[[xr.Dataset, xr.Dataset], object], str]] = {
     ),
     "noise": (
         lambda c, r: separation.solve(c, r.assign(noise=("band", [1.0, -1.0]))),
-        "Invalid noise .count. -1.0. Must be finite and positive",
+        "Invalid noise .count. -1.0 in band '9.5'. Must be finite and positive",
     ),
     "coefficient": (
         lambda c, r: separation.solve(c, r.assign(offset=("band", [np.nan, 0.0]))),

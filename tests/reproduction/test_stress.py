@@ -164,27 +164,9 @@ def test_units_and_inputs() -> None:
         xr.testing.assert_identical(given_one, kept)
 
 
-def test_sweep_names_its_cases() -> None:
-    """Each case is a row under its name, whose numbers are those of a run of its own."""
-    found = stress.sweep([GLASS, STILL], Rig(), TIME[:120], 30, seed=3)
-    assert found["case"].values.tolist() == ["glass", "still"]
-    assert found.attrs == {"origin": "simulated", "pixels": 30, "seed": 3}
-    alone = stress.judge(*run_case(STILL, Rig(), TIME[:120], 30, 3))
-    xr.testing.assert_equal(found.sel(case="still", drop=True), alone)
-    assert found["by_flag"].sel(case="still", flag="no_background_motion") == 1.0
-
-
-@pytest.mark.parametrize("names", [["a", "a"], ["a", ""]])
-def test_names_of_cases(names: list[str]) -> None:
-    """Two rows of one name, or a row of none, could not be told apart."""
-    cases = [GLASS | {"case": name} for name in names]
-    with pytest.raises(ValueError, match=f"Invalid name '{names[-1]}' of a case. Must be"):
-        stress.sweep(cases, Rig(), TIME, 5, 0)
-
-
 def test_clean_glass() -> None:
     """Of clean glass at most one pixel in ten is flagged, and the object's intervals are true."""
-    found = stress.sweep([GLASS], Rig(), TIME, 400, seed=7).isel(case=0)
+    found = stress.judge(*run_case(GLASS, Rig(), TIME, 400, seed=7))
     covered, width = found["object_coverage"].values, found["width"].values
     print(f"flagged {float(found['flagged']):.3f}, object {covered}, widths {width}")
     assert float(found["flagged"]) <= 0.1
