@@ -187,6 +187,19 @@ def record_scene(
     -------
     Summary
         How it ended, and numbers of frames.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments.devices import open_devices
+    >>> from dbthermal.instruments.session import Camera, Device, Session
+    >>> camera = Camera(Device("sim://camera/wide", "v4l2:///dev/video0"))
+    >>> session = Session("demo", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
+    >>> folder, small = getfixture("tmp_path"), Limits(reserve=0)
+    >>> with open_devices(session) as devices:
+    ...     devices.prepare()
+    ...     summary = record_scene(devices, folder / "demo.zarr", limits=small)
+    >>> summary.ended, summary.totals["8-14"]["lost"]
+    ('duration', 0)
     """
     identities, expected = devices.identities(), devices.session.filtered
     if devices.wheel is not None and devices.wheel.band() != expected:

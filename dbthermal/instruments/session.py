@@ -52,6 +52,11 @@ from dbthermal.instruments.camera import KINDS
 
 __all__ = ["Blackbody", "Camera", "Device", "Session"]
 
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
@@ -81,20 +86,11 @@ class Device:
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
-    """
-    One camera: addresses of its frames and of its command port, if it has one.
-
-    Attributes
-    ----------
-    video, control : Device
-        Addresses.
-    kind : str
-        One of `dbthermal.instruments.camera.KINDS`.
-    """
+    """One camera: addresses of its frames and of its command port, if any, and its kind."""
 
     video: Device
     control: Device | None = None
-    kind: str = "boson"
+    kind: str = "boson"  # one of `dbthermal.instruments.camera.KINDS`
 
     @field_validator("kind")
     @classmethod
@@ -257,11 +253,11 @@ class Session:
         try:
             session: Self = TypeAdapter(cls).validate_python(content)
         except ValidationError as error:
-            told = [
+            messages = [
                 f"{files.get(str(one['loc'][0]), path) if one['loc'] else path}: {_message(one)}"
                 for one in error.errors()
             ]
-            raise ValueError("\n".join(told)) from None
+            raise ValueError("\n".join(messages)) from None
         return session
 
 
@@ -293,7 +289,7 @@ def _message(error: Any) -> str:
     """One error of pydantic as a sentence: place, value and rule."""
     place = ".".join(str(part) for part in error["loc"] if part != "[key]")
     if error["type"] == "missing":
-        return f"Missing '{place}'. Must be given."
+        return f"Missing '{place}'. Must be set."
     if error["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
         return f"Unknown key '{place}'. Must be one of those in dbthermal.instruments.session."
     rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"])

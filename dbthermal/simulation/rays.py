@@ -15,7 +15,7 @@ import numpy.typing as npt
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-__all__ = ["MISSED", "Camera", "Caster", "Hits", "mirror", "unit"]
+__all__ = ["MISSED", "Camera", "Caster", "Hits", "mirror", "unit", "vertex_normals"]
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -160,7 +160,7 @@ class Caster:
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.faces = np.asarray(mesh.faces)
         self.corners: Array = np.asarray(mesh.vertices)[self.faces]
-        self.normals: Array = np.asarray(mesh.vertex_normals)[self.faces]
+        self.normals = vertex_normals(mesh)[self.faces]
         self.face_normals: Array = np.asarray(mesh.face_normals)
         self.size = float(mesh.scale)
         self._intersector = RayMeshIntersector(mesh)
@@ -229,6 +229,14 @@ def unit(vectors: npt.ArrayLike) -> Array:
     """Vectors (..., 3) divided by their length."""
     vectors = np.asarray(vectors, dtype=np.float64)
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def vertex_normals(mesh: trimesh.Trimesh) -> Array:
+    """Unit normals (vertex, 3), the mean of the faces around a vertex weighted by their areas."""
+    total = np.zeros((len(mesh.vertices), 3))
+    area_vectors = np.asarray(mesh.face_normals) * np.asarray(mesh.area_faces)[:, np.newaxis]
+    np.add.at(total, np.asarray(mesh.faces), area_vectors[:, np.newaxis, :])
+    return unit(total)
 
 
 def mirror(directions: Array, normals: Array) -> Array:

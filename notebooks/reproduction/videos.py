@@ -24,28 +24,11 @@ SMOOTHING: Final = 1.0
 
 def inputs(files: Mapping[str, Path], name: str, first: int, last: int) -> xr.DataArray:
     """
-    Both bands of a scene.
+    Both bands (band, time, y, x) of a scene, in [0, 1], with `radiometric = 0`.
 
-    Parameters
-    ----------
-    files : mapping
-        Name to path, from `manifest.local("scenes")`.
-    name : str
-        Scene, "coffeepot" or "glass-plate".
-    first, last : int
-        First frame and the one after the last.
-
-    Returns
-    -------
-    DataArray
-        (band, time, y, x) in [0, 1], `radiometric = 0`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the scene has no such video.
-    ValueError
-        If the two videos differ in shape, or are shorter than `last`.
+    Of the files of `manifest.local("scenes")`, the scene "coffeepot" or "glass-plate", from the
+    first frame to the one before the last. Raises a FileNotFoundError without such a video, a
+    ValueError if the two videos differ in shape or are too short.
     """
     movies = []
     for number in BANDS.values():
@@ -68,23 +51,11 @@ def inputs(files: Mapping[str, Path], name: str, first: int, last: int) -> xr.Da
 
 def authors_reflection(files: Mapping[str, Path], name: str, kind: str, width: int) -> xr.Dataset:
     """
-    Magnitude of the background's change as the authors found it.
+    Magnitude of the background's change as published by the authors.
 
-    Parameters
-    ----------
-    files : mapping
-        Name to path.
-    name : str
-        Scene.
-    kind : {"uncalib", "calib"}
-        With the emissivities estimated, or calibrated.
-    width : int
-        Width of the input video [pixel]; a printed bar lies beyond it.
-
-    Returns
-    -------
-    Dataset
-        `value` (time, y, x) in [0, 1], in units of the frame's own bar, and `valid`.
+    `kind` is "uncalib" or "calib", by estimated or calibrated emissivities; beyond the width of the
+    input video [pixel] lies a printed bar. `value` (time, y, x) in [0, 1], in units of the frame's
+    own bar, and `valid`.
     """
     path = _file(files, f"{name}_{kind}_Tbdiff_video.mp4")
     return readers.masked_palette_video(path, "turbo", width)
@@ -92,28 +63,11 @@ def authors_reflection(files: Mapping[str, Path], name: str, kind: str, width: i
 
 def agreement(reflection: xr.DataArray, theirs: xr.Dataset, strongest: int) -> xr.DataArray:
     """
-    Correlation of our map of the reflection with the authors', where it is strongest.
+    Correlation (time) [1] of our reflection's magnitude with the authors', where it is strongest.
 
-    Parameters
-    ----------
-    reflection : DataArray
-        (time, y, x), from `separation.uncalibrated_reflection`; its magnitude is compared,
-        smoothed by `SMOOTHING`.
-    theirs : Dataset
-        From `authors_reflection`, with as many frames.
-    strongest : int
-        Number of frames, those in which our reflection has the largest mean square on the object.
-
-    Returns
-    -------
-    DataArray
-        Pearson's correlation (time) [1] over the pixels that the authors' map covers in all of
-        these frames, in their order in time.
-
-    Raises
-    ------
-    ValueError
-        If the frames differ in number or size.
+    Our reflection (time, y, x), smoothed by `SMOOTHING`, is compared over the pixels that the
+    authors' map covers in all of the frames in which its mean square on the object is strongest.
+    Raises a ValueError if the frames differ in number or size.
     """
     if theirs["value"].shape != reflection.shape:
         raise ValueError(

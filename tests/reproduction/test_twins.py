@@ -275,10 +275,13 @@ def test_thermocouples_read_the_mean_under_the_bead() -> None:
 
 
 def test_a_probe_is_on_its_ring() -> None:
-    """A probe is at its height and angle on a wall, halfway between two rings, too."""
-    cone = surfaces.revolved([(0.05, 0.0), (0.03, 0.1)], 0.005)
-    place = surfaces.on_wall(cone, 0.05, 30.0)
-    np.testing.assert_allclose(place, [0.02, -0.04 * np.sqrt(0.75), 0.05], rtol=0, atol=1e-12)  # m
+    """A probe is at its angle on the ring of vertices that is nearest to its height."""
+    cone = surfaces.revolved([(0.05, 0.0), (0.03, 0.1)], 0.03)
+    place = np.array(surfaces.on_wall(cone, 0.013, 30.0))
+    assert place[2] in cone.vertices[:, 2]
+    radius = 0.05 - 0.2 * place[2]
+    expected = radius * np.array([0.5, -np.sqrt(0.75)])
+    np.testing.assert_allclose(place[:2], expected, rtol=0, atol=1e-12)  # m
 
 
 def vessel(**changes: object) -> Vessel:

@@ -123,9 +123,9 @@ def judged(labels: Array, second: Array) -> tuple[float, int]:
     ("name", "shape", "seed"),
     [
         ("side by side", (96, 128), 4),
-        ("oblique", (144, 192), 5),
-        ("disc", (144, 192), 6),
-        ("one", (96, 128), 7),
+        pytest.param("oblique", (144, 192), 5, marks=pytest.mark.slow),
+        pytest.param("disc", (144, 192), 6, marks=pytest.mark.slow),
+        pytest.param("one", (96, 128), 7, marks=pytest.mark.slow),
     ],
 )
 def test_borders_are_kept(name: str, shape: tuple[int, int], seed: int) -> None:

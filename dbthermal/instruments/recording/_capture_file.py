@@ -36,7 +36,7 @@ from dbthermal.instruments.camera import (
     Shutter,
     next_shutter,
 )
-from dbthermal.schema import EXPOSURE_TIME, STAGES, Variable
+from dbthermal.schema import EXPOSURE_TIME, FRAME_FLAGS, STAGES, Variable
 
 CHUNK: Final = 30
 """Frames of a chunk: half a second at 60 Hz, the most that a kill may cost."""
@@ -119,13 +119,13 @@ ABOUT: Final = (
     "each has its exposure_time, and the coordinate time is the first band's, without holes. "
     "exposure_time, host_time and log_time count from attribute clock_origin on the host's "
     "monotonic clock, which was attribute started in UTC; device_time is as the device gave it. "
-    "exposure_time is NaN where a frame is no measurement; frame_flags say why. A band has the "
-    "number of frames that frames_written says; what follows is its last one, repeated. "
-    "Note n of the log is of log_sources[log_source], and its log_value is what log_kind says; a "
-    "reading is in the unit that log_units says. totals: frames of each band, those lost by the "
-    "driver's numbers, refused by a full queue, damaged. ended: why it ended; complete: as was "
-    "planned; closed: false if it is being written or was cut short, and then only frames_written "
-    "and log_written are valid."
+    "exposure_time is NaN if a frame is no measurement; frame_flags has the reason. frames_written "
+    "is the number of frames of each band; after them its last one is repeated. Note n of the log "
+    "is of log_sources[log_source], and log_kind explains its log_value; log_units has the units "
+    "of readings. totals: frames of each band, those lost by the driver's numbers, refused by a "
+    "full queue, damaged. ended: reason of the end; complete: ended as planned; closed: false "
+    "while it is being written or if it was cut short: then only frames_written and log_written "
+    "are valid."
 )
 """Explanation for a reader of the store: its attribute ``comment``."""
 
@@ -146,7 +146,7 @@ VARIABLES: Final = MappingProxyType(
         "device_time": _of_frames("float64", "s", "device's stamp of the frame, as it came"),
         "host_time": _of_frames("float64", "s", "arrival at the host, since clock_origin"),
         "sequence": _of_frames("int64", "1", "number of the frame by its driver"),
-        "frame_flags": _coded(_of_frames("uint16", "1", "flags, 0 for a good frame"), MEANINGS),
+        "frame_flags": _coded(FRAME_FLAGS, MEANINGS),
         "log_time": _of_log("float64", "time of the note, since clock_origin", "s"),
         "log_kind": _coded(_of_log("int16", "kind of the note"), NOTES),
         "log_source": _of_log("int16", "source of the note: place in attribute log_sources"),

@@ -157,23 +157,21 @@ def bench_series(
         As `open_sweep`; or if a region has no pixel or a band no good frame.
     """
     sweep = _find(folder, name)
-    columns: dict[str, list[dict[str, Any]]] = {material: [] for material in region}
+    series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
     for paths in sweep.steps():
         background = _agreed(paths, BLACKBODY, sweep.stability)
-        captures = list(_bands(paths))
+        captures = dict(_bands(paths))
         for material, place in region.items():
-            columns[material].append(
-                {
-                    "counts": {
-                        band: _mean(capture, band, place, correction) for band, capture in captures
-                    },
-                    "object_temperature": _agreed(paths, material, sweep.stability),
-                    "background_temperature": background,
-                }
-            )
+            measured = {
+                "object_temperature": _agreed(paths, material, sweep.stability),
+                "background_temperature": background,
+            }
+            counts = [_mean(captures[band], band, place, correction) for band in captures]
+            one = xr.Dataset({"counts": ("band", counts), **measured}, {"band": list(captures)})
+            series[material].append(one)
     return {
-        material: _contact(rows).assign_attrs(sweep.attrs, material=material)
-        for material, rows in columns.items()
+        material: _contact(measurements).assign_attrs(sweep.attrs, material=material)
+        for material, measurements in series.items()
     }
 
 
@@ -253,18 +251,9 @@ def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset
     return mean
 
 
-def _contact(rows: list[dict[str, Any]]) -> xr.Dataset:
+def _contact(measurements: list[xr.Dataset]) -> xr.Dataset:
     """Series of one material, stage `contact`, from its measurements."""
-    variables = schema.STAGES["contact"]
-    bands = list(rows[0]["counts"])
-    counts = [[row["counts"][band] for row in rows] for band in bands]
-    temperatures = {
-        name: ("measurement", [row[name] for row in rows], variables[name].attrs)
-        for name in ("object_temperature", "background_temperature")
-    }
-    attrs = variables["counts"].attrs
-    series = xr.Dataset(
-        {"counts": (("band", "measurement"), np.array(counts), attrs), **temperatures},
-        coords={"band": bands},
-    )
+    series = xr.concat(measurements, "measurement").transpose("band", "measurement")
+    for name, variable in schema.STAGES["contact"].items():
+        series[name].attrs = variable.attrs
     return schema.check(series, "contact")

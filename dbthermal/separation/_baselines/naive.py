@@ -16,7 +16,7 @@ al. 2000, doi:10.1007/3-540-44480-7_21), for all pixels and starts at once.
 """
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +25,9 @@ from scipy.special import expit, logit
 from dbthermal import mixing, planck
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Tile
+from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
 # Damping of the first step, relative to the diagonal of the normal equations, and its range; the
 # Schur complement is proportional to the damping, and is rounding below the least.
@@ -37,8 +38,6 @@ _EASIER: Final = 0.2
 _HARDER: Final = 8.0
 # A step that changes a logit by more is not taken: it would end where the logit's slope is nil.
 _LONGEST: Final = 3.0
-
-Columns = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -91,37 +90,28 @@ class _State:
     objective: Array  # (column,)
     active: Mask  # (column,)
 
-    def select(self, columns: Mask | Columns) -> "_State":
+    def select(self, columns: npt.NDArray[Any]) -> "_State":
         return _State(**{name: value[..., columns] for name, value in vars(self).items()})
 
 
-def separate(tile: Tile, settings: NaiveSettings, truth: Array | None = None) -> Estimate:
+def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
     """
     Temperatures and emissivities of one tile, without deviations.
 
-    With the true object temperature (time, pixel) [K], which only an experiment has, the start
-    nearest to it is kept instead of that of least objective. `not_converged` where the kept start
-    was still improving at the last step, or has no finite objective.
+    `not_converged` where the kept start was still improving at the last step, or has no finite
+    objective.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         state = _search(tile, settings)
-        kept = state.select(_choice(state, settings, truth))
+        cost = np.where(np.isfinite(state.objective), state.objective, np.inf)
+        pixels = tile.signals.shape[-1]
+        start = np.argmin(cost.reshape(settings.starts, pixels), axis=0)
+        kept = state.select(start * pixels + np.arange(pixels))
         (temperature, background), emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
     status = status_bits({Status.NOT_CONVERGED: kept.active | lost})
     estimate = point_estimate(temperature, status, emissivity, background)
     return estimate.undefine(lost, lost, lost).check_range(tile.curves[0], deviations=False)
-
-
-def _choice(state: _State, settings: NaiveSettings, truth: Array | None) -> Columns:
-    """Column of the start that each pixel keeps: of least objective, or nearest the truth."""
-    pixels = state.objective.size // settings.starts
-    cost = state.objective.reshape(settings.starts, pixels)
-    if truth is not None:
-        temperature = np.exp(state.logarithms[0]).reshape(-1, settings.starts, pixels)
-        cost = np.mean((temperature - truth[:, np.newaxis]) ** 2, axis=0)
-    start = np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=0)
-    return np.asarray(start * pixels + np.arange(pixels))
 
 
 def _search(tile: Tile, settings: NaiveSettings) -> _State:

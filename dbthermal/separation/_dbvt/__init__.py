@@ -23,30 +23,19 @@ class DbvtSettings:
 
     Attributes
     ----------
-    smoothness : float
-        :math:`\gamma_1`, of the squared second differences in units of `curvature` [1].
-    huber : float
-        :math:`\gamma_2`, of the Huber loss, which is divided by its threshold: beyond it the slope
-        is 1, whatever the threshold [1].
-    reconstruction : float
-        :math:`\gamma_3`, of the squared reconstruction error in units of the second band's noise
-        [1]: the normalised error, its weight set by the signal-to-noise ratio.
-    noise : float
-        :math:`\gamma_4`, of the noise's square in units of each band's own noise [1]. With 0 no
-        noise is modelled: it is held at zero, and its mean with it.
-    noise_mean : float
-        :math:`\gamma_5`, of the square of the noise's mean over time, in the same units [1].
+    smoothness, huber, reconstruction, noise, noise_mean : float
+        Weights :math:`\gamma_1` to :math:`\gamma_5` [1]: of the squared second differences in units
+        of `curvature`; of the Huber loss over its threshold, so that its slope beyond is 1; of the
+        squared reconstruction error in units of the second band's noise; of the noise's square in
+        units of each band's own (with 0 the noise is held at zero); of the square of its mean.
     curvature : float
         Second derivative of a smooth signal that costs 1 [K/s^2].
-    huber_threshold : float
-        Where the Huber loss turns from square to linear, in units of each band's noise [1].
-    deviation_floor : float
-        Least deviation by which a signal is divided, in units of its noise [1].
-    stages : int
-        Stages of the homotopy, from a small share of the reconstruction's weight to all of it; with
-        1 all of it counts from the first step on.
-    stage_steps : int
-        Steps in each stage but the last.
+    huber_threshold, deviation_floor : float
+        Where the Huber loss turns from square to linear, and least deviation by which a signal is
+        divided, in units of each band's noise [1].
+    stages, stage_steps : int
+        Stages of the homotopy, from a small share of the reconstruction's weight to all of it, and
+        steps in each but the last; with 1 stage all of it counts from the first step on.
     first_share : float
         Weight of the normalised reconstruction error in the first stage, as a fraction of
         `reconstruction`; in the last it counts in units of the noise, not of the deviation [1].
@@ -55,10 +44,8 @@ class DbvtSettings:
     tolerance, patience : float, int
         A pixel is done when no step lowers its objective by more than this fraction [1], so many
         times in a row.
-    largest_step : float
-        Largest change of an emissivity in a step [1].
-    margin : float
-        Least distance of an emissivity from 0 and 1 [1].
+    largest_step, margin : float
+        Largest change of an emissivity in a step, and its least distance from 0 and 1 [1].
     start : {"random", "subspace"}
         Emissivities uniform in (0, 1), as published; or emissivities and object of the subspace
         separator, and at random where it has none.
@@ -74,10 +61,8 @@ class DbvtSettings:
         Signals without their estimated noise, or as measured.
     batch : int
         Pixels in a tile.
-    device : str
-        Where to compute, in torch's words: "cpu", "cuda".
-    precision : {"float64", "float32"}
-        Floating-point type.
+    device, precision : str, {"float64", "float32"}
+        Where to compute, in torch's words ("cpu", "cuda"), and floating-point type.
 
     Raises
     ------
@@ -134,12 +119,6 @@ class DbvtSettings:
             raise ValueError(
                 f"Invalid margin {self.margin} of method 'dbvt'. Must lie in (0, 0.5)."
             )
-        if self.device != "cpu":
-            _require_device(self.device)
-
-
-def _require_device(name: str) -> None:
-    """Refuse a CUDA device where there is none."""
-    torch = importlib.import_module("torch")
-    if torch.device(name).type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"Invalid device '{name}' of method 'dbvt'. No CUDA device is available.")
+        cuda = self.device.startswith("cuda")
+        if cuda and not importlib.import_module("torch").cuda.is_available():
+            raise ValueError(f"Invalid device '{self.device}' of method 'dbvt'. CUDA is missing.")

@@ -274,8 +274,10 @@ def whittaker(diagonal: Tensor, stiffness: Tensor, right: Tensor) -> Tensor:
     definite, solved by the factors :math:`L\,\mathrm{diag}(p)\,L^T` with a recursion over time.
     """
     frames = diagonal.shape[0]
-    main = (diagonal + _with_ends(frames, (1.0, 5.0), 6.0, diagonal) * stiffness).unbind()
-    near = (_with_ends(frames - 1, (-2.0,), -4.0, diagonal) * stiffness).unbind()
+    # D^T D has the diagonal 1, 5, 6, ..., 6, 5, 1, beside it -2, -4, ..., -4, -2, and then 1.
+    center, beside = diagonal.new_full((frames, 1), 6.0), diagonal.new_full((frames - 1, 1), -4.0)
+    center[[0, -1]], center[[1, -2]], beside[[0, -1]] = 1.0, 5.0, -2.0
+    main, near = (diagonal + center * stiffness).unbind(), (beside * stiffness).unbind()
     solved, pivots = list(right.unbind()), [main[0]]
     below, further = [torch.zeros_like(stiffness)], [torch.zeros_like(stiffness)]
     for t in range(1, frames):
@@ -296,11 +298,3 @@ def whittaker(diagonal: Tensor, stiffness: Tensor, right: Tensor) -> Tensor:
     for t in range(frames - 3, -1, -1):
         solved[t] = solved[t] - below[t + 1] * solved[t + 1] - further[t + 2] * solved[t + 2]
     return torch.stack(solved)
-
-
-def _with_ends(size: int, ends: tuple[float, ...], middle: float, like: Tensor) -> Tensor:
-    """Column of one number but for its two ends."""
-    column = torch.full((size, 1), middle, dtype=like.dtype, device=like.device)
-    for place, value in enumerate(ends):
-        column[place] = column[-1 - place] = value
-    return column

@@ -1,4 +1,4 @@
-"""Seeded experiments that print what they measure: the separation's accuracy case by case."""
+"""Seeded experiments on the separation's accuracy, one simulated case at a time."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -29,12 +29,12 @@ _OPTIONAL: Final = frozenset(
 @dataclass(frozen=True)
 class Jump:
     """
-    A change of the object that is no smooth curve, as when a palm is laid on a bulb.
+    Change of the object that is not a smooth curve, as when a palm is laid on a bulb.
 
     Attributes
     ----------
     height : float
-        Change that stays [K].
+        Permanent change [K].
     between : tuple of float
         Earliest and latest beginning, drawn for each pixel [s].
     duration : float
@@ -46,30 +46,14 @@ class Jump:
     duration: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are no jump."""
+        """Check beginning and duration."""
         if not self.between[0] <= self.between[1]:
             raise ValueError(f"Invalid between {self.between} s of a jump. Must not fall.")
         if not self.duration >= 0:
             raise ValueError(f"Invalid duration {self.duration} s of a jump. Must not be negative.")
 
     def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
-        """
-        Draw one realisation for each pixel.
-
-        Parameters
-        ----------
-        time : ndarray, shape (time,)
-            Times [s].
-        pixels : int
-            Number of pixels.
-        rng : Generator
-            Source of the beginnings.
-
-        Returns
-        -------
-        ndarray, shape (time, pixels)
-            What is added to the object temperature [K].
-        """
+        """Change (time, pixel) [K] of the object at times [s], one realisation a pixel."""
         elapsed = time[:, np.newaxis] - rng.uniform(*self.between, pixels)
         if self.duration == 0:
             return np.where(elapsed >= 0, self.height, 0.0)
@@ -80,21 +64,11 @@ def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     """
     Errors of one separation, over the pixels that have a value.
 
-    Parameters
-    ----------
-    truth : Dataset
-        A scene of `simulation`.
-    result : Dataset
-        From `separation.solve`.
-
-    Returns
-    -------
-    Dataset
-        `object_temperature_rmse` [K]: root mean square over time, median over pixels;
-        `emissivity_error` (band) [1]: median magnitude; `object_coverage`, and
-        `emissivity_coverage` (band) [1]: share of errors within one standard deviation, 0.683 if
-        the error bars are true; `good` and `with_temperature` [1]: share of pixels with no flag,
-        and with an object temperature.
+    Of a scene as the truth and a result of `separation.solve`: `object_temperature_rmse` [K], root
+    mean square over time, median over pixels; `emissivity_error` (band) [1], median magnitude;
+    `object_coverage`, and `emissivity_coverage` (band) [1], share of errors within one standard
+    deviation, 0.683 for a calibrated uncertainty; `good` and `with_temperature` [1], share of
+    pixels with no flag, and with an object temperature.
     """
     error = result["object_temperature"] - truth["object_temperature"]
     of_emissivity = abs(result["emissivity"] - truth["emissivity"])
@@ -122,23 +96,10 @@ def efficiency(
     truth: xr.Dataset, result: xr.Dataset, noise: tuple[float, float], order: int
 ) -> float:
     """
-    Scatter of the reflection ratio over its Cramer-Rao bound.
+    Scatter of the reflection ratio over its Cramer-Rao bound [1]; 1 is the best possible.
 
-    Parameters
-    ----------
-    truth : Dataset
-        A scene of one material.
-    result : Dataset
-        From `separation.solve`.
-    noise : tuple of float
-        Standard deviation of the two bands' signals [K].
-    order : int
-        Size of the smooth subspace for the bound, see `limits.ratio_variance`.
-
-    Returns
-    -------
-    float
-        Robust standard deviation of error over bound [1]; 1 is the best possible.
+    Robust standard deviation over the pixels of a scene of one material. The noise is that of the
+    two bands' signals [K], the order the size of the smooth subspace of `limits.ratio_variance`.
     """
     emissivity = truth["emissivity"].values[:, 0, 0]
     background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
@@ -155,31 +116,10 @@ def run_case(
     case: Case, rig: Rig, time: np.ndarray, pixels: int, seed: int
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """
-    Simulate and separate one case.
+    Scene and separation of one case.
 
-    Parameters
-    ----------
-    case : mapping
-        See `simulate`; and `noise_known` (default true) and `response_kind` (default "exact") for
-        the separation.
-    rig : Rig
-        The rig.
-    time : ndarray
-        Times [s].
-    pixels : int
-        Number of pixels.
-    seed : int
-        Of the random numbers.
-
-    Returns
-    -------
-    tuple of Dataset
-        The scene, and the result.
-
-    Raises
-    ------
-    ValueError
-        As `simulate`.
+    The case as for `simulate`, and `noise_known` (default true) and `response_kind` (default
+    "exact") for the separation; times [s].
     """
     scene, capture, response = simulate(case, rig, time, pixels, seed)
     if not case.get("noise_known", True):
@@ -210,14 +150,12 @@ def simulate(
     Returns
     -------
     tuple of Dataset
-        The scene, as it is when the first band is exposed; the capture, without stamps; the
-        response.
+        The scene at the first band's exposures; the capture, without stamps; the response.
 
     Raises
     ------
     ValueError
-        If the case has a key that is not listed here or in `run_case`, or lacks one; or a value is
-        none of those described.
+        If the case has an unknown key, lacks one, or has a value other than described.
     """
     _check_keys(case)
     rng = np.random.default_rng(seed)
@@ -271,7 +209,7 @@ def _finer(time: np.ndarray, later: int) -> Array:
 def _draw(
     case: Case, bands: tuple[str, ...], time: Array, pixels: int, rng: np.random.Generator
 ) -> xr.Dataset:
-    """The scene of a case: independent pixels, with what the case changes of them."""
+    """Scene of a case: independent pixels, with the changes of the case."""
     pair = np.asarray(case["emissivity"], dtype=np.float64)
     emissivity = xr.DataArray(pair, dims="band", coords={"band": list(bands)})
     background = Background(**case.get("background", {}))
@@ -301,23 +239,7 @@ def sweep(
     *,
     order: int = 5,
 ) -> xr.Dataset:
-    """
-    Run and score many cases, all with the same seed.
-
-    Parameters
-    ----------
-    cases : iterable of mapping
-        See `run_case`; each with a name `case`.
-    rig, time, pixels, seed
-        See `run_case`.
-    order : int
-        See `efficiency`.
-
-    Returns
-    -------
-    Dataset
-        Variables of `score`, and `efficiency` [1], over `case`.
-    """
+    """Scores (see `score`) and `efficiency` [1] over `case`, all with the same seed."""
     rows, names = [], []
     for case in cases:
         scene, result = run_case(case, rig, time, pixels, seed)

@@ -1,4 +1,4 @@
-"""All methods on the same simulated pixels, over materials and noise: the paper's comparison."""
+"""Comparison of all methods on the same simulated pixels, over materials and noise."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -22,7 +22,7 @@ Options = Mapping[str, Any]
 @dataclass(frozen=True)
 class Plate:
     """
-    The scene of `compare`.
+    Size of the scene of `compare`.
 
     Attributes
     ----------
@@ -57,31 +57,30 @@ def compare(
     """
     Errors of several methods on one simulated scene: a heated plate, people walking by.
 
-    The scene is an image, for methods that look at a pixel's neighbours. All are scored on the
-    same pixels, drawn from those in which the reflection moves by more than `MOVING`; methods that
-    treat each pixel alone are given these only. The noise is known to all.
+    The scene is an image, for methods that use a pixel's neighbours. All are scored on the same
+    pixels, drawn from those in which the reflection varies by more than `MOVING`; methods that
+    treat each pixel alone get these only. The noise is known to all.
 
     Parameters
     ----------
     emissivity : sequence of float
-        Of the plate in the two bands [1].
+        Emissivity of the plate in the two bands [1].
     noise : sequence of float
         Standard deviation of the two bands' signals [K].
     variants : mapping
-        Label -> `method` of `separation.solve` and fields of its settings; "calibrated" is given
-        the true emissivities.
+        Label -> `method` of `separation.solve` and fields of its settings; "calibrated" gets the
+        true emissivities.
     plate : mapping
         Fields of `Plate`.
     pixels : int
         Number of pixels that are scored.
     seed : int
-        Of scene, noise, pixels and random starts.
+        Seed of scene, noise, pixels and random starts.
 
     Returns
     -------
     Dataset
-        `object_temperature_rmse` (variant, pixel) [K], NaN where a frame has no value;
-        `emissivity_error` (variant, band, pixel) [1], a magnitude; `status` (variant, pixel).
+        Variables of `judge` (variant, ...).
     """
     rng, settings = np.random.default_rng(seed), Plate(**plate)
     rig = Rig(bands=settings.bands, noise=tuple(noise))
@@ -107,20 +106,10 @@ def compare(
 
 def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     """
-    Errors of one separation, pixel by pixel.
+    Errors of one separation, pixel by pixel, of a truth one row high.
 
-    Parameters
-    ----------
-    truth : Dataset
-        A scene of `simulation`, one row high.
-    result : Dataset
-        From `separation.solve`.
-
-    Returns
-    -------
-    Dataset
-        `object_temperature_rmse` (pixel) [K], NaN where a frame has no value; `emissivity_error`
-        (band, pixel) [1]; `status` (pixel).
+    `object_temperature_rmse` (pixel) [K], NaN where a frame has no value; `emissivity_error`
+    (band, pixel) [1], a magnitude; `status` (pixel).
     """
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     of_emissivity = abs(result["emissivity"] - truth["emissivity"])
@@ -139,22 +128,11 @@ def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
     """
     Median errors over pixels, of every variant over the pixels that the default can solve.
 
-    A pixel that a variant loses there counts as its worst, and does not flatter it.
-
-    Parameters
-    ----------
-    comparison : Dataset
-        Variables of `compare` over any further dims; over `seed` too the median is taken.
-    default : str
-        The variant that decides which pixels count.
-
-    Returns
-    -------
-    Dataset
-        `object_temperature_rmse` [K] and `emissivity_error` (band) [1]: medians, NaN where the
-        default has no pixel or the variant loses half of them; `wrong` [1]: share of these pixels
-        with an emissivity off by more than `WRONG`, or lost; `solved` [1]: share of all pixels with
-        an object temperature; `good` [1]: share of all without any flag.
+    A pixel that a variant loses there counts as its worst. Over `seed` too the median is taken.
+    `object_temperature_rmse` [K] and `emissivity_error` (band) [1]: medians, NaN where the default
+    has no pixel or the variant loses half of them; `wrong` [1]: share of these pixels with an
+    emissivity error above `WRONG`, or lost; `solved` [1]: share of all pixels with an object
+    temperature; `good` [1]: share of all without any flag.
     """
     over = [dim for dim in ("pixel", "seed") if dim in comparison.dims]
     known = comparison["object_temperature_rmse"].notnull()
@@ -204,18 +182,9 @@ def _known(scene: xr.Dataset, options: Options) -> dict[str, Any]:
 
 def arguments(variant: Options) -> dict[str, Any]:
     """
-    Arguments of `separation.solve` for a variant of a method.
+    Arguments of `separation.solve` for a variant, with the settings' fields in their record.
 
-    Parameters
-    ----------
-    variant : mapping
-        `method`, fields of its settings, and other arguments of `solve`, side by side as a table
-        of parameters has them.
-
-    Returns
-    -------
-    dict
-        The same, with the fields of the settings in their record.
+    The variant has `method`, fields of its settings, and other arguments of `solve`, side by side.
     """
     kind = separation.get_method(variant["method"]).settings
     names = set() if kind is None else {field.name for field in fields(kind)} & variant.keys()

@@ -19,12 +19,11 @@ class Bench(World):
     rng : Generator
         Source of the errors, and of the samples' temperatures.
     reading_std : mapping
-        Standard deviation of one reading of what is named, as in `thermocouples` [K]; what is not
-        named is read without error.
+        Standard deviation of one reading [K] of the names in `thermocouples`; others have no error.
     samples : mapping, optional
         Sample to the lowest and highest temperature to which it is heated [K].
     touched : mapping, optional
-        What else a thermocouple touches, to its temperature (time) [K] over the scene's time [s].
+        Other objects of thermocouples, to their temperature (time) [K] over the scene's time [s].
     **world
         As for `World`.
     """
@@ -53,24 +52,10 @@ class Bench(World):
         touched: Mapping[str, xr.DataArray] | None = None,
     ) -> Self:
         """
-        Bench of an emulated session; its scene waits for `begin`.
+        Bench of an emulated session with its cameras, filters and thermocouples; waits for `begin`.
 
-        Parameters
-        ----------
-        session : Session
-            Its cameras, filters and thermocouples are on the bench.
-        rng : Generator
-            As for `Bench`.
-        errors : mapping
-            Standard deviation of one reading of the ``blackbody`` and of any other
-            ``thermocouple`` [K].
-        samples, touched : mapping, optional
-            As for `Bench`.
-
-        Returns
-        -------
-        Bench
-            For `dbthermal.instruments.devices.open_devices`.
+        The errors are standard deviations of one reading of the ``blackbody`` and of any other
+        ``thermocouple`` [K]; samples and touched as for `Bench`.
         """
         std = dict.fromkeys(session.thermocouples.values(), errors["thermocouple"])
         std["blackbody"] = errors["blackbody"]
@@ -79,38 +64,14 @@ class Bench(World):
         return bench
 
     def step(self, temperature: float) -> None:
-        """
-        Set the blackbody, and heat every sample to a temperature of its own.
-
-        Parameters
-        ----------
-        temperature : float
-            Of the blackbody [K].
-        """
+        """Set the blackbody [K], and heat every sample to a temperature of its own."""
         self.blackbody_temperature = temperature
         self._temperatures = {
             name: float(self._rng.uniform(*ends)) for name, ends in self._samples.items()
         }
 
     def thermocouple_temperature(self, channel: int) -> float:
-        """
-        Temperature of the tip of one thermocouple, with the error of one reading.
-
-        Parameters
-        ----------
-        channel : int
-            Of the logger.
-
-        Returns
-        -------
-        float
-            Temperature [K]; NaN if it is open or there is none.
-
-        Raises
-        ------
-        KeyError
-            If it is at something that the scene does not have.
-        """
+        """Temperature of one thermocouple's tip with the error of one reading [K]; NaN if open."""
         std = self._std.get(self.thermocouples.get(channel, "open"), 0.0)
         with self.lock:
             return super().thermocouple_temperature(channel) + std * float(self._rng.normal())

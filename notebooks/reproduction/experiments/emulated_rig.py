@@ -1,9 +1,8 @@
-"""What the cameras of the emulated rig see, from the simulation and with its truth.
+"""Frames of the emulated rig's cameras, from the simulation and with its truth.
 
-The emulators of `dbthermal.instruments.emulated` know positions and protocols, and the simulation
-knows what a scene looks like; here they meet. The pictures of `Views` are mixed, and given noise,
-fixed pattern and 16 bits, frame by frame when a camera takes them, from the temperatures that the
-world has at that moment. Everything here is simulated.
+The frames of `Views` are mixed, and given noise, fixed pattern and 16 bits, one by one when a
+camera takes them, from the temperatures that the emulated world has at that moment. Everything
+here is simulated.
 """
 
 import shutil
@@ -34,7 +33,7 @@ _TRUTH: Final = "truth_"
 @dataclass(frozen=True)
 class Views:
     """
-    What the cameras of a simulated rig see.
+    Views of the cameras of a simulated rig.
 
     Attributes
     ----------
@@ -43,7 +42,7 @@ class Views:
     detector : Dataset
         From `simulation.pattern`.
     seed : int
-        Of the noise.
+        Seed of the noise.
     response : Dataset
         The rig's.
     """
@@ -54,43 +53,20 @@ class Views:
     response: xr.Dataset = field(init=False)
 
     def __post_init__(self) -> None:
-        """Work out the rig's response, once."""
+        """Compute the rig's response, once."""
         object.__setattr__(self, "response", self.rig.response())
 
     def blackbody(self, world: World) -> dict[str, Picture]:
-        """
-        Pictures of the world's blackbody, which fills the view.
-
-        Parameters
-        ----------
-        world : World
-            Its `blackbody_temperature` must lie within the rig's range.
-
-        Returns
-        -------
-        dict
-            Band to picture.
-        """
+        """Frames, by band, of the world's blackbody, which fills the view."""
         curves = self._curves().items()
         return self._pictures({band: _bench(world, it, {}, {}, self._shape) for band, it in curves})
 
     def samples(self, world: World, emissivity: xr.DataArray, places: Places) -> dict[str, Picture]:
         """
-        Pictures of samples that reflect the world's blackbody, as on the emissivity bench.
+        Frames, by band, of samples that reflect the world's blackbody, as on the emissivity bench.
 
-        Parameters
-        ----------
-        world : World
-            Its scene has a temperature for each material.
-        emissivity : DataArray
-            (material, band) [1].
-        places : mapping
-            Material to its rows and columns; elsewhere is the blackbody itself.
-
-        Returns
-        -------
-        dict
-            Band to picture.
+        The world has a temperature for each material; emissivity is (material, band) [1]; `places`
+        are the rows and columns of each material, elsewhere is the blackbody itself.
         """
         looks = {}
         for band, curve in self._curves().items():
@@ -99,19 +75,7 @@ class Views:
         return self._pictures(looks)
 
     def movie(self, scene: xr.Dataset) -> dict[str, Picture]:
-        """
-        Pictures of a scene, on the line between its frames.
-
-        Parameters
-        ----------
-        scene : Dataset
-            From the simulation: evenly sampled from time 0 on.
-
-        Returns
-        -------
-        dict
-            Band to picture, for each band of the scene.
-        """
+        """Frames, by band, of an evenly sampled scene from time 0 on, linear between its frames."""
         curves = self._curves()
         names = [str(name) for name in scene["band"].values]
         return self._pictures({name: _shown(scene, curves[name], name) for name in names})
@@ -127,7 +91,7 @@ class Views:
         return {band: self._picture(band, look) for band, look in looks.items()}
 
     def _picture(self, band: str, look: Look) -> Picture:
-        """What is looked at, with noise, fixed pattern and 16 bits."""
+        """Counts of a view with noise, fixed pattern and 16 bits."""
         rng = np.random.default_rng([self.seed, self.rig.bands.index(band)])
         noise = float(self.response["noise"].sel(band=band))
         detector = self.detector.sel(band=band)
@@ -183,24 +147,10 @@ def _shown(scene: xr.Dataset, curve: Curve, band: str) -> Look:
 
 def shown(scene: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
     """
-    Truth of a scene at the times of a capture.
+    Truth of a scene at the times of a capture, linear between its frames.
 
-    Parameters
-    ----------
-    scene : Dataset
-        As for `Views.movie`, with attribute ``began``, when time 0 was on the host's clock [s].
-    capture : Dataset
-        From `dbthermal.instruments.recording.open_capture`, or made of it.
-
-    Returns
-    -------
-    Dataset
-        The scene on the line between its frames, at the capture's times and with its coordinates.
-
-    Raises
-    ------
-    ValueError
-        If the capture begins before the scene, or goes on after it.
+    The scene as for `Views.movie`, with attribute ``began``, its time 0 on the host's clock [s].
+    Raises a ValueError if the capture begins before the scene, or goes on after it.
     """
     times = capture["time"] + (capture.attrs["clock_origin"] - scene.attrs["began"])
     found = scene.interp(time=times.values, assume_sorted=True).assign_coords(time=capture["time"])
@@ -213,36 +163,13 @@ def shown(scene: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
 
 
 def keep_truth(folder: Path, record: Mapping[str, Any], **truth: xr.Dataset) -> None:
-    """
-    Keep beside recordings what was simulated.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the recordings.
-    record : mapping
-        Provenance.
-    **truth : Dataset
-        By name.
-    """
+    """Keep the truth, by name, beside recordings in their folder, with its provenance."""
     for name, dataset in truth.items():
         store.save(dataset, folder / f"{_TRUTH}{name}.zarr", record)
 
 
 def truth(folder: Path) -> dict[str, xr.Dataset]:
-    """
-    Open what was simulated, if it was.
-
-    Parameters
-    ----------
-    folder : Path
-        Of recordings.
-
-    Returns
-    -------
-    dict
-        As given to `keep_truth`; empty for recordings of hardware.
-    """
+    """Open the truth that `keep_truth` left, by name; empty for recordings of hardware."""
     found = sorted(folder.glob(f"{_TRUTH}*.zarr"))
     return {path.stem.removeprefix(_TRUTH): store.open_dataset(path).load() for path in found}
 
@@ -251,15 +178,8 @@ def clear(folder: Path) -> None:
     """
     Remove emulated recordings with their truth, so that they can be made anew.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the recordings; it need not exist.
-
-    Raises
-    ------
-    FileExistsError
-        If there is anything in it that was not simulated: then nothing is removed.
+    Raises a FileExistsError, and removes nothing, if the folder has anything that was not
+    simulated.
     """
     for path in sorted(folder.glob("*")):
         if path.suffix != ".zarr" or not _simulated(path):

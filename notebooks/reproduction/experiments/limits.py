@@ -1,4 +1,4 @@
-"""How near to the statistical limit the separation comes: noise, bands, and pixels that agree."""
+"""Distance of the separation from its statistical limit: noise, bands, pooled pixels."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -43,19 +43,20 @@ def near_bound(
     Errors of the separation of independent pixels of one material, beside their bounds.
 
     Noise and smooth subspace are unknown to the method and known to the bounds. Of those there are
-    three (`KNOWING`), for a bound depends on what is known of the background:
+    three (`KNOWING`), by the knowledge of the background:
 
     - "nothing": `limits.bounds` with one free number a frame and emissivities anywhere in (0, 1).
       At low noise it is loose, for the data tell the emissivities, and with them the level of
       the background and the ratio of the bands' slopes there, which this bound does not know;
     - "slope": the closed form `limits.ratio_variance`, one free number a frame, but the slopes are
       known: of the three the one that fits the reflection ratio. It says nothing of the object;
-    - "rest": `limits.bounds` told in which frames the background rests, which the method is not.
+    - "rest": `limits.bounds` that know in which frames the background rests, which the method does
+      not.
 
     Parameters
     ----------
     emissivity : sequence of float
-        Of the bands [1].
+        Emissivity of the bands [1].
     noise : sequence of float
         Standard deviation of the bands' signals [K].
     bands : sequence of str
@@ -65,7 +66,7 @@ def near_bound(
     clock : sequence of float
         Number of frames, and their rate [Hz].
     pixels, seed : int
-        Number of pixels; of the random numbers.
+        Number of pixels; seed of the random numbers.
 
     Returns
     -------
@@ -74,11 +75,6 @@ def near_bound(
         `reflection_ratio_bound` (knowing, pixel); `object_temperature_error` (pixel) [K], root mean
         square over time, and `object_temperature_bound` (knowing, pixel), NaN for "slope"; NaN
         in pixels without an object temperature. `status` (pixel).
-
-    Raises
-    ------
-    ValueError
-        As `cases.simulate` and `limits.bounds`.
     """
     rig = Rig(bands=tuple(bands), noise=tuple(noise))
     case = {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1], "noise_known": False}
@@ -109,21 +105,13 @@ def near_bound(
 
 def summary(measured: xr.Dataset) -> xr.Dataset:
     r"""
-    Errors in units of their bounds, over the pixels that have a value.
+    Errors in units of their bounds, over the pixels of `near_bound` that have a value.
 
-    Parameters
-    ----------
-    measured : Dataset
-        Variables of `near_bound` over any further dims.
-
-    Returns
-    -------
-    Dataset
-        `reflection_ratio_error` [1] and `object_temperature_error` [K], root mean square over the
-        pixels, and `reflection_ratio_bound`, `object_temperature_bound` (knowing), of the same
-        pixels; `scatter` (knowing) [1], standard deviation over the pixels of each one's error of
-        the ratio over its own bound; `excess` (knowing) [1], the object's error over its bound;
-        `solved` and `flagged` [1], shares of the pixels with a temperature, and with a flag.
+    `reflection_ratio_error` [1] and `object_temperature_error` [K], root mean square over the
+    pixels, and `reflection_ratio_bound`, `object_temperature_bound` (knowing) of the same pixels;
+    `scatter` (knowing) [1], standard deviation over the pixels of the ratio's error over its bound;
+    `excess` (knowing) [1], the object's error over its bound; `solved` and `flagged` [1], shares of
+    the pixels with a temperature, and with a flag.
     """
     parts = {
         name: _rms(measured[name])
@@ -151,19 +139,12 @@ def pooled(
     seed: int,
 ) -> xr.Dataset:
     r"""
-    Error of the reflection ratio where so many pixels are known to be of one material.
+    Error of the reflection ratio in groups of pixels that are known to be of one material.
 
-    All pixels are of one material, in groups that share their ratio and know nothing of the
-    others. The error of a group should fall as :math:`1/\sqrt{n}` until a bias that all pixels
-    have in common is left.
-
-    Parameters
-    ----------
-    size : int
-        Pixels in a group; 1 is no pooling.
-    emissivity, ends, clock, pixels, seed
-        See `near_bound`; the bands are those of the default `Rig`. The scene depends on neither
-        `size` nor what is found.
+    All pixels are of one material, in groups of a size that share their ratio; size 1 is no
+    pooling. The error of a group should fall as :math:`1/\sqrt{n}` down to the bias that all pixels
+    share. Other parameters as for `near_bound`; the bands are those of the default `Rig`. The scene
+    does not depend on the size.
 
     Returns
     -------
@@ -213,21 +194,10 @@ def stressed(
     aligned: bool = False,
 ) -> xr.Dataset:
     """
-    Run and judge one case.
+    Error bars and flags (`stress.judge`) of one case of `cases.simulate`.
 
-    Parameters
-    ----------
-    case : mapping
-        See `cases.simulate`.
-    clock, pixels, seed
-        See `near_bound`.
-    aligned : bool
-        Bring the bands onto one clock first, by `alignment.align`.
-
-    Returns
-    -------
-    Dataset
-        See `stress.judge`; `frames_lost` [1], those that the alignment leaves empty in a band.
+    Aligned, the bands are first brought onto one clock by `alignment.align`; `frames_lost` [1] is
+    the number of frames that this leaves empty in a band.
     """
     rig, time = Rig(), _times(clock)
     if not aligned:
@@ -242,47 +212,17 @@ def stressed(
 
 
 def on_clock(truth: xr.Dataset, time: xr.DataArray) -> xr.Dataset:
-    """
-    Truth at other times, on the line between its own.
-
-    Parameters
-    ----------
-    truth : Dataset
-        A scene whose object is smooth.
-    time : DataArray
-        Times [s].
-
-    Returns
-    -------
-    Dataset
-        The scene; NaN past its ends, which are then not judged.
-    """
+    """Scene with a smooth object at other times [s], by linear interpolation; NaN outside."""
     return truth.interp(time=time).assign_attrs(truth.attrs)
 
 
 def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
     """
-    Hold labels of materials against the true ones.
+    Labels (y, x) of `separation.materials`, -1 for none, against the true panels (y, x).
 
-    Parameters
-    ----------
-    labels : DataArray
-        (y, x), from `separation.materials`; -1 is no material.
-    truth : DataArray
-        (y, x) of whole numbers, which panel a pixel is of.
-
-    Returns
-    -------
-    Dataset
-        `right` [1], share of the pixels farther than `BORDER` from a border that carry the label
-        most frequent in their panel; `bleeding` [1], number of labels that are on both sides of a
-        border, that far from it; `distance` (y, x) [pixel], from the nearest pixel of another
-        panel.
-
-    Raises
-    ------
-    ValueError
-        If the images differ in size, or there is one panel only.
+    `right` [1], share of the pixels farther than `BORDER` from a border that carry the label most
+    frequent in their panel; `bleeding` [1], number of labels that are on both sides of a border,
+    that far from it. Raises a ValueError if the images differ in size, or there is one panel only.
     """
     found, panels = labels.values, np.unique(truth.values)
     if found.shape != truth.shape or panels.size < 2:
@@ -308,12 +248,12 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
 
 
 def _times(clock: Sequence[float]) -> npt.NDArray[np.float64]:
-    """Times of a clock of so many frames, and so many a second [s]."""
+    """Times [s] of a clock: number of frames, and their rate [Hz]."""
     return np.arange(int(clock[0])) / clock[1]
 
 
 def _as_line(response: xr.Dataset, rig: Rig) -> xr.Dataset:
-    """The response with the noise [count] that is the rig's [K] by the linear slopes."""
+    """Response with the noise [count] that is the rig's [K] by the linear slopes."""
     slopes = response["linear_slope"].sel(band=list(rig.bands))
     linear = (slopes * list(rig.noise)).assign_attrs(response["noise"].attrs)
     return response.assign(noise=linear)

@@ -1,4 +1,4 @@
-"""What the nuisances of a real rig cost, and what is left of it when they are undone."""
+"""Cost of the nuisances of a real rig, before and after their correction."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -44,7 +44,7 @@ class Pixels:
     Attributes
     ----------
     emissivity : sequence of float
-        Of the two bands of the default `Rig` [1].
+        Emissivity in the two bands of the default `Rig` [1].
     ends : sequence of float
         First and last temperature of the object [K].
     clock : sequence of float
@@ -62,23 +62,7 @@ class Pixels:
     background: Mapping[str, Any] = field(default_factory=dict)
 
     def scene(self, rng: np.random.Generator, *, later: int = 0, steps: int = 1) -> xr.Dataset:
-        """
-        Draw a scene.
-
-        Parameters
-        ----------
-        rng : Generator
-            Source of the heating and of the background.
-        later : int
-            Steps that the scene goes on beyond the last frame.
-        steps : int
-            Steps in a frame.
-
-        Returns
-        -------
-        Dataset
-            See `simulation.independent_pixels`.
-        """
+        """Scene on a clock of `steps` a frame that goes on `later` steps beyond the last frame."""
         count, rate = int(self.clock[0]), self.clock[1]
         time = np.arange((count - 1) * steps + 1 + later) / (rate * steps)
         value = xr.DataArray(list(self.emissivity), dims="band", coords={"band": list(Rig().bands)})
@@ -91,28 +75,12 @@ class Pixels:
 
 def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
     """
-    Record two bands a delay apart, find the delay and undo it.
+    Two bands recorded a delay [frame] apart: the delay estimated and undone.
 
-    Parameters
-    ----------
-    delay : float
-        How much later the second band is exposed [frame], zero or positive; rounded to
-        1 / `cases.STEPS`.
-    pixels : mapping
-        Fields of `Pixels`.
-    seed : int
-        Of scene and noise.
-
-    Returns
-    -------
-    Dataset
-        `found` [frame], the offset that `alignment.time_offset` finds; and over `treatment`
-        the variables of `cost`. "without" is a capture of both bands at the later time.
-
-    Raises
-    ------
-    ValueError
-        If the delay is negative, or as `alignment.time_offset`.
+    The delay of the second band is rounded to 1 / `cases.STEPS`; `pixels` are fields of `Pixels`.
+    `found` [frame] is the offset by `alignment.time_offset`; over `treatment` the variables of
+    `cost`, where "without" is a capture of both bands at the later time. Raises a ValueError if the
+    delay is negative.
     """
     if delay < 0:
         raise ValueError(f"Invalid delay {delay} frames. Must be zero or positive.")
@@ -141,31 +109,25 @@ def disturbed(
     name: str, *, pixels: Mapping[str, Any], nuisance: Mapping[str, Any], seed: int
 ) -> xr.Dataset:
     """
-    Put a nuisance into a capture, and mark it.
+    A nuisance put into a capture, and marked.
 
     Parameters
     ----------
     name : {"lost frames", "shutter", "lost frames and shutter"}
-        The nuisance: a share of each band's frames lost, its driver handing out the last one
-        again; or both cameras' shutters closing.
+        The nuisance: a share of each band's frames lost, the driver returning the previous one;
+        or both cameras' shutters closing.
     pixels : mapping
         Fields of `Pixels`.
     nuisance : mapping
-        `share` of the frames lost [1]; `shutter`, when the shutters close, as shares of the capture
+        `share` of the frames lost [1]; `shutter`, times of its closing, as shares of the capture
         [1].
     seed : int
-        Of scene, noise and nuisance.
+        Seed of scene, noise and nuisance.
 
     Returns
     -------
     Dataset
-        Over `treatment`, the variables of `cost`. "undone" has been through
-        `frames.mark_shutter`.
-
-    Raises
-    ------
-    ValueError
-        If the nuisance is unknown.
+        Over `treatment`, the variables of `cost`; "undone" is by `correction.mark_shutter`.
     """
     if name not in NUISANCES:
         raise ValueError(f"Unknown nuisance '{name}'. Must be one of {NUISANCES}.")
@@ -190,16 +152,16 @@ def parallax(
     seed: int,
 ) -> xr.Dataset:
     """
-    Two cameras side by side: the object is registered, what it reflects is not.
+    Two cameras side by side: the object is registered, its reflection is not.
 
     A plate of glass, heated in its middle, people walking by; a second camera sees the plate
-    shifted, and what it mirrors shifted by some pixels more. A registration (translation) brings
+    shifted, and its reflection shifted by some pixels more. A registration (translation) brings
     the plate together and leaves the reflection apart.
 
     Parameters
     ----------
     distance : float
-        How far apart the reflection is in the registered views, along x [pixel]; a multiple of
+        Distance of the reflections in the registered views, along x [pixel]; a multiple of
         1 / `COLUMNS`.
     shape : sequence of int
         Rows and columns.
@@ -209,20 +171,20 @@ def parallax(
         How far the second camera looks to the right, a multiple of 1 / `COLUMNS`, and down, a
         whole number [pixel].
     seed : int
-        Of scene and noise.
+        Seed of scene and noise.
 
     Returns
     -------
     Dataset
-        `misregistered` [pixel], distance of the transform that `alignment.register` finds from
-        the true one; and over `treatment`, one of `VIEWS`, the variables of `cost`.
+        `misregistered` [pixel], distance of the transform by `registration.register` from the true
+        one; and over `treatment`, one of `VIEWS`, the variables of `cost`.
 
     Raises
     ------
     ImportError
         If OpenCV is not installed.
     ValueError
-        If a shift or the parallax is no such multiple, or they are beyond the margin of the
+        If a shift or the parallax is not such a multiple, or they are beyond the margin of the
         scene, 12 pixels together.
     """
     places = np.array([COLUMNS * shift[0], COLUMNS * distance, shift[1]])
@@ -249,21 +211,11 @@ def parallax(
 
 def cost(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     """
-    What a separation is worth.
+    Error and flags of one separation.
 
-    Parameters
-    ----------
-    truth : Dataset
-        A scene, on the clock of the result.
-    result : Dataset
-        From `separation.solve`.
-
-    Returns
-    -------
-    Dataset
-        `object_temperature_rmse` [K], root mean square over time, median over the pixels with a
-        value; of them `flagged` [1], the share with any flag, and `covered` [1], share of the
-        samples of those without whose 95 % interval holds the truth, NaN if there is none.
+    `object_temperature_rmse` [K], root mean square over time, median over the pixels with a value;
+    of them `flagged` [1], the share with any flag, and `covered` [1], share of the samples of the
+    others whose 95 % interval holds the truth, NaN without any.
     """
     error = result["object_temperature"] - truth["object_temperature"]
     solved, good = error.notnull().any("time"), result["status"] == 0
@@ -278,7 +230,7 @@ def cost(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
 
 
 def _with(value: xr.DataArray, attrs: Mapping[str, str]) -> xr.DataArray:
-    """A number with nothing but its unit."""
+    """Number with nothing but its unit."""
     return value.reset_coords(drop=True).drop_attrs().assign_attrs(attrs)
 
 

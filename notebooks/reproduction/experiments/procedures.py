@@ -32,7 +32,7 @@ def compare_procedures(
     repeats: int = 100,
 ) -> xr.Dataset:
     """
-    Measure objects on the bench and by the reflector method, many times over.
+    Statistics of many measurements of objects on the bench and by the reflector method.
 
     Parameters
     ----------
@@ -41,11 +41,11 @@ def compare_procedures(
     rng : Generator
         Source of the errors; a series' common errors are drawn anew each time.
     bench : Bench, optional
-        Steps and errors; the defaults of `Bench` if not given.
+        Steps and errors; by default those of `Bench`.
     samples : tuple of Sample
         The objects.
     repeats : int
-        Series of each.
+        Series of each, two or more.
 
     Returns
     -------
@@ -53,12 +53,7 @@ def compare_procedures(
         `true` (object, band); over (object, procedure, band): `mean` of the estimates, their
         standard deviation `spread`, their root mean square `error` and `largest` error, root mean
         square `stated` of the stated standard deviations, and `coverage`, the share of errors
-        within one, 0.68 if the error bars are true [1].
-
-    Raises
-    ------
-    ValueError
-        If there is no sample, or fewer than two repeats.
+        within one, 0.68 for a calibrated uncertainty [1].
     """
     true, here = _true(response, samples, repeats), Bench() if bench is None else bench
     found = np.array(
@@ -96,32 +91,12 @@ def reflector_sensitivity(
     repeats: int = 100,
 ) -> xr.Dataset:
     """
-    What the reflector method finds, by how much the mirrored direction is warmer than the room.
+    Emissivity by the reflector method over the excess of the reflected direction over the room.
 
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    rng : Generator
-        Source of the errors.
-    excesses : sequence of float
-        Largest excess of what a smooth object mirrors [K]; a series' own is drawn evenly from 0.
-    samples : tuple of Sample
-        The objects.
-    repeats : int
-        Series of each.
-
-    Returns
-    -------
-    Dataset
-        `mean` of the estimates (object, excess, band), `true` (object, band) [1]. With 0 K the
-        foil gives what the object mirrors, and the method is right; what it is off by beyond is
-        the emissivity's share in the excess, whatever the foil.
-
-    Raises
-    ------
-    ValueError
-        If there is no sample, there are fewer than two repeats, or an excess is negative.
+    The excesses [K] are the largest of a smooth object's reflection; a series' own is drawn evenly
+    from 0. `mean` of the estimates (object, excess, band), `true` (object, band) [1]. With 0 K the
+    foil gives what the object reflects, and the method is right; beyond, its error is the
+    emissivity's share in the excess, whatever the foil.
     """
     true = _true(response, samples, repeats)
     benches = [replace(Bench(), mirrored_excess=(0.0, float(excess))) for excess in excesses]

@@ -1,10 +1,9 @@
-"""Are the error bars true, and is every wrong pixel flagged? Case by case, on simulated pixels.
+"""Calibration of the error bars and flags, case by case, on simulated pixels.
 
 Two promises are judged. An error bar: 95 % intervals hold the truth in 95 of 100 cases. A status
-of 0: what has no flag is right; a pixel whose error is far beyond its error bar should have one.
+of 0: the pixel is right; a pixel whose error is far beyond its error bar should have a flag.
 """
 
-from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
@@ -12,8 +11,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 from dbthermal import schema
-from dbthermal.simulation import Rig
-from reproduction.experiments.cases import Case, run_case, score
+from reproduction.experiments.cases import score
 
 INTERVAL: Final = float(ndtri(0.975))
 """Half-width of a 95 % interval, in standard deviations [1]."""
@@ -22,10 +20,10 @@ FAR: Final = 4.0
 """Standard deviations of error from which a pixel is bad [1]; of normal errors 1 of 16,000 is."""
 
 AMONG: Final = ("unflagged", "all")
-"""Whose intervals are counted: of pixels with status 0, or of all that have a value."""
+"""Pixels whose intervals are counted: those with status 0, or all that have a value."""
 
 KINDS: Final = ("object", "any")
-"""What makes a pixel bad: its object temperature; or that, or an emissivity."""
+"""Quantities by which a pixel is bad: its object temperature; or that, or an emissivity."""
 
 _PIXELS: Final = ("y", "x")
 _INNER: Final = (0.1587, 0.8413)
@@ -33,21 +31,14 @@ _INNER: Final = (0.1587, 0.8413)
 
 def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     r"""
-    Hold the error bars and flags of one separation against the truth.
+    Error bars and flags of one separation against the truth.
 
     A pixel is **bad** in its `object` where
 
     .. math:: \sqrt{\overline{(\hat x - x)^2}} > 4 \sqrt{\overline{s_x^2}}
 
     over the frames, and bad in `any` where that is so or the error of an emissivity exceeds four
-    of its standard deviations. What has no value is not bad.
-
-    Parameters
-    ----------
-    truth : Dataset
-        A scene of `simulation`.
-    result : Dataset
-        From `separation.solve`.
+    of its standard deviations. A pixel without a value is not bad.
 
     Returns
     -------
@@ -57,11 +48,11 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
         - `object_coverage` (among): share of samples whose 95 % interval holds the truth;
           `emissivity_coverage` (among, band): share of pixels;
         - `width` (band): stated standard deviation of the emissivity over the robust standard
-          deviation of its error, both of all pixels with a value; 1 if the bars are true;
+          deviation of its error, both of all pixels with a value; 1 for a calibrated uncertainty;
         - `object_temperature_rmse` [K] and `emissivity_error` (band), see `cases.score`;
         - `flagged`, and `by_flag` (flag): share of pixels with any flag, with this flag;
         - `bad_pixels` (kind): their number; `bad_flagged` (kind): share of them with a flag;
-        - `status` (pixel), and `bad` (kind, pixel), true where bad: what the shares come from.
+        - `status` (pixel), and `bad` (kind, pixel), true where bad.
     """
     found = {**_coverage(truth, result), **_flags(result["status"])}
     bad, flagged = _bad(truth, result), _flat(result["status"] != 0)
@@ -77,39 +68,8 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(units).merge(errors).assign_attrs(origin="simulated")
 
 
-def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: int) -> xr.Dataset:
-    """
-    Run and judge many cases, all with the same seed.
-
-    Parameters
-    ----------
-    cases : iterable of mapping
-        See `cases.run_case`; each with a name `case` of its own.
-    rig, time, pixels, seed
-        See `cases.run_case`.
-
-    Returns
-    -------
-    Dataset
-        Variables of `judge`, over `case`.
-
-    Raises
-    ------
-    ValueError
-        If a case has no name, or one that another has; and as `cases.run_case`.
-    """
-    cases = list(cases)
-    names = [str(case.get("case", "")) for case in cases]
-    for name in names:
-        if not name or names.count(name) > 1:
-            raise ValueError(f"Invalid name '{name}' of a case. Must be there, and unique.")
-    rows = [judge(*run_case(case, rig, time, pixels, seed)) for case in cases]
-    together = xr.concat(rows, dim=xr.DataArray(names, dims="case", name="case"))
-    return together.assign_attrs(pixels=pixels, seed=seed)
-
-
 def _share(holds: xr.DataArray, counted: xr.DataArray, over: tuple[str, ...]) -> xr.DataArray:
-    """Share of what is counted for which it holds; NaN where nothing is counted."""
+    """Share of the counted samples for which a condition holds; NaN where none is counted."""
     number = counted.sum(over)
     return (holds & counted).sum(over) / number.where(number > 0)
 
@@ -160,8 +120,8 @@ def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
 def _flags(status: xr.DataArray) -> dict[str, xr.DataArray]:
     """Share of pixels with any flag, and with each."""
     bits = xr.DataArray(
-        np.array(list(schema.FLAGS.values()), dtype=status.dtype),
+        np.array(list(schema.Status), dtype=status.dtype),
         dims="flag",
-        coords={"flag": list(schema.FLAGS)},
+        coords={"flag": list(schema.Status.bits())},
     )
     return {"flagged": (status != 0).mean(), "by_flag": ((status & bits) != 0).mean(_PIXELS)}

@@ -36,12 +36,12 @@ def judge_twin(
     name : str
         One of `twins.TWINS` with a thermocouple.
     seed : int
-        Of all motion, noise and errors.
+        Seed of all motion, noise and errors.
     variants : mapping
-        See `at_thermocouple`; "calibrated" is given the emissivities that the bench found for a
+        See `at_thermocouple`; "calibrated" gets the emissivities that the bench found for a
         piece of the same material, with their deviations.
     material : str
-        Of `emissivity.embedded_table`.
+        Material of `emissivity.embedded_table`.
     shape : sequence of int
         Rows and columns.
     frames : int
@@ -56,7 +56,7 @@ def judge_twin(
     Dataset
         Variables of `at_thermocouple`; `emissivity_difference` (band) [1], mean magnitude of the
         default method's emissivity less the calibrated one over the pixels without a flag; `good`
-        [1], the share of the object's pixels in which the background moves that have no flag.
+        [1], the share without a flag of the object's pixels in which the background moves.
     """
     rng, rig = np.random.default_rng(seed), simulation.Rig()
     response = rig.response()
@@ -86,23 +86,7 @@ def judge_twin(
 
 
 def on_bench(response: xr.Dataset, material: str, rng: np.random.Generator) -> xr.Dataset:
-    """
-    Calibrate the emissivity of a smooth piece of a material on the simulated bench.
-
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    material : str
-        Of `emissivity.embedded_table`.
-    rng : Generator
-        Source of the bench's errors.
-
-    Returns
-    -------
-    Dataset
-        From `calibration.fit_emissivity`.
-    """
+    """Emissivity of a smooth piece of a material, calibrated on the simulated bench."""
     value = float(emissivity.embedded_table()["emissivity"].sel(material=material, band="8-14"))
     sample, bench = simulation.Sample(material, value, material, _STRAY), simulation.Bench()
     series = simulation.bench_series(response, sample, bench, rng)
@@ -124,23 +108,19 @@ def at_thermocouple(
 
     The estimate is the mean over the pixels that the bead covers. The reading has the errors of a
     probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew many times,
-    so that the result does not hang on one probe's luck.
+    so that the result does not depend on one probe's error.
 
     Parameters
     ----------
-    scene : Dataset
-        A twin.
-    corrected : Dataset
-        Its capture.
-    response : Dataset
-        Response of the cameras.
+    scene, corrected, response : Dataset
+        The twin, its capture, and the response of the cameras.
     variants : mapping
         Label -> `method` of `separation.solve` and its arguments. Methods that treat each pixel
-        alone are given the bead's pixels only, and so is an emissivity map.
+        alone get the bead's pixels only.
     rng : Generator
         Source of the probes' errors.
     probes : int
-        How many probes are drawn.
+        Number of probes that are drawn.
 
     Returns
     -------
@@ -199,27 +179,12 @@ def _mean(
 
 def share(found: xr.DataArray, cause: xr.DataArray) -> float:
     r"""
-    How much of one change is found in another: the slope of a regression through their means.
+    Share of a change that another one holds: the slope of a regression through their means [1].
 
     .. math:: \sum a b / \sum b^2
 
-    with :math:`a` and :math:`b` less their means over time, over all samples in which the first is
-    known.
-
-    Parameters
-    ----------
-    found, cause : DataArray
-        (time, y, x), in one unit.
-
-    Returns
-    -------
-    float
-        1 if all of the cause's change is in what was found, 0 if none.
-
-    Raises
-    ------
-    ValueError
-        If nothing was found, or the cause does not change.
+    with a the first (time, y, x) and b its cause, each less its mean over time, over all samples in
+    which the first is known, in one unit. Raises a ValueError if the cause does not change there.
     """
     a, b = (part - part.where(found.notnull()).mean("time") for part in (found, cause))
     power = float((b**2).where(found.notnull()).sum())

@@ -28,17 +28,9 @@ _DOTS: Final = (COLORS[0], COLORS[3], COLORS[4], COLORS[2])
 
 def accuracy(sweep: xr.Dataset) -> Figure:
     """
-    Errors of the object temperature and of the emissivities, case by case.
+    Errors of the object temperature and of the emissivities, case by case, as bars.
 
-    Parameters
-    ----------
-    sweep : Dataset
-        `object_temperature_rmse` [K], `emissivity_error` (band) [1], over `case`.
-
-    Returns
-    -------
-    Figure
-        Two panels.
+    Of `object_temperature_rmse` [K] and `emissivity_error` (band) [1], over `case`.
     """
     figure, axes = canvas(1, 2, (11.0, 0.34 * sweep.sizes["case"] + 1.8))
     place = np.arange(sweep.sizes["case"])
@@ -62,18 +54,9 @@ def accuracy(sweep: xr.Dataset) -> Figure:
 
 def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
     """
-    Distribution of error over standard deviation; a true error bar gives the normal curve.
+    Histograms of error over standard deviation [1], by quantity, over the standard normal density.
 
-    Parameters
-    ----------
-    scores : mapping of str to DataArray
-        Quantity, and its errors divided by their standard deviation [1]; the first one's
-        attributes say what the data are.
-
-    Returns
-    -------
-    Figure
-        Histograms over the standard normal density.
+    The attributes of the first quantity say what the data are.
     """
     figure, axes = canvas(1, len(scores), (3.4 * len(scores), 3.0))
     grid = np.linspace(-5, 5, 201)
@@ -90,23 +73,14 @@ def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
 
 def validity(stress: xr.Dataset) -> Figure:
     """
-    What becomes of the pixels, case by case: right, wrong without a warning, or flagged and why.
+    Pixels case by case: right, wrong without a warning, or flagged, with the reason.
 
-    Left, a bar of all pixels: no flag and right; no flag and wrong, in red, the one thing that
-    must not be; flagged, by the flag that says most. Right, how many of the 95 % intervals hold
-    the truth, over the span from 92 to 98 %: of the object temperature in pixels without a flag,
-    of the emissivities in all that have a value. What lies left of the axis is an arrow.
-
-    Parameters
-    ----------
-    stress : Dataset
-        From `experiments.stress.sweep`: `status` (case, pixel), `bad` (case, kind, pixel),
-        `object_coverage` (case, among), `emissivity_coverage` (case, among, band) [1].
-
-    Returns
-    -------
-    Figure
-        A row a case.
+    Left, a bar of all pixels: no flag and right; no flag and wrong, in red; flagged, by the most
+    telling flag. Right, the share of the 95 % intervals that hold the truth, over the span from 92
+    to 98 %: of the object temperature in pixels without a flag, of the emissivities in all that
+    have a value; an arrow lies left of the axis. Of `experiments.limits.stressed`: `status` (case,
+    pixel), `bad` (case, kind, pixel), `object_coverage` (case, among), `emissivity_coverage` (case,
+    among, band) [1].
     """
     figure, axes = canvas(1, 2, (12.5, 5.0))
     left, right = axes[0]
@@ -156,7 +130,7 @@ def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
 
 
 def _count(axis: Axes, share: npt.NDArray[np.float64]) -> None:
-    """Shares of wrong pixels [%] at the end of the bars, for some are too few to be seen."""
+    """Shares of wrong pixels [%] as numbers at the end of the bars; some are too small to see."""
     for row in np.flatnonzero(share).tolist():
         text = f"{percent(share[row] / 100)} wrong"
         axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")

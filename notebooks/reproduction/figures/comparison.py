@@ -23,18 +23,9 @@ def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
     """
     Error of the object temperature over noise, a line a method, a panel a material.
 
-    Parameters
-    ----------
-    errors : DataArray
-        Median error (material, noise, variant) [K]; without the dimension `material`, one panel.
-        `noise` is that of the quieter band [K]. A missing value is left out.
-    title : str
-        Title.
-
-    Returns
-    -------
-    Figure
-        Both axes logarithmic.
+    The errors are medians (material, noise, variant) [K]; without the dimension `material`, one
+    panel. `noise` is that of the quieter band [K]. Both axes are logarithmic; a missing value is
+    left out.
     """
     panels = errors if "material" in errors.dims else errors.expand_dims(material=[""])
     columns = min(4, panels.sizes["material"])
@@ -86,21 +77,7 @@ def _lines(axis: Axes, errors: xr.DataArray) -> None:
 
 
 def emissivity_errors(errors: xr.DataArray, *, title: str) -> Figure:
-    """
-    Error of the emissivity over emissivity and noise, a map a method.
-
-    Parameters
-    ----------
-    errors : DataArray
-        Median error (variant, emissivity, noise) [1]; gray where there is none.
-    title : str
-        Title.
-
-    Returns
-    -------
-    Figure
-        Maps with their numbers.
-    """
+    """Maps, a method each, of median errors (variant, emissivity, noise) [1] with numbers."""
     count = errors.sizes["variant"]
     figure, axes = canvas(1, count, (4.6 * count, 4.0))
     highest = float(np.nanpercentile(errors.values, 98))
@@ -124,21 +101,7 @@ def emissivity_errors(errors: xr.DataArray, *, title: str) -> Figure:
 
 
 def reductions(reduction: xr.DataArray, published: Sequence[float]) -> Figure:
-    """
-    What each loss term is worth, beside the published figure.
-
-    Parameters
-    ----------
-    reduction : DataArray
-        Reduction of the error by adding the term to the others (term) [%].
-    published : sequence of float
-        The paper's [%], in the same order.
-
-    Returns
-    -------
-    Figure
-        Two bars a term, with their numbers.
-    """
+    """Reduction of the error by each loss term (term) [%] beside the published ones, as bars."""
     figure, ((axis,),) = canvas(1, 1, (6.0, 3.4))
     place = np.arange(reduction.sizes["term"])
     for shift, values, label, color in (
@@ -157,21 +120,7 @@ def reductions(reduction: xr.DataArray, published: Sequence[float]) -> Figure:
 
 
 def sensitivity(errors: xr.DataArray, base: float) -> Figure:
-    """
-    Error with one setting changed at a time.
-
-    Parameters
-    ----------
-    errors : DataArray
-        Median error (variant) [K] with the change that the variant's name says.
-    base : float
-        The error with all settings at their defaults [K].
-
-    Returns
-    -------
-    Figure
-        Bars, and a line at the default's error.
-    """
+    """Bars of the error (variant) [K] with one setting changed, and a line at the defaults'."""
     figure, ((axis,),) = canvas(1, 1, (7.5, 0.24 * errors.sizes["variant"] + 1.4))
     place = np.arange(errors.sizes["variant"])
     axis.barh(place, errors.values, color=COLORS[0])
@@ -190,19 +139,8 @@ def emissivity_procedures(
     """
     Emissivity of several objects by each procedure, beside the truth and the published values.
 
-    Parameters
-    ----------
-    compared : Dataset
-        `true` (object, band), `mean` and `spread` (object, procedure, band) [1].
-    published : mapping
-        Label -> object -> the paper's value [1].
-    band : str
-        The band that is drawn.
-
-    Returns
-    -------
-    Figure
-        A group of marks an object, lines of one standard deviation, and the truth as a bar.
+    `true` (object, band), `mean` and `spread` (object, procedure, band) [1], drawn for one band
+    with lines of one standard deviation; published: label -> object -> the paper's value [1].
     """
     here = compared.sel(band=band)
     objects, procedures = here["object"].values, here["procedure"].values
@@ -238,17 +176,8 @@ def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.Da
     """
     Our reflection beside the authors' published one, and their correlation frame by frame.
 
-    Parameters
-    ----------
-    ours, theirs : DataArray
-        Magnitude of the reflection at a few times (time, y, x), in units of their own.
-    scores : DataArray
-        Correlation of the two maps (time) [1], of the frames that were compared.
-
-    Returns
-    -------
-    Figure
-        Two maps a chosen time, and the correlations with their median.
+    Both magnitudes (time, y, x) are in units of their own; `scores` (time) [1] of all compared
+    frames.
     """
     columns = ours.sizes["time"]
     figure, axes = canvas(3, columns, (3.2 * columns, 8.0))

@@ -23,20 +23,13 @@ _MICRO: Final = "\N{MICRO SIGN}m"
 
 def error_over_bound(measured: xr.Dataset) -> Figure:
     """
-    Errors of an estimate beside the bound that no estimate can beat, over the noise.
+    Errors of an estimate over the noise, beside the bound that no estimate can beat.
 
-    Parameters
-    ----------
-    measured : Dataset
-        Over `noise` (that of the quieter band [K]): `reflection_ratio_error` [1] and
-        `object_temperature_error` [K], root mean square over the pixels, and their bounds
-        `reflection_ratio_bound` and `object_temperature_bound`. A further dimension `case` gives
-        lines of several colours; where the bounds alone have it, the errors are drawn once.
-
-    Returns
-    -------
-    Figure
-        Above, errors as markers and bounds as lines; below, errors in units of their bound.
+    Above, errors as markers and bounds as lines; below, errors in units of their bound. Over
+    `noise` (that of the quieter band [K]): `reflection_ratio_error` [1] and
+    `object_temperature_error` [K], root mean square over the pixels, and their bounds
+    `reflection_ratio_bound` and `object_temperature_bound`. A further dimension `case` gives lines
+    of several colours; where the bounds alone have it, the errors are drawn once.
     """
     cases = measured if "case" in measured.dims else measured.expand_dims(case=[""])
     figure, axes = canvas(2, 2, (9.0, 6.2))
@@ -68,19 +61,10 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
 
 def pooling(measured: xr.Dataset) -> Figure:
     """
-    What pixels gain that are known to be of one material.
+    Gain of pooling pixels of one material: error of the ratio beside its bound, and of the object.
 
-    Parameters
-    ----------
-    measured : Dataset
-        Over `size`, pixels in a group: `reflection_ratio_error`, its bound
-        `reflection_ratio_bound` and the separation's own deviation `stated` [1];
-        `object_temperature_error` [K].
-
-    Returns
-    -------
-    Figure
-        Left, the error of the ratio beside its bound and what is stated; right, the object's.
+    Over `size`, pixels in a group: `reflection_ratio_error`, its bound `reflection_ratio_bound` and
+    the separation's own deviation `stated` [1]; `object_temperature_error` [K].
     """
     figure, ((left, right),) = canvas(1, 2, (9.0, 3.6))
     size = measured["size"]
@@ -101,18 +85,10 @@ def pooling(measured: xr.Dataset) -> Figure:
 
 def error_over_bands(measured: xr.Dataset) -> Figure:
     """
-    What a third and a fourth band gain.
+    Gain of a third and a fourth band: error beside its bounds, and in units of them.
 
-    Parameters
-    ----------
-    measured : Dataset
-        Over `bands`, names of the bands in use: `object_temperature_error` [K] and, over `case`
-        too, `object_temperature_bound` [K].
-
-    Returns
-    -------
-    Figure
-        Left, the error beside its bounds; right, in units of them.
+    Over `bands`, names of the bands in use: `object_temperature_error` [K] and, over `case` too,
+    `object_temperature_bound` [K].
     """
     figure, ((left, right),) = canvas(1, 2, (9.0, 3.8))
     error, place = measured["object_temperature_error"], np.arange(measured.sizes["bands"])
@@ -140,21 +116,10 @@ def pooled_materials(
     single: xr.DataArray, pooled: xr.DataArray, labels: xr.DataArray, panels: xr.DataArray
 ) -> Figure:
     """
-    The reflection ratio pixel by pixel, and pooled over the materials found.
+    Maps of the reflection ratio (y, x) [1] of single pixels and pooled, and of the material labels.
 
-    Parameters
-    ----------
-    single, pooled : DataArray
-        Reflection ratio (y, x) [1] without and with pooling.
-    labels : DataArray
-        Materials found (y, x), -1 for none.
-    panels : DataArray
-        True materials (y, x), whose borders are drawn.
-
-    Returns
-    -------
-    Figure
-        Three maps, with the true borders as lines.
+    Labels (y, x) of -1 are of no material; the borders of the true panels (y, x) are drawn as
+    lines.
     """
     figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.4))
     limits = limits_of(single)

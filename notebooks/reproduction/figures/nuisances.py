@@ -1,4 +1,4 @@
-"""Figures of a real rig's nuisances: what each costs, and what is left when it is undone."""
+"""Figures of the cost of a real rig's nuisances, before and after their correction."""
 
 from typing import Final
 
@@ -17,18 +17,10 @@ _RMSE_LABEL: Final = "RMSE of the object temperature [K]"
 
 def offsets(measured: xr.Dataset) -> Figure:
     """
-    Bands that are not exposed together: the offset found, and the object before and after.
+    Bands exposed apart: error of the estimated offset; error and flags of the object.
 
-    Parameters
-    ----------
-    measured : Dataset
-        Over `delay`, the true offset [frame]: `found` [frame]; and over `treatment` too,
-        `object_temperature_rmse` [K] and `flagged` [1].
-
-    Returns
-    -------
-    Figure
-        Left, the error of the offset; middle, that of the object; right, the share flagged.
+    Over `delay`, the true offset [frame]: `found` [frame]; and over `treatment` too,
+    `object_temperature_rmse` [K] and `flagged` [1].
     """
     figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.6))
     left.axhline(0.0, color="black", linewidth=0.6)
@@ -48,17 +40,9 @@ def offsets(measured: xr.Dataset) -> Figure:
 
 def disturbances(measured: xr.Dataset) -> Figure:
     """
-    Nuisances in time: the object as recorded, undone, and without.
+    Error with each nuisance as recorded, corrected, and without: bars, and the share flagged.
 
-    Parameters
-    ----------
-    measured : Dataset
-        Over `nuisance` and `treatment`: `object_temperature_rmse` [K] and `flagged` [1].
-
-    Returns
-    -------
-    Figure
-        Bars with their numbers, a group a nuisance; above each the share of pixels flagged.
+    Over `nuisance` and `treatment`: `object_temperature_rmse` [K] and `flagged` [1].
     """
     figure, ((axis,),) = canvas(1, 1, (8.0, 3.8))
     names, treatments = measured["nuisance"].values, measured["treatment"].values
@@ -80,19 +64,10 @@ def disturbances(measured: xr.Dataset) -> Figure:
 
 def parallax(measured: xr.Dataset) -> Figure:
     """
-    Two views of one object whose reflections are apart: what it costs, and how much is flagged.
+    Cost of the parallax of the reflection in two registered views: error, flags, coverage.
 
-    Parameters
-    ----------
-    measured : Dataset
-        Over `parallax` [pixel] and `treatment`: `object_temperature_rmse` [K], `flagged` and
-        `covered` [1].
-
-    Returns
-    -------
-    Figure
-        Left, the error; middle, the share flagged; right, the share of the 95 % intervals that
-        hold the truth in the pixels without a flag.
+    Over `parallax` [pixel] and `treatment`: `object_temperature_rmse` [K], `flagged` and `covered`
+    [1].
     """
     figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.6))
     _lines(left, measured[_RMSE], "parallax")

@@ -12,18 +12,10 @@ from dbthermal.figures.drawing import COLORS, canvas, draw_image, limits_of, pro
 
 def thermocouples(scores: xr.Dataset) -> Figure:
     """
-    What the thermocouple reads in each scene, and what each method finds there.
+    Reading of the thermocouple and estimates of all methods there, a panel a scene.
 
-    Parameters
-    ----------
-    scores : Dataset
-        `reading` (scene, time) and `temperature` (scene, variant, time) [K], `relative_error`
-        (scene, variant) [percent of degrees Celsius].
-
-    Returns
-    -------
-    Figure
-        A panel a scene.
+    `reading` (scene, time) and `temperature` (scene, variant, time) [K], `relative_error`
+    (scene, variant) [percent of degrees Celsius].
     """
     count = scores.sizes["scene"]
     figure, axes = canvas(1, count, (5.6 * count, 4.0))
@@ -51,19 +43,9 @@ def thermocouples(scores: xr.Dataset) -> Figure:
 
 def error_maps(picture: xr.DataArray, errors: Mapping[str, xr.DataArray]) -> Figure:
     """
-    Error of each method over the image, beside what the camera sees.
+    Maps of the error (y, x) [K] of each method, beside the apparent temperature (y, x) [K].
 
-    Parameters
-    ----------
-    picture : DataArray
-        Apparent temperature (y, x) [K].
-    errors : mapping
-        Method -> error (y, x) [K]; pixels without a value are gray. Each has its own scale.
-
-    Returns
-    -------
-    Figure
-        A panel for the picture and one a method.
+    Pixels without a value are gray; each map has its own scale.
     """
     count = 1 + len(errors)
     aspect = picture.sizes["y"] / picture.sizes["x"]

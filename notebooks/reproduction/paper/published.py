@@ -1,5 +1,7 @@
-"""Numbers of the paper, as published."""
+"""Published numbers of the paper, and one row of the comparison with ours."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final
 
 _OBJECTS: Final = ("chrome ball", "aluminium cup", "blue paint", "glass jar", "wineglass")
@@ -23,3 +25,94 @@ method is its optimiser, ours is the default one."""
 
 PEAKS: Final = {"wineglass": 63.6, "coffee_pot": 63.1}
 """Figure 6: highest reading of the thermocouple [degree Celsius]."""
+
+Numbers = Mapping[str, Mapping[str, float | int | str | bool]]
+"""Stem of a notebook -> name -> number, as `verify.read_run` gives them."""
+
+TWIN: Final = "simulated twin"
+"""What a row is measured on that stands for a scene of the paper."""
+
+_AGREES: Final = 0.1
+_ON_A_TWIN: Final = ", on a twin"
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One published number, or one figure without a number.
+
+    Attributes
+    ----------
+    place, quantity : str
+        Where in the paper, and of what.
+    stem, names : str, tuple of str
+        Notebook that measures it here, and the names of its numbers there.
+    data : str
+        Data that ours is measured on.
+    published, unit : float, optional, and str
+        The paper's number and its unit.
+    judged : {"error", "value", "distance", "lowest", "alike", "no"}
+        As an error (lower is better), as a value (near the paper's is agreement, within `within`),
+        by the distance from `reference` (lower is better), as the "lowest" being the one that
+        `note` names, as the second being within `within` times the first ("alike"), or not at all,
+        for the reason in `note`.
+    within : float
+        Largest difference that is agreement.
+    note : str
+        Verdict where none is computed.
+    labels : tuple of str
+        Labels of several numbers.
+    reference : float, optional
+        True value for the paper and for ours.
+    """
+
+    place: str
+    quantity: str
+    stem: str = ""
+    names: tuple[str, ...] = ()
+    data: str = ""
+    published: float | None = None
+    unit: str = "1"
+    judged: str = "no"
+    within: float = 0.0
+    note: str = "no number published"
+    labels: tuple[str, ...] = ()
+    reference: float | None = None
+
+    def ours(self, numbers: Numbers) -> dict[str, float]:
+        """Numbers measured here, by label or name; without those that were not measured."""
+        found = numbers.get(self.stem, {})
+        pairs = zip(self.labels or self.names, self.names, strict=True)
+        return {label: float(found[name]) for label, name in pairs if name in found}
+
+    def verdict(self, numbers: Numbers) -> str:
+        """
+        Verdict on ours against the paper's.
+
+        "agrees", "better", "worse" or "differs", of a twin with a note that says so, since theirs
+        cannot be checked; "not measured"; or the row's note.
+        """
+        found = self.ours(numbers)
+        if len(found) < len(self.names):
+            return "not measured"
+        if self.judged == "lowest":
+            return (
+                "agrees" if min(found, key=lambda label: found[label]) == self.note else "differs"
+            )
+        if self.judged == "alike":
+            first, second = found.values()
+            return "agrees" if second < self.within * first else "differs"
+        if self.published is None or self.judged == "no":
+            return self.note
+        word = self._word(next(iter(found.values())), self.published)
+        return word + _ON_A_TWIN * (self.data == TWIN)
+
+    def _word(self, ours: float, theirs: float) -> str:
+        """One word for ours against theirs."""
+        if self.judged == "value":
+            return "agrees" if abs(ours - theirs) <= self.within else "differs"
+        if self.reference is not None:
+            ours, theirs = abs(ours - self.reference), abs(theirs - self.reference)
+        if abs(ours - theirs) <= max(self.within, _AGREES * theirs):
+            return "agrees"
+        return "better" if ours < theirs else "worse"

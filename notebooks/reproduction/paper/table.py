@@ -4,8 +4,15 @@ from collections.abc import Iterator
 from itertools import product
 from typing import Final
 
-from reproduction.paper.published import EMISSIVITIES, PEAKS, REDUCTIONS, SCENE_ERRORS
-from reproduction.paper.row import TWIN, Numbers, Row
+from reproduction.paper.published import (
+    EMISSIVITIES,
+    PEAKS,
+    REDUCTIONS,
+    SCENE_ERRORS,
+    TWIN,
+    Numbers,
+    Row,
+)
 
 COLUMNS: Final = ("in the paper", "quantity", "paper", "here", "measured on", "verdict")
 """Columns of the table."""
@@ -14,19 +21,7 @@ _PERCENT: Final = "%"
 
 
 def compare(numbers: Numbers) -> Iterator[tuple[str, ...]]:
-    """
-    Set every published number beside ours.
-
-    Parameters
-    ----------
-    numbers : mapping
-        See `Numbers`.
-
-    Yields
-    ------
-    tuple of str
-        Cells of `COLUMNS`.
-    """
+    """Cells of `COLUMNS` for every published number beside ours."""
     for row in rows():
         found = row.ours(numbers)
         texts = [
@@ -41,32 +36,13 @@ def compare(numbers: Numbers) -> Iterator[tuple[str, ...]]:
 
 
 def markdown(numbers: Numbers) -> str:
-    """
-    Write the comparison as a table in Markdown.
-
-    Parameters
-    ----------
-    numbers : mapping
-        See `Numbers`.
-
-    Returns
-    -------
-    str
-        Head, rule, and a line for each row.
-    """
+    """Comparison as a table in Markdown."""
     lines = [COLUMNS, ("---",) * len(COLUMNS), *compare(numbers)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def rows() -> tuple[Row, ...]:
-    """
-    List every number of the paper, and every figure.
-
-    Returns
-    -------
-    tuple of Row
-        In the paper's order.
-    """
+    """Every number of the paper, and every figure, in the paper's order."""
     return (*_FIRST, *_terms(), *_bench(), *_scenes(), *_LAST)
 
 

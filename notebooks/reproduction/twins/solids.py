@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dbthermal.simulation import heat
-from dbthermal.simulation.rays import Array, Camera
+from dbthermal.simulation.rays import Array, Camera, vertex_normals
 from dbthermal.simulation.surroundings import Actor, Motion, Pose, Room, gliding
 from reproduction.twins import surfaces
 from reproduction.twins.panes import Touch
@@ -61,7 +61,7 @@ def bulb(capture: Capture, rng: np.random.Generator) -> Stage:
             cup(_sips(route, rng), uncovered=8.0),
         ],
         Room(AMBIENT),
-        [surfaces.on_wall(mesh, 0.05486, 5.0)],
+        [surfaces.on_wall(mesh, 0.055, 5.0)],
     )
 
 
@@ -104,7 +104,7 @@ def bunny(
     """
     mesh = rabbit() if scan is None else _stood(scan)
     towards = np.asarray(LAMP_TOWARDS) / np.linalg.norm(LAMP_TOWARDS)
-    facing = np.maximum(np.asarray(mesh.vertex_normals) @ towards, 0.0)
+    facing = np.maximum(vertex_normals(mesh) @ towards, 0.0)
 
     def flux(time: float) -> Array:
         on = -np.expm1(-max(time - LAMP_START, 0.0) / LAMP_RISE)

@@ -1,9 +1,10 @@
 """Meshes of the twins: plates, ellipsoids, limbs, and vessels turned about the z axis.
 
-Lengths are in metres, z is up, the normals point outward. Most shapes are those of
-`trimesh.creation`; here they get vertices at a `spacing`, so that a mesh refines by one number.
+Lengths are in metres, z is up, the normals point outward. Unlike those of `trimesh.creation`, the
+shapes have even triangles up to the poles, at a `spacing` that refines a mesh by one number.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Final
 
@@ -14,7 +15,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from dbthermal.planck import require_positive
-from dbthermal.simulation.rays import Array
+from dbthermal.simulation.rays import Array, unit
 
 Profile = tuple[tuple[float, float], ...]
 
@@ -42,6 +43,14 @@ BULB_PROFILE: Final[Profile] = (
 after the common A60 shape [m]."""
 
 
+_ROW: Final = np.sqrt(0.75)
+"""Distance of the rows of equilateral triangles, in their sides [1]."""
+_CORNER: Final = np.deg2rad(30.0)
+"""Angle of a profile's corners, which the mesh keeps [rad]."""
+_SAMPLES: Final = 400
+"""Points along a smooth profile before it is cut into rows."""
+
+
 def plate(width: float, height: float, spacing: float) -> trimesh.Trimesh:
     """
     Upright rectangle in the plane y = 0, centred in x, from z = 0 up, with its normal along -y.
@@ -62,41 +71,107 @@ def plate(width: float, height: float, spacing: float) -> trimesh.Trimesh:
 
 
 def ellipsoid(semi_axes: Sequence[float], middle: npt.ArrayLike, spacing: float) -> trimesh.Trimesh:
-    """Stretched geodesic sphere about a point; along its longest axis `spacing` is the largest."""
-    edge = np.arctan(2.0) * max(semi_axes) / require_positive("spacing [m]", spacing)
-    ball = trimesh.creation.icosphere(max(0, int(np.ceil(np.log2(edge)))))
-    return trimesh.Trimesh(ball.vertices * semi_axes + middle, ball.faces, process=False)
+    """
+    Stretched geodesic sphere about a point; along its longest axis `spacing` is the largest.
+
+    The faces of an icosahedron are cut evenly, its edges into n pieces: 10 n^2 + 2 vertices.
+    """
+    count = _pieces(np.arctan(2.0) * max(semi_axes), spacing)
+    grid = [(i, j) for i in range(count + 1) for j in range(count + 1 - i)]
+    number = {point: index for index, point in enumerate(grid)}
+    up = [((i, j), (i + 1, j), (i, j + 1)) for i, j in grid if i + j < count]
+    down = [(q, (p[0] + 1, p[1] + 1), r) for p, q, r in up if sum(p) < count - 1]
+    cells = np.array([[number[corner] for corner in face] for face in up + down])
+    first, second = np.array(grid, dtype=np.float64).T / count
+    weights = np.stack([1.0 - first - second, first, second], axis=1)
+    points = np.einsum("pk,fkd->fpd", weights, trimesh.creation.icosahedron().triangles)
+    faces = cells + len(grid) * np.arange(len(points))[:, np.newaxis, np.newaxis]
+    # Processed, the vertices that neighbouring faces share become one.
+    ball = trimesh.Trimesh(unit(points).reshape(-1, 3), faces.reshape(-1, 3))
+    vertices = ball.vertices * np.asarray(semi_axes) + np.asarray(middle)
+    return trimesh.Trimesh(vertices, ball.faces, process=False)
 
 
 def capsule(
     start: npt.ArrayLike, end: npt.ArrayLike, radius: float, spacing: float
 ) -> trimesh.Trimesh:
     """Cylinder with round ends, centred at two points: a finger, an arm, a leg."""
-    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-    count = 2 * _pieces(np.pi * radius, spacing)
-    mesh = trimesh.creation.capsule(np.linalg.norm(end - start), radius, count=[count, count])
-    turn, _ = Rotation.align_vectors([end - start], [(0.0, 0.0, 1.0)])
-    return moved(mesh, turn, (start + end) / 2.0)
+    axis = np.asarray(end, dtype=np.float64) - np.asarray(start, dtype=np.float64)
+    angle = np.linspace(0.0, np.pi / 2.0, _SAMPLES // 4)
+    across, along = radius * np.sin(angle), radius * np.cos(angle)
+    below, above = np.stack([across, -along], 1), np.stack([across, along], 1)[::-1]
+    profile = np.concatenate([below, above + np.array([0.0, np.linalg.norm(axis)])])
+    turn, _ = Rotation.align_vectors([axis], [(0.0, 0.0, 1.0)])
+    return moved(revolved(profile, spacing), turn, start)
 
 
 def vessel(profile: Profile, spacing: float, *, floor: bool) -> trimesh.Trimesh:
     """Smooth profile turned about the z axis, open at its top rim, with a flat floor or without."""
     points = np.array(profile)
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    places = np.linspace(0.0, along[-1], _pieces(along[-1], spacing) + 1)
-    wall = PchipInterpolator(along, points)(places)
-    wall[-1] = points[-1]  # a pole stays one, whatever the rounding of the interpolation
+    along = _along(points)
+    wall = PchipInterpolator(along, points)(np.linspace(0.0, along[-1], _SAMPLES))
+    wall[-1, 0] = points[-1, 0]  # a pole stays one, whatever the rounding of the interpolation
     if floor:
-        radii = np.linspace(0.0, points[0, 0], _pieces(points[0, 0], spacing) + 1)[:-1]
-        wall = np.concatenate([np.stack([radii, np.full(radii.size, points[0, 1])], 1), wall])
+        wall = np.concatenate([[(0.0, points[0, 1])], wall])
     return revolved(wall, spacing)
 
 
 def revolved(profile: npt.ArrayLike, spacing: float) -> trimesh.Trimesh:
-    """Profile of radius and height (point, 2) [m] turned about the z axis, outside to its right."""
-    profile = np.asarray(profile, dtype=np.float64)
-    sections = _pieces(2.0 * np.pi * profile[:, 0].max(), spacing)
-    return trimesh.creation.revolve(profile, sections=sections)
+    """
+    Profile of radius and height (point, 2) [m] turned about the z axis, outside to its right.
+
+    It is cut into rows of equal distance between its corners, and every row holds as many vertices
+    as its circle has room for. The radius is zero at a pole, which can only be an end; another end
+    is an open rim.
+    """
+    rows = _rows(np.asarray(profile, dtype=np.float64), spacing)
+    counts = np.maximum(3, np.round(2.0 * np.pi * rows[:, 0] / spacing)).astype(np.int64)
+    counts[rows[:, 0] == 0] = 1
+    first = np.cumsum([0, *counts])
+    # Every second row is turned by half a step, as the rows of equilateral triangles are.
+    turns = [(np.arange(n) + 0.5 * (row % 2)) / n for row, n in enumerate(counts)]
+    angle = 2.0 * np.pi * np.concatenate(turns)
+    radius, height = np.repeat(rows, counts, axis=0).T
+    faces = [_band(*pair) for pair in zip(first[:-2], turns[:-1], turns[1:], strict=True)]
+    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+
+
+def _along(points: Array) -> Array:
+    """Arc length (point,) [m] of a polyline."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+
+
+def _rows(profile: Array, spacing: float) -> Array:
+    """Points along a profile at equal distances between its corners, (row, 2) [m]."""
+    step = np.diff(profile, axis=0)
+    turn = np.abs(np.diff(np.unwrap(np.arctan2(step[:, 1], step[:, 0]))))
+    ends = [0, *(np.flatnonzero(turn > _CORNER) + 1), len(profile) - 1]
+    along = _along(profile)
+    cuts = [
+        np.linspace(along[a], along[b], _pieces(along[b] - along[a], _ROW * spacing) + 1)[:-1]
+        for a, b in itertools.pairwise(ends)
+    ]
+    places = np.concatenate([*cuts, along[-1:]])
+    return np.stack([np.interp(places, along, column) for column in profile.T], axis=1)
+
+
+def _band(first: int, lower: Array, upper: Array) -> npt.NDArray[np.int64]:
+    """
+    Faces (face, 3) between two neighbouring rings with vertices at angles [turns].
+
+    `first` is the number of the lower ring's first vertex; those of the upper follow. There is one
+    face for each edge of either ring; a ring of one vertex is a pole and has no edge.
+    """
+    below, above = len(lower), len(upper)
+    bottom, top = lower + 0.5 / below, upper + 0.5 / above  # middles of the edges
+    j, k = np.arange(below), np.arange(above)
+    tip = np.searchsorted(top, bottom, side="left") % above
+    foot = np.searchsorted(bottom, top, side="right") % below
+    start = first + below
+    standing = np.stack([first + j, first + (j + 1) % below, start + tip], axis=1)
+    hanging = np.stack([start + k, first + foot, start + (k + 1) % above], axis=1)
+    return np.concatenate([standing[: below * (below > 1)], hanging[: above * (above > 1)]])
 
 
 def wineglass(spacing: float = 0.003) -> trimesh.Trimesh:
@@ -136,11 +211,10 @@ def _pieces(length: float, spacing: float) -> int:
 
 def on_wall(mesh: trimesh.Trimesh, height: float, angle: float) -> tuple[float, float, float]:
     """
-    Point on the wall of a mesh of revolution about the z axis.
+    Point x, y, z [m] on the wall of a mesh of revolution, on the ring nearest to a height [m].
 
-    The angle about the axis is from negative y towards positive x [degrees]; x, y and z are in [m].
+    The angle about the axis is from negative y towards positive x [degrees].
     """
-    levels, first = np.unique(mesh.vertices[:, 2], return_index=True)
-    radii: Array = np.linalg.norm(mesh.vertices[first, :2], axis=1)
-    radius, turn = float(np.interp(height, levels, radii)), np.radians(angle)
-    return radius * float(np.sin(turn)), -radius * float(np.cos(turn)), height
+    x, y, ring = mesh.vertices[np.argmin(np.abs(mesh.vertices[:, 2] - height))]
+    radius, turn = float(np.hypot(x, y)), np.radians(angle)
+    return radius * float(np.sin(turn)), -radius * float(np.cos(turn)), float(ring)

@@ -120,7 +120,7 @@ WINEGLASS: Final = Vessel(
     level=0.175,
     thickness=0.0015,
     solid=heat.GLASS,
-    probe=(0.15104, -12.0),
+    probe=(0.152, -12.0),
 )
 """A wineglass with a wall of 1.5 mm."""
 
@@ -130,7 +130,7 @@ COFFEE_POT: Final = Vessel(
     level=0.110,
     thickness=0.0022,
     solid=heat.BOROSILICATE,
-    probe=(0.05056, 10.0),
+    probe=(0.050, 10.0),
 )
 """A coffee pot of borosilicate glass with a wall of 2.2 mm."""
 

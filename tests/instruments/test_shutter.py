@@ -1,0 +1,68 @@
+"""A shutter event from the serial command to the corrected capture, on the emulated Boson."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from test_y16 import SESSION
+
+from dbthermal import correction
+from dbthermal.instruments.camera import FrameFlag
+from dbthermal.instruments.devices import Devices, open_devices
+from dbthermal.instruments.emulated.world import FFC_DURATION
+from dbthermal.instruments.protocols import record_scene
+from dbthermal.instruments.recording import Limits, Preview, notes, open_capture
+from dbthermal.instruments.session import Session
+
+RATE, SHAPE = 50.0, [16, 80]
+
+
+def recorded(path: Path, telemetry_rows: int) -> xr.Dataset:
+    """A scene during which the narrow camera corrects its offsets, once, by its command port."""
+    cameras = {
+        band: {
+            "video": {"simulated": f"sim://camera/{name}", "hardware": "v4l2:///dev/video0"},
+            "control": {"simulated": f"sim://boson/{name}", "hardware": "serial:///dev/ttyACM0"},
+        }
+        for band, name in (("8-14", "wide"), ("9.5", "narrow"))
+    }
+    changes = {"cameras": cameras, "shape": SHAPE, "frame_rate": RATE, "duration": 1.3}
+    session = Session.load(SESSION, {**changes, "telemetry_rows": telemetry_rows})
+    with open_devices(session) as devices:
+        corrector = _Corrector(devices)
+        limits = Limits(reserve=0, reading_period=0.05, preview_period=0.02)
+        record_scene(devices, path, limits=limits, preview=corrector)
+        corrector.thread.join()
+    return open_capture(path)
+
+
+class _Corrector:
+    """A preview that runs one correction, some time after the start."""
+
+    def __init__(self, devices: Devices) -> None:
+        self.thread = threading.Thread(target=devices.cameras["9.5"].run_ffc)
+
+    def __call__(self, preview: Preview) -> None:
+        """Start it once."""
+        if preview.time > 0.3 and self.thread.ident is None:
+            self.thread.start()
+
+
+@pytest.mark.parametrize("telemetry_rows", [2, 0])
+def test_a_correction_is_taken_out_of_its_band(telemetry_rows: int, tmp_path: Path) -> None:
+    """Telemetry tells the first frozen frame, the serial line and the image a later one."""
+    capture = recorded(tmp_path / "a.zarr", telemetry_rows)
+    closed = (capture["frame_flags"].values & int(FrameFlag.SHUTTER_CLOSED)) != 0
+    frozen = round(FFC_DURATION * RATE)
+    assert not closed[0].any()
+    assert closed[1].sum() == pytest.approx(frozen if telemetry_rows else frozen - 1, abs=1.5)
+    kinds = [kind for _, kind, source, _ in notes(tmp_path / "a.zarr") if source == "9.5"]
+    assert [kind for kind in kinds if "shutter" in kind] == ["shutter_closed", "shutter_open"]
+    unity = xr.DataArray(np.ones((2, *SHAPE)), dims=("band", "y", "x"))
+    maps = xr.Dataset({"gain": unity, "offset": 0 * unity, "bad": unity < 0})
+    corrected = correction.correct_capture(capture, maps.assign_coords(band=capture["band"]))
+    taken = corrected.attrs["frames_taken_out"]
+    assert taken == [0, pytest.approx(frozen, abs=1)]
+    assert (corrected.attrs["shutter_events"], int(corrected["segment"][-1])) == (1, 1)
