@@ -271,7 +271,14 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
     schema.check_variable(response["noise"], schema.NOISE, "'noise' of the response")
     places = schema.band_positions(response, bands, "the response")
-    return planck.require_positive("noise [count]", response["noise"].values[places])
+    values = np.asarray(response["noise"].values[places], dtype=np.float64)
+    bad = ~((values > 0) & np.isfinite(values))
+    if np.any(bad):
+        raise ValueError(
+            f"Invalid noise [count] {values[bad][0]} in band '{bands[int(np.argmax(bad))]}'. "
+            "Must be finite and positive."
+        )
+    return values
 
 
 def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact") -> xr.DataArray:

@@ -1,6 +1,8 @@
-"""Inputs of a separation: a capture and all that is known of it, checked, as arrays."""
+"""Inputs of a separation: the method, a capture and all that is known of it, checked."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -10,33 +12,52 @@ from dbthermal import noise as noises
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.response import Curve
+from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
-from dbthermal.separation._tiles import Method
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.intp]
 
 # Pixels from which the noise is estimated where the response has none.
-_NOISE_PIXELS = 4096
-_READ = ("counts", "status", "segment")
-_MASK_DIMS = (("time",), ("y", "x"), ("time", "y", "x"))
+_NOISE_PIXELS: Final = 4096
+_READ: Final = ("counts", "status", "segment")
+_MASK_DIMS: Final = (("time",), ("y", "x"), ("time", "y", "x"))
+
+
+@dataclass(frozen=True)
+class Method:
+    """A separation method: its functions of a tile, and its demands on the capture."""
+
+    separate: Callable[..., Any]  # `Estimate` of a `Tile`, and of the settings where there are any
+    settings: type[Any] | None = None  # frozen dataclass; a field `batch` is a tile's pixels
+    minimum_frames: int = 1
+    knows_emissivity: bool = False  # is given the emissivities, and does not estimate them
+    whole_image: bool = False  # looks at a pixel's neighbours: a tile is the whole image
+    every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
+    survey: Callable[..., Any] | None = None  # `Survey` of the same arguments, for pooling
+    any_bands: bool = False  # takes more than two bands
+    not_estimated: tuple[str, ...] = ()  # variables of the result that are NaN everywhere
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Capture, responses, noise and known quantities of an image, in the capture's band order."""
+    """Method, capture, responses, noise and known quantities, in the capture's band order."""
 
+    method: Method
+    settings: Any  # of the type that the method has, or None
+    seed: int  # of random starts
     capture: xr.Dataset  # counts, where present status and segment, and `mask`; may be lazy
     curves: list[Curve]
     noise: Array  # standard deviation of the linearised signals (band) [K]
+    bands: list[int]  # places of the bands in the order of their noise
     emissivity: Array | None  # known beforehand (band, y, x) [1]
     emissivity_std: Array | None
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
 
-    @property
-    def bands(self) -> list[int]:
-        """Places of the bands in the order of their noise."""
-        return [int(band) for band in np.argsort(self.noise, kind="stable")]
+    def apply(self, function: Callable[..., Any] | None, tile: Any) -> Any:
+        """Apply a function of the method to a tile, with the settings where it has any."""
+        assert function is not None
+        return function(tile) if self.settings is None else function(tile, self.settings)
 
 
 def check(  # noqa: PLR0913 - all that the user gives, by name
@@ -45,6 +66,8 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     method: Method,
     name: str,
     *,
+    settings: Any,
+    seed: int,
     emissivity: xr.DataArray | None,
     emissivity_std: xr.DataArray | None,
     mask: xr.DataArray | None,
@@ -52,8 +75,9 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     response_kind: str,
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
+    settings = _checked_settings(method, name, settings)
     schema.check(corrected, "corrected")
-    quality.check_status(corrected)
+    _check_status(corrected)
     bands = [str(band) for band in corrected["band"].values]
     _check_demands(method, name, bands, corrected.sizes["time"])
     if emissivity is not None and not method.knows_emissivity:
@@ -69,7 +93,53 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         capture = capture.assign(mask=_checked_mask(capture, mask))
     noise = _noise(capture, response, curves)
     value, std = _known_emissivity(corrected, emissivity, emissivity_std)
-    return Inputs(capture, curves, noise, value, std, _labels(corrected, pool))
+    return Inputs(
+        method=method,
+        settings=settings,
+        seed=seed,
+        capture=capture,
+        curves=curves,
+        noise=noise,
+        bands=[int(band) for band in np.argsort(noise, kind="stable")],
+        emissivity=value,
+        emissivity_std=std,
+        labels=_labels(corrected, pool),
+    )
+
+
+def _checked_settings(method: Method, name: str, settings: Any) -> Any:
+    """Return the settings of a method, its defaults for None; None for a method without any."""
+    kind = method.settings
+    if settings is None:
+        return None if kind is None else kind()
+    if kind is None or type(settings) is not kind:
+        rule = "be omitted: it has no settings" if kind is None else f"be {kind.__name__}"
+        raise TypeError(
+            f"Invalid settings of type {type(settings).__name__} for method '{name}'. Must {rule}."
+        )
+    for field in fields(kind):
+        value = getattr(settings, field.name)
+        if type(field.default) is int and type(value) is not int:
+            raise TypeError(
+                f"Invalid {field.name} {value!r} of method '{name}'. Must be a whole number."
+            )
+    return settings
+
+
+def _check_status(corrected: xr.Dataset) -> None:
+    """Check the status that a capture brings along: (y, x), whole numbers of known bits."""
+    if "status" not in corrected:
+        return
+    status = corrected["status"]
+    if status.dims != ("y", "x") or status.dtype.kind not in "ui":
+        raise ValueError(
+            f"Invalid status {status.dims} of {status.dtype}. Must be ('y', 'x') of whole numbers."
+        )
+    unknown = status.values.astype(np.int64) & ~sum(Status)
+    if np.any(unknown):
+        raise ValueError(
+            f"Unknown bits {int(unknown.max())} in the status. Must be of {list(Status.bits())}."
+        )
 
 
 def _check_demands(method: Method, name: str, bands: list[str], frames: int) -> None:

@@ -38,22 +38,6 @@ def unusable(status: Bits) -> Mask:
     return np.asarray((status & _UNUSABLE) != 0)
 
 
-def check_status(corrected: xr.Dataset) -> None:
-    """Check the status that a capture brings along: (y, x), whole numbers of known bits."""
-    if "status" not in corrected:
-        return
-    status = corrected["status"]
-    if status.dims != ("y", "x") or status.dtype.kind not in "ui":
-        raise ValueError(
-            f"Invalid status {status.dims} of {status.dtype}. Must be ('y', 'x') of whole numbers."
-        )
-    unknown = status.values.astype(np.int64) & ~sum(Status)
-    if np.any(unknown):
-        raise ValueError(
-            f"Unknown bits {int(unknown.max())} in the status. Must be of {list(Status.names())}."
-        )
-
-
 def read(part: xr.Dataset, fewest: int = 1) -> tuple[Array, Mask, Bits]:
     """
     Read the samples of a part of the capture, and judge its pixels.
@@ -117,33 +101,41 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     return filled, valid | gap
 
 
-def frame_sets(valid: Mask, excluded: Mask) -> Iterator[tuple[Mask, Mask]]:
+def frame_sets(valid: Mask, status: Bits) -> Iterator[tuple[Mask, Mask]]:
     """Yield sets of frames (time), and the pixels (pixel) that have these frames and no others."""
-    if np.all(excluded):
+    usable = ~unusable(status)
+    if not np.any(usable):
         return
-    if np.all(valid[:, ~excluded]):
-        yield np.ones(valid.shape[0], dtype=bool), ~excluded
+    if np.all(valid[:, usable]):
+        yield np.ones(valid.shape[0], dtype=bool), usable
         return
     packed = np.packbits(valid, axis=0)
     _, first, group = np.unique(packed, axis=1, return_index=True, return_inverse=True)
     for index, pixel in enumerate(first):
-        pixels = (group.ravel() == index) & ~excluded
+        pixels = (group.ravel() == index) & usable
         if np.any(pixels):
             yield valid[:, pixel], pixels
 
 
-def common_frames(valid: Mask, excluded: Mask, fewest: int = 1) -> tuple[Mask, Mask]:
+def common_frames(
+    counts: Array, valid: Mask, status: Bits, fewest: int = 1
+) -> list[tuple[Mask, Mask]]:
     """
-    Frames that most pixels have, for methods that need the same frames of all.
+    Frames (time) that most pixels have, and the pixels (pixel) that have them all.
 
-    Returns these frames (time), and the usable pixels (pixel) that lack any of them; all usable
-    pixels where the frames are fewer than `fewest`.
+    For methods that need the same frames of all pixels. A usable pixel that lacks one gets the bit
+    of invalid samples and counts of zero, in place; so do all where the frames are fewer than
+    `fewest`, and then the list is empty.
     """
-    if np.all(excluded):
-        return np.ones(valid.shape[0], dtype=bool), np.zeros_like(excluded)
-    frames = np.mean(valid[:, ~excluded], axis=1) > MOST_MISSING
+    usable = ~unusable(status)
+    if not np.any(usable):
+        return []
+    frames = np.mean(valid[:, usable], axis=1) > MOST_MISSING
     enough = frames.sum() >= fewest
-    return frames, ~excluded & ~(enough & np.all(valid[frames], axis=0))
+    complete = usable & enough & np.all(valid[frames], axis=0)
+    status[usable & ~complete] |= np.uint32(Status.INVALID_SAMPLES)
+    counts[:, :, usable & ~complete] = 0.0
+    return [(frames, complete)] if np.any(complete) else []
 
 
 def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:

@@ -2,35 +2,20 @@
 
 import importlib
 import operator
-from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from dbthermal.schema import Status
-from dbthermal.separation import _inputs as inputs
-from dbthermal.separation import _quality as quality
+from dbthermal import schema
 from dbthermal.separation import _tiles as tiles
-from dbthermal.separation._inputs import Inputs, Labels
+from dbthermal.separation._inputs import Inputs, Labels, Method, check
 from dbthermal.separation._pooling import pool as pooling
-from dbthermal.separation._tiles import (
-    PIXELS,
-    Array,
-    Bits,
-    Estimate,
-    Mask,
-    Material,
-    Method,
-    Parts,
-    Survey,
-    Tile,
-    Window,
-)
+from dbthermal.separation._tiles import Array, Estimate, Mask, Material, Survey
 
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
@@ -39,7 +24,9 @@ if TYPE_CHECKING:
     from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
-    Settings = SubspaceSettings | DbvtSettings | NaiveSettings | RatioSettings | BcpSettings
+    Settings: TypeAlias = (
+        SubspaceSettings | DbvtSettings | NaiveSettings | RatioSettings | BcpSettings
+    )
 
 _MODULES: Final = {
     "subspace": ("_subspace.method", "METHOD"),
@@ -50,6 +37,7 @@ _MODULES: Final = {
     "bcp": ("_baselines.bcp", "METHOD"),
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
+_KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
 
@@ -115,7 +103,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         `object_temperature`, `background_temperature` (time, y, x) [K], `emissivity`
         (band, y, x) [1] and `reflection_ratio` (band, y, x) [1], the reflectivity over that of the
         quietest band (attribute `reference_band`), each with `_std`; `status` (y, x), bits of
-        `schema.FLAGS`; `noise` (band) [count], as used. Values are NaN where a flag says that they
+        `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says that they
         are undefined, at samples that the capture lacks or the mask leaves out, and where a method
         never estimates them (attribute `not_estimated`); where the status is 0, all others are
         finite. A given emissivity without a deviation has deviation 0.
@@ -145,54 +133,56 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        doi:10.48550/arXiv.2509.11334
     """
-    module = get_method(method)
-    settings = _checked_settings(module, method, settings)
     if operator.index(workers) < 1:
         raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")
     if operator.index(seed) < 0:
         raise ValueError(f"Invalid seed {seed}. Must be zero or positive.")
-    checked = inputs.check(
+    inputs = check(
         corrected,
         response,
-        module,
+        get_method(method),
         method,
+        settings=settings,
+        seed=seed,
         emissivity=emissivity,
         emissivity_std=emissivity_std,
         mask=mask,
         pool=pool,
         response_kind=response_kind,
     )
-    run = _Run(checked, module, settings, seed)
-    result = tiles.allocate(corrected)
-    height, pixels = corrected.sizes["y"], corrected.sizes["y"] * corrected.sizes["x"]
+    height, width = corrected.sizes["y"], corrected.sizes["x"]
+    result = _allocate(corrected)
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
         tqdm(
-            total=pixels if checked.labels is None else 2 * pixels,
+            total=height * width * (1 if inputs.labels is None else 2),
             unit="pixel",
             desc=method,
             disable=not progress,
         ) as bar,
     ):
-        blocks = list(tiles.blocks(height, whole_image=module.whole_image))
-        if checked.labels is not None:
-            selected = pooling.select(checked.labels)
-            run = run.pooled(threads.map(lambda rows: run.survey(rows, selected, bar), blocks))
-        for _ in threads.map(lambda rows: run.separate(rows, result.isel(y=rows), bar), blocks):
+        rows = height if inputs.method.whole_image else tiles.BLOCK_ROWS
+        blocks = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
+        material = None
+        if inputs.labels is not None:
+            selected = pooling.select(inputs.labels)
+            surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), blocks)
+            material = _pool(inputs, [part for found in surveys for part in found])
+        for _ in threads.map(lambda block: _separate(inputs, block, material, result, bar), blocks):
             pass
-    counts_per_kelvin = np.array([curve.reference_slope for curve in checked.curves])
+    counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
-    result["noise"] = xr.DataArray(checked.noise * counts_per_kelvin, dims="band", attrs=attrs)
-    ratios = () if module.survey else ("reflection_ratio", "reflection_ratio_std")
+    result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
+    ratios = () if inputs.method.survey else ("reflection_ratio", "reflection_ratio_std")
     return result.assign_attrs(
         method=method,
         response_kind=response_kind,
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
-        not_estimated=" ".join(module.not_estimated + ratios),
-        reference_band=str(corrected["band"].values[checked.bands[0]]),
-        **({} if settings is None else {"settings": repr(settings)}),
+        not_estimated=" ".join(inputs.method.not_estimated + ratios),
+        reference_band=str(corrected["band"].values[inputs.bands[0]]),
+        **({} if inputs.settings is None else {"settings": repr(inputs.settings)}),
     )
 
 
@@ -222,136 +212,105 @@ def get_method(name: str) -> Method:
     return method
 
 
-def _checked_settings(method: Method, name: str, settings: Any) -> Any:
-    """Return the settings of a method, its defaults for None; None for a method without any."""
-    kind = method.settings
-    if settings is None:
-        return None if kind is None else kind()
-    if kind is None or type(settings) is not kind:
-        rule = "be omitted: it has no settings" if kind is None else f"be {kind.__name__}"
-        raise TypeError(
-            f"Invalid settings of type {type(settings).__name__} for method '{name}'. Must {rule}."
-        )
-    for field in fields(kind):
-        value = getattr(settings, field.name)
-        if type(field.default) is int and type(value) is not int:
-            raise TypeError(
-                f"Invalid {field.name} {value!r} of method '{name}'. Must be a whole number."
+def _separate(
+    inputs: Inputs, rows: slice, material: Material | None, result: xr.Dataset, bar: "tqdm[Any]"
+) -> None:
+    """Separate a block of rows into its place in the result."""
+    for cut in tiles.cut(inputs, rows, material):
+        estimates = []
+        for frames, pixels, tile in cut.parts:
+            estimate: Estimate = inputs.apply(inputs.method.separate, tile)
+            whole = estimate.status.size == pixels.size
+            estimates.append(
+                (frames, pixels, estimate.select_pixels(pixels) if whole else estimate)
             )
-    return settings
+        _write(result, inputs.bands, cut, estimates)
+        bar.update(cut.status.size)
 
 
-@dataclass(frozen=True)
-class _Run:
-    """One run of a method over a capture, a block of rows at a time."""
+def _survey(
+    inputs: Inputs, rows: slice, selected: Mask, bar: "tqdm[Any]"
+) -> list[tuple[Labels, Survey]]:
+    """Survey the selected pixels of a block; with their numbers in the image."""
+    surveys = []
+    for cut in tiles.cut(inputs, rows):
+        numbers = tiles.numbers(cut.window, inputs.capture.sizes["x"])
+        for _, pixels, tile in cut.parts:
+            wanted = selected[numbers[pixels]]
+            if np.any(wanted):
+                part = tile if np.all(wanted) else tile.select_pixels(wanted)
+                survey: Survey = inputs.apply(inputs.method.survey, part)
+                surveys.append((numbers[pixels][wanted], survey))
+        bar.update(cut.status.size)
+    return surveys
 
-    inputs: Inputs
-    method: Method
-    settings: Any
-    seed: int
-    materials: Material | None = None
 
-    def separate(self, rows: slice, result: xr.Dataset, bar: "tqdm[Any]") -> None:
-        """Separate a block of rows into its place in the result."""
-        for window, status, valid, parts in self._tiles(rows):
-            estimates = []
-            for frames, pixels, tile in parts:
-                estimate: Estimate = self._call(self.method.separate, tile)
-                whole = estimate.status.size == pixels.size
-                estimate = estimate.select_pixels(pixels) if whole else estimate
-                estimates.append((frames, pixels, estimate))
-            tiles.write(result, window, self.inputs.bands, status, valid, estimates)
-            bar.update(status.size)
+def _pool(inputs: Inputs, surveys: list[tuple[Labels, Survey]]) -> Material | None:
+    """Ratios and emissivity of the material of each pixel of the image; None without a survey."""
+    labels = inputs.labels
+    if labels is None or not surveys:
+        return None
+    numbers = np.concatenate([number for number, _ in surveys])
+    survey = pooling.join([part for _, part in surveys])
+    noise = inputs.noise[inputs.bands]
+    materials = pooling.estimate(labels[numbers], int(labels.max()) + 1, survey, noise)
+    return pooling.expand(materials, labels)
 
-    def survey(self, rows: slice, selected: Mask, bar: "tqdm[Any]") -> list[tuple[Labels, Survey]]:
-        """Survey the selected pixels of a block; with their numbers in the image."""
-        surveys = []
-        for window, status, _, parts in self._tiles(rows):
-            numbers = self._numbers(window, rows)
-            for _, pixels, tile in parts:
-                wanted = selected[numbers[pixels]]
-                if np.any(wanted):
-                    part = tile if np.all(wanted) else tile.select_pixels(wanted)
-                    survey: Survey = self._call(self.method.survey, part)
-                    surveys.append((numbers[pixels][wanted], survey))
-            bar.update(status.size)
-        return surveys
 
-    def pooled(self, blocks: Iterable[list[tuple[Labels, Survey]]]) -> "_Run":
-        """Return the run in which the pixels of one material share their ratios and emissivity."""
-        labels = self.inputs.labels
-        surveys = [part for block in blocks for part in block]
-        if not surveys or labels is None:
-            return self
-        numbers = np.concatenate([number for number, _ in surveys])
-        survey = pooling.join([part for _, part in surveys])
-        noise = self.inputs.noise[self.inputs.bands]
-        materials = pooling.estimate(labels[numbers], int(labels.max()) + 1, survey, noise)
-        return replace(self, materials=materials)
+def _allocate(corrected: xr.Dataset) -> xr.Dataset:
+    """Make an empty result of the stage `separated` with the coordinates of a capture."""
+    dims = ("band", "time", "y", "x")
+    kept = {name: value for name, value in corrected.attrs.items() if name in _KEPT_ATTRS}
+    arrays = {}
+    for name, variable in schema.STAGES["separated"].items():
+        shape = tuple(corrected.sizes[dim] for dim in variable.dims)
+        attrs = schema.status_attrs() if name == "status" else variable.attrs
+        empty = np.empty(shape, dtype=variable.dtype)
+        arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs={**attrs, **kept})
+    coordinates = {name: corrected[name] for name in dims if name in corrected.coords}
+    return xr.Dataset(arrays, coords=coordinates, attrs=kept)
 
-    def _call(self, function: Callable[..., Any] | None, tile: Tile) -> Any:
-        assert function is not None
-        return function(tile) if self.settings is None else function(tile, self.settings)
 
-    def _numbers(self, window: Window, rows: slice) -> Labels:
-        """Numbers (pixel) of a window's pixels in the image."""
-        lines = np.arange(window[0].start, window[0].stop)[:, np.newaxis] + rows.start
-        columns = np.arange(window[1].start, window[1].stop)
-        return np.asarray((lines * self.inputs.capture.sizes["x"] + columns).ravel())
+def _write(
+    result: xr.Dataset,
+    bands: list[int],
+    cut: tiles.Cut,
+    estimates: list[tuple[Mask, Mask, Estimate]],
+) -> None:
+    """
+    Write the estimates of a window into the result, at frames (time) and pixels (pixel).
 
-    def _tiles(self, rows: slice) -> Iterator[tuple[Window, Bits, Mask, Parts[Tile]]]:
-        """Yield the windows of a block, status and valid samples, and a tile by set of frames."""
-        block = self.inputs.capture.isel(y=rows).load()
-        height, width, time = block.sizes["y"], block.sizes["x"], block["time"].values
-        method = self.method
-        size = height * width if method.whole_image else getattr(self.settings, "batch", PIXELS)
-        for window in tiles.windows(height, width, size):
-            part = block.isel(y=window[0], x=window[1])
-            counts, valid, status = quality.read(part, method.minimum_frames)
-            excluded, used = quality.unusable(status), valid
-            counts, valid = quality.bridge(counts, valid, time)
-            if method.whole_image or method.every_frame:
-                fewest = method.minimum_frames
-                frames, lacking = quality.common_frames(valid, excluded, fewest)
-                status[lacking] |= np.uint32(Status.INVALID_SAMPLES)
-                counts[:, :, lacking] = 0.0
-                usable = ~excluded & ~lacking
-                sets = [(frames, usable)] if np.any(usable) else []
+    `bands` are the places of the tile's bands in the capture. A pixel of no estimate becomes NaN
+    and keeps its status; so do temperatures at frames of no estimate, and at invalid samples.
+    """
+    complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
+    for name, variable in schema.STAGES["separated"].items():
+        target = result[name].values[..., cut.window[0], cut.window[1]]
+        shape = target.shape[-2:]
+        if name == "status":
+            target[...] = cut.status.reshape(shape)
+        elif not complete or any(getattr(estimate, name) is None for _, _, estimate in estimates):
+            target[...] = np.nan
+        for frames, pixels, estimate in estimates:
+            values = getattr(estimate, name)
+            if values is None:
+                continue
+            where = pixels.reshape(shape)
+            if name == "status":
+                target[where] |= values
+            elif "band" in variable.dims:
+                for index, band in enumerate(bands):
+                    target[band][where] = values[index]
             else:
-                sets = list(quality.frame_sets(valid, excluded))
-            tile = self._tile(part, counts, window, rows)
-            parts = []
-            for frames, pixels in sets:
-                one = tile if np.all(frames) else tile.select_frames(frames)
-                alone = not (method.whole_image or np.all(pixels))
-                parts.append((frames, pixels, one.select_pixels(pixels) if alone else one))
-            yield window, status, used, parts
+                _write_film(target, frames, where, values)
+        if "time" in variable.dims and not np.all(cut.valid):
+            target[~cut.valid.reshape(-1, *shape)] = np.nan
 
-    def _tile(self, part: xr.Dataset, counts: Array, window: Window, rows: slice) -> Tile:
-        """Make the tile of all pixels and frames of a window."""
-        known, bands = self.inputs, self.inputs.bands
-        place = (slice(window[0].start + rows.start, window[0].stop + rows.start), window[1])
-        curves = tuple(known.curves[band] for band in bands)
-        signals = [
-            curve.linearise(counts[band]) - curve.reference
-            for band, curve in zip(bands, curves, strict=True)
-        ]
-        emissivity, std = (
-            None if array is None else array[(slice(None), *place)].reshape(len(bands), -1)[bands]
-            for array in (known.emissivity, known.emissivity_std)
-        )
-        material = None
-        if self.materials is not None and known.labels is not None:
-            material = pooling.expand(self.materials, known.labels[self._numbers(window, rows)])
-        return Tile(
-            signals=np.stack(signals),
-            time=part["time"].values.astype(np.float64),
-            curves=curves,
-            noise=tuple(float(known.noise[band]) for band in bands),
-            shape=(part.sizes["y"], part.sizes["x"]),
-            rng=tiles.generator(self.seed, place),
-            segment=part["segment"].values.astype(np.intp) if "segment" in part else None,
-            material=material,
-            emissivity=emissivity,
-            emissivity_std=std,
-        )
+
+def _write_film(target: npt.NDArray[np.floating], frames: Mask, where: Mask, values: Array) -> None:
+    """Write values (time, pixel) at some frames and pixels of (time, y, x), in place."""
+    if np.all(frames) and np.all(where):
+        target[...] = values.reshape(target.shape)
+    else:
+        rows, columns = np.nonzero(where)
+        target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values

@@ -1,4 +1,4 @@
-"""Records of a tile: its inputs, the method that is applied to it, and the estimate it yields.
+"""Tiles of a capture: the inputs of each, cut out of the capture, and the estimate that it yields.
 
 A capture is read in blocks of rows and separated a few hundred pixels at a time: the memory beyond
 the result stays small, a lazy capture is never read whole, and a tile fits in the processor's
@@ -6,17 +6,18 @@ cache. A tile's bands are in the order of their noise, the quietest first: the r
 emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
-import xarray as xr
 
-from dbthermal import mixing, schema
+from dbthermal import mixing
 from dbthermal.response import Curve
 from dbthermal.schema import Status
+from dbthermal.separation import _quality as quality
+from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import status_bits
 
 Array = npt.NDArray[np.float64]
@@ -24,24 +25,25 @@ Whole = npt.NDArray[np.intp]
 Bits = npt.NDArray[np.uint32]
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
-"""Rows and columns of a tile."""
+"""Rows and columns of a tile in the image."""
 
 PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
-_BLOCK_ROWS: Final = 32
+BLOCK_ROWS: Final = 32
+"""Rows that are read at once: a lazy capture is then decoded about once."""
+
 # A temperature leaves the calibrated range if it is so many standard deviations outside.
 _RANGE_SIGMAS: Final = 5.0
 # A temperature [K], emissivity [1] or deviation beyond is no result.
 _USELESS: Final = 1e6
-_KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 
 
 @dataclass(frozen=True)
 class _Pixels:
     """A record of arrays, optional ones among them, whose last axis is the pixel."""
 
-    def select_pixels(self, selected: Mask) -> Self:
+    def select_pixels(self, selected: Mask | Whole) -> Self:
         """Return the record of the selected pixels alone."""
         values = ((field.name, getattr(self, field.name)) for field in fields(self))
         parts: dict[str, Any] = {name: v if v is None else v[..., selected] for name, v in values}
@@ -208,34 +210,22 @@ class Estimate(_Pixels):
 
 
 @dataclass(frozen=True)
-class Method:
-    """A separation method: its functions of a tile, and its demands on the capture."""
+class Cut:
+    """A window of the image, its data quality, and a tile by set of frames."""
 
-    separate: Callable[..., Estimate]  # of a `Tile`, and of the settings where there are any
-    settings: type[Any] | None = None  # frozen dataclass; a field `batch` is a tile's pixels
-    minimum_frames: int = 1
-    knows_emissivity: bool = False  # is given the emissivities, and does not estimate them
-    whole_image: bool = False  # looks at a pixel's neighbours: a tile is the whole image
-    every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
-    survey: Callable[..., Survey] | None = None  # of the same arguments, to pool the pixels
-    any_bands: bool = False  # takes more than two bands
-    not_estimated: tuple[str, ...] = ()  # variables of the result that are NaN everywhere
+    window: Window
+    status: Bits  # (pixel)
+    valid: Mask  # samples of the capture (time, pixel)
+    parts: list[tuple[Mask, Mask, Tile]]  # frames (time), pixels (pixel), and the tile of these
 
 
-def blocks(height: int, *, whole_image: bool = False) -> Iterator[slice]:
-    """Yield blocks of rows, each read at once: a lazy capture is then decoded about once."""
-    rows = height if whole_image else _BLOCK_ROWS
-    for top in range(0, height, rows):
-        yield slice(top, min(top + rows, height))
-
-
-def windows(height: int, width: int, pixels: int = PIXELS) -> Iterator[Window]:
-    """Yield windows of at most so many pixels that cover an image, along its rows."""
+def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
+    """Yield windows of at most so many pixels that cover some rows of an image."""
     columns = min(width, pixels)
-    rows = max(1, pixels // columns)
-    for top in range(0, height, rows):
+    height = max(1, pixels // columns)
+    for top in range(rows.start, rows.stop, height):
         for left in range(0, width, columns):
-            yield slice(top, min(top + rows, height)), slice(left, min(left + columns, width))
+            yield slice(top, min(top + height, rows.stop)), slice(left, min(left + columns, width))
 
 
 def generator(seed: int, window: Window) -> np.random.Generator:
@@ -244,68 +234,57 @@ def generator(seed: int, window: Window) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
-def allocate(corrected: xr.Dataset) -> xr.Dataset:
-    """Make an empty result of the stage `separated` with the coordinates of a capture."""
-    dims = ("band", "time", "y", "x")
-    kept = {name: value for name, value in corrected.attrs.items() if name in _KEPT_ATTRS}
-    arrays = {}
-    for name, variable in schema.STAGES["separated"].items():
-        shape = tuple(corrected.sizes[dim] for dim in variable.dims)
-        attrs = schema.status_attrs() if name == "status" else variable.attrs
-        empty = np.empty(shape, dtype=variable.dtype)
-        arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs={**attrs, **kept})
-    coordinates = {name: corrected[name] for name in dims if name in corrected.coords}
-    return xr.Dataset(arrays, coords=coordinates, attrs=kept)
+def numbers(window: Window, width: int) -> Whole:
+    """Numbers (pixel) of a window's pixels in an image of so many columns."""
+    lines = np.arange(window[0].start, window[0].stop)[:, np.newaxis] * width
+    return np.asarray((lines + np.arange(window[1].start, window[1].stop)).ravel())
 
 
-Part = TypeVar("Part")
-Parts = list[tuple[Mask, Mask, Part]]
-"""Frames (time) and pixels (pixel) of a window, and the tile or the estimate of these."""
-
-
-def write(
-    result: xr.Dataset,
-    window: Window,
-    bands: list[int],
-    status: Bits,
-    valid: Mask,
-    parts: Parts[Estimate],
-) -> None:
-    """
-    Write the estimates of a window's parts into the result.
-
-    `bands` are the places of the tile's bands in the capture. A pixel of no part becomes NaN and
-    keeps its `status` (pixel); so do temperatures at frames of no part and at samples that are not
-    `valid` (time, pixel).
-    """
-    complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in parts)
-    for name, variable in schema.STAGES["separated"].items():
-        target = result[name].values[..., window[0], window[1]]
-        shape = target.shape[-2:]
-        if name == "status":
-            target[...] = status.reshape(shape)
-        elif not complete or any(getattr(estimate, name) is None for _, _, estimate in parts):
-            target[...] = np.nan
-        for frames, pixels, estimate in parts:
-            values = getattr(estimate, name)
-            if values is None:
-                continue
-            where = pixels.reshape(shape)
-            if name == "status":
-                target[where] |= values
-            elif "band" in variable.dims:
-                for index, band in enumerate(bands):
-                    target[band][where] = values[index]
-            else:
-                _write_film(target, frames, where, values)
-        if "time" in variable.dims and not np.all(valid):
-            target[~valid.reshape(-1, *shape)] = np.nan
-
-
-def _write_film(target: npt.NDArray[np.floating], frames: Mask, where: Mask, values: Array) -> None:
-    """Write values (time, pixel) at some frames and pixels of (time, y, x), in place."""
-    if np.all(frames) and np.all(where):
-        target[...] = values.reshape(target.shape)
-    else:
-        rows, columns = np.nonzero(where)
-        target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values
+def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterator[Cut]:
+    """Read a block of rows and cut it into tiles; with the material of each pixel of the image."""
+    block = inputs.capture.isel(y=rows).load()
+    method, bands, width = inputs.method, inputs.bands, block.sizes["x"]
+    size = getattr(inputs.settings, "batch", PIXELS)
+    size = block.sizes["y"] * width if method.whole_image else size
+    time = block["time"].values.astype(np.float64)
+    segment = block["segment"].values.astype(np.intp) if "segment" in block else None
+    curves = tuple(inputs.curves[band] for band in bands)
+    for window in windows(rows, width, size):
+        rng, places = generator(inputs.seed, window), numbers(window, width)
+        local = slice(window[0].start - rows.start, window[0].stop - rows.start)
+        counts, valid, status = quality.read(
+            block.isel(y=local, x=window[1]), method.minimum_frames
+        )
+        filled, usable = quality.bridge(counts, valid, time)
+        if method.whole_image or method.every_frame:
+            sets = quality.common_frames(filled, usable, status, method.minimum_frames)
+        else:
+            sets = list(quality.frame_sets(usable, status))
+        emissivity, std = (
+            None if known is None else known[(slice(None), *window)].reshape(len(bands), -1)[bands]
+            for known in (inputs.emissivity, inputs.emissivity_std)
+        )
+        tile = Tile(
+            # The linearised signals (see `response`), less the reference temperature.
+            signals=np.stack(
+                [
+                    curve.linearise(filled[band]) - curve.reference
+                    for band, curve in zip(bands, curves, strict=True)
+                ]
+            ),
+            time=time,
+            curves=curves,
+            noise=tuple(float(inputs.noise[band]) for band in bands),
+            shape=(local.stop - local.start, window[1].stop - window[1].start),
+            rng=rng,
+            segment=segment,
+            material=None if material is None else material.select_pixels(places),
+            emissivity=emissivity,
+            emissivity_std=std,
+        )
+        parts = []
+        for frames, pixels in sets:
+            part = tile if np.all(frames) else tile.select_frames(frames)
+            whole = method.whole_image or np.all(pixels)
+            parts.append((frames, pixels, part if whole else part.select_pixels(pixels)))
+        yield Cut(window, status, valid, parts)

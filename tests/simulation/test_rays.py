@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from dbthermal.simulation.rays import Camera, Caster, mirror, unit
 from dbthermal.simulation.surroundings import Actor, Motion, Pose, Room, distance, incident
+from reproduction.twins.surfaces import ellipsoid
 
 CAMERA = Camera(position=(0.1, -0.6, 0.3), target=(0.0, 0.0, 0.05), shape=(45, 60))
 FRONT = Camera(position=(0.0, -1.0, 0.0), target=(0.0, 0.0, 0.0), shape=(90, 120))
@@ -19,7 +20,7 @@ SKIN = 307.15  # K
 
 def sphere(radius: float = RADIUS, subdivisions: int = 4) -> Caster:
     """Sphere about the origin."""
-    return Caster(trimesh.creation.icosphere(subdivisions, radius))
+    return Caster(ellipsoid((radius,) * 3, (0.0, 0.0, 0.0), radius * 1.107 / 2**subdivisions))
 
 
 def wall(turn: float = 0.0) -> trimesh.Trimesh:

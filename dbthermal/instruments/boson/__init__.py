@@ -252,12 +252,14 @@ class Boson(Closing):
         return self.read(commands.SERIAL_NUMBER)
 
     def identity(self) -> Identity:
-        """Numbers and versions of the camera, and whether it is emulated."""
+        """Numbers, versions and modes of the camera, and ``is_simulated``."""
         return {
             "serial_number": str(self.serial_number()),
             "sensor_serial_number": str(self.read(commands.SENSOR_SERIAL_NUMBER)),
             "part_number": self.read(commands.PART_NUMBER),
             "software_revision": self.read(commands.SOFTWARE_REVISION),
+            "gain_mode": self.gain_mode().name.lower(),
+            "ffc_mode": self.ffc_mode().name.lower(),
             "is_simulated": self.is_simulated,
         }
 

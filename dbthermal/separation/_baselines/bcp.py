@@ -28,7 +28,8 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from dbthermal import planck
 from dbthermal.response import require_range
 from dbthermal.separation._baselines import point_estimate
-from dbthermal.separation._tiles import Array, Estimate, Method, Tile
+from dbthermal.separation._inputs import Method
+from dbthermal.separation._tiles import Array, Estimate, Tile
 
 
 @dataclass(frozen=True)

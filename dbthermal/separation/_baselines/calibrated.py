@@ -13,8 +13,9 @@ import numpy as np
 
 from dbthermal import mixing
 from dbthermal.schema import Status
+from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import Array, Estimate, Method, Tile
+from dbthermal.separation._tiles import Array, Estimate, Tile
 
 _STEPS: Final = 5
 # Largest last step of a sample that is solved [K].

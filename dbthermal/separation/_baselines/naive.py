@@ -25,8 +25,9 @@ from scipy.special import expit, logit
 from dbthermal import mixing, planck
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Tile
+from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
 # Damping of the first step, relative to the diagonal of the normal equations, and its range; the
 # Schur complement is proportional to the damping, and is rounding below the least.

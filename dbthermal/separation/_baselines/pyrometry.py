@@ -25,8 +25,9 @@ from dbthermal import bands, planck
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import Array, Estimate, Method, Tile
+from dbthermal.separation._tiles import Array, Estimate, Tile
 
 KINDS: Final = ("wide", "narrow")
 # Knots of the table of ln R, in which 1/T is nearly straight: the spline is within 1 uK.

@@ -31,9 +31,10 @@ from dbthermal.schema import Status
 from dbthermal.separation._baselines import calibrated
 from dbthermal.separation._dbvt import DbvtSettings, newton, objective
 from dbthermal.separation._dbvt.objective import Images, Unknowns
+from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import method as subspace
-from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Tile
+from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
 # Largest departure of an interval from the median one, relative to it.
 _UNEVEN: Final = 0.5

@@ -52,12 +52,13 @@ import numpy as np
 
 from dbthermal import _smooth as smooth
 from dbthermal.schema import Status
+from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import reflection_ratio, residuals
 from dbthermal.separation._subspace.emission import Emission
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
-from dbthermal.separation._tiles import Array, Estimate, Mask, Method, Survey, Tile
+from dbthermal.separation._tiles import Array, Estimate, Mask, Survey, Tile
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -118,8 +119,7 @@ class _Solution:
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of two bands or more."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        functions = _functions(tile)
-        return _with_jumps(tile, functions, _exact(tile, functions, settings, _report), settings)
+        return _with_jumps(tile, settings)
 
 
 def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
@@ -143,8 +143,8 @@ def _exact(
 ) -> Record:
     """Steps 1 to 4, where it matters a second time on signals with proportional reflections."""
     solution = _steps(tile, tile, functions, settings)
-    bend = emissions.bend(tile, solution.emission, solution.background)
     result = finish(tile, functions, solution)
+    bend = emissions.bend(tile, solution.emission, solution.background)
     change = bend - bend.mean(axis=1, keepdims=True)
     energy = np.einsum("btp,btp->bp", change, change)
     bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
@@ -237,10 +237,10 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     }
 
 
-def _with_jumps(
-    tile: Tile, functions: smooth.Subspace, result: Estimate, settings: SubspaceSettings
-) -> Estimate:
-    """Step 5: pixels that do not fit are solved anew with a jump in the subspace."""
+def _with_jumps(tile: Tile, settings: SubspaceSettings) -> Estimate:
+    """All steps: pixels that do not fit are solved anew with a jump in the subspace."""
+    functions = _functions(tile)
+    result = _exact(tile, functions, settings, _report)
     inside, ramp = residuals.candidates(tile.time), residuals.ramp_frames(tile.time)
     if inside.size == 0:
         return result
