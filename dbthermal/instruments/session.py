@@ -253,11 +253,11 @@ class Session:
         try:
             session: Self = TypeAdapter(cls).validate_python(content)
         except ValidationError as error:
-            told = [
+            messages = [
                 f"{files.get(str(one['loc'][0]), path) if one['loc'] else path}: {_message(one)}"
                 for one in error.errors()
             ]
-            raise ValueError("\n".join(told)) from None
+            raise ValueError("\n".join(messages)) from None
         return session
 
 
@@ -289,7 +289,7 @@ def _message(error: Any) -> str:
     """One error of pydantic as a sentence: place, value and rule."""
     place = ".".join(str(part) for part in error["loc"] if part != "[key]")
     if error["type"] == "missing":
-        return f"Missing '{place}'. Must be given."
+        return f"Missing '{place}'. Must be set."
     if error["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
         return f"Unknown key '{place}'. Must be one of those in dbthermal.instruments.session."
     rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"])

@@ -83,7 +83,7 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("text", "status", "message"),
     [
-        ("name: plate", 2, "Missing 'simulated'. Must be given"),
+        ("name: plate", 2, "Missing 'simulated'. Must be set"),
         (TEXT.replace("sim://tc08", "sim://tc09"), 1, "Failed: Invalid URL 'sim://tc09'"),
     ],
 )
