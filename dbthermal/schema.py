@@ -20,7 +20,6 @@ __all__ = [
     "COORDINATES",
     "EMISSIVITY_LIMITS",
     "EXPOSURE_TIME",
-    "FLAGS",
     "FRAME_FLAGS",
     "NOISE",
     "OPTIONAL",
@@ -219,19 +218,24 @@ class Flags(IntFlag):
         member.meaning = meaning
         return member
 
-    @classmethod
-    def names(cls) -> dict[str, Self]:
-        """Bits by their name in lower case, as in `flag_meanings`."""
-        return {str(bit.name).lower(): bit for bit in cls}
+    @property
+    def label(self) -> str:
+        """Name in lower case, as in `flag_meanings`."""
+        return str(self.name).lower()
 
     @classmethod
-    def attrs(cls, variable: Variable) -> dict[str, object]:
+    def bits(cls) -> dict[str, int]:
+        """Values by label."""
+        return {bit.label: bit.value for bit in cls}
+
+    @classmethod
+    def cf_attrs(cls, variable: Variable) -> dict[str, object]:
         """CF attributes of a variable of these flags: masks, names, a sentence each, unit."""
         return {
             **variable.attrs,
-            "flag_masks": np.array([bit.value for bit in cls], dtype=variable.dtype),
-            "flag_meanings": " ".join(cls.names()),
-            "comment": "; ".join(f"{name}: {bit.meaning}" for name, bit in cls.names().items()),
+            "flag_masks": np.array(list(cls.bits().values()), dtype=variable.dtype),
+            "flag_meanings": " ".join(cls.bits()),
+            "comment": "; ".join(f"{bit.label}: {bit.meaning}" for bit in cls),
         }
 
 
@@ -256,18 +260,14 @@ class Status(Flags):
     ROLES_MAY_BE_SWAPPED = 1 << 15, "mean emissivity below 1/2: object and background exchanged"
 
 
-FLAGS: Final = MappingProxyType({name: int(bit) for name, bit in Status.names().items()})
-"""Bits of `status`, by name."""
-
-
 def status_attrs() -> dict[str, object]:
     """CF attributes of a `status` variable: `flag_masks` (uint32), `flag_meanings`, units."""
-    return Status.attrs(_STATUS)
+    return Status.cf_attrs(_STATUS)
 
 
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """
-    Where any of some flags is set, by the CF attributes of the variable that holds them.
+    Mask of the places where any of some flags is set, by the CF attributes of the variable.
 
     Parameters
     ----------
@@ -408,7 +408,7 @@ def nomenclature() -> str:
     parts = [_PREFACE, "## Coordinates", _table(COORDINATES)]
     for stage, variables in STAGES.items():
         parts += [f"## Stage `{stage}`", _table({**variables, **OPTIONAL.get(stage, {})}, stage)]
-    bits = [f"| {int(bit)} | `{name}` | {bit.meaning} |" for name, bit in Status.names().items()]
+    bits = [f"| {bit.value} | `{bit.label}` | {bit.meaning} |" for bit in Status]
     head = ["| value | name | meaning |", "| --: | --- | --- |"]
     return "\n\n".join([*parts, "## Bits of `status`", "\n".join([*head, *bits])]) + "\n"
 

@@ -1,6 +1,7 @@
 """An import points strictly down the layers; the heavy and the optional have one place each."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -9,16 +10,10 @@ from pathlib import Path
 import dbthermal
 
 PACKAGE = Path(dbthermal.__file__).parent
-LAYERS = (
-    "schema planck mixing _smooth",
-    "noise",
-    "response bands correction alignment metrics figures store readers",
-    "calibration emissivity limits",
-    "separation",
-    "simulation",
-    "instruments",
-    "acquire",
-)
+ARCHITECTURE = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+# The page lists the layers from the top down.
+(BLOCK,) = re.findall(r"```layers\n(.*?)```", ARCHITECTURE, re.DOTALL)
+LAYERS = BLOCK.splitlines()[::-1]
 LEVEL = {module: level for level, row in enumerate(LAYERS) for module in row.split()}
 PLACES = {
     "zarr": {"store"},

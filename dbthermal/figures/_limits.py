@@ -28,7 +28,7 @@ _MICRO: Final = "\N{MICRO SIGN}m"
 
 def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) -> Figure:
     """
-    What accuracy to expect with which filter, and what a longer film gains.
+    Expected accuracy with each filter, and what a longer film gains.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def status(result: xr.Dataset) -> Figure:
     Parameters
     ----------
     result : Dataset
-        From `separation.solve`: `status` (y, x), bits of `schema.FLAGS`.
+        From `separation.solve`: `status` (y, x), bits of `schema.Status`.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def status(result: xr.Dataset) -> Figure:
     Raises
     ------
     ValueError
-        If a bit is none of `schema.FLAGS`.
+        If a bit is none of `schema.Status`.
     """
     first = first_reason(result["status"])
     shares = {name: float(np.mean(first == name)) for name in ("", *REASONS)}
@@ -87,9 +87,9 @@ def _patch(name: str, share: float) -> Patch:
 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
     """Name of the most decisive flag of each pixel; empty where there is none."""
-    unknown = int(np.bitwise_or.reduce(flags.values, axis=None)) & ~sum(schema.FLAGS.values())
+    unknown = int(np.bitwise_or.reduce(flags.values, axis=None)) & ~sum(schema.Status)
     if unknown:
-        raise ValueError(f"Unknown bits {unknown} of a status. Must be of {dict(schema.FLAGS)}.")
-    names = sorted(schema.FLAGS, key=list(REASONS).index)
-    masks = [(flags.values & schema.FLAGS[name]) != 0 for name in names]
+        raise ValueError(f"Unknown bits {unknown} of a status. Must be of {schema.Status.bits()}.")
+    names = sorted(schema.Status.bits(), key=list(REASONS).index)
+    masks = [(flags.values & schema.Status.bits()[name]) != 0 for name in names]
     return np.select(masks, [np.array(name) for name in names], default=np.array(""))

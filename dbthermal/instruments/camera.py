@@ -1,10 +1,10 @@
 """The interface of a camera: all that recorder, sessions and live view need of any camera.
 
 `FrameSource` gives frames with two clocks, a number, flags and metadata; `CameraControl`, which a
-camera may lack, sets its modes and tells its temperature and its shutter. `KINDS` names the module
-of each kind of camera, which is imported when a session asks for it. `next_shutter` turns what a
-camera tells into the flag of a closed shutter, for all cameras alike. A damaged frame is handed on
-and says so in its flags: to hide or mend it is not the driver's task.
+camera may lack, sets its modes and reads its temperature and the state of its shutter. `KINDS`
+names the module of each kind of camera, which is imported when a session asks for it.
+`next_shutter` makes the flag of a closed shutter from telemetry, serial line and image, for all
+cameras alike. A damaged frame is handed on with flags: to hide or mend it is not the driver's task.
 """
 
 import importlib
@@ -85,8 +85,8 @@ GOOD: Final = FrameFlag(0)
 
 MEANINGS: Final = MappingProxyType(
     {
-        FrameFlag.DRIVER_ERROR: "the driver says that the data are damaged",
-        FrameFlag.WRONG_SIZE: "fewer or more bytes than a frame has: what is missing is 0",
+        FrameFlag.DRIVER_ERROR: "the driver reports damaged data",
+        FrameFlag.WRONG_SIZE: "fewer or more bytes than a frame has: missing ones are 0",
         FrameFlag.FOREIGN_CLOCK: "the device time is not on the host's monotonic clock",
         FrameFlag.SHUTTER_CLOSED: "the shutter is closed, or the offsets were just renewed",
         FrameFlag.FRAMES_LOST_BEFORE: "the sequence number leaps: frames are missing before it",
@@ -156,7 +156,7 @@ class SourceLostError(ConnectionError):
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a camera says of one frame besides its image."""
+    """Metadata that a camera gives with one frame, besides its image."""
 
     frame_counter: int = -1  # camera's own number of the frame, -1 if not known
     last_ffc_frame: int | None = None  # frame_counter at the last flat-field correction
@@ -168,7 +168,7 @@ class Frame:
     """
     One frame as it came.
 
-    The counts are the frame's own: no driver writes to them again. A leap of the sequence number is
+    No driver writes to the counts again. A leap of the sequence number is
     a loss. Metadata are missing without telemetry, or if the frame is damaged.
     """
 
@@ -187,8 +187,7 @@ class Stream:
 
     shape: tuple[int, int] = (512, 640)  # rows and columns of the image, without telemetry [pixel]
     frame_rate: float = 60.0  # [Hz]
-    telemetry_rows: int = 0  # besides: 2 for a Boson with telemetry on
-    telemetry_first: bool = False  # whether these are above the image, as the camera is set
+    telemetry_rows: int = 0  # below the image: 2 for a Boson with telemetry on
 
     @property
     def rows(self) -> int:
@@ -231,14 +230,14 @@ class FrameSource(Protocol):
 
 
 class CameraControl(Protocol):
-    """The command port of a camera that has one; what fails is a RuntimeError or an OSError."""
+    """The command port of a camera that has one; failures are RuntimeError or OSError."""
 
     @property
     def is_simulated(self) -> bool:
         """True if the camera is emulated."""
 
     def identity(self) -> Identity:
-        """Serial number, versions and ``is_simulated``, by name, for the record of a capture."""
+        """Serial number, versions, modes and ``is_simulated``, for the record of a capture."""
 
     def prepare(self, telemetry_rows: int) -> None:
         """Set 16-bit counts, telemetry and FFC on command only; ValueError if one is not kept."""
@@ -268,12 +267,15 @@ OpenControl = Callable[[str, object | None], AbstractContextManager[CameraContro
 
 @dataclass(frozen=True)
 class CameraKind:
-    """One kind of camera, as its module names it in ``KIND``."""
+    """
+    One kind of camera, as its module names it in ``KIND``.
 
-    open_frames: OpenFrames  # opens the frames of a hardware address in a format
-    open_control: OpenControl | None = (
-        None  # opens a command port, given the emulated bench or None
-    )
+    `open_frames` opens the frames of a hardware address in a format, `open_control` the command
+    port of an address, given the emulated bench or None.
+    """
+
+    open_frames: OpenFrames
+    open_control: OpenControl | None = None
     telemetry_rows: tuple[int, ...] = (0,)  # numbers of telemetry rows that it can give
 
 
@@ -291,7 +293,7 @@ class Shutter:
 
     closed: bool = False  # whether the frame is flagged `FrameFlag.SHUTTER_CLOSED`
     copies: int = 0  # frames in a row, up to this one, that repeat the image before
-    last_ffc_frame: int | None = None  # frame of the last correction, as far as telemetry told it
+    last_ffc_frame: int | None = None  # frame of the last correction, from telemetry
 
 
 def next_shutter(
@@ -302,21 +304,21 @@ def next_shutter(
     ffc_status: FfcStatus | None = None,
 ) -> Shutter:
     """
-    State of a camera's shutter after one more frame, from what the camera tells.
+    State of a camera's shutter after one more frame, from telemetry, serial line and image.
 
     A camera freezes its image while the shutter is closed. A frame counts as closed if
 
-    - telemetry says that the offsets were renewed since the frame before (`last_ffc_frame`
+    - by its telemetry the offsets were renewed since the frame before (`last_ffc_frame`
       changed), be it at the start or at the end of the correction: then one frame more is lost, but
       no renewal is missed, even where the frozen frames were lost on the way; or
-    - it repeats the image, and the frame before counted as closed, or the serial line says that a
+    - it repeats the image, and the frame before counted as closed, or by the serial line a
       correction is imminent or in progress (a reading is older than its frame, so that it does not
       count against an image that changes); or
     - it is the `FEWEST_COPIES`-th copy in a row or a later one, of a camera without telemetry. A
-      serial line alone may miss an event: it is asked once a second, and stalls meanwhile.
+      serial line alone may miss an event: it is read once a second, and stalls meanwhile.
 
-    The flag is per band and frame, and is known with the frame. It marks an event at least once,
-    not always from its first copy: `dbthermal.correction.find_shutter(capture, closed=...)` takes
+    The flag is per band and frame, and is known with the frame. It marks an event, not
+    always from its first copy: `dbthermal.correction.find_shutter(capture, closed=...)` takes
     ``(frame_flags & SHUTTER_CLOSED) != 0`` (band, time) as `closed`, and every run of copies that
     holds or touches a flagged frame becomes one event with renewed offsets, which
     `dbthermal.correction.mark_shutter` takes out.

@@ -54,7 +54,7 @@ class Status:
     """Recording state of one band; numbers of its last frame are NaN before it."""
 
     band: str
-    frame_rate: float  # over the last window, by the times of arrival [Hz]; 0 if none came in it
+    frame_rate: float  # over the last window, by the times of arrival [Hz]; 0 without any
     frames: int
     lost: int
     refused: int
@@ -185,7 +185,7 @@ def _metadata(band: str, preview: Preview | None) -> Metadata:
 
 
 def _corrected(band: str, before: Preview | None, now: Preview) -> bool:
-    """Whether the telemetry says that the offsets were renewed between two previews."""
+    """Whether the offsets were renewed between two previews, by the telemetry."""
     earlier, later = (_metadata(band, shown).last_ffc_frame for shown in (before, now))
     return None not in {earlier, later} and earlier != later
 
@@ -320,7 +320,7 @@ class View:
 
 
 def _apart(limits: tuple[float, float]) -> tuple[float, float]:
-    """Black and white, apart even where all counts are equal; 0 and 1 where there are none."""
+    """Counts drawn black and white: distinct even in a uniform picture, 0 and 1 without one."""
     low, high = limits
     if math.isnan(low):
         return 0.0, 1.0
@@ -328,7 +328,7 @@ def _apart(limits: tuple[float, float]) -> tuple[float, float]:
 
 
 def _foot(preview: Preview) -> str:
-    """Readings that belong to no band that is shown: of thermocouples, of the blackbody."""
+    """Readings beside those of the shown bands: of thermocouples, of the blackbody."""
     used = {prefix + band for prefix in (_FPA, _FFC) for band in preview.totals}
     return ", ".join(
         f"{name} {_reading(name, value, preview.units.get(name, 'K'))}"

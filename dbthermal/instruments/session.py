@@ -31,7 +31,7 @@ band is one of the filters is the one behind the wheel.
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -199,10 +199,6 @@ class Session:
         """Address of a device in this session: the simulated one, or the hardware's."""
         return device.simulated if self.simulated else device.hardware
 
-    def content(self) -> dict[str, Any]:
-        """Content of the session for the attributes of a recording, JSON."""
-        return asdict(self)
-
     @classmethod
     def from_yaml(cls, text: str) -> Self:
         """Read a session from YAML, see the module; ValueError as from `load`."""
@@ -217,21 +213,16 @@ class Session:
         ----------
         path : str or Path
             YAML; see the module. Keys that several sessions share, such as the addresses, may stand
-            in a file of their own, whose name is the key ``rig``, relative to this one.
+            in another file, whose name relative to this one is the key ``rig``.
         changes : mapping, optional
             Values in place of those in the files, by key; of ``blackbody``, key by key.
-
-        Returns
-        -------
-        Session
-            Checked.
 
         Raises
         ------
         FileNotFoundError
             If a file does not exist.
         ValueError
-            If it is not YAML, a key is missing, unknown or in both files, or a value is invalid:
+            If it is not YAML, or a key is missing, unknown or in both files, or a value is invalid:
             the message has the file, the place in it, the value and the rule.
         """
         content = _read_yaml(Path(path).read_text(encoding="utf-8"), str(path))
@@ -253,11 +244,11 @@ class Session:
         try:
             session: Self = TypeAdapter(cls).validate_python(content)
         except ValidationError as error:
-            told = [
+            messages = [
                 f"{files.get(str(one['loc'][0]), path) if one['loc'] else path}: {_message(one)}"
                 for one in error.errors()
             ]
-            raise ValueError("\n".join(told)) from None
+            raise ValueError("\n".join(messages)) from None
         return session
 
 
@@ -289,7 +280,7 @@ def _message(error: Any) -> str:
     """One error of pydantic as a sentence: place, value and rule."""
     place = ".".join(str(part) for part in error["loc"] if part != "[key]")
     if error["type"] == "missing":
-        return f"Missing '{place}'. Must be given."
+        return f"Missing '{place}'. Must be set."
     if error["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
         return f"Unknown key '{place}'. Must be one of those in dbthermal.instruments.session."
     rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"])

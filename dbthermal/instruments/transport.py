@@ -1,7 +1,7 @@
 """Byte streams to devices, each opened by one name like an address.
 
 ``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``pty:///dev/pts/3`` a
-pseudo-terminal on which somebody emulates a device, and ``sim://boson?sn=7`` an emulator that is
+pseudo-terminal of an emulated device, and ``sim://boson?sn=7`` an emulator that is
 started for the caller and ends with the transport. Nothing is sent when one is opened. Tested on
 pseudo-terminals, not on hardware.
 """

@@ -46,8 +46,8 @@ Y16: Final = 0x20363159
 """Pixel format ``Y16 ``: 16 bits a pixel, little-endian, before any gain control."""
 
 BUFFERS: Final = 32
-"""Frames that the kernel holds while nobody reads, the most it can; beyond, it drops: half a second
-at 60 Hz, in which a busy computer gets round to read again."""
+"""Frames that the kernel holds while no program reads, the most it can; beyond, it drops: half a
+second at 60 Hz, in which a busy computer gets round to read again."""
 
 QUERYCAP: Final = 0x80685600
 ENUM_FMT: Final = 0xC0405602
@@ -271,23 +271,24 @@ class Capture(Closing):
         try:
             self._kernel.ask(file, QBUF, buffer)
         except OSError as error:
-            if error.errno not in _GONE:  # else the next `read` tells that this frame was the last
+            if error.errno not in _GONE:  # else the next `read` reports the loss
                 raise
 
     def _frame(self, buffer: bytearray, host_time: float) -> Frame:
         """Copy a frame out of its buffer and translate the kernel's flags."""
-        index, _, used, said, _, seconds, micros, sequence, *_ = BUFFER.unpack(buffer)
+        index, _, used, state, _, seconds, micros, sequence, *_ = BUFFER.unpack(buffer)
         image = np.zeros((self.stream.rows, self.shape[1]), dtype="<u2")
         size = min(used, image.nbytes)
         image.reshape(-1).view(np.uint8)[:size] = np.frombuffer(self._maps[index], np.uint8, size)
-        flags = FrameFlag.DRIVER_ERROR if said & _ERROR else GOOD
+        flags = FrameFlag.DRIVER_ERROR if state & _ERROR else GOOD
         flags |= FrameFlag.WRONG_SIZE if used != image.nbytes else GOOD
-        flags |= FrameFlag.FOREIGN_CLOCK if said & _CLOCK_MASK != _MONOTONIC else GOOD
-        counts, rows = _split(image.astype(np.uint16, copy=False), self.stream)
-        readable = self._decode is not None and rows is not None and not flags & DAMAGED
-        metadata = self._decode(rows) if readable else None  # type: ignore[misc, arg-type]
-        time_stamp = seconds + _MICRO * micros
-        return Frame(counts, time_stamp, host_time, sequence, flags, rows, metadata)
+        flags |= FrameFlag.FOREIGN_CLOCK if state & _CLOCK_MASK != _MONOTONIC else GOOD
+        counts, rows, metadata = image.astype(np.uint16, copy=False), None, None
+        if self.telemetry_rows:
+            counts, rows = counts[: self.shape[0]], counts[self.shape[0] :]
+            metadata = self._decode(rows) if self._decode and not flags & DAMAGED else None
+        stamp = seconds + _MICRO * micros
+        return Frame(counts, stamp, host_time, sequence, flags, rows, metadata)
 
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
@@ -324,16 +325,6 @@ def _formats(file: int, kernel: Kernel) -> list[int]:
 def _buffer(index: int) -> bytearray:
     """Argument for a buffer of this number."""
     return bytearray(BUFFER.pack(index, CAPTURE, 0, 0, 0, 0, 0, 0, MMAP, 0, 0))
-
-
-def _split(image: Counts, stream: Stream) -> tuple[Counts, Counts | None]:
-    """Image, and telemetry rows if there are any."""
-    rows = stream.telemetry_rows
-    if rows == 0:
-        return image, None
-    return (
-        (image[rows:], image[:rows]) if stream.telemetry_first else (image[:-rows], image[-rows:])
-    )
 
 
 def __dir__() -> list[str]:

@@ -138,7 +138,7 @@ def _check_status(corrected: xr.Dataset) -> None:
     unknown = status.values.astype(np.int64) & ~sum(Status)
     if np.any(unknown):
         raise ValueError(
-            f"Unknown bits {int(unknown.max())} in the status. Must be of {list(Status.names())}."
+            f"Unknown bits {int(unknown.max())} in the status. Must be of {list(Status.bits())}."
         )
 
 

@@ -103,7 +103,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         `object_temperature`, `background_temperature` (time, y, x) [K], `emissivity`
         (band, y, x) [1] and `reflection_ratio` (band, y, x) [1], the reflectivity over that of the
         quietest band (attribute `reference_band`), each with `_std`; `status` (y, x), bits of
-        `schema.FLAGS`; `noise` (band) [count], as used. Values are NaN where a flag says that they
+        `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says that they
         are undefined, at samples that the capture lacks or the mask leaves out, and where a method
         never estimates them (attribute `not_estimated`); where the status is 0, all others are
         finite. A given emissivity without a deviation has deviation 0.

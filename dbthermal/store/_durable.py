@@ -1,8 +1,8 @@
 """Files and folders that survive a power loss: written, then synced, then renamed.
 
-A file system may write names and contents in any order: a file that took the place of another may
-come back from a power loss with its new name and without its content. So the new content is brought
-to the disk first, then it takes the place, then the folder that holds the name is brought there.
+A file system may write names and contents in any order: after a power loss a renamed file may have
+its new name and no content. So the new content is synced to the disk first, then it is renamed,
+then the folder that holds the name is synced.
 """
 
 import asyncio

@@ -83,7 +83,7 @@ def commit() -> str:
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    """Return what a git command prints in `folder`; nothing if it fails or git is absent."""
+    """Output of a git command in `folder`; empty if it fails or git is absent."""
     command = ["git", "-C", str(folder), *arguments]
     environment = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}
     try:
@@ -94,7 +94,7 @@ def _git(folder: Path, *arguments: str) -> str:
 
 
 def _plain(name: str, value: object) -> Any:
-    """Return the value as JSON gives it back: tuples are lists, keys are strings."""
+    """Value after a round trip through JSON: tuples are lists, keys are strings."""
     try:
         return json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as error:
@@ -105,7 +105,7 @@ def _plain(name: str, value: object) -> Any:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Yield the files below `folder`, ordered by their relative names."""
+    """Files below `folder`, ordered by their relative names."""
     yield from sorted(
         (path for path in folder.rglob("*") if path.is_file()),
         key=lambda path: path.relative_to(folder).as_posix(),

@@ -38,7 +38,7 @@ class Recording:
 
     def __init__(self, path: Path, group: zarr.Group, chunk: int, attrs: dict[str, Any]) -> None:
         self.path, self.chunk = path, chunk
-        # A chunk of zeros is written too: one that is not there was never recorded.
+        # A chunk of zeros is written too: a missing one was never recorded.
         config: Any = {"write_empty_chunks": True}
         self._arrays = {name: array.with_config(config) for name, array in group.arrays()}
         self._attrs = attrs
@@ -146,9 +146,9 @@ class Recording:
             return
         self.commit()
         frames = max(self.frames.values())
-        for place, own in enumerate(self.frames.values()):
-            if 0 < own < frames:
-                self._repeat_last(place, own, frames)
+        for place, recorded in enumerate(self.frames.values()):
+            if 0 < recorded < frames:
+                self._repeat_last(place, recorded, frames)
         for array in self._arrays.values():
             shape = {"time": frames, "log": self.rows}
             sizes = zip(_dims(array), array.shape, strict=True)
@@ -158,16 +158,18 @@ class Recording:
         self.commit(complete=complete, closed=True, **attrs)
         self._closed = True
 
-    def _repeat_last(self, place: int, own: int, frames: int) -> None:
+    def _repeat_last(self, place: int, recorded: int, frames: int) -> None:
+        """Fill a band up to a number of frames with copies of its last one, chunk by chunk."""
         counts = self._arrays["counts"]
         _grow(counts, 1, frames)
-        last = np.asarray(counts[place, own - 1])
-        while own < frames:
-            number = own // self.chunk
-            after = min(frames, (number + 1) * self.chunk)
-            counts[place, own:after] = np.broadcast_to(last, (after - own, *last.shape))
+        last = np.asarray(counts[place, recorded - 1])
+        start = recorded
+        while start < frames:
+            number = start // self.chunk
+            stop = min(frames, (number + 1) * self.chunk)
+            counts[place, start:stop] = np.broadcast_to(last, (stop - start, *last.shape))
             self._to_disk(["counts"], [Path("c", str(place), str(number))])
-            own = after
+            start = stop
 
     def _create_time(self, time: Values) -> None:
         with made_beside(self.path / "time", self.path.absolute().parent) as part:

@@ -20,7 +20,7 @@ TOLERANCE: Final = 0.01
 """Largest difference of two numbers, relative to the larger of the two [1]."""
 
 MARKS: Final = ("<!-- paper_vs_ours -->", "<!-- end of paper_vs_ours -->")
-"""Marks around the comparison with the paper in the README."""
+"""Marks around the comparison with the paper in docs/paper.md."""
 
 Numbers = dict[str, store.Number]
 
@@ -63,24 +63,24 @@ def agree(value: object, expected: object) -> bool:
     return value == expected and type(value) is type(expected)
 
 
-def with_table(readme: str, numbers: Mapping[str, Numbers]) -> str:
-    """Text of the README with the comparison with the paper between its `MARKS`."""
-    head, start, rest = readme.partition(MARKS[0])
+def with_table(page: str, numbers: Mapping[str, Numbers]) -> str:
+    """Text of docs/paper.md with the comparison with the paper between its `MARKS`."""
+    head, start, rest = page.partition(MARKS[0])
     _, stop, tail = rest.partition(MARKS[1])
     if not (start and stop):
-        raise ValueError(f"Missing marks {MARKS} in the README. Must enclose its table.")
+        raise ValueError(f"Missing marks {MARKS} in docs/paper.md. Must enclose its table.")
     return f"{head}{start}\n\n{paper.markdown(numbers)}\n{stop}{tail}"
 
 
 def record(numbers: Mapping[str, Numbers], reference: Mapping[str, object]) -> None:
-    """Keep a run's numbers as the reference of its kind; with data, in the README's table too."""
+    """Keep a run's numbers as the reference of its kind; with data, in docs/paper.md, too."""
     kind = kind_of(numbers)
     text = json.dumps({**reference, kind: numbers}, indent=1, sort_keys=True)
     reference_path().write_text(text + "\n", encoding="utf-8")
     if kind == "with data":
-        readme = paths.root() / "README.md"
-        text = with_table(readme.read_text(encoding="utf-8"), numbers)
-        readme.write_text(text, encoding="utf-8")
+        page = paths.root() / "docs" / "paper.md"
+        text = with_table(page.read_text(encoding="utf-8"), numbers)
+        page.write_text(text, encoding="utf-8")
     print(f"kept {sum(map(len, numbers.values()))} numbers, {kind}")
 
 

@@ -59,6 +59,7 @@ class StubCamera(_Stub):
             0x50054: struct.pack(">i", 3),
             LAST_FFC: struct.pack(">I", 0),
             FFC_MODE: struct.pack(">i", 1),
+            0x50015: struct.pack(">i", 0),
         }
 
     def write(self, data: bytes) -> None:

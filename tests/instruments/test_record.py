@@ -10,8 +10,7 @@ import pytest
 import xarray as xr
 from faulty_camera import Faults, FaultyCamera
 
-from dbthermal import alignment, store
-from dbthermal import correction as frames
+from dbthermal import alignment, correction, store
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import (
@@ -132,11 +131,16 @@ def test_frames_from_before_are_not_taken(tmp_path: Path) -> None:
     assert all(total["lost"] == 0 for total in summary.totals.values())
 
 
-def test_recording_goes_on_to_alignment(tmp_path: Path) -> None:
-    """A recording with losses and a shutter event goes through correction, marking, alignment."""
+@pytest.mark.parametrize("telemetry_rows", [0, 12])
+def test_recording_goes_on_to_alignment(telemetry_rows: int, tmp_path: Path) -> None:
+    """A recording with losses and a shutter event goes through correction and alignment.
+
+    The camera reports the event by its telemetry, or without any by its frozen image.
+    """
     first = Faults(dropped=frozenset({7, 8}), corrupt=frozenset({20}))
     second = Faults(ffc=frozenset({10}), offset_step=20.0)
-    record(session(0.9), bench(first, second), tmp_path / "a.zarr", limits=SMALL)
+    sources = bench(first, second, telemetry_rows=telemetry_rows)
+    record(session(0.9), sources, tmp_path / "a.zarr", limits=SMALL)
     capture = open_capture(tmp_path / "a.zarr")
     ones = np.ones((2, *SHAPE))
     gain, offset, bad = (("band", "y", "x"), ones), (("band", "y", "x"), 0 * ones), ones > 1
@@ -144,9 +148,10 @@ def test_recording_goes_on_to_alignment(tmp_path: Path) -> None:
         {"gain": gain, "offset": offset, "bad": (("band", "y", "x"), bad)},
         coords={"band": list(BANDS)},
     )
-    marked = frames.mark_shutter(frames.correct(capture, unity))
-    assert marked.attrs["shutter_events"] == 1
-    aligned = alignment.align(marked, offset=0.0)
+    corrected = correction.correct_capture(capture, unity, bad_pixels=None)
+    assert corrected.attrs["shutter_events"] == 1
+    assert [number > 0 for number in corrected.attrs["shutter_closed_frames"]] == [False, True]
+    aligned = alignment.align(corrected, offset=0.0)
     assert int(aligned["segment"].max()) == 1
     exact = aligned["counts"].sel(band="8-14").values - PATTERN
     level = exact - RATE * aligned["time"].values[:, None, None]

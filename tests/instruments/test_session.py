@@ -22,7 +22,8 @@ def test_session_is_read(tmp_path: Path) -> None:
     assert session.filters == {1: "9.5", 3: "11"}
     real = Session.from_yaml(replaced(("simulated: true", "simulated: false")))
     assert real.url(wheel) == "serial:///dev/ttyUSB0"
-    assert real.content()["blackbody"]["temperatures"] == (300.0, 290.0, 310.0)
+    assert real.blackbody is not None
+    assert real.blackbody.temperatures == (300.0, 290.0, 310.0)
 
 
 @pytest.mark.parametrize(
@@ -34,7 +35,7 @@ def test_session_is_read(tmp_path: Path) -> None:
             "Invalid protocol 'sweep'. Must be 'gain_offset'",
         ),
         ("protocol: response", "protocol: scene", "of protocol 'scene'. Must have no blackbody"),
-        ("duration: 0.15\n", "", "session: Missing 'duration'. Must be given"),
+        ("duration: 0.15\n", "", "session: Missing 'duration'. Must be set"),
         ("duration: 0.15", "duration: -1", "Invalid duration -1. Must be greater than 0"),
         ("duration: 0.15", "time: 1", "Unknown key 'time'. Must be one of"),
         ("simulated: true", "simulated: maybe", "Invalid simulated 'maybe'. Must be a valid bool"),
@@ -85,7 +86,7 @@ def test_session_is_read(tmp_path: Path) -> None:
         (
             '{simulated: "sim://apt/wheel", ',
             "{",
-            "Missing 'devices.filter_wheel.simulated'. Must be given",
+            "Missing 'devices.filter_wheel.simulated'. Must be set",
         ),
     ],
 )

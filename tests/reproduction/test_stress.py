@@ -49,7 +49,7 @@ def normal(truth: xr.Dataset, scale: float = 1.0, seed: int = 1) -> xr.Dataset:
 def with_flag(result: xr.Dataset, name: str, pixels: slice) -> xr.Dataset:
     """The same with a flag set in some pixels."""
     flags = result["status"].copy(deep=True)
-    flags[0, pixels] |= schema.FLAGS[name]
+    flags[0, pixels] |= schema.Status.bits()[name]
     return result.assign(status=flags)
 
 
@@ -111,7 +111,7 @@ def test_each_flag_has_its_share() -> None:
     result = with_flag(normal(truth), "gray", slice(0, 30))
     found = stress.judge(truth, with_flag(result, "saturated", slice(20, 40)))
     shares = {str(name): float(value) for name, value in found["by_flag"].to_series().items()}
-    assert shares == dict.fromkeys(schema.FLAGS, 0.0) | {"gray": 0.3, "saturated": 0.2}
+    assert shares == dict.fromkeys(schema.Status.bits(), 0.0) | {"gray": 0.3, "saturated": 0.2}
     assert float(found["flagged"]) == 0.4
 
 
@@ -259,7 +259,7 @@ def test_status_in_words() -> None:
 def test_a_few_pixels_are_not_none() -> None:
     """One of 10,000 is not drawn as a share of zero."""
     flags = np.zeros((100, 100), dtype=np.uint16)
-    flags[3, 4] = schema.FLAGS["dead_pixel"]
+    flags[3, 4] = schema.Status.DEAD_PIXEL
     legend = status(xr.Dataset({"status": (("y", "x"), flags)})).axes[1].get_legend()
     assert legend is not None
     assert legend.get_texts()[1].get_text() == "< 0.1 %  dead pixel"
@@ -275,7 +275,7 @@ def test_unknown_bit() -> None:
 
 def test_every_flag_has_words_and_a_colour() -> None:
     """No two have the same, and none has the colours of right and wrong."""
-    assert schema.FLAGS.keys() <= REASONS.keys()
+    assert schema.Status.bits().keys() <= REASONS.keys()
     words, colors = zip(*REASONS.values(), strict=True)
     assert len({*words}) == len({*colors}) == len(REASONS)
     assert all(max(to_rgb(color)) - to_rgb(color)[0] < 0.99 for color in colors)

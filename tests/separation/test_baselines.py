@@ -100,7 +100,7 @@ def test_naive_follows_its_random_numbers(glass: Tile) -> None:
 
 def test_naive_says_when_it_stopped_early(glass: Tile) -> None:
     """After a single step a start is not done; after a hundred all are."""
-    bit = schema.FLAGS["not_converged"]
+    bit = schema.Status.NOT_CONVERGED
     early = naive.separate(fresh(glass), naive.NaiveSettings(iterations=1))
     late = naive.separate(fresh(glass), naive.NaiveSettings())
     assert np.mean((early.status & bit) > 0) > 0.9
@@ -196,7 +196,7 @@ def test_ratio_out_of_range_is_undefined() -> None:
     tile = seen(WARM + 20.0, np.full_like(WARM, 290.0), (0.9, 0.4))
     found = pyrometry.ratio(tile, pyrometry.RatioSettings(order=None))
     assert np.isnan(found.object_temperature).any()
-    assert np.all(found.status & schema.FLAGS["outside_response"])
+    assert np.all(found.status & schema.Status.OUTSIDE_RESPONSE)
 
 
 @pytest.mark.parametrize(

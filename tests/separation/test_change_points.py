@@ -18,7 +18,7 @@ TIME = np.arange(350) / 10.0
 GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 50}
 SUDDEN = {"height": 6.0}
 SLOW = {"height": 6.0, "duration": 1.0}
-JUMP = schema.FLAGS["object_jump"]
+JUMP = schema.Status.OBJECT_JUMP
 
 
 def errors(scene: xr.Dataset, result: xr.Dataset) -> np.ndarray:

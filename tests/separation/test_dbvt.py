@@ -277,7 +277,7 @@ def test_too_few_steps_are_flagged() -> None:
     """A pixel that is still improving at its last step says so."""
     _, capture, response = glass(QUIET, 8)
     result = separation.solve(capture, response, "dbvt", settings=DbvtSettings(stages=1, steps=2))
-    assert np.all(result["status"].values & schema.FLAGS["not_converged"])
+    assert np.all(result["status"].values & schema.Status.NOT_CONVERGED)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
 def share(flag: str, pixels: int = 400, seed: int = 1, rig: Rig = RIG, **changes: Any) -> float:
     """Share of the pixels of a case that carry a flag."""
     _, result = experiments.run_case({**GLASS, **changes}, rig, TIME, pixels, seed)
-    found = float((result["status"].values & schema.FLAGS[flag] != 0).mean())
+    found = float((result["status"].values & schema.Status.bits()[flag] != 0).mean())
     print(f"{changes}: {100 * found:.2f} % carry {flag}")
     return found
 

@@ -17,7 +17,7 @@ TIME = np.arange(350) / 10.0
 GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
 PIXELS = 20
 FRAMES = ("object_temperature", "background_temperature")
-INVALID = schema.FLAGS["invalid_samples"]
+INVALID = schema.Status.INVALID_SAMPLES
 Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 
@@ -258,7 +258,7 @@ def test_pixel_that_lacks_a_frame_is_left_out_where_all_must_have_the_same(metho
     spoilt = capture.copy(deep=True)
     spoilt["counts"].values[1, 7:10, 0, 2] = np.nan  # longer than what is bridged
     result = separation.solve(spoilt, response, method)
-    lacking = result["status"].values[0] & schema.FLAGS["invalid_samples"] != 0
+    lacking = result["status"].values[0] & schema.Status.INVALID_SAMPLES != 0
     np.testing.assert_array_equal(lacking, [False, False, True, False])
     given = np.isfinite(result["object_temperature"].values[:, 0]).any(axis=0)
     np.testing.assert_array_equal(given, ~lacking)

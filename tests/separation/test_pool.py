@@ -111,7 +111,7 @@ def test_still_pixels_of_a_material_get_a_temperature() -> None:
     print(f"still pixels with their material: {rmse:.3f} K")
     assert bool(error.notnull().all())
     assert rmse < 0.3
-    assert not np.any(shared["status"].values & schema.FLAGS["no_background_motion"])
+    assert not np.any(shared["status"].values & schema.Status.NO_BACKGROUND_MOTION)
 
 
 @pytest.mark.parametrize("kind", [{"background": {"kind": "still"}}, {"emissivity": [0.8, 0.8]}])
@@ -188,7 +188,7 @@ def test_a_capture_of_nothing_can_be_pooled() -> None:
     _, capture, response = case(4, 15)
     empty = capture.assign(counts=capture["counts"] * np.nan)
     result = separation.solve(empty, response, pool=labels(one(4)))
-    assert np.all(result["status"] == schema.FLAGS["invalid_samples"])
+    assert np.all(result["status"] == schema.Status.INVALID_SAMPLES)
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def test_bad_pixel_is_flagged_and_alone(
     spoilt = capture.copy(deep=True)
     spoil(spoilt)
     whole, result = separation.solve(capture, response), separation.solve(spoilt, response)
-    assert result["status"].values[1, 2] == schema.FLAGS[name]
+    assert result["status"].values[1, 2] == schema.Status.bits()[name]
     assert np.all(np.isnan(result["object_temperature"].values[:, 1, 2]))
     others = np.ones((4, 5), dtype=bool)
     others[1, 2] = False
@@ -99,10 +99,10 @@ def test_status_of_the_correction_is_kept(
     """Saturated and dead pixels keep the flags that the frame correction gave them."""
     _, capture, response = glass
     status = np.zeros((4, 5), dtype=np.uint32)
-    status[0, 0], status[3, 4] = schema.FLAGS["saturated"], schema.FLAGS["dead_pixel"]
+    status[0, 0], status[3, 4] = schema.Status.SATURATED, schema.Status.DEAD_PIXEL
     result = separation.solve(capture.assign(status=(("y", "x"), status)), response)
-    assert result["status"].values[0, 0] & schema.FLAGS["saturated"]
-    assert result["status"].values[3, 4] == schema.FLAGS["dead_pixel"]
+    assert result["status"].values[0, 0] & schema.Status.SATURATED
+    assert result["status"].values[3, 4] == schema.Status.DEAD_PIXEL
     assert np.all(np.isnan(result["object_temperature"].values[:, 3, 4]))
 
 
@@ -113,7 +113,7 @@ def test_temperature_outside_the_response_is_flagged(
     scene, capture, response = glass
     narrow = response.assign(temperature_max=xr.DataArray(323.15, attrs={"units": "K"}))
     result = separation.solve(capture, narrow)
-    assert np.all(result["status"].values & schema.FLAGS["outside_response"])
+    assert np.all(result["status"].values & schema.Status.OUTSIDE_RESPONSE)
     error = result["object_temperature"] - scene["object_temperature"]
     assert float(np.sqrt((error**2).mean())) < 0.5  # [K]
 
@@ -238,7 +238,7 @@ def test_saturated_counts_are_flagged(glass: Glass) -> None:
     counts = np.rint(capture["counts"].values).astype(np.uint16)
     counts[0, 100:110, 1, 1] = 65535
     result = separation.solve(capture.assign(counts=(capture["counts"].dims, counts)), response)
-    flagged = result["status"].values & schema.FLAGS["saturated"] != 0
+    flagged = result["status"].values & schema.Status.SATURATED != 0
     assert flagged[1, 1]
     assert flagged.sum() == 1
 
@@ -251,8 +251,8 @@ def test_masked_samples_do_not_saturate_a_pixel(glass: Glass) -> None:
     used = xr.DataArray((TIME < 10.0) | (TIME >= 11.0), dims="time")
     whole = capture.assign(counts=(capture["counts"].dims, counts, capture["counts"].attrs))
     result = separation.solve(whole, response, mask=used)
-    assert not np.any(result["status"].values & schema.FLAGS["saturated"])
-    assert np.all(separation.solve(whole, response)["status"] & schema.FLAGS["saturated"])
+    assert not np.any(result["status"].values & schema.Status.SATURATED)
+    assert np.all(separation.solve(whole, response)["status"] & schema.Status.SATURATED)
 
 
 def test_frozen_frames_are_flagged(glass: Glass) -> None:
@@ -260,14 +260,14 @@ def test_frozen_frames_are_flagged(glass: Glass) -> None:
     _, capture, response = glass
     frozen = capture.copy(deep=True)
     frozen["counts"].values[:, 201:206] = frozen["counts"].values[:, [200]]
-    assert np.all(separation.solve(frozen, response)["status"] & schema.FLAGS["frozen_frames"])
+    assert np.all(separation.solve(frozen, response)["status"] & schema.Status.FROZEN_FRAMES)
     assert not np.any(separation.solve(capture, response)["status"])
 
 
 @pytest.mark.parametrize("name", ["gray", None])
 def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> None:
     """Where no background gives the signals in any frame: outside, unless a flag says why."""
-    before = np.full(1, 0 if name is None else schema.FLAGS[name], dtype=np.uint32)
+    before = np.full(1, 0 if name is None else schema.Status.bits()[name], dtype=np.uint32)
     warm, none, share = np.full((9, 1), 300.0), np.full((9, 1), np.nan), np.full((2, 1), 0.5)
     found = Estimate(warm, 0.1 * np.ones((9, 1)), none, none, share, 0.1 * share, before)
     status = found.check_range(responses.curve(RIG.response(), RIG.bands[0])).status

@@ -121,7 +121,7 @@ def test_a_dead_pixel_harms_no_neighbour() -> None:
     dead = clean.copy(deep=True)
     dead["counts"][:, :, 10, 12] = 60000.0
     status = xr.zeros_like(clean["counts"][0, 0], dtype=np.uint16).drop_vars(["band", "time"])
-    status[10, 12] = schema.FLAGS["dead_pixel"]
+    status[10, 12] = schema.Status.DEAD_PIXEL
     options: dict[str, Any] = {
         "method": "bcp",
         "settings": separation.BcpSettings(patch=5, window=9),

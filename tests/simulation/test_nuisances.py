@@ -20,7 +20,7 @@ from reproduction import experiments
 RIG = Rig()
 TIME = np.arange(350) / 10.0
 SHAPE = (64, 80)
-DEAD = schema.FLAGS["dead_pixel"]
+DEAD = schema.Status.DEAD_PIXEL
 
 
 def panels(*, size: int = 16) -> xr.DataArray:
@@ -297,7 +297,7 @@ def test_drift_refuses_nonsense() -> None:
     with pytest.raises(ValueError, match=re.escape("NaN in frame 7 of band '9.5'")):
         frames.undo_drift(capture, patch())
     status = xr.zeros_like(patch(), dtype=np.uint16)
-    status[2, 3] = schema.FLAGS["invalid_samples"]
+    status[2, 3] = schema.Status.INVALID_SAMPLES
     assert frames.undo_drift(capture.assign(status=status), patch()).attrs["drift_pixels"] == 99
 
 

@@ -1,7 +1,7 @@
 """Commands of a FLIR Boson: identifiers, layouts and meanings of the answers.
 
-A `Reading` is asked for, a `Setting` is set and read; here are those that driver and emulator need,
-as facts, none of the vendor's text or code.
+A `Reading` is read, a `Setting` is set and read; only those that the driver sends are here, as
+facts, none of the vendor's text or code.
 
 References
 ----------
@@ -73,7 +73,7 @@ class TelemetryLocation(IntEnum):
 
 @dataclass(frozen=True)
 class Reading(Generic[T]):
-    """A value that the camera is asked for."""
+    """A value that is read from the camera."""
 
     name: str  # for messages
     command: int  # identifier

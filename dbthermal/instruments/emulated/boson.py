@@ -1,4 +1,4 @@
-"""An emulated FLIR Boson: answers on the command port as the public descriptions say one does.
+"""An emulated FLIR Boson: the command port, after the public descriptions.
 
 It knows every command of `boson.commands`, refuses as a camera would, and runs a shutter on the
 clock of its world, on command only. It is no camera: the duration of a correction and the settings

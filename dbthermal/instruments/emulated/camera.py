@@ -1,10 +1,10 @@
 """Emulated cameras: frames of a `World`.
 
 The look of the scene is handed in: for each band a picture, a function of the scene's time that
-gives counts. The emulated camera adds a frame rate, a clock, buffers that overflow if nobody reads,
-a shutter that freezes the image, and telemetry. It is no model of a detector: noise and response
-are in the counts that are handed in. It never flags its shutter: as with a real camera, that
-follows from telemetry, serial line and frozen image, see `camera.next_shutter`.
+gives counts. The emulated camera adds a frame rate, a clock, buffers that overflow if no program
+reads, a shutter that freezes the image, and telemetry. It is no model of a detector: noise and
+response are in the counts that are handed in. It never flags its shutter: as with a real camera,
+that follows from telemetry, serial line and frozen image, see `camera.next_shutter`.
 """
 
 import math
@@ -36,7 +36,7 @@ __all__ = ["BUFFERS", "CLOSED", "FFC_PERIODS", "MODELS", "EmulatedCamera", "Pict
 Picture = Callable[[float], Counts]
 
 BUFFERS: Final = 32
-"""Frames that are held while nobody reads, as by the V4L2 driver; beyond, they are dropped."""
+"""Frames that are held while no program reads, as by the V4L2 driver; beyond, they are dropped."""
 
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
@@ -80,7 +80,7 @@ class EmulatedCamera(Closing):
 
     @property
     def identity(self) -> Mapping[str, str]:
-        """Names that say that it is emulated."""
+        """Device, model and number, labelled as emulated."""
         return {
             "device": f"sim://camera/{self.name}",
             "model": self.model,
@@ -110,7 +110,7 @@ class EmulatedCamera(Closing):
         return self.frame(number, due)
 
     def next_number(self, number: int, elapsed: float) -> int:
-        """Number of the next frame: if nobody read for too long [s], the buffers overflowed."""
+        """Number of the next frame, some time [s] after the first; full buffers drop frames."""
         latest = math.floor(elapsed * self.frame_rate)
         return latest if latest - number >= BUFFERS else number
 

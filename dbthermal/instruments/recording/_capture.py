@@ -44,7 +44,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
     if fitted:
         opened = _fitted(opened)
-    # The coordinate must be there for the stamps to be looked at, of which it is made.
+    # Exposure times are checked against a coordinate, which is made of them.
     numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
     time = fill_times(exposure_times(numbered)[0])
     seconds = {**schema.COORDINATES["time"].attrs, "long_name": "time since the start"}

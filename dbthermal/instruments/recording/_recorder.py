@@ -3,7 +3,7 @@
 A thread for each camera fetches its frames, one more reads the other instruments, so that none
 waits for another: a command that a camera answers late, because it corrects its offsets just then,
 costs no frame. A queue of bounded length leads to the thread that writes. If the disk is too slow
-the queue fills, frames are refused, and the recording says how many and when.
+the queue fills, frames are refused, and the log has their number and time.
 
 The caller's thread shows the preview. A preview that is slow or raises, or an interrupt by the
 keyboard, twice maybe, stops no chunk half-way: the frames that came before are written before the
@@ -17,7 +17,7 @@ import shutil
 import threading
 import time as system_time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -109,9 +109,9 @@ def record(  # noqa: PLR0913 - all but the first three are by name
     clock: Callable[[], float] = system_time.monotonic,
 ) -> Summary:
     """
-    Record until the session's duration is over, `stop` is set or no source is left.
+    Record until the end of the session's duration, a stop, or the loss of the last camera.
 
-    Frames that a driver held from before the start, by their stamps, are not recorded: they show
+    Frames that a driver buffered before the start, by their stamps, are not recorded: they show
     another filter, or another scene. Two seconds after the start such a stamp counts as wrong.
 
     Parameters
@@ -131,7 +131,7 @@ def record(  # noqa: PLR0913 - all but the first three are by name
     preview : callable, optional
         Called now and then with a `Preview`, in the caller's thread; it may take its time.
     stop : Event, optional
-        Ends the recording when set.
+        Ends the recording when it is set.
     clock : callable
         Host's monotonic clock [s], that of the sources' stamps.
 
@@ -147,7 +147,7 @@ def record(  # noqa: PLR0913 - all but the first three are by name
     OSError
         If there is too little space, before or on the way.
     ValueError
-        If the sources are not the session's, or are emulated where it says hardware, or vice versa.
+        If the sources are not those of the session, or are emulated and the session is not.
     Exception
         Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
         what was recorded is kept. A second interrupt ends the wait, not the writing.
@@ -201,7 +201,7 @@ def _new_file(
     start: float,
     limits: Limits,
 ) -> CaptureFile:
-    """Begin the capture file, if there is room for all of it, uncompressed."""
+    """Create the capture file, if the disk has room for all of it, uncompressed."""
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
     rows, columns = session.shape
@@ -217,7 +217,7 @@ def _new_file(
         },
         "frame_rates": {band: source.frame_rate for band, source in sources.items()},
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
-        "provenance": store.provenance(session.content()),
+        "provenance": store.provenance(asdict(session)),
     }
     units = {name: reading.units for name, reading in readings.items()}
     return CaptureFile(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)
@@ -264,10 +264,10 @@ class _Run:
 
     def fetch(self, band: str, source: FrameSource) -> None:
         """
-        Bring the frames of one source to the queue, until it is over.
+        Put the frames of one source into the queue, until the end.
 
-        Where the queue has no more room for the band a frame is refused, and the next one that is
-        not says how many were.
+        If the queue has no room for the band a frame is refused; the next one that is accepted
+        carries the number of refused ones.
         """
         refused = 0
         try:
@@ -292,7 +292,7 @@ class _Run:
             self._refused_last[band] = refused
 
     def read(self) -> None:
-        """Read all other instruments, one after the other, until it is over."""
+        """Read all other instruments, one after the other, until the end."""
         try:
             while self.readings and self.is_going():
                 for name, reading in self.readings.items():
@@ -320,10 +320,9 @@ class _Run:
 
     def write(self) -> None:
         """
-        Start the other threads, write frames and notes until all is over, and close the file.
+        Start the other threads, write frames and notes until the end, and close the file.
 
-        Errors go to `errors`. After one of writing itself the file is left as it is on the disk,
-        for nothing more can be written.
+        Errors go to `errors`. After an error of writing itself the file stays as it is on the disk.
         """
         threads = (*self._fetching, self._reading)
         try:
@@ -361,7 +360,7 @@ class _Run:
                 _check_space(self.file.recording.path, self.limits.reserve)
 
     def _write_rest(self) -> None:
-        """Write what is still in the queues, when the threads have ended."""
+        """Write the rest of the queues, when the threads have ended."""
         while not self._frames.empty():
             self._take(*self._frames.get_nowait())
         self._take_notes()

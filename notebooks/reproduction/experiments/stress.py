@@ -120,8 +120,8 @@ def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
 def _flags(status: xr.DataArray) -> dict[str, xr.DataArray]:
     """Share of pixels with any flag, and with each."""
     bits = xr.DataArray(
-        np.array(list(schema.FLAGS.values()), dtype=status.dtype),
+        np.array(list(schema.Status), dtype=status.dtype),
         dims="flag",
-        coords={"flag": list(schema.FLAGS)},
+        coords={"flag": list(schema.Status.bits())},
     )
     return {"flagged": (status != 0).mean(), "by_flag": ((status & bits) != 0).mean(_PIXELS)}
