@@ -91,9 +91,9 @@ class Camera:
         """Size of a pixel at unit distance [1]."""
         return float(2.0 * np.tan(np.radians(self.field_of_view) / 2.0) / self.shape[1])
 
-    def directions(self, offset: npt.ArrayLike = (0.0, 0.0)) -> Array:
-        """Unit vectors of the pixels' rays, (pixel, 3) in C order, off the middle by [pixel]."""
-        places = np.indices(self.shape).reshape(2, -1).T + np.asarray(offset)
+    def directions(self) -> Array:
+        """Unit vectors of the rays through the pixels' middles, (pixel, 3) in C order."""
+        places = np.indices(self.shape).reshape(2, -1).T
         middle = (np.array(self.shape) - 1.0) / 2.0
         down, right = ((places - middle) * self._pixel).T
         return unit(np.stack([right, down, np.ones_like(right)], axis=-1) @ self.axes)

@@ -63,12 +63,6 @@ GLASS: Final = Solid(conductivity=1.4, density=2500.0, specific_heat=750.0)
 BOROSILICATE: Final = Solid(conductivity=1.4, density=2225.0, specific_heat=835.0)
 """Pyrex at 300 K: table A.3 of Bergman et al. (2011)."""
 
-ALUMINIUM: Final = Solid(conductivity=237.0, density=2702.0, specific_heat=903.0)
-"""Pure aluminium at 300 K: table A.1 of Bergman et al. (2011)."""
-
-STEEL: Final = Solid(conductivity=14.9, density=7900.0, specific_heat=477.0)
-"""Stainless steel AISI 304 at 300 K: table A.1 of Bergman et al. (2011)."""
-
 CERAMIC: Final = Solid(conductivity=1.5, density=2400.0, specific_heat=1050.0)
 """Porcelain near room temperature, round values: material-properties.org, page "Porcelain"."""
 
