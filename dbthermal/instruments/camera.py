@@ -187,8 +187,7 @@ class Stream:
 
     shape: tuple[int, int] = (512, 640)  # rows and columns of the image, without telemetry [pixel]
     frame_rate: float = 60.0  # [Hz]
-    telemetry_rows: int = 0  # besides: 2 for a Boson with telemetry on
-    telemetry_first: bool = False  # whether these are above the image, as the camera is set
+    telemetry_rows: int = 0  # below the image: 2 for a Boson with telemetry on
 
     @property
     def rows(self) -> int:

@@ -283,11 +283,12 @@ class Capture(Closing):
         flags = FrameFlag.DRIVER_ERROR if state & _ERROR else GOOD
         flags |= FrameFlag.WRONG_SIZE if used != image.nbytes else GOOD
         flags |= FrameFlag.FOREIGN_CLOCK if state & _CLOCK_MASK != _MONOTONIC else GOOD
-        counts, rows = _split(image.astype(np.uint16, copy=False), self.stream)
-        readable = self._decode is not None and rows is not None and not flags & DAMAGED
-        metadata = self._decode(rows) if readable else None  # type: ignore[misc, arg-type]
-        time_stamp = seconds + _MICRO * micros
-        return Frame(counts, time_stamp, host_time, sequence, flags, rows, metadata)
+        counts, rows, metadata = image.astype(np.uint16, copy=False), None, None
+        if self.telemetry_rows:
+            counts, rows = counts[: self.shape[0]], counts[self.shape[0] :]
+            metadata = self._decode(rows) if self._decode and not flags & DAMAGED else None
+        stamp = seconds + _MICRO * micros
+        return Frame(counts, stamp, host_time, sequence, flags, rows, metadata)
 
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
@@ -324,16 +325,6 @@ def _formats(file: int, kernel: Kernel) -> list[int]:
 def _buffer(index: int) -> bytearray:
     """Argument for a buffer of this number."""
     return bytearray(BUFFER.pack(index, CAPTURE, 0, 0, 0, 0, 0, 0, MMAP, 0, 0))
-
-
-def _split(image: Counts, stream: Stream) -> tuple[Counts, Counts | None]:
-    """Image, and telemetry rows if there are any."""
-    rows = stream.telemetry_rows
-    if rows == 0:
-        return image, None
-    return (
-        (image[rows:], image[:rows]) if stream.telemetry_first else (image[:-rows], image[-rows:])
-    )
 
 
 def __dir__() -> list[str]:

@@ -84,16 +84,10 @@ def bounds(
     r"""
     Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
 
-    Of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` + white noise :math:`s_m` the unknowns
-    are
-
-    - every :math:`e_m`, from this pixel alone (pixels that share a material do better);
-    - x, in a known smooth subspace of polynomials of time;
-    - y, one number a frame; in the frames at rest, one number for all of them.
-
-    Response and noise are known. The bound is the inverse Fisher information [1]_ at the truth; y
-    is eliminated frame by frame by a Schur complement, as an estimate by variable projection [2]_
-    does.
+    The inverse Fisher information [1]_ of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` +
+    white noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a known smooth
+    subspace of polynomials of time; y, one number a frame, eliminated as by variable projection
+    [2]_, and in the frames at rest one number for all of them. Response and noise are known.
 
     Parameters
     ----------
@@ -103,8 +97,8 @@ def bounds(
     response : Dataset
         Stage `response` with `noise`, of every band of the scene.
     order : int, optional
-        Size of the smooth subspace. If not given, for each pixel the smallest that leaves at most
-        0.1 of the noise's variance.
+        Size of the smooth subspace; for each pixel the smallest that leaves at most 0.1 of the
+        noise's variance if not given.
     resting : bool
         The frames are known (the level is not) in which a pixel's background has its most frequent
         temperature, where two or more share it; False assumes nothing about y.
@@ -117,14 +111,13 @@ def bounds(
     Returns
     -------
     Dataset
-        `object_temperature_std`, `background_temperature_std` (time, y, x) [K];
-        `emissivity_std` (band, y, x) [1]; `reflection_ratio_std` (band, y, x) [1], of
-        :math:`(1 - e_m) / (1 - e_r)` with r the quieter band, the attribute `reference_band`;
-        infinite without information. `identifiable` (quantity, y, x): True if the deviation, root
-        mean square over time and largest of the bands, is below that of a uniform number between
-        the limits, which are 0 and 1 for an emissivity and the calibrated range for a temperature,
-        and for a ratio below the ratio itself.
-        `condition_number`, `order` (y, x) [1]; `resting` (time, y, x).
+        `object_temperature_std`, `background_temperature_std` (time, y, x) [K], `emissivity_std`
+        and `reflection_ratio_std` (band, y, x) [1], of :math:`(1 - e_m) / (1 - e_r)` with r the
+        quieter band (attribute `reference_band`); infinite without information. `identifiable`
+        (quantity, y, x): True if the deviation, root mean square over time and largest of the
+        bands, is below that of a uniform number in (0, 1) or in the calibrated range, and for a
+        ratio below the ratio itself. `condition_number`, `order` (y, x) [1]; `resting`
+        (time, y, x).
 
     Raises
     ------
@@ -138,30 +131,14 @@ def bounds(
     For the linear response and two bands, ``resting=False`` gives the reflection ratio the bound
     of `ratio_variance`, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down alike
     changes no sample. Frames at rest determine the emissivities, and sharpen the ratio. The exact
-    response determines the emissivities without them, by its curvature, but hardly; as nothing then
-    keeps y near the truth, the bound of the ratio is loose. An `emissivity_std` of 0.29, that of a
-    uniform number in (0, 1), tightens it.
+    response determines them without, by its curvature, but hardly; as nothing then keeps y near the
+    truth, the bound of the ratio is loose. An `emissivity_std` of 0.29, that of a uniform number
+    in (0, 1), tightens it. Pixels that share a material do better than one.
 
     References
     ----------
     .. [1] Kay (1993), Fundamentals of Statistical Signal Processing: Estimation Theory, chapter 3
     .. [2] Golub, Pereyra (2003), Inverse Problems 19, R1, doi:10.1088/0266-5611/19/2/201
-
-    Examples
-    --------
-    Glass that warms by 20 K while someone walks by:
-
-    >>> import numpy as np, xarray as xr
-    >>> from dbthermal import limits, simulation
-    >>> rig, time = simulation.Rig(), np.arange(100) / 10.0
-    >>> glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    >>> scene = simulation.independent_pixels(
-    ...     time, glass, simulation.Background(), 1, np.random.default_rng(0),
-    ...     start=293.15, stop=313.15,
-    ... )
-    >>> bound = limits.bounds(scene, rig.response())
-    >>> bool(bound["identifiable"].sel(quantity="object_temperature").all())
-    True
     """
     if not emissivity_std >= 0:
         raise ValueError(f"Invalid emissivity_std {emissivity_std}. Must not be negative.")

@@ -6,12 +6,11 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import mixing, planck, schema
 from dbthermal.bands import FILTERS, Band
-from dbthermal.limits._fisher import Array, Truth, deviations, smallest_order
+from dbthermal.limits._fisher import Array, TopHat, Truth, deviations, smallest_order
 
 # Best filter of a material whose temperature no filter determines.
 _NO_FILTER: Final = "none"
@@ -90,11 +89,9 @@ def plan(
     r"""
     Expected accuracy of one pixel for each material and filter, and the best filter.
 
-    The Cramer-Rao bound of `bounds` for the capture that a `CaptureDesign` describes, with the
-    response of Planck's law over each band: the smooth subspace and the frames at rest are known,
-    the emissivities, the level and everything else are not. Estimates of a pixel alone come close
-    to it; those of n pixels of one material share their ratios and emissivities, whose deviations
-    fall as :math:`1 / \sqrt{n}`.
+    The Cramer-Rao bound of `bounds` for a designed capture, with the response of Planck's law over
+    each band. Those of n pixels of one material share their ratios and emissivities, whose
+    deviations fall as :math:`1 / \sqrt{n}`.
 
     Parameters
     ----------
@@ -117,23 +114,21 @@ def plan(
     -------
     Dataset
         Over (material, filter), the filters of a combination joined by " + ":
-        `object_temperature_std` and `background_temperature_std` [K], root mean square over time;
-        `condition_number` [1], see `mixing.condition_number`. Over (material, filter, band):
-        `emissivity_std` [1], and `reflection_ratio_std` [1] of :math:`(1 - e_m) / (1 - e_1)` with
-        band 1 the one that is always recorded; NaN for a band outside the combination.
-        `best` (material): the filter of the smallest object deviation, "none" where each is above
-        that of a uniform number within the capture's range of temperatures.
-        `best_of_all` (): the filter whose median over the materials is smallest, "none" under the
-        same rule. `noise` (band) [K], and the design's numbers as attributes.
+        `object_temperature_std`, `background_temperature_std` [K], root mean square over time, and
+        `condition_number` [1]. Over (material, filter, band): `emissivity_std` and
+        `reflection_ratio_std` [1], over the band always recorded; NaN for a band outside the
+        combination. `best` (material): the filter of the smallest object deviation, "none" where
+        each is above that of a uniform number within the capture's range of temperatures;
+        `best_of_all` (): that of the smallest median over the materials. `noise` (band) [K], and
+        the design's numbers as attributes.
 
     Raises
     ------
     KeyError
         If a band of the table is not in the filters.
     TypeError, ValueError
-        If the table is not as `schema` has it, an emissivity lies outside (0, 1), the band
-        `beside` or one of the noise is missing, the noise is not finite and positive or of
-        another unit, or there are fewer filters than are to be used together.
+        If table or noise are not as `schema` has them, an emissivity lies outside (0, 1), the band
+        `beside` is missing, or there are fewer filters than are to be used together.
 
     Examples
     --------
@@ -151,7 +146,7 @@ def plan(
     for name in names:
         if name not in filters:
             raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
-    bodies = [_TopHat(filters[name], temperature) for name in names]
+    bodies = [TopHat(filters[name], temperature) for name in names]
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
     parts = [
         _expected(truth, [bodies[band] for band in chosen], std[chosen])
@@ -196,7 +191,7 @@ def plan_durations(
 
     Raises
     ------
-    KeyError, TypeError, ValueError
+    ValueError
         As `plan`, or if the lengths do not increase.
     """
     design = CaptureDesign() if design is None else design
@@ -208,21 +203,6 @@ def plan_durations(
     without_noise = [one.drop_vars("noise") for one in plans]
     result = xr.concat(without_noise, dim=coordinate, combine_attrs="drop_conflicts")
     return result.assign(noise=plans[0]["noise"])
-
-
-@dataclass(frozen=True)
-class _TopHat:
-    """Linearised signal of a band by Planck's law, relative to a temperature [K]."""
-
-    band: Band
-    reference: float
-
-    def signal(self, temperature: npt.ArrayLike) -> Array:
-        excess = self.band.radiance(temperature) - self.band.radiance(self.reference)
-        return np.asarray(self.reference + excess / self.band.slope(self.reference))
-
-    def slope(self, temperature: npt.ArrayLike) -> Array:
-        return np.asarray(self.band.slope(temperature) / self.band.slope(self.reference))
 
 
 def _truth(design: CaptureDesign, emissivity: Array) -> Truth:
@@ -275,7 +255,7 @@ def _noise(noise: xr.DataArray, names: list[str]) -> Array:
     return planck.require_positive("noise [K]", noise.values[places])
 
 
-def _expected(truth: Truth, bodies: Sequence[_TopHat], noise: Array) -> dict[str, Array]:
+def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str, Array]:
     """Deviations of one combination: temperatures (material), the others (band, material)."""
     order = smallest_order(truth, truth.sensitivity(bodies, noise))
     sensitivity = truth.smoothed(order).sensitivity(bodies, noise)

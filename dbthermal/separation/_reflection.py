@@ -70,14 +70,13 @@ def uncalibrated_reflection(
     r"""
     Separate rapid, correlated changes from slow ones in two bands of any unit.
 
-    Without a response there are no temperatures, but the rapid changes are still the background's,
-    and their ratio between the bands still differs from pixel to pixel. Smooth functions of time,
-    which hold the object's change, are projected out of both bands. Frame by frame, the gain and
-    offset errors of the picture's own scaling are fitted to the uncorrelated pixels (correlation
-    below 0.1) and subtracted. With :math:`\lambda` the noise variance of the second band over that
-    of the first there, the ratio k of a pixel is that of Deming's regression [2]_, the pooled ratio
-    is its median over the correlated pixels, and the reflection in the first band's unit is the
-    best linear estimate
+    Without a response there are no temperatures, but the rapid changes are still the background's.
+    Smooth functions of time, which hold the object's change, are projected out of both bands. Frame
+    by frame, the gain and offset errors of the picture's own scaling are fitted to the uncorrelated
+    pixels (correlation below 0.1) and subtracted. With :math:`\lambda` the noise variance of the
+    second band over that of the first there, the ratio k of a pixel is that of Deming's regression
+    [2]_, the pooled ratio is its median over the correlated pixels, and the reflection in the first
+    band's unit is the best linear estimate
 
     .. math:: r(t) = \frac{r_1(t) + (k / \lambda) \, r_2(t)}{1 + k^2 / \lambda}
 

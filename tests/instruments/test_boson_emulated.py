@@ -168,7 +168,7 @@ def test_a_correction_is_waited_for(bench: BosonBench, stalls: bool) -> None:
 def test_a_correction_that_stalls_past_the_timeout_shifts_no_reply(bench: BosonBench) -> None:
     """Replies that a closed shutter delays past their time are not taken for later ones."""
     bench.device.faults.ffc_stalls = True
-    bench.camera._link.timeout = 0.1
+    bench.camera.timeout = 0.1
     bench.world.start_ffc("boson")
     assert bench.camera.read(commands.SERIAL_NUMBER, repeats=9) == 93588
     assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)

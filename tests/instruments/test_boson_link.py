@@ -16,7 +16,6 @@ from dbthermal.instruments.boson import (
     REPLY_TIMEOUT,
     Boson,
     BosonError,
-    Link,
     commands,
 )
 from dbthermal.instruments.camera import FfcStatus
@@ -72,7 +71,7 @@ def test_each_program_begins_at_another_number(monkeypatch: pytest.MonkeyPatch) 
         bench = BosonBench()
         bench.camera = Boson(bench.loop, clock=bench.clock, sleep=bench.clock.sleep)
         bench.camera.serial_number()
-        first.append(bench.camera._link._sequence)
+        first.append(bench.camera._sequence)
         assert first[-1] == fslp.next_sequence((microseconds - 1) % 2**32)
     assert first[0] != first[1]
 
@@ -152,10 +151,10 @@ def test_closing_waits_for_an_exchange_of_another_thread() -> None:
     assert (len(errors), line.overlaps) == (1, 0)
 
 
-def test_a_link_may_be_closed_twice() -> None:
+def test_a_camera_may_be_closed_twice() -> None:
     """A second time does nothing."""
-    link = Link(Slow())
+    camera = Boson(Slow())
     for _ in range(2):
-        link.close()
+        camera.close()
     with pytest.raises(TransportError):
-        link.exchange("serial number", commands.SERIAL_NUMBER.command)
+        camera.serial_number()

@@ -100,101 +100,6 @@ class Statistics:
     timeouts: int = 0  # requests that were not answered in time
 
 
-class Link(Closing):
-    """
-    One line to one camera; an exchange at a time, from any thread.
-
-    The first request's number comes from the time of day by default, so that replies to a program
-    that ended are not taken for this one's.
-    """
-
-    def __init__(
-        self,
-        transport: Transport,
-        *,
-        timeout: float = REPLY_TIMEOUT,
-        first_sequence: int | None = None,
-        clock: Callable[[], float] = system_time.monotonic,
-    ) -> None:
-        first = system_time.time_ns() // 1000 if first_sequence is None else first_sequence
-        self.statistics = Statistics()
-        self.timeout = timeout
-        self.is_simulated = transport.is_simulated
-        self._transport = transport
-        self._clock = clock
-        self._decoder = fslp.Decoder()
-        self._sequence = (first - 1) % (1 << 32)
-        self._lock = threading.Lock()
-
-    def exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
-        """Send a request, again if no reply comes, and return the data of its reply."""
-        for _ in range(repeats):
-            try:
-                return self._exchange(name, command, data)
-            except BosonTimeoutError:
-                continue
-        return self._exchange(name, command, data)
-
-    def close(self) -> None:
-        """Release the line, once an exchange of another thread is over; twice is as once."""
-        with self._lock:
-            self._transport.close()
-
-    def _exchange(self, name: str, command: int, data: bytes) -> bytes:
-        with self._lock:
-            self._sequence = fslp.next_sequence(self._sequence)
-            self._transport.write(fslp.encode(self._sequence, command, data))
-            reply = self._reply(name)
-        if reply.command != command:
-            raise BosonReplyError(
-                f"Invalid reply to '{name}', of command 0x{reply.command:08X}. "
-                f"Must be of command 0x{command:08X}."
-            )
-        if reply.status:
-            meaning = commands.STATUSES.get(reply.status, "unknown status")
-            raise BosonStatusError(
-                f"Refused '{name}' by the camera: status 0x{reply.status:X}, {meaning}. "
-                "Must be 0, OK.",
-                reply.status,
-            )
-        return reply.data
-
-    def _reply(self, name: str) -> fslp.Frame:
-        """Wait for the reply to the last request; discard all other frames."""
-        deadline = self._clock() + self.timeout
-        received = 0
-        while (remaining := deadline - self._clock()) > 0:
-            piece = self._transport.read(_READ_SIZE, remaining)
-            if not piece:
-                break
-            received += len(piece)
-            if received > MAXIMUM_RECEIVED:
-                raise BosonReplyError(
-                    f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. "
-                    "Must be a Boson's command port that no other program uses."
-                )
-            reply = self._matching(self._decoder.feed(piece))
-            if reply is not None:
-                return reply
-        self.statistics.timeouts += 1
-        raise BosonTimeoutError(
-            f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
-            "and the camera through with booting."
-        )
-
-    def _matching(self, frames: list[fslp.Frame]) -> fslp.Frame | None:
-        """Reply to the last request, if it is among the frames; the others are counted."""
-        key = (fslp.COMMAND_CHANNEL, self._sequence)
-        replies = [
-            frame
-            for frame in frames
-            if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
-        ]
-        self.statistics.discarded += len(frames) - len(replies[:1])
-        self.statistics.damaged = self._decoder.damaged
-        return replies[0] if replies else None
-
-
 class Boson(Closing):
     """
     One camera's command port, a `camera.CameraControl`; for any number of threads.
@@ -214,11 +119,17 @@ class Boson(Closing):
         clock: Callable[[], float] = system_time.monotonic,
         sleep: Callable[[float], None] = system_time.sleep,
     ) -> None:
-        self._link = Link(transport, timeout=timeout, first_sequence=first_sequence, clock=clock)
+        # From the time of day: replies to a program that ended are not taken for this one's.
+        first = system_time.time_ns() // 1000 if first_sequence is None else first_sequence
+        self.is_simulated = transport.is_simulated
+        self.statistics = Statistics()
+        self.timeout = timeout
+        self._transport = transport
         self._clock = clock
         self._sleep = sleep
-        self.is_simulated = self._link.is_simulated
-        self.statistics = self._link.statistics
+        self._decoder = fslp.Decoder()
+        self._sequence = (first - 1) % (1 << 32)
+        self._lock = threading.Lock()
 
     @classmethod
     def from_url(
@@ -228,12 +139,13 @@ class Boson(Closing):
         return cls(open_serial(url, baudrate=BAUDRATE, world=world), timeout=timeout)
 
     def close(self) -> None:
-        """Release the port; the camera goes on as it is. A second time does nothing."""
-        self._link.close()
+        """Release the port, once an exchange of another thread is over; the camera goes on."""
+        with self._lock:
+            self._transport.close()
 
     def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
         """Value of one of `commands.READINGS`, in the unit that its name says."""
-        reply = self._link.exchange(reading.name, reading.command, repeats=repeats)
+        reply = self._exchange(reading.name, reading.command, repeats=repeats)
         try:
             return reading.value(reply)
         except ValueError as error:
@@ -324,11 +236,71 @@ class Boson(Closing):
 
     def _tell(self, name: str, command: int, data: bytes = b"") -> None:
         """Send a command that changes the camera, once; its reply must be empty."""
-        reply = self._link.exchange(name, command, data)
+        reply = self._exchange(name, command, data)
         if reply:
             raise BosonReplyError(
                 f"Invalid reply of {len(reply)} bytes to '{name}'. Must be empty."
             )
+
+    def _exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
+        """Send a request, again if no reply comes, and return the data of its reply."""
+        for _ in range(repeats):
+            try:
+                return self._exchange(name, command, data)
+            except BosonTimeoutError:
+                continue
+        with self._lock:
+            self._sequence = fslp.next_sequence(self._sequence)
+            self._transport.write(fslp.encode(self._sequence, command, data))
+            reply = self._reply(name)
+        if reply.command != command:
+            raise BosonReplyError(
+                f"Invalid reply to '{name}', of command 0x{reply.command:08X}. "
+                f"Must be of command 0x{command:08X}."
+            )
+        if reply.status:
+            meaning = commands.STATUSES.get(reply.status, "unknown status")
+            raise BosonStatusError(
+                f"Refused '{name}' by the camera: status 0x{reply.status:X}, {meaning}. "
+                "Must be 0, OK.",
+                reply.status,
+            )
+        return reply.data
+
+    def _reply(self, name: str) -> fslp.Frame:
+        """Wait for the reply to the last request; discard all other frames."""
+        deadline = self._clock() + self.timeout
+        received = 0
+        while (remaining := deadline - self._clock()) > 0:
+            piece = self._transport.read(_READ_SIZE, remaining)
+            if not piece:
+                break
+            received += len(piece)
+            if received > MAXIMUM_RECEIVED:
+                raise BosonReplyError(
+                    f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. "
+                    "Must be a Boson's command port that no other program uses."
+                )
+            reply = self._matching(self._decoder.feed(piece))
+            if reply is not None:
+                return reply
+        self.statistics.timeouts += 1
+        raise BosonTimeoutError(
+            f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
+            "and the camera through with booting."
+        )
+
+    def _matching(self, frames: list[fslp.Frame]) -> fslp.Frame | None:
+        """Reply to the last request, if it is among the frames; the others are counted."""
+        key = (fslp.COMMAND_CHANNEL, self._sequence)
+        replies = [
+            frame
+            for frame in frames
+            if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
+        ]
+        self.statistics.discarded += len(frames) - len(replies[:1])
+        self.statistics.damaged = self._decoder.damaged
+        return replies[0] if replies else None
 
 
 def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:

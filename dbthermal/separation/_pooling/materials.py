@@ -82,12 +82,9 @@ def materials(
         From `solve` without labels, of the same capture, with `reflection_ratio` and `emissivity`
         (band, y, x) [1], `background_temperature` (time, y, x) [K], their deviations, `noise` and
         `status`. Pixels with a ratio of NaN are labelled by the maps alone.
-    corrected : Dataset
-        The capture: `counts` (band, time, y, x) [count]. May be lazy; only means over time are
-        kept. Frames that are NaN are left out, and of a capture with a `segment` all but the
-        longest.
-    response : Dataset
-        As in `solve`.
+    corrected, response : Dataset
+        As in `solve`. The capture may be lazy; only means over time are kept. Frames that are NaN
+        are left out, and of a capture with a `segment` all but the longest.
     error_rate : float
         Probability, in the whole image, that cells of one material are cut or held apart by
         chance [1]. It is shared out among the tests.
@@ -116,10 +113,9 @@ def materials(
     background's slow part), so its mean is taken to be no surer than that of one pixel. The
     deviations of the ratios of several bands are taken as independent.
 
-    Borders are found within 2 pixels, single pixels apart; at one, a few pixels may belong to none.
-    Where nothing moved and the object hardly changed, no map shows a border, and pixels belong
-    to none too.
-    A ratio that is withheld by its own value, as for being close to 1, biases the pooled one.
+    Borders are found within 2 pixels, single pixels apart. A few pixels at a border may belong to
+    no material, and those where nothing moved and the object hardly changed. A ratio that is
+    withheld by its own value, as for being close to 1, biases the pooled one.
 
     Examples
     --------
@@ -133,9 +129,9 @@ def materials(
     >>> capture, response = simulation.observe(scene, rig.response(), rng), rig.response()
     >>> alone = separation.solve(capture, response)
     >>> labels = separation.materials(alone, capture, response)
+    >>> int(labels.max())
+    0
     >>> pooled = separation.solve(capture, response, pool=labels)
-    >>> labels.dims, int(labels.max())
-    (('y', 'x'), 0)
     """
     _check(result, corrected, error_rate, resolution)
     frames = _longest_segment(corrected)
