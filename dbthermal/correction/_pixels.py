@@ -77,8 +77,8 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     Raises
     ------
     TypeError, ValueError
-        If the threshold is not positive, or a band has fewer than 16 frames that are not NaN, or than 0.5
-        s have.
+        If the threshold is not positive, or a band has fewer than 16 frames that are not NaN, or
+        than 0.5 s have.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not threshold > 0:
