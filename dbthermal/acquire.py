@@ -11,7 +11,7 @@ invalid, 130 if it was interrupted; what was recorded is kept. Never tried on ha
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,8 +21,6 @@ from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.devices import Devices, open_devices
-from dbthermal.instruments.emulated.camera import Picture
-from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording import Preview, Summary
 from dbthermal.instruments.session import Session
@@ -67,27 +65,8 @@ def plugged_in(session: Session) -> str:
         return f"The USB bus was not looked at: {error}"
 
 
-def main(
-    arguments: Sequence[str] | None = None,
-    world: World | None = None,
-    pictures: Mapping[str, Picture] | None = None,
-) -> int:
-    """
-    Record a session.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Command line: session, folder, ``--simulate``, ``--dry-run``.
-    world, pictures : optional
-        Emulated bench of an emulated session, and frames of its cameras, as for
-        `dbthermal.instruments.devices.open_devices`.
-
-    Returns
-    -------
-    int
-        Exit status, see the module.
-    """
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Record a session, as the command line tells, and return the exit status; see the module."""
     options = _parser().parse_args(arguments)
     try:
         session = Session.load(options.session)
@@ -96,7 +75,7 @@ def main(
         return 2
     session = replace(session, simulated=True) if options.simulate else session
     try:
-        return _run(session, options.folder, world, pictures, dry=options.dry_run)
+        return _run(session, options.folder, dry=options.dry_run)
     except KeyboardInterrupt:
         print("\nInterrupted: what was recorded is kept.", file=sys.stderr)
         return 130
@@ -118,20 +97,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(
-    session: Session,
-    folder: Path,
-    world: World | None,
-    pictures: Mapping[str, Picture] | None,
-    *,
-    dry: bool,
-) -> int:
+def _run(session: Session, folder: Path, *, dry: bool) -> int:
     """Open the devices, print their identities, and record; returns the exit status."""
     if session.simulated:
         print(f"Session '{session.name}': every device is emulated, nothing is measured.")
     else:
         print(plugged_in(session))
-    with open_devices(session, world, pictures) as devices:
+    with open_devices(session) as devices:
         for name, identity in devices.identities().items():
             print(f"{name}: " + ", ".join(f"{key} {value}" for key, value in identity.items()))
         if dry:

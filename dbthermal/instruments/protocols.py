@@ -25,9 +25,9 @@ from dbthermal.instruments.recording import (
     Preview,
     Reading,
     Summary,
-    mean_reading,
     record,
 )
+from dbthermal.instruments.recording._capture import mean_reading
 from dbthermal.instruments.recording._sweep import (
     BLACKBODY,
     is_complete,

@@ -31,7 +31,7 @@ band is one of the filters is the one behind the wheel.
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -199,10 +199,6 @@ class Session:
         """Address of a device in this session: the simulated one, or the hardware's."""
         return device.simulated if self.simulated else device.hardware
 
-    def content(self) -> dict[str, Any]:
-        """Content of the session for the attributes of a recording, JSON."""
-        return asdict(self)
-
     @classmethod
     def from_yaml(cls, text: str) -> Self:
         """Read a session from YAML, see the module; ValueError as from `load`."""
@@ -217,21 +213,16 @@ class Session:
         ----------
         path : str or Path
             YAML; see the module. Keys that several sessions share, such as the addresses, may stand
-            in a file of their own, whose name is the key ``rig``, relative to this one.
+            in another file, whose name relative to this one is the key ``rig``.
         changes : mapping, optional
             Values in place of those in the files, by key; of ``blackbody``, key by key.
-
-        Returns
-        -------
-        Session
-            Checked.
 
         Raises
         ------
         FileNotFoundError
             If a file does not exist.
         ValueError
-            If it is not YAML, a key is missing, unknown or in both files, or a value is invalid:
+            If it is not YAML, or a key is missing, unknown or in both files, or a value is invalid:
             the message has the file, the place in it, the value and the rule.
         """
         content = _read_yaml(Path(path).read_text(encoding="utf-8"), str(path))

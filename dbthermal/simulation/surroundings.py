@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from dbthermal.simulation._scenes import increasing
 from dbthermal.simulation.rays import Caster, Hits
 
-__all__ = ["Actor", "Pose", "Room", "distance", "gliding", "hinged", "incident", "painted"]
+__all__ = ["Actor", "Pose", "gliding", "hinged", "incident", "painted"]
 
 Array = npt.NDArray[np.float64]
 
@@ -70,24 +70,10 @@ def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:
 
 def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
     """
-    Motion in straight lines from place to place, without turning.
+    Motion in straight lines between places (stop, 3) [m] at times (stop,) [s], without turning.
 
-    Parameters
-    ----------
-    times : array_like, shape (stop,)
-        Time of arrival at each place [s], increasing; two or more.
-    places : array_like, shape (stop, 3)
-        Places [m].
-
-    Returns
-    -------
-    function of time
-        The pose; before and after, that of the nearest stop.
-
-    Raises
-    ------
-    ValueError
-        If the times do not increase, or the places are not finite, or not one for each time.
+    Before and after, the pose is that of the nearest stop. Raises a ValueError if the times do not
+    increase, or the places are not finite, one for each time.
     """
     times, places = increasing(times, "a motion"), np.asarray(places, dtype=np.float64)
     if places.shape != (times.size, 3) or not np.all(np.isfinite(places)):
@@ -108,14 +94,9 @@ class Actor:
     mesh : trimesh.Trimesh
         Its mesh, in its own frame [m].
     temperature : ndarray, shape (vertex,), or function of time
-        Temperature [K].
+        Temperature [K], finite.
     motion : function of time, optional
         Its pose; without one it stands still, its own frame being the world's.
-
-    Raises
-    ------
-    ValueError
-        If the temperatures are not finite, one for each vertex; of a function, when it is called.
     """
 
     mesh: trimesh.Trimesh
@@ -142,28 +123,6 @@ class Actor:
                 f"Must be finite, {expected}."
             )
         return temperature
-
-
-@dataclass(frozen=True)
-class Room:
-    r"""
-    Walls of constant temperature behind all bodies, :math:`T + g \cdot d` along direction d.
-
-    Attributes
-    ----------
-    temperature : float
-        Mean temperature [K].
-    gradient : tuple of float
-        Change of temperature from the middle to each of the directions x, y and z [K]: (0, 0, 1)
-        is a room whose ceiling is 2 K warmer than its floor.
-    """
-
-    temperature: float = 295.15
-    gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def seen(self, directions: Array) -> Array:
-        """Temperature (ray,) [K] of the walls along directions (ray, 3)."""
-        return np.asarray(self.temperature + directions @ np.asarray(self.gradient))
 
 
 def painted(parts: Sequence[tuple[trimesh.Trimesh, float]], motion: Motion | None = None) -> Actor:
@@ -210,7 +169,7 @@ class _Target:
 
 
 def incident(
-    origins: Array, directions: Array, time: Array, room: Room, actors: Sequence[Actor]
+    origins: Array, directions: Array, time: Array, room: float, actors: Sequence[Actor]
 ) -> Array:
     """
     Blackbody temperature (time, ray) [K] that rays meet, frame by frame.
@@ -221,13 +180,13 @@ def incident(
         Origins [m] and unit vectors of the rays, the same in all frames.
     time : ndarray, shape (time,)
         Times [s].
-    room : Room
-        Walls behind all actors.
+    room : float
+        Temperature of the walls behind all actors [K].
     actors : sequence of Actor
         Bodies; the nearest hides the others.
     """
     targets = [_Target(actor, origins, directions) for actor in actors]
-    result = np.tile(room.seen(directions), (time.size, 1))
+    result = np.full((time.size, len(directions)), room)
     for frame, now in zip(result, time, strict=True):
         nearest = np.full(frame.shape, np.inf)
         for target in targets:
@@ -237,13 +196,3 @@ def incident(
             nearest[selected] = hits.distance[first]
             frame[selected] = target.caster.interpolate(hits.of(first), warmth)
     return result
-
-
-def distance(origins: Array, directions: Array, time: Array, actors: Sequence[Actor]) -> Array:
-    """Least distance (ray,) [m] to any actor over all frames; infinite where no actor is met."""
-    nearest = np.full(len(origins), np.inf)
-    for target in (_Target(actor, origins, directions) for actor in actors):
-        for now in time:
-            rays, hits = target.at(float(now))
-            nearest[rays] = np.minimum(nearest[rays], hits.distance)
-    return nearest

@@ -22,7 +22,8 @@ def test_session_is_read(tmp_path: Path) -> None:
     assert session.filters == {1: "9.5", 3: "11"}
     real = Session.from_yaml(replaced(("simulated: true", "simulated: false")))
     assert real.url(wheel) == "serial:///dev/ttyUSB0"
-    assert real.content()["blackbody"]["temperatures"] == (300.0, 290.0, 310.0)
+    assert real.blackbody is not None
+    assert real.blackbody.temperatures == (300.0, 290.0, 310.0)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ recording as stage `capture`, `notes` its log, `overview` a folder of recordings
 and `bench_series` those of a blackbody. See `dbthermal.instruments.protocols` for whole procedures.
 """
 
-from dbthermal.instruments.recording._capture import mean_reading, notes, open_capture, overview
+from dbthermal.instruments.recording._capture import notes, open_capture, overview
 from dbthermal.instruments.recording._recorder import Limits, Preview, Reading, Summary, record
 from dbthermal.instruments.recording._sweep import bench_series, open_sweep
 
@@ -15,7 +15,6 @@ __all__ = [
     "Reading",
     "Summary",
     "bench_series",
-    "mean_reading",
     "notes",
     "open_capture",
     "open_sweep",

@@ -17,7 +17,7 @@ import shutil
 import threading
 import time as system_time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -217,7 +217,7 @@ def _new_file(
         },
         "frame_rates": {band: source.frame_rate for band, source in sources.items()},
         "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
-        "provenance": store.provenance(session.content()),
+        "provenance": store.provenance(asdict(session)),
     }
     units = {name: reading.units for name, reading in readings.items()}
     return CaptureFile(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)

@@ -21,12 +21,9 @@ Varying: TypeAlias = float | Array | Callable[[float], float | Array]
 @dataclass(frozen=True, eq=False)
 class Balance:
     """
-    Flux into a shell at one time, as a function of its temperature T: a - b T - s T^4.
+    Flux a - b T - s T^4 into a shell at one time, as a function of its temperature T.
 
-    Attributes
-    ----------
-    constant, linear, quartic : ndarray, shape (vertex,)
-        a [W m^-2], b [W m^-2 K^-1] and s [W m^-2 K^-4].
+    Of a, b and s (vertex,) in [W m^-2], [W m^-2 K^-1] and [W m^-2 K^-4].
     """
 
     constant: Array
@@ -58,6 +55,8 @@ class Exchange(ABC):
 class Convection(Exchange):
     """
     Exchange with a fluid, or through a contact: h (T_fluid - T).
+
+    With a very large coefficient, such as 1e9 W m^-2 K^-1, a prescribed temperature.
 
     Attributes
     ----------
@@ -124,47 +123,6 @@ class Heating(Exchange):
         """Terms a, b, s of `Balance` at a time [s]; see `Exchange.balance`."""
         nothing = np.zeros(vertices)
         return _evaluate("flux of heating", self.flux, time, vertices), nothing, nothing
-
-
-@dataclass(frozen=True, eq=False)
-class Held:
-    """
-    Vertices of prescribed temperature.
-
-    Attributes
-    ----------
-    vertices : ndarray of int, shape (held,), or of bool, shape (vertex,)
-        Numbers of the vertices, or a mask.
-    temperature : float, ndarray (held,) or function of time
-        Their temperature [K].
-    """
-
-    vertices: npt.NDArray[np.int64] | npt.NDArray[np.bool_]
-    temperature: Varying
-
-    def indices(self, vertices: int) -> npt.NDArray[np.int64]:
-        """Numbers of the held vertices of a shell of so many; a ValueError if they do not fit."""
-        array = np.asarray(self.vertices)
-        if array.dtype == np.bool_ and array.shape == (vertices,):
-            return np.flatnonzero(array)
-        if array.ndim != 1 or not (np.issubdtype(array.dtype, np.integer) or array.size == 0):
-            raise ValueError(
-                f"Invalid held vertices of shape {array.shape} and type {array.dtype}. "
-                f"Must be numbers, or a mask of shape ({vertices},)."
-            )
-        numbers = array.astype(np.int64)
-        bad = (numbers < 0) | (numbers >= vertices)
-        if np.any(bad):
-            raise ValueError(f"Invalid held vertex {numbers[bad][0]}. Must lie in [0, {vertices}).")
-        if np.unique(numbers).size < numbers.size:
-            raise ValueError("Invalid held vertices: one is repeated. Must all differ.")
-        return numbers
-
-    def at(self, time: float) -> Array:
-        """Temperature of the held vertices at a time [s], (held,) [K]."""
-        array = np.asarray(self.vertices)
-        count = int(array.sum()) if array.dtype == np.bool_ else array.size
-        return _not_negative("temperature of held vertices", self.temperature, time, count)
 
 
 def combine(exchanges: Sequence[Exchange], time: float, vertices: int) -> Balance:

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.linalg import splu
-from tqdm import tqdm
 
-from dbthermal.simulation.heat._exchange import Balance, Exchange, Held, combine
+from dbthermal.planck import require_positive
+from dbthermal.simulation.heat._exchange import Balance, Exchange, combine
 from dbthermal.simulation.heat._shell import Shell
 
 Array = npt.NDArray[np.float64]
@@ -38,10 +38,8 @@ def simulate(
     initial: npt.ArrayLike,
     exchanges: Sequence[Exchange] = (),
     *,
-    held: Held | None = None,
     step: float | None = None,
     tolerance: float = TOLERANCE,
-    progress: bool = False,
 ) -> Array:
     r"""
     Transient temperature of a thin shell.
@@ -65,15 +63,11 @@ def simulate(
         Initial temperature [K].
     exchanges : sequence of Exchange
         Heat exchanges; one record for each side and cause, none for an insulated body.
-    held : Held, optional
-        Vertices of prescribed temperature, at the first time too.
     step : float, optional
         Longest internal step [s]: every interval of `time` is cut evenly into as few steps as
         this allows. One step an interval if left out.
     tolerance : float
         Largest error of the iteration in a stage [K].
-    progress : bool
-        Show a bar.
 
     Returns
     -------
@@ -107,12 +101,12 @@ def simulate(
     [3.68, 3.68, 3.68, 3.68]
     """
     times = _times(time)
-    limit = np.inf if step is None else _positive("step [s]", step)
-    stepper = _Stepper(shell, exchanges, held, _positive("tolerance [K]", tolerance))
+    limit = np.inf if step is None else float(require_positive("step [s]", step))
+    stepper = _Stepper(shell, exchanges, float(require_positive("tolerance [K]", tolerance)))
     temperature = stepper.start(_initial(initial, len(shell.vertices)), times[0])
     result = np.empty((times.size, temperature.size))
     result[0] = temperature
-    for index in tqdm(range(1, times.size), desc="heat", unit="frame", disable=not progress):
+    for index in range(1, times.size):
         first, last = times[index - 1], times[index]
         count = max(1, int(np.ceil((last - first) / limit - _EVEN)))
         # linspace ends exactly on the sample: no function is called beyond the last time.
@@ -137,22 +131,14 @@ class _Stepper:
     stop, and when the factorisation is too old.
     """
 
-    def __init__(
-        self, shell: Shell, exchanges: Sequence[Exchange], held: Held | None, tolerance: float
-    ) -> None:
+    def __init__(self, shell: Shell, exchanges: Sequence[Exchange], tolerance: float) -> None:
         """Keep the problem, and the tolerance [K]."""
-        self.shell, self.exchanges, self.held, self.tolerance = shell, exchanges, held, tolerance
-        count = len(shell.vertices)
-        self.fixed = np.empty(0, dtype=np.int64) if held is None else held.indices(count)
-        self.free = np.setdiff1d(np.arange(count), self.fixed)
-        if not self.free.size:
-            raise ValueError(f"Invalid held vertices: all {count}. Must leave one free.")
+        self.shell, self.exchanges, self.tolerance = shell, exchanges, tolerance
         self.weight = 0.0
-        self.slope = np.zeros(count)
+        self.slope = np.zeros(len(shell.vertices))
 
     def start(self, temperature: Array, time: float) -> Array:
-        """Initial temperature [K] with the held vertices at theirs; keep its rate of change."""
-        self._hold(temperature, time)
+        """Initial temperature [K]; keep its rate of change [K/s]."""
         balance = combine(self.exchanges, time, temperature.size)
         heat = self.shell.area * balance.flux(temperature) - self.shell.stiffness @ temperature
         self.rate = heat / self.shell.capacity
@@ -177,7 +163,6 @@ class _Stepper:
         temperature = base + weight * self.rate
         if not np.all(temperature > 0):
             temperature = before.copy()
-        self._hold(temperature, time)
         slope = balance.slope(temperature)
         for _ in range(_ITERATIONS):
             same = math.isclose(self.weight, weight, rel_tol=_EVEN)
@@ -195,32 +180,27 @@ class _Stepper:
             f"Must be below {self.tolerance:g} K; take a shorter step."
         )
 
-    def _hold(self, temperature: Array, time: float) -> None:
-        """Set the held vertices to their temperature at a time [s]."""
-        if self.held is not None:
-            temperature[self.fixed] = self.held.at(time)
-
     def _shrink(self, slope: Array) -> float:
         """Bound of the factor by which an iteration shrinks the error [1]."""
         inertia = self.shell.capacity_per_area / self.weight
         return float(np.max(np.abs(slope - self.slope) / (inertia + self.slope)))
 
     def _factorise(self, weight: float, slope: Array) -> None:
-        """Factorise the matrix of a stage, for the free vertices."""
+        r"""Factorise the matrix of a stage, :math:`C + w K + w A \bar b`."""
         self.weight, self.slope = weight, slope
         diagonal = self.shell.capacity + weight * self.shell.area * slope
         matrix = sparse.diags(diagonal, format="csr") + weight * self.shell.stiffness
-        inner = matrix[self.free][:, self.free].tocsc()
-        self.factors = splu(inner, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        options = {"SymmetricMode": True}
+        self.factors = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options)
 
     def _correct(self, temperature: Array, base: Array, balance: Balance, weight: float) -> float:
         """Correct the temperature of a stage in place; return the largest correction [K]."""
         shell = self.shell
         heat = shell.area * balance.flux(temperature) - shell.stiffness @ temperature
         residual = shell.capacity * (temperature - base) - weight * heat
-        change = self.factors.solve(residual[self.free])
-        temperature[self.free] -= change
-        return float(np.max(np.abs(change), initial=0.0))
+        change = self.factors.solve(residual)
+        temperature -= change
+        return float(np.max(np.abs(change)))
 
 
 def _physical(temperature: Array, time: float) -> Array:
@@ -232,13 +212,6 @@ def _physical(temperature: Array, time: float) -> Array:
             "Must be above 0 K; cool less or take a shorter step."
         )
     return temperature
-
-
-def _positive(name: str, value: float) -> float:
-    """Return a number that is finite and positive, or raise a ValueError."""
-    if not (np.isfinite(value) and value > 0):
-        raise ValueError(f"Invalid {name} {value}. Must be finite and positive.")
-    return value
 
 
 def _times(time: npt.ArrayLike) -> Array:

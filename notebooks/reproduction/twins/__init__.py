@@ -14,10 +14,10 @@ import xarray as xr
 
 from reproduction.twins.panes import fingerprint, fingers, glass_plate
 from reproduction.twins.solids import bulb, bunny
-from reproduction.twins.stage import Capture, Stage, obstructed, take, thermocouple_readings
+from reproduction.twins.stage import Capture, Stage, take, thermocouple_readings
 from reproduction.twins.vessels import coffee_pot, wineglass
 
-__all__ = ["TWINS", "Capture", "Stage", "obstructed", "take", "thermocouple_readings", "twin"]
+__all__ = ["TWINS", "Capture", "Stage", "take", "thermocouple_readings", "twin"]
 
 TWINS: Final[MappingProxyType[str, Callable[..., Stage]]] = MappingProxyType(
     {

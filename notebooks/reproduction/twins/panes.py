@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from dbthermal.simulation import heat
 from dbthermal.simulation.rays import Array, Camera
-from dbthermal.simulation.surroundings import Actor, Motion, Pose, Room, gliding
+from dbthermal.simulation.surroundings import Actor, Motion, Pose, gliding
 from reproduction.twins import surfaces
 from reproduction.twins.people import FINGERS, hand, imprint, pacing, person
 from reproduction.twins.props import Writing, board
@@ -125,7 +125,6 @@ def glass_plate(
         pane.temperature(start, mesh, capture.time, gun.blast(mesh)),
         camera,
         _written(writing, camera),
-        Room(AMBIENT),
         [(0.02, 0.0, 0.01)],
     )
 
@@ -179,7 +178,6 @@ def fingers(capture: Capture, rng: np.random.Generator) -> Stage:
         np.full((capture.time.size, len(mesh.vertices)), AMBIENT),
         camera,
         hand(_waving(capture.time, rng), flex=0.5),
-        Room(AMBIENT),
         [(0.0, 0.0, 0.03)],
     )
 
@@ -248,6 +246,5 @@ def fingerprint(
         pane.temperature(touch.start, mesh, capture.time, touch.press(share)),
         Camera((0.12, -0.50, 0.02), (0.0, 0.0, 0.0), capture.shape),
         person(pacing(VISIT, capture.time, rng), height=floor) if visitor else [],
-        Room(AMBIENT),
         [(0.0, 0.0, -0.03)],
     )

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from dbthermal.simulation import heat
 from dbthermal.simulation.rays import Array, Camera, vertex_normals
-from dbthermal.simulation.surroundings import Actor, Motion, Pose, Room, gliding
+from dbthermal.simulation.surroundings import Actor, Motion, Pose, gliding
 from reproduction.twins import surfaces
 from reproduction.twins.panes import Touch
 from reproduction.twins.people import Route, hand, imprint, pacing, person
@@ -60,7 +60,6 @@ def bulb(capture: Capture, rng: np.random.Generator) -> Stage:
             *person(route, height=-TABLE - STAND),
             cup(_sips(route, rng), uncovered=8.0),
         ],
-        Room(AMBIENT),
         [surfaces.on_wall(mesh, 0.055, 5.0)],
     )
 
@@ -121,7 +120,6 @@ def bunny(
         since(LAMP_START, mesh, BUNNY_WALL, capture.time, exchanges),
         Camera((0.0, -0.54, 0.36), (0.0, 0.0, 0.07), capture.shape),
         [table(), *_toys(capture.time, rng), *passers_by(capture.time, rng)],
-        Room(AMBIENT),
     )
 
 

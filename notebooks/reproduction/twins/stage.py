@@ -12,7 +12,7 @@ import xarray as xr
 from dbthermal import schema, simulation
 from dbthermal.simulation import heat
 from dbthermal.simulation.rays import Array, Camera, Caster, Hits, Mask, unit
-from dbthermal.simulation.surroundings import Actor, Room, distance, incident, painted
+from dbthermal.simulation.surroundings import Actor, incident, painted
 from reproduction.twins.people import pacing, person
 
 AMBIENT: Final = 295.15
@@ -78,8 +78,6 @@ class Stage:
         The first camera.
     actors : sequence of Actor
         Bodies that move, or stand, around it.
-    room : Room
-        Walls behind all of it.
     thermocouples : ndarray, shape (thermocouple, 3)
         Points of the surface where thermocouples are [m].
     """
@@ -89,17 +87,14 @@ class Stage:
     temperature: Array
     camera: Camera
     actors: Sequence[Actor]
-    room: Room
     thermocouples: npt.ArrayLike = ()
 
 
 @dataclass(frozen=True)
 class _View:
-    """The object as the first camera sees it: rays (pixel, 3) and their intersections."""
+    """The object as the first camera sees it: intersections of the pixels' rays."""
 
     caster: Caster
-    origins: Array
-    directions: Array
     hits: Hits
 
     @property
@@ -109,14 +104,6 @@ class _View:
     @property
     def seen(self) -> Hits:
         return self.hits.of(self.hits.met)
-
-
-def _view(stage: Stage) -> _View:
-    """Cast the first camera's rays at the object."""
-    directions = stage.camera.directions()
-    origins = np.array(np.broadcast_to(np.asarray(stage.camera.position), directions.shape))
-    caster = Caster(stage.mesh)
-    return _View(caster, origins, directions, caster.cast(origins, directions))
 
 
 def take(stage: Stage, capture: Capture) -> xr.Dataset:
@@ -146,10 +133,13 @@ def take(stage: Stage, capture: Capture) -> xr.Dataset:
     ValueError
         If a thermocouple is not seen by the camera.
     """
-    view = _view(stage)
-    origins, directions, on = view.origins.copy(), view.directions.copy(), view.on_object
-    origins[on], directions[on] = view.caster.mirrored(view.seen, view.directions[on])
-    background = incident(origins, directions, capture.time, stage.room, stage.actors)
+    directions = stage.camera.directions()
+    origins = np.array(np.broadcast_to(np.asarray(stage.camera.position), directions.shape))
+    caster = Caster(stage.mesh)
+    view = _View(caster, caster.cast(origins, directions))
+    on = view.on_object
+    origins[on], directions[on] = caster.mirrored(view.seen, directions[on])
+    background = incident(origins, directions, capture.time, AMBIENT, stage.actors)
     background[:, on] = _with_itself(stage, view, origins[on], directions[on], background[:, on])
     emitted = background.copy()
     emitted[:, on] = view.caster.interpolate(view.seen, stage.temperature)
@@ -177,7 +167,7 @@ def _with_second(scene: xr.Dataset, stage: Stage, capture: Capture, view: _View)
     points = view.caster.points(view.seen)
     seen = view.caster.visible(points, other.position)
     rays = view.caster.mirrored(view.seen, unit(points - np.asarray(other.position)))
-    reflected = incident(*rays, capture.time, stage.room, stage.actors)
+    reflected = incident(*rays, capture.time, AMBIENT, stage.actors)
     reflected = _with_itself(stage, view, *rays, reflected)
     first = scene["background_temperature"]
     second = first.values.copy().reshape(capture.time.size, -1)
@@ -209,17 +199,6 @@ def _with_thermocouples(scene: xr.Dataset, stage: Stage, caster: Caster) -> xr.D
     for name, places in (("thermocouple_y", rows), ("thermocouple_x", columns)):
         scene[name] = ("thermocouple", places, {"units": "1", "long_name": name})
     return scene
-
-
-def obstructed(stage: Stage, time: Array) -> Mask:
-    """
-    Pixels (y, x) of the object that an actor hides from the camera at some time [s].
-
-    A scene cannot hold a body between the object and the camera: a twin must have none.
-    """
-    view = _view(stage)
-    nearest = distance(view.origins, view.directions, time, stage.actors)
-    return np.asarray((view.on_object & (nearest < view.hits.distance)).reshape(stage.camera.shape))
 
 
 def thermocouple_readings(

@@ -8,7 +8,6 @@ import trimesh
 
 from dbthermal.simulation import heat
 from dbthermal.simulation.rays import Array, Camera
-from dbthermal.simulation.surroundings import Room
 from reproduction.twins import surfaces
 from reproduction.twins.stage import AMBIENT, Capture, Stage, passers_by, since, table
 
@@ -163,6 +162,5 @@ def _filled(
         since(vessel.start, mesh, wall, capture.time, vessel.exchanges(mesh)),
         camera,
         [table(), *passers_by(capture.time, rng)],
-        Room(AMBIENT),
         [surfaces.on_wall(mesh, *vessel.probe)],
     )

@@ -1,0 +1,130 @@
+"""Data quality: valid samples, bits of the status, gaps, and sets of frames."""
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal.schema import Status
+from dbthermal.separation import _quality as quality
+
+FRAMES = 20
+Place = tuple[int | slice, int | slice, int]
+
+
+def part(dtype: str = "float32", pixels: int = 6) -> xr.Dataset:
+    """Part of a capture (band, time, y, x) of noise about 1000 counts, one row high."""
+    rng = np.random.default_rng(1)
+    counts = 1000.0 + 20.0 * rng.standard_normal((2, FRAMES, 1, pixels))
+    return xr.Dataset({"counts": (("band", "time", "y", "x"), counts.astype(dtype))})
+
+
+def spoilt(*values: tuple[Place, float], dtype: str = "float32") -> xr.Dataset:
+    """The same with some counts replaced, by index (band, time, pixel)."""
+    result = part(dtype)
+    for (band, time, pixel), value in values:
+        result["counts"].values[band, time, 0, pixel] = value
+    return result
+
+
+def bits(*flags: tuple[int, Status]) -> npt.NDArray[np.uint32]:
+    """Status (pixel) with a bit in some pixels."""
+    result = np.zeros(6, dtype=np.uint32)
+    for pixel, bit in flags:
+        result[pixel] |= np.uint32(bit)
+    return result
+
+
+def test_good_samples_pass_unchanged() -> None:
+    """Counts as float64, all valid, no bit."""
+    counts, valid, status = quality.read(part())
+    np.testing.assert_array_equal(counts, part()["counts"].values[:, :, 0].astype(np.float64))
+    assert valid.all()
+    assert not status.any()
+
+
+def test_bits_of_bad_pixels() -> None:
+    """NaN in one band makes a sample invalid in all; too few, constant or frozen is told."""
+    every, some = slice(None), slice(0, 11)
+    bad = spoilt(
+        ((0, 3, 0), np.nan),
+        ((1, some, 1), np.nan),
+        ((0, every, 2), 7.0),
+        ((every, slice(4, 9), 3), 1000.0),
+    )
+    counts, valid, status = quality.read(bad)
+    expected = bits(
+        (1, Status.INVALID_SAMPLES), (2, Status.CONSTANT_SIGNAL), (3, Status.FROZEN_FRAMES)
+    )
+    np.testing.assert_array_equal(status, expected)
+    assert valid[:, 0].sum() == FRAMES - 1
+    assert np.all(counts[:, 3, 0] == 0.0)
+    assert np.all(counts[:, :, [1, 2]] == 0.0)  # unusable
+    np.testing.assert_array_equal(quality.unusable(status), [False, True, True] + 3 * [False])
+
+
+def test_saturation_is_of_whole_numbers_in_use() -> None:
+    """An end of the type is told for whole numbers, but not in a masked sample."""
+    wild = spoilt(((1, 5, 4), 65535), ((1, 6, 5), 65535), dtype="uint16")
+    mask = np.ones((FRAMES, 1, 6), dtype=bool)
+    mask[6, 0, 5] = False
+    _, valid, status = quality.read(wild.assign(mask=(("time", "y", "x"), mask)))
+    np.testing.assert_array_equal(status, bits((4, Status.SATURATED)))
+    assert not valid[6, 5]
+    assert not quality.read(spoilt(((1, 5, 4), 65535)))[2].any()
+
+
+def test_status_of_the_capture_is_kept() -> None:
+    """A pixel that the correction marked as dead is unusable, and keeps its bit."""
+    known = part().assign(status=(("y", "x"), bits((2, Status.DEAD_PIXEL))[np.newaxis]))
+    counts, _, status = quality.read(known)
+    assert status[2] == Status.DEAD_PIXEL
+    assert np.all(counts[:, :, 2] == 0.0)
+
+
+def test_short_gaps_are_bridged_by_a_line() -> None:
+    """Gaps of one and two frames follow the clock; one of three, or at an end, stays."""
+    time = np.cumsum(np.r_[1.0, np.full(FRAMES - 1, 0.1)])
+    time[7:] += 0.3  # an uneven clock
+    counts = np.stack([5.0 * time, -3.0 * time])[..., np.newaxis] * np.ones(6)
+    valid = np.ones((FRAMES, 6), dtype=bool)
+    valid[6, 0] = valid[8:10, 1] = valid[12:15, 2] = valid[0, 3] = False
+    filled, usable = quality.bridge(np.where(valid, counts, 0.0), valid, time)
+    np.testing.assert_allclose(filled[:, :, :2], counts[:, :, :2], rtol=1e-12)
+    np.testing.assert_array_equal(usable.all(axis=0), [True, True, False, False, True, True])
+
+
+def test_pixels_of_the_same_frames_are_one_set() -> None:
+    """Every usable pixel is in one set, and has its frames."""
+    valid = np.ones((FRAMES, 6), dtype=bool)
+    valid[3, [1, 4]] = valid[9, 2] = False
+    status = bits((5, Status.DEAD_PIXEL))
+    pairs = quality.frame_sets(valid, status)
+    sets = {tuple(map(int, np.flatnonzero(pixels))): frames for frames, pixels in pairs}
+    assert set(sets) == {(0, 3), (1, 4), (2,)}
+    assert not sets[(1, 4)][3]
+    assert sets[(1, 4)].sum() == FRAMES - 1
+    assert list(quality.frame_sets(valid, np.full(6, Status.DEAD_PIXEL, np.uint32))) == []
+
+
+def test_common_frames_leave_out_who_lacks_one() -> None:
+    """A frame that most lack is dropped for all; a pixel that lacks another is not solved."""
+    valid = np.ones((FRAMES, 6), dtype=bool)
+    valid[3, :5] = valid[9, 2] = False
+    counts, status = np.ones((2, FRAMES, 6)), bits()
+    ((frames, pixels),) = quality.common_frames(counts, valid, status)
+    np.testing.assert_array_equal(np.flatnonzero(~frames), [3])
+    np.testing.assert_array_equal(np.flatnonzero(~pixels), [2])
+    np.testing.assert_array_equal(status, bits((2, Status.INVALID_SAMPLES)))
+    assert np.all(counts[:, :, 2] == 0.0)
+    assert quality.common_frames(counts, valid, status, fewest=FRAMES) == []
+    assert np.all(status == Status.INVALID_SAMPLES)
+
+
+def test_sample_is_even_and_good() -> None:
+    """About the number of pixels asked for, none with a bit, at the frames that most have."""
+    whole = part(pixels=600)
+    whole["counts"].values[0, 4, 0, :] = np.nan
+    whole["counts"].values[0, 7, 0, :60] = np.nan
+    counts, frames = quality.sample(whole, 150)
+    np.testing.assert_array_equal(np.flatnonzero(~frames), [4])
+    assert counts.shape == (2, FRAMES - 1, 270)
