@@ -29,12 +29,7 @@ _CURVATURE_SIGMAS: Final = 5.0
 _CURVATURE: Final = 0.003
 
 
-def fit_response(
-    counts: xr.DataArray,
-    noise: xr.DataArray | None = None,
-    *,
-    linear_range: tuple[float, float] | None = None,
-) -> xr.Dataset:
+def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.Dataset:
     r"""
     Fit the response of each band to blackbody measurements.
 
@@ -51,8 +46,6 @@ def fit_response(
     noise : DataArray, optional
         Standard deviation of one pixel's counts from frame to frame, (band) [count]. If given,
         the response keeps it, and its NETD.
-    linear_range : tuple of float, optional
-        Temperatures [K] between which the line is fitted; all if not given.
 
     Returns
     -------
@@ -99,8 +92,7 @@ def fit_response(
     names = [str(name) for name in counts["band"].values]
     temperature = counts["temperature"].values.astype(np.float64)
     values = counts.values.astype(np.float64)
-    line = _linear_mask(temperature, linear_range)
-    rows = [_fit_band(temperature, row, line) for row in values]
+    rows = [_fit_band(temperature, row) for row in values]
     parameters = [*responses.COEFFICIENTS, "linear_slope", "linear_intercept"]
     stage = schema.STAGES["response"]
     variables: dict[str, xr.DataArray] = {
@@ -167,22 +159,7 @@ def _check_curvature(band: str, temperature: Array, counts: Array) -> None:
         )
 
 
-def _linear_mask(
-    temperature: Array, linear_range: tuple[float, float] | None
-) -> npt.NDArray[np.bool_]:
-    if linear_range is None:
-        return np.ones(temperature.shape, dtype=bool)
-    lowest, highest = linear_range
-    inside = (temperature >= lowest) & (temperature <= highest)
-    if inside.sum() < 2:
-        raise ValueError(
-            f"Invalid linear_range ({lowest}, {highest}) K with {inside.sum()} of the blackbody "
-            "temperatures. Must hold at least two."
-        )
-    return np.asarray(inside)
-
-
-def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) -> tuple[float, ...]:
+def _fit_band(temperature: Array, counts: Array) -> tuple[float, ...]:
     """Amplitude, effective wavelength, shift, offset, linear slope and intercept of one band."""
     middle = 0.5 * (temperature[0] + temperature[-1])
     span = counts[-1] - counts[0]
@@ -208,9 +185,7 @@ def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) ->
         max_nfev=1000,
     )
     amplitude, offset = linear_part(fit.x)[0]
-    slope, intercept = (
-        np.polynomial.Polynomial.fit(temperature[line], counts[line], 1).convert().coef[::-1]
-    )
+    slope, intercept = np.polynomial.Polynomial.fit(temperature, counts, 1).convert().coef[::-1]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle
     shift = _SHAPE_UNIT * fit.x[0] * (1.0 - fit.x[1])
     return (amplitude, wavelength, shift, offset, slope, intercept)

@@ -210,7 +210,6 @@ def correct(
     correction: xr.Dataset,
     *,
     after: xr.Dataset | None = None,
-    times: tuple[float, float] | None = None,
     maximum: int = DETECTOR_MAXIMUM,
 ) -> xr.Dataset:
     r"""
@@ -220,6 +219,7 @@ def correct(
 
     .. math:: I' = (1 - w) (g_0 I + f_0) + w (g_1 I + f_1), \quad w = \frac{t - t_0}{t_1 - t_0}
 
+    from the first frame to the last,
     which is right for a pattern that drifts so, and wrong across a shutter event, where a camera
     renews its offsets.
 
@@ -232,9 +232,6 @@ def correct(
         From `fit_correction`, of the same pixels; it may hold more bands.
     after : Dataset, optional
         Correction that holds after the capture, e.g. from `renew_offset`.
-    times : tuple of float, optional
-        When the two corrections hold [s], on the capture's clock; by default its first and its last
-        frame. The capture lies between them: nothing is extrapolated.
     maximum : int
         Largest count of the detector [count].
 
@@ -245,23 +242,24 @@ def correct(
         with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample of a band at `maximum` or
         above, or at 0) of `schema.Status`. The counts of these pixels are kept. Attributes say
         that gain and offset were corrected (``gain_offset_corrected`` = 1), with which parameters
-        they were fitted (``gain_offset_...``), between which times they were interpolated
-        (``correction_times`` [s]), and how many pixels are marked.
+        they were fitted (``gain_offset_...``), whether they were interpolated
+        (``offset_interpolated``), and how many pixels are marked.
 
     Raises
     ------
     TypeError, ValueError
         If capture or correction is not as `schema` has it, the capture is not uint16 or was
-        corrected before, a band is missing in the correction, a gain or offset is not finite, the
-        pixels are not the same, or the times do not rise or do not enclose the capture.
+        corrected before, a band is missing in the correction, a gain or offset is not finite, or
+        the pixels are not the same.
     """
     counts = _require_raw(capture)
     names = [str(name) for name in counts["band"].values]
     maps = _maps(correction, counts, names)
-    time = counts["time"].values.astype(np.float64)
-    times = (float(time[0]), float(time[-1])) if times is None else times
     if after is not None:
-        last, weight = _maps(after, counts, names), _weight(time, times)
+        last = _maps(after, counts, names)
+        time = counts["time"].values.astype(np.float64)
+        planck.require_positive("length of the capture [s]", time[-1] - time[0])
+        weight = (time - time[0]) / (time[-1] - time[0])
         change = last[["gain", "offset"]] - maps
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
@@ -291,25 +289,13 @@ def correct(
         result.assign_attrs(
             gain_offset_corrected=1,
             **done,
-            **({} if after is None else {"correction_times": list(times)}),
+            offset_interpolated=int(after is not None),
             detector_maximum=maximum,
             dead_pixels=int(bad.sum()),
             saturated_pixels=int(saturated.sum()),
         ),
         "corrected",
     )
-
-
-def _weight(time: Array, times: tuple[float, float]) -> Array:
-    """Weight of the later correction at each time [1]."""
-    start, stop = times
-    planck.require_positive("time between the corrections [s]", stop - start)
-    if not (start <= time[0] and time[-1] <= stop):
-        raise ValueError(
-            f"Invalid times {start} s and {stop} s of the corrections. Must enclose the capture, "
-            f"{time[0]} s to {time[-1]} s."
-        )
-    return np.asarray((time - start) / (stop - start))
 
 
 def _difference_variance(counts: xr.DataArray) -> Array:

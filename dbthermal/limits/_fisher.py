@@ -8,13 +8,15 @@ divided by the noise :math:`s_m`, so that the information is a sum of their prod
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from dbthermal import _smooth as smooth
 from dbthermal import mixing
+from dbthermal.bands import Band
+from dbthermal.response import Curve
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -41,14 +43,19 @@ _DEPENDENT: Final = 1e-8
 _PIXELS: Final = 512
 
 
-class Blackbody(Protocol):
-    """Linearised signal u(T) [K] of a blackbody in one band, and its slope u'(T) [1]."""
+@dataclass(frozen=True)
+class TopHat:
+    """Linearised signal u(T) [K] of a band by Planck's law, about a temperature [K]; its slope."""
+
+    band: Band
+    reference: float
 
     def signal(self, temperature: npt.ArrayLike) -> Array:
-        """Signal [K] at temperatures [K]."""
+        excess = self.band.radiance(temperature) - self.band.radiance(self.reference)
+        return np.asarray(self.reference + excess / self.band.slope(self.reference))
 
     def slope(self, temperature: npt.ArrayLike) -> Array:
-        """Derivative [1] of the signal at temperatures [K]."""
+        return np.asarray(self.band.slope(temperature) / self.band.slope(self.reference))
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,7 @@ class Truth:
     emissivity: Array  # (band, pixel) [1]
     resting: Mask  # frames with the background at its resting level (time, pixel)
 
-    def sensitivity(self, blackbodies: Sequence[Blackbody], noise: Array) -> Sensitivity:
+    def sensitivity(self, blackbodies: Sequence[Curve | TopHat], noise: Array) -> Sensitivity:
         """Derivatives of equation (1) for the bands' blackbodies and noise (band) [K]."""
         x, y = self.object_temperature, self.background_temperature
         bands = list(zip(blackbodies, noise, mixing.matrix(self.emissivity), strict=True))
@@ -187,12 +194,16 @@ def _deviations(
     emissivity = sensitivity.emissivity
     bands, (frames, order) = len(emissivity), functions.shape
     inverse = fisher_inverse(sensitivity, functions, prior)
-    # Gradients (pixel or 1, quantity, unknown) of the quantities; x(t) = Phi(t) c.
+    # Gradients (pixel or 1, quantity, unknown): x(t) = Phi(t) c, d kappa_m = -d e_m / (1 - e_r)
+    # + (1 - e_m) d e_r / (1 - e_r)^2.
     of_emissivity = np.eye(bands, bands + order + 1)[np.newaxis]
     of_object = np.zeros((1, frames, bands + order + 1))
     of_object[0, :, bands:-1] = functions
     of_background, free_variance = _background(sensitivity, functions)
-    of_ratio = _ratio_gradient(1.0 - emissivity, reference) @ -of_emissivity
+    of_ratio = np.zeros((emissivity.shape[1], bands, bands + order + 1))
+    of_ratio[:, range(bands), range(bands)] = -1.0 / (1.0 - emissivity[reference])[:, np.newaxis]
+    of_ratio[:, :, reference] += ((1.0 - emissivity) / (1.0 - emissivity[reference]) ** 2).T
+    of_ratio[:, reference] = 0.0  # 1 by definition, not but for rounding
     variances = {
         "object_temperature": inverse.variance(of_object),
         "background_temperature": inverse.variance(of_background) + free_variance,
@@ -219,16 +230,6 @@ def _background(sensitivity: Sensitivity, functions: Array) -> tuple[Array, Arra
     ]
     gradient = np.concatenate(parts, axis=-1)
     return np.swapaxes(gradient, 0, 1), (~sensitivity.resting / energy).T
-
-
-def _ratio_gradient(part: Array, reference: int) -> Array:
-    """Derivative (pixel, band, band) of each band's part over the reference's, with all parts."""
-    # d(a_m / a_r) = da_m / a_r - a_m da_r / a_r^2
-    below = part[reference]
-    result = np.eye(len(part)) / below[:, np.newaxis, np.newaxis]
-    result[:, :, reference] -= (part / below**2).T
-    result[:, reference] = 0.0  # 1 by definition, not but for rounding
-    return np.asarray(result)
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,11 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import mixing, planck, schema
 from dbthermal.bands import FILTERS, Band
-from dbthermal.limits._fisher import Array, Truth, deviations, smallest_order
+from dbthermal.limits._fisher import Array, TopHat, Truth, deviations, smallest_order
 
 # Best filter of a material whose temperature no filter determines.
 _NO_FILTER: Final = "none"
@@ -147,7 +146,7 @@ def plan(
     for name in names:
         if name not in filters:
             raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
-    bodies = [_TopHat(filters[name], temperature) for name in names]
+    bodies = [TopHat(filters[name], temperature) for name in names]
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
     parts = [
         _expected(truth, [bodies[band] for band in chosen], std[chosen])
@@ -206,21 +205,6 @@ def plan_durations(
     return result.assign(noise=plans[0]["noise"])
 
 
-@dataclass(frozen=True)
-class _TopHat:
-    """Linearised signal of a band by Planck's law, relative to a temperature [K]."""
-
-    band: Band
-    reference: float
-
-    def signal(self, temperature: npt.ArrayLike) -> Array:
-        excess = self.band.radiance(temperature) - self.band.radiance(self.reference)
-        return np.asarray(self.reference + excess / self.band.slope(self.reference))
-
-    def slope(self, temperature: npt.ArrayLike) -> Array:
-        return np.asarray(self.band.slope(temperature) / self.band.slope(self.reference))
-
-
 def _truth(design: CaptureDesign, emissivity: Array) -> Truth:
     """One pixel of each material (band, material); the background rests between the pulses."""
     time = np.arange(round(design.seconds * design.rate)) / design.rate
@@ -271,7 +255,7 @@ def _noise(noise: xr.DataArray, names: list[str]) -> Array:
     return planck.require_positive("noise [K]", noise.values[places])
 
 
-def _expected(truth: Truth, bodies: Sequence[_TopHat], noise: Array) -> dict[str, Array]:
+def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str, Array]:
     """Deviations of one combination: temperatures (material), the others (band, material)."""
     order = smallest_order(truth, truth.sensitivity(bodies, noise))
     sensitivity = truth.smoothed(order).sensitivity(bodies, noise)

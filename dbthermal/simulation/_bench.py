@@ -144,11 +144,6 @@ class Bench:
     least_excess : float
         Excess over the air from which the reflector method takes a step [K]; ASTM E1933 asks for
         10 K.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range, or there is no step.
     """
 
     object_temperatures: tuple[float, ...] = (300.15, 313.15, 325.15, 338.15)
@@ -253,24 +248,17 @@ def bench_series(
     response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
 ) -> xr.Dataset:
     """
-    One series of measurements on the paper's bench, with all its errors.
+    One series of measurements on the paper's bench, with all its errors: the stage `contact`.
 
     Parameters
     ----------
     response : Dataset
         With `noise`, that of one pixel and frame: it stands for the drift of the camera between
         shutter events, which no mean over pixels removes.
-    sample : Sample
-        The object.
-    bench : Bench
-        Steps and errors; the common ones are drawn once.
+    sample, bench : Sample, Bench
+        The object; steps and errors, of which the common ones are drawn once.
     rng : Generator
         Source of the errors.
-
-    Returns
-    -------
-    Dataset
-        Stage `contact`.
     """
     warm, cold = (
         part.ravel()
@@ -294,31 +282,12 @@ def reflector_series(
     response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
 ) -> xr.Dataset:
     """
-    One series by the reflector method, with all its errors.
+    One series by the reflector method, with all its errors: the stage `reflector`.
 
-    The foil gives the mean of the room, and a little of its own emission. Of what the object
-    reflects all but the stray part is mirror-like, of a temperature higher by `mirrored_excess`.
-
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    sample : Sample
-        The object.
-    bench : Bench
-        Steps and errors; the common ones are drawn once.
-    rng : Generator
-        Source of the errors.
-
-    Returns
-    -------
-    Dataset
-        Stage `reflector`.
-
-    Raises
-    ------
-    ValueError
-        If no step of the object is warm enough.
+    The foil gives the mean of the room, and a little of its own emission. Of the object's
+    reflection all but the stray part is mirror-like, of a temperature higher by
+    `Bench.mirrored_excess`. Parameters are those of `bench_series`. Raises a ValueError if no step
+    of the object is `Bench.least_excess` above the air.
     """
     steps = np.array(bench.object_temperatures)
     warm = steps[steps >= bench.air_temperature + bench.least_excess]
@@ -378,17 +347,9 @@ def _thermocouple(temperature: Array, bench: Bench, rng: np.random.Generator) ->
 def _dataset(
     response: xr.Dataset, counts: dict[str, Array], temperatures: dict[str, Array]
 ) -> xr.Dataset:
-    """Put a series together."""
-    return xr.Dataset(
-        {
-            **{
-                name: (("band", "measurement"), value, {"units": "count"})
-                for name, value in counts.items()
-            },
-            **{
-                name: ("measurement", value, {"units": "K"}) for name, value in temperatures.items()
-            },
-        },
-        coords={"band": response["band"].values},
-        attrs={"origin": "simulated"},
-    )
+    """Series of counts (band, measurement) and temperatures (measurement)."""
+    dims, units = ("band", "measurement"), {"units": "count"}
+    parts = {name: xr.DataArray(value, dims=dims, attrs=units) for name, value in counts.items()}
+    for name, value in temperatures.items():
+        parts[name] = xr.DataArray(value, dims="measurement", attrs={"units": "K"})
+    return xr.Dataset(parts, {"band": response["band"].values}, {"origin": "simulated"})

@@ -1,7 +1,7 @@
 """Nuisances of real cameras added to a perfect capture: one function each, with its truth."""
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -105,7 +105,8 @@ def drop_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
         for values in (counts[band], stamps[band]):
             values[:kept] = values[~gone]
             values[kept:] = np.nan
-    return _replaced(corrected, counts=counts, exposure_time=stamps)
+    replaced = {"counts": counts, "exposure_time": stamps}
+    return corrected.assign({name: corrected[name].copy(data=it) for name, it in replaced.items()})
 
 
 def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
@@ -122,7 +123,8 @@ def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
     for band, gone in enumerate(lost):
         for frame in np.flatnonzero(gone):
             counts[band, frame] = counts[band, frame - 1]
-    return _replaced(corrected.drop_vars("exposure_time", errors="ignore"), counts=counts)
+    unstamped = corrected.drop_vars("exposure_time", errors="ignore")
+    return unstamped.assign(counts=corrected["counts"].copy(data=counts))
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
@@ -134,7 +136,7 @@ def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -
     corrected : Dataset
         Stage `corrected` of `schema`.
     share : float
-        Share of frames that are lost [1].
+        Share of frames that are lost, in [0, 1).
     rng : Generator
         Source of the losses.
 
@@ -142,11 +144,6 @@ def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -
     -------
     Dataset
         The capture with frames repeated, and `repeated` (band, time), bool.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not as `schema` has it, or the share does not lie in [0, 1).
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not 0 <= share < 1:
@@ -183,11 +180,6 @@ def fire_shutter(
         Standard deviation of a pixel's step [count].
     bands : tuple of str, optional
         Bands whose cameras close; by default all.
-
-    Returns
-    -------
-    Dataset
-        The capture with the frames repeated and the steps added.
 
     Raises
     ------
@@ -238,11 +230,6 @@ def drift_pattern(
     -------
     Dataset
         The drifting capture, and `drifted` (band, y, x) [count]: the offsets at the last frame.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not as `schema` has it, or has one frame.
     """
     counts = _floating(corrected)
     time = counts["time"].values.astype(np.float64)
@@ -275,7 +262,7 @@ def spoil_pixels(
     corrected : Dataset
         Stage `corrected` of `schema`.
     share : float
-        Share of pixels that are bad in a band, a third of each kind on average [1].
+        Share of pixels that are bad in a band, a third of each kind on average, in [0, 1).
     rng : Generator
         Source of the pixels and of their signals.
     noise_std : float
@@ -289,12 +276,6 @@ def spoil_pixels(
     -------
     Dataset
         The capture with bad pixels, and `spoiled` (band, y, x), int8: position in `SPOILED`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not as `schema` has it, the share does not lie in [0, 1), or the time
-        between steps is not positive.
     """
     counts = _floating(corrected).copy(deep=True)
     if not 0 <= share < 1:
@@ -325,26 +306,15 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
     .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
 
     the exact solution of :math:`\tau \dot I = z - I` for a signal z held from each frame to the
-    next, at rest before the first. The input should be without noise: that of the read-out does
-    not pass through the pixel. `correction.undo_lag` is the inverse.
+    next, at rest before the first; `correction.undo_lag` is the inverse.
 
     Parameters
     ----------
     corrected : Dataset
-        Stage `corrected` of `schema`.
+        Stage `corrected` of `schema`, without noise: that of the read-out does not pass through
+        the pixel.
     time_constant : float or DataArray
         Time constant [s], of all bands or (band), by name.
-
-    Returns
-    -------
-    Dataset
-        The lagging capture.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not as `schema` has it, or a time constant is not finite and positive or
-        a band has none.
     """
     counts = _floating(corrected).copy(deep=True)
     _, new = lag_coefficients(time_constant, counts)
@@ -382,9 +352,3 @@ def _check_lost(corrected: xr.Dataset, lost: Mask) -> None:
         raise ValueError(
             f"Invalid lost frames {lost.shape} of {lost.dtype}. Must be {expected} of bool."
         )
-
-
-def _replaced(corrected: xr.Dataset, **values: npt.NDArray[Any]) -> xr.Dataset:
-    return corrected.assign(
-        {name: corrected[name].copy(data=part) for name, part in values.items()}
-    )

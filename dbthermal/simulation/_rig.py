@@ -40,12 +40,6 @@ class Rig:
     bad_fraction : float
         Fraction of dead pixels [1].
 
-    Raises
-    ------
-    ValueError
-        If a band is unknown, the noise is not positive, one for each band, or the fraction of dead
-        pixels lies outside [0, 1).
-
     Examples
     --------
     >>> from dbthermal import simulation
@@ -177,23 +171,10 @@ def observe(
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
     """
-    Fixed pattern of the rig's detectors.
+    Fixed pattern of the rig's detectors of a shape (rows, columns).
 
-    Parameters
-    ----------
-    rig : Rig
-        The rig.
-    shape : tuple of int
-        Rows and columns.
-    rng : Generator
-        Source of the pattern.
-
-    Returns
-    -------
-    Dataset
-        `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies,
-        relative to the mean of the live pixels, a smooth vignette (narcissus) included; `dead`
-        (band, y, x).
+    `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies, relative to
+    the mean of the live pixels, a smooth vignette (narcissus) included; `dead` (band, y, x).
     """
     size = (len(rig.bands), *shape)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
@@ -235,8 +216,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     ValueError
-        If the detector lacks a band, or a count does not fit into 16 bits; a real detector would
-        saturate, which a simulation must ask for rather than meet by accident.
+        If the detector lacks a band, or a count does not fit into 16 bits (no silent saturation).
     """
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
@@ -259,7 +239,7 @@ def blackbody_movies(
     rig : Rig
         The rig.
     temperatures : ndarray
-        Blackbody temperatures [K], increasing.
+        Blackbody temperatures [K], increasing, within the rig's range.
     frames : int
         Frames at each.
     detector : Dataset
@@ -271,12 +251,6 @@ def blackbody_movies(
     -------
     Dataset
         `counts` uint16 (band, temperature, frame, y, x) [count].
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the rig's range, the detector lacks a band, or a count does
-        not fit into 16 bits.
     """
     response = rig.response()
     shape = (frames, *detector["gain"].shape[1:])
@@ -298,24 +272,10 @@ def blackbody_movies(
 
 def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
     """
-    Raw counts of one band: fixed pattern, rounding, dead pixels at 0.
+    Raw counts of one band, uint16 (..., y, x): fixed pattern, rounding, dead pixels at 0.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (..., y, x)
-        Corrected counts [count].
-    detector : Dataset
-        From `pattern`, of this band: (y, x).
-
-    Returns
-    -------
-    ndarray of uint16, shape (..., y, x)
-        Raw counts [count].
-
-    Raises
-    ------
-    ValueError
-        If a count does not fit into 16 bits.
+    Of corrected counts (..., y, x) [count] and a `pattern` of this band (y, x). Raises a ValueError
+    if a count does not fit into 16 bits.
     """
     raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
     if not (raw.min() >= 0 and raw.max() <= correction.DETECTOR_MAXIMUM):  # a NaN fails it, too

@@ -12,8 +12,7 @@ from dbthermal import planck, schema
 
 Array = npt.NDArray[np.float64]
 
-BACKGROUNDS: Final = ("pulses", "random walk", "still")
-"""Kinds of background."""
+_BACKGROUNDS: Final = ("pulses", "random walk", "still")
 
 
 @dataclass(frozen=True)
@@ -38,11 +37,6 @@ class Background:
         Correlation time of the walk [s].
     drift : float
         Change of the resting temperature over the capture, linear in time [K].
-
-    Raises
-    ------
-    ValueError
-        If the kind is unknown, a range falls, or a time is not positive.
     """
 
     kind: str = "pulses"
@@ -55,8 +49,8 @@ class Background:
 
     def __post_init__(self) -> None:
         """Check the kind and the numbers."""
-        if self.kind not in BACKGROUNDS:
-            raise ValueError(f"Unknown background '{self.kind}'. Must be one of {BACKGROUNDS}.")
+        if self.kind not in _BACKGROUNDS:
+            raise ValueError(f"Unknown background '{self.kind}'. Must be one of {_BACKGROUNDS}.")
         if not 0 <= self.count[0] <= self.count[1]:
             raise ValueError(f"Invalid count {self.count} of pulses. Must be two, not falling.")
         if not 0 < self.duration[0] <= self.duration[1]:
@@ -135,21 +129,10 @@ def scene(
     time: Array, object_temperature: Array, background_temperature: Array, emissivity: xr.DataArray
 ) -> xr.Dataset:
     """
-    Scene of given temperatures and emissivity.
+    Scene of given temperatures (time, y, x) [K] and emissivity (band) or (band, y, x) [1].
 
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s], two or more, increasing.
-    object_temperature, background_temperature : ndarray, shape (time, y, x)
-        Temperatures [K].
-    emissivity : DataArray
-        (band) or (band, y, x) [1].
-
-    Returns
-    -------
-    Dataset
-        The truth: names, dims and units of the stage `separated` without its deviations.
+    The truth of a simulated capture: names, dims and units of the stage `separated` without its
+    deviations. Raises a ValueError unless the times (time,) [s] are two or more and increase.
     """
     increasing(time, "a scene")
     stage = schema.STAGES["separated"]

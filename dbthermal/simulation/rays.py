@@ -24,6 +24,7 @@ Point = tuple[float, float, float]
 MISSED: Final = -1
 """Face number of a ray that meets nothing."""
 
+_UP: Final = (0.0, 0.0, 1.0)
 # A reflected ray starts this far off the surface, in units of the mesh's size: well above the
 # rounding of single precision, well below what can be seen.
 _LIFT: Final = 1e-4
@@ -48,42 +49,33 @@ class Camera:
         Rows and columns.
     field_of_view : float
         Horizontal field of view [degrees]; 24 in the paper.
-    up : tuple of float
-        Direction that is up in the image.
-
-    Raises
-    ------
-    ValueError
-        If the field of view lies outside (0, 180), the shape is not positive, or the view is
-        parallel to `up`.
     """
 
     position: Point
     target: Point
     shape: tuple[int, int]
     field_of_view: float = 24.0
-    up: Point = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Check field of view, shape and orientation."""
+        """Check field of view, shape and direction."""
         if not 0 < self.field_of_view < 180:
             raise ValueError(
                 f"Invalid field_of_view {self.field_of_view} degrees. Must lie in (0, 180)."
             )
         if min(self.shape) < 1:
             raise ValueError(f"Invalid shape {self.shape} of the camera. Must be positive.")
-        right = np.cross(np.subtract(self.target, self.position), self.up)
+        right = np.cross(np.subtract(self.target, self.position), _UP)
         if not np.linalg.norm(right) > 0:
             raise ValueError(
-                f"Invalid up {self.up} of the camera at {self.position}. Must not be parallel to "
-                f"the view, towards {self.target}."
+                f"Invalid target {self.target} of the camera at {self.position}. "
+                "Must not be straight above or below."
             )
 
     @cached_property
     def axes(self) -> Array:
         """Unit vectors to the right, down and forward, shape (3, 3), a row each."""
         forward = unit(np.subtract(self.target, self.position))
-        right = unit(np.cross(forward, self.up))
+        right = unit(np.cross(forward, _UP))
         return np.stack([right, np.cross(forward, right), forward])
 
     @property

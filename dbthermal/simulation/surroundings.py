@@ -70,24 +70,10 @@ def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:
 
 def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
     """
-    Motion in straight lines from place to place, without turning.
+    Motion in straight lines between places (stop, 3) [m] at times (stop,) [s], without turning.
 
-    Parameters
-    ----------
-    times : array_like, shape (stop,)
-        Time of arrival at each place [s], increasing; two or more.
-    places : array_like, shape (stop, 3)
-        Places [m].
-
-    Returns
-    -------
-    function of time
-        The pose; before and after, that of the nearest stop.
-
-    Raises
-    ------
-    ValueError
-        If the times do not increase, or the places are not finite, or not one for each time.
+    Before and after, the pose is that of the nearest stop. Raises a ValueError if the times do not
+    increase, or the places are not finite, one for each time.
     """
     times, places = increasing(times, "a motion"), np.asarray(places, dtype=np.float64)
     if places.shape != (times.size, 3) or not np.all(np.isfinite(places)):
@@ -108,14 +94,9 @@ class Actor:
     mesh : trimesh.Trimesh
         Its mesh, in its own frame [m].
     temperature : ndarray, shape (vertex,), or function of time
-        Temperature [K].
+        Temperature [K], finite.
     motion : function of time, optional
         Its pose; without one it stands still, its own frame being the world's.
-
-    Raises
-    ------
-    ValueError
-        If the temperatures are not finite, one for each vertex; of a function, when it is called.
     """
 
     mesh: trimesh.Trimesh

@@ -42,7 +42,7 @@ def test_invalid_shell(
 
 def test_invalid_solid() -> None:
     """A solid has positive properties."""
-    with pytest.raises(ValueError, match=r"Invalid density -1\.0 of a solid"):
+    with pytest.raises(ValueError, match=r"Invalid density of a solid -1\.0"):
         heat.Solid(1.0, -1.0, 1.0)
 
 

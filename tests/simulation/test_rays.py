@@ -65,7 +65,7 @@ def test_field_of_view_is_horizontal() -> None:
     [
         ({"field_of_view": 180.0}, r"field_of_view 180.0 degrees. Must lie in \(0, 180\)"),
         ({"shape": (0, 4)}, "shape .* Must be positive"),
-        ({"up": (-0.1, 0.6, -0.25)}, "up .* Must not be parallel"),
+        ({"target": (0.1, -0.6, 0.0)}, "target .* Must not be straight above"),
     ],
 )
 def test_no_camera(change: dict[str, object], message: str) -> None:

@@ -55,10 +55,6 @@ class BcpSettings:
     least_transmission : float
         t0, below which the emissivity is not divided by [1].
 
-    Raises
-    ------
-    ValueError
-        If a side is not odd or another number lies outside its range.
     """
 
     patch: int = 15

@@ -3,16 +3,14 @@ r"""Naive least squares: both emissivities and every frame's temperatures from t
 .. math:: \min_{e_1, e_2, x(t), y(t)} \sum_{m, t}
           \frac{[e_m u_m(x(t)) + (1 - e_m) u_m(y(t)) - z_m(t)]^2}{s_m^2}
 
-without any prior. N frames give 2 N numbers and ask for 2 N + 2: for nearly every pair of
-emissivities there are temperatures that meet the images exactly, so the objective is zero at wrong
-answers too and cannot tell them apart. This is the naive baseline of Narayanan et al. (2026),
-doi:10.48550/arXiv.2509.11334: several random starts, of which the one of least objective is kept.
+without any prior. N frames give 2 N numbers for 2 N + 2 unknowns: nearly every pair of emissivities
+meets the images exactly, and the objective is zero at wrong answers too. This is the naive baseline
+of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334: the best of several random starts.
 
 The search is Levenberg and Marquardt's (Marquardt 1963, doi:10.1137/0111030), on the logits of the
 emissivities and the logarithms of the temperatures, so that both stay physical. The normal
-equations have the shape of an arrow: a 2x2 block for each frame and a border of two columns for the
-emissivities. They are solved block by block, through the Schur complement of the border (Triggs et
-al. 2000, doi:10.1007/3-540-44480-7_21), for all pixels and starts at once.
+equations, a 2x2 block for each frame and a border of two columns for the emissivities, are solved
+through the Schur complement of the border (Triggs et al. 2000, doi:10.1007/3-540-44480-7_21).
 """
 
 from dataclasses import dataclass, replace
@@ -58,10 +56,6 @@ class NaiveSettings:
         A start is done when its objective, a sample's mean squared residual in units of the noise's
         variance, is below this, or a step lowers it by less than this fraction [1].
 
-    Raises
-    ------
-    ValueError
-        If a number is not positive.
     """
 
     starts: int = 5
@@ -95,12 +89,7 @@ class _State:
 
 
 def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
-    """
-    Temperatures and emissivities of one tile, without deviations.
-
-    `not_converged` where the kept start was still improving at the last step, or has no finite
-    objective.
-    """
+    """Point estimate of one tile; `not_converged` where the kept start was still improving."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         state = _search(tile, settings)
         cost = np.where(np.isfinite(state.objective), state.objective, np.inf)
@@ -134,27 +123,23 @@ def _start(tile: Tile, signals: Array, settings: NaiveSettings) -> _State:
     logits = logit(tile.rng.uniform(np.finfo(np.float64).tiny, 1.0, (2, columns)))
     shifts = settings.shift_std * tile.rng.standard_normal((2, 1, columns))
     logarithms = np.log(tile.temperature(0, signals[0]) + shifts)
-    objective = _objective(_residual(tile, signals, logits, logarithms))
+    _, objective = _residual(tile, signals, logits, logarithms)
     damping = np.full(columns, _FIRST_DAMPING)
     return _State(logits, logarithms, damping, objective, np.isfinite(objective))
 
 
-def _residual(tile: Tile, signals: Array, logits: Array, logarithms: Array) -> Array:
-    """Signals less the model, in units of the noise, (band, time, column)."""
+def _residual(tile: Tile, signals: Array, logits: Array, logarithms: Array) -> tuple[Array, Array]:
+    """Signals less the model over the noise (band, time, column); its mean square (column,)."""
     model = tile.mixed(expit(logits), np.exp(logarithms))
-    return np.asarray((signals - model) / np.array(tile.noise)[:, np.newaxis, np.newaxis])
-
-
-def _objective(residual: Array) -> Array:
-    """Mean square over bands and time, (column,)."""
-    return np.asarray(np.mean(residual**2, axis=(0, 1)))
+    residual = (signals - model) / np.array(tile.noise)[:, np.newaxis, np.newaxis]
+    return residual, np.mean(residual**2, axis=(0, 1))
 
 
 def _step(tile: Tile, signals: Array, state: _State, tolerance: float) -> _State:
     """One damped step of every column; it is taken where it lowers the objective."""
     logits_step, logarithms_step = _solve(tile, signals, state)
     logits, logarithms = state.logits + logits_step, state.logarithms + logarithms_step
-    objective = _objective(_residual(tile, signals, logits, logarithms))
+    _, objective = _residual(tile, signals, logits, logarithms)
     better = objective < state.objective  # false where it is NaN
     better &= np.all(np.abs(logits_step) < _LONGEST, axis=0)
     smallest, largest = _DAMPING
@@ -179,7 +164,7 @@ def _solve(tile: Tile, signals: Array, state: _State) -> tuple[Array, Array]:
     own block, the logits solve :math:`(B - S^T T^{-1} S) l = b - S^T T^{-1} f`.
     """
     inner, border = _jacobian(tile, state)
-    residual = _residual(tile, signals, state.logits, state.logarithms)
+    residual, _ = _residual(tile, signals, state.logits, state.logarithms)
     # Marquardt's damping, in proportion to the diagonal, and Levenberg's, of every logarithm and
     # logit alike: without it an emissivity of 0 or 1 within rounding is a singular system.
     harder, damping = 1.0 + state.damping, state.damping
@@ -201,12 +186,7 @@ def _solve(tile: Tile, signals: Array, state: _State) -> tuple[Array, Array]:
 
 
 def _jacobian(tile: Tile, state: _State) -> tuple[Array, Array]:
-    """
-    Derivatives of the model in units of the noise.
-
-    With the logarithms of the temperatures (band, 2, time, column) and with the band's own logit
-    (band, time, column).
-    """
+    """Derivatives of the model over the noise, with ln T (band, 2, ...) and logit (band, ...)."""
     temperatures, emissivity = np.exp(state.logarithms), expit(state.logits)
     inner = np.empty((2, *temperatures.shape))
     border = np.empty_like(temperatures)

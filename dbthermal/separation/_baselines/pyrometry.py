@@ -6,11 +6,10 @@ of two radiances gives the temperature of a gray body,
 .. math:: R = \frac{L_1}{L_2} = \frac{e_1 B_1(T)}{e_2 B_2(T)} = \frac{B_1(T)}{B_2(T)}
           \quad\text{if}\quad e_1 = e_2 \qquad (1)
 
-No background is reflected and the emissivity is the same in both bands: the two assumptions of the
-method, see Araujo (2017), Meas. Sci. Technol. 28, 082002, doi:10.1088/1361-6501/aa7b4b. Near room
-temperature neither holds, which is what this baseline shows. What it can do itself it does well:
-bands of any width are inverted exactly, and the radiances are smoothed before their ratio is taken,
-since 9.5 against 8-14 um changes by 0.16 % a kelvin only.
+if no background is reflected and the emissivity is the same in both bands, see Araujo (2017), Meas.
+Sci. Technol. 28, 082002, doi:10.1088/1361-6501/aa7b4b. Near room temperature neither holds. Bands
+of any width are inverted exactly, and the radiances are smoothed before their ratio is taken, since
+9.5 against 8-14 um changes by 0.16 % a kelvin only.
 """
 
 from collections.abc import Callable
@@ -58,10 +57,6 @@ class RatioSettings:
         Number of polynomials of time that both radiances are smoothed with, by least squares,
         before their ratio is taken; None for no smoothing.
 
-    Raises
-    ------
-    ValueError
-        If the kind is unknown or the order is less than 1.
     """
 
     kind: str = "wide"

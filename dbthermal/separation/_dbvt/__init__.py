@@ -63,11 +63,6 @@ class DbvtSettings:
         Pixels in a tile.
     device, precision : str, {"float64", "float32"}
         Where to compute, in torch's words ("cpu", "cuda"), and floating-point type.
-
-    Raises
-    ------
-    ValueError
-        If a choice is unknown, a number outside its range, or the device is missing.
     """
 
     smoothness: float = 1.0

@@ -64,7 +64,8 @@ def step(
     share = search.huber_share * torch.where(better, _LESS, _MORE)
     count = torch.where(stalled, search.stalled + 1, 0)
     after = Search(damping.clamp(*_DAMPING), share.clamp(*_SHARE), least, count)
-    return proposal.where(better, unknowns), after
+    pairs = zip(vars(proposal).values(), vars(unknowns).values(), strict=True)
+    return Unknowns(*(torch.where(better, new, old) for new, old in pairs)), after
 
 
 @dataclass(frozen=True)

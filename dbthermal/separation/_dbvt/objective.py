@@ -33,12 +33,6 @@ class Columns:
             values.append(value)
         return type(self)(*values)
 
-    def where(self, mask: Tensor, other: Self) -> Self:
-        """The columns of a mask (column,) from this record, the others from another."""
-        names = [field.name for field in fields(self)]
-        pairs = [(getattr(self, name), getattr(other, name)) for name in names]
-        return type(self)(*(torch.where(mask, one, two) for one, two in pairs))
-
 
 @dataclass(frozen=True)
 class Unknowns(Columns):
@@ -82,8 +76,7 @@ def deviation(signals: Tensor, noise: Tensor, sigma: Tensor, floor: float) -> Te
     r"""
     Standard deviation over time (2, column) [K] of the corrected signals, at least the noise.
 
-    The corrected signal is :math:`\ddot I_m = I_m - n_m`. Both sides of a comparison are normalised
-    alike, so that the mean drops out.
+    The corrected signal is :math:`\ddot I_m = I_m - n_m`; the mean drops out of a comparison.
     """
     return torch.maximum((signals - noise).std(dim=1), floor * sigma)
 

@@ -1,12 +1,7 @@
-r"""Transient heat in thin shells: conduction along a surface, and exchange with its surroundings.
+"""Transient heat in thin shells: conduction along a surface, and exchange with its surroundings.
 
-The balance of a shell of thickness d, uniform through it, per area of its surface:
-
-.. math:: \rho c d \, \dot T = \nabla \cdot (k d \, \nabla T) + \sum_i h_i (T_i - T)
-          + \sum_j \varepsilon_j \sigma (T_j^4 - T^4) + q
-
-`Shell` is the body, `Convection`, `Radiation` and `Heating` are the terms that follow, and
-`simulate` steps through time.
+`Shell` is the body, of a thickness and a `Solid`; `Convection`, `Radiation` and `Heating` are its
+exchanges; `simulate` states the balance and steps it through time.
 """
 
 from dbthermal.simulation.heat._exchange import Convection, Exchange, Heating, Radiation

@@ -21,12 +21,9 @@ Varying: TypeAlias = float | Array | Callable[[float], float | Array]
 @dataclass(frozen=True, eq=False)
 class Balance:
     """
-    Flux into a shell at one time, as a function of its temperature T: a - b T - s T^4.
+    Flux a - b T - s T^4 into a shell at one time, as a function of its temperature T.
 
-    Attributes
-    ----------
-    constant, linear, quartic : ndarray, shape (vertex,)
-        a [W m^-2], b [W m^-2 K^-1] and s [W m^-2 K^-4].
+    Of a, b and s (vertex,) in [W m^-2], [W m^-2 K^-1] and [W m^-2 K^-4].
     """
 
     constant: Array

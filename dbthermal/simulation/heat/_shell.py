@@ -9,6 +9,8 @@ import numpy.typing as npt
 import robust_laplacian
 from scipy import sparse
 
+from dbthermal.planck import require_positive
+
 Array = npt.NDArray[np.float64]
 
 _FLATTEST: Final = 1e-9
@@ -28,11 +30,6 @@ class Solid:
         Density [kg m^-3].
     specific_heat : float
         Specific heat at constant pressure c [J kg^-1 K^-1].
-
-    Raises
-    ------
-    ValueError
-        If a property is not finite and positive.
     """
 
     conductivity: float
@@ -40,13 +37,9 @@ class Solid:
     specific_heat: float
 
     def __post_init__(self) -> None:
-        """Check the properties."""
+        """Refuse a property that is not finite and positive."""
         for field in fields(self):
-            value = getattr(self, field.name)
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(
-                    f"Invalid {field.name} {value} of a solid. Must be finite and positive."
-                )
+            require_positive(f"{field.name} of a solid", getattr(self, field.name))
 
     @property
     def diffusivity(self) -> float:
@@ -54,8 +47,8 @@ class Solid:
         return self.conductivity / (self.density * self.specific_heat)
 
 
-# At 300 K, from tables A.1 (metals) and A.3 (glasses) of Bergman, Lavine, Incropera, DeWitt (2011),
-# Fundamentals of Heat and Mass Transfer, 7th edition, Wiley, ISBN 978-0-470-50197-9.
+# At 300 K, from table A.3 of Bergman, Lavine, Incropera, DeWitt (2011), Fundamentals of Heat and
+# Mass Transfer, 7th edition, Wiley, ISBN 978-0-470-50197-9.
 
 GLASS: Final = Solid(conductivity=1.4, density=2500.0, specific_heat=750.0)
 """Plate glass, soda-lime, at 300 K: table A.3 of Bergman et al. (2011)."""
