@@ -130,25 +130,21 @@ def embedded_table() -> xr.Dataset:
     """
     Table of 25 common materials that comes with the package.
 
-    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public
-    libraries, which the head of ``emissivity_table.csv`` cites. The spectra themselves are not
-    redistributed.
+    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
+    [1]_ [2]_ [3]_, whose spectra are not redistributed.
 
     Returns
     -------
     Dataset
-        Stage `emissivity_table`: `emissivity` (material, band) [1] to 4 decimals and `coverage`
-        (material, band) [1]: some metals and tiles were measured up to 12.5 um only. Coordinates
-        `library` and `source` (material) name the library, and the file or sample in it.
+        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]; some metals and
+        tiles were measured up to 12.5 um only. Coordinates `library` and `source` (material) name
+        the library, and the file or sample in it.
 
     References
     ----------
-    .. [1] Baldridge et al. (2009), Remote Sensing of Environment 113, 711,
-       doi:10.1016/j.rse.2008.11.007
-    .. [2] Meerdink et al. (2019), Remote Sensing of Environment 230, 111196,
-       doi:10.1016/j.rse.2019.05.015
-    .. [3] Kotthaus et al. (2014), ISPRS Journal of Photogrammetry and Remote Sensing 94, 194,
-       doi:10.1016/j.isprsjprs.2014.05.005
+    .. [1] Baldridge et al. (2009), doi:10.1016/j.rse.2008.11.007
+    .. [2] Meerdink et al. (2019), doi:10.1016/j.rse.2019.05.015
+    .. [3] Kotthaus et al. (2014), doi:10.1016/j.isprsjprs.2014.05.005
     """
     text = resources.files("dbthermal").joinpath(_TABLE).read_text(encoding="utf-8")
     rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))

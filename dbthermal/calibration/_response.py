@@ -35,8 +35,8 @@ def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
 
-    C and O enter linearly and are eliminated; A and B are found by nonlinear least squares. The
-    linear pair is the least-squares line.
+    the Sakuma-Hattori curve [1]_ and the least-squares line. C and O enter linearly and are
+    eliminated [2]_; A and B are found by nonlinear least squares.
 
     Parameters
     ----------
@@ -44,39 +44,37 @@ def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.
         Mean counts (band, temperature) [count] of a blackbody, `temperature` [K] increasing, at
         least four.
     noise : DataArray, optional
-        Standard deviation of one pixel's counts from frame to frame, (band) [count]. If given,
-        the response keeps it, and its NETD.
+        Standard deviation of one pixel's counts from frame to frame, (band) [count]. The response
+        then has it, and its NETD.
 
     Returns
     -------
     Dataset
-        Stage `response` of `schema`: `amplitude` C, `effective_wavelength` A,
-        `wavelength_shift` B, `offset` O, `linear_slope` a, `linear_intercept` b (band);
-        `residual`, `linear_residual` (band, temperature) [count] and the measured `counts`;
-        `reference_temperature`, `temperature_min`, `temperature_max` [K]; and, with a noise,
-        `noise` (band) [count] and `netd` (band) [K].
+        Stage `response` of `schema`: `amplitude` C, `effective_wavelength` A, `wavelength_shift` B,
+        `offset` O, `linear_slope` a, `linear_intercept` b (band); `residual`, `linear_residual`
+        (band, temperature) [count] and the measured `counts`; `reference_temperature`,
+        `temperature_min`, `temperature_max` [K]; and, with a noise, `noise` (band) [count] and
+        `netd` (band) [K].
 
     Raises
     ------
-    TypeError
-        If the counts are not a DataArray of numbers.
-    ValueError
-        If dims, units or order are wrong, there are too few temperatures, a value is NaN, counts
-        do not grow with temperature, or the noise does not fit the bands or is not positive.
+    TypeError, ValueError
+        If the counts are not a DataArray of numbers, dims, units or order are wrong, there are too
+        few temperatures, a value is NaN, counts do not grow with temperature, or the noise does not
+        fit the bands or is not positive.
 
     References
     ----------
     .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
        Industry 5, 421-427
-    .. [2] Golub, Pereyra (2003), Separable nonlinear least squares, Inverse Problems 19, R1,
-       doi:10.1088/0266-5611/19/2/201
+    .. [2] Golub, Pereyra (2003), Inverse Problems 19, R1, doi:10.1088/0266-5611/19/2/201
 
     Examples
     --------
     Blackbodies from 10 to 70 degrees Celsius, seen in the band 8-14 um at 100 count W^-1 m^2 sr.
 
     >>> import numpy as np, xarray as xr
-    >>> from dbthermal import bands, response
+    >>> from dbthermal import bands
     >>> temperature = np.linspace(283.15, 343.15, 7)
     >>> counts = xr.DataArray(
     ...     [15000 + 100 * bands.get("8-14").radiance(temperature)],

@@ -38,14 +38,11 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     r"""
     Mean frames and temporal noise of movies of a blackbody.
 
-    The noise of a pixel comes from the differences d of successive frames, so that a drift of the
-    camera or of the blackbody does not enter:
-
-    .. math:: s^2 = \overline{d^2} / 2
-
-    Its median over pixels and temperatures is divided by that of a chi-square distribution of the
-    degrees of freedom that n differences leave, :math:`2 n^2 / (3 n - 1)`: a median of few frames
-    is otherwise too low (by 33 % for two frames, 5 % for ten).
+    The noise of a pixel, :math:`s^2 = \overline{d^2} / 2`, comes from the differences d of
+    successive frames, so that a drift of the camera or of the blackbody does not enter. Its median
+    over pixels and temperatures is divided by that of a chi-square distribution of the degrees of
+    freedom that n differences leave, :math:`2 n^2 / (3 n - 1)`: a median of few frames is otherwise
+    too low (by 33 % for two frames, 5 % for ten).
 
     Parameters
     ----------
@@ -219,15 +216,13 @@ def correct(
 
     .. math:: I' = (1 - w) (g_0 I + f_0) + w (g_1 I + f_1), \quad w = \frac{t - t_0}{t_1 - t_0}
 
-    from the first frame to the last,
-    which is right for a pattern that drifts so, and wrong across a shutter event, where a camera
-    renews its offsets.
+    from the first frame to the last, which is right for a pattern that drifts so, and wrong across
+    a shutter event, where a camera renews its offsets.
 
     Parameters
     ----------
     capture : Dataset
-        Stage `capture` of `schema`: `counts` (band, time, y, x) [count], uint16. Other variables
-        are handed on.
+        Stage `capture` of `schema`, raw uint16. Other variables are handed on.
     correction : Dataset
         From `fit_correction`, of the same pixels; it may hold more bands.
     after : Dataset, optional
@@ -239,18 +234,16 @@ def correct(
     -------
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), uint32,
-        with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample of a band at `maximum` or
-        above, or at 0) of `schema.Status`. The counts of these pixels are kept. Attributes say
-        that gain and offset were corrected (``gain_offset_corrected`` = 1), with which parameters
-        they were fitted (``gain_offset_...``), whether they were interpolated
-        (``offset_interpolated``), and how many pixels are marked.
+        with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or
+        at 0) of `schema.Status`. The counts of these pixels are kept. Attributes:
+        ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``),
+        ``offset_interpolated``, and the numbers of marked pixels.
 
     Raises
     ------
     TypeError, ValueError
-        If capture or correction is not as `schema` has it, the capture is not uint16 or was
-        corrected before, a band is missing in the correction, a gain or offset is not finite, or
-        the pixels are not the same.
+        If the capture is not uint16 or was corrected before, a band is missing in the correction, a
+        gain or offset is not finite, or the pixels are not the same.
     """
     counts = _require_raw(capture)
     names = [str(name) for name in counts["band"].values]
