@@ -32,16 +32,7 @@ def __dir__() -> list[str]:
 
 @dataclass(frozen=True)
 class Band:
-    """
-    A spectral band with a top-hat transmission.
-
-    Attributes
-    ----------
-    name : str
-        Label on the dimension `band`.
-    lower, upper : float
-        Edges [m].
-    """
+    """A spectral band with a top-hat transmission: a name, and its lower and upper edge [m]."""
 
     name: str
     lower: float
@@ -164,22 +155,7 @@ doi:10.48550/arXiv.2509.11334): centre and full width at half maximum, as top ha
 
 def get(name: str) -> Band:
     """
-    Band of `FILTERS` by its name.
-
-    Parameters
-    ----------
-    name : str
-        Name of the band, e.g. "9.5".
-
-    Returns
-    -------
-    Band
-        The band.
-
-    Raises
-    ------
-    KeyError
-        If the name is unknown; the error lists the known ones.
+    Band of `FILTERS` by its name, e.g. "9.5"; KeyError lists the known ones.
 
     Examples
     --------

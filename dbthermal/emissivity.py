@@ -82,9 +82,8 @@ def band_table(
     Returns
     -------
     Dataset
-        Stage `emissivity_table`: `emissivity` (material, band) [1], `coverage` (material, band)
-        [1], and `unphysical_values` (material, band), how many of the spectrum's values in the
-        band lie outside (0, 1]. Those come from the libraries and are averaged as they are.
+        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]. Values of the
+        libraries' spectra outside (0, 1] are averaged as they are.
 
     Raises
     ------
@@ -116,44 +115,36 @@ def band_table(
     if not 0 < minimum_coverage <= 1:
         raise ValueError(f"Invalid minimum_coverage {minimum_coverage}. Must lie in (0, 1].")
     whole = [float(band.radiance(temperature)) for band in chosen]
-    rows = np.empty((3, len(spectra), len(chosen)))
+    rows = np.empty((2, len(spectra), len(chosen)))
     for row, (material, spectrum) in enumerate(spectra.items()):
         wavelength, emissivity = _values(spectrum, material)
         for column, band in enumerate(chosen):
             covered = _covered(wavelength, band, temperature, whole[column])
             _require_coverage(covered, minimum_coverage, wavelength, material, band)
-            mean = _average(wavelength, emissivity, band, temperature)
-            rows[:, row, column] = mean, covered, _unphysical(wavelength, emissivity, band)
-    table = _dataset(list(spectra), [band.name for band in chosen], rows[0], rows[1])
-    counts = {"units": "1", "long_name": "values of the spectrum in the band outside (0, 1]"}
-    return table.assign(
-        unphysical_values=(("material", "band"), rows[2].astype(np.int64), counts)
-    ).assign_attrs(temperature=float(temperature), minimum_coverage=minimum_coverage)
+            rows[:, row, column] = _average(wavelength, emissivity, band, temperature), covered
+    table = _dataset(list(spectra), [band.name for band in chosen], *rows)
+    return table.assign_attrs(temperature=float(temperature), minimum_coverage=minimum_coverage)
 
 
 def embedded_table() -> xr.Dataset:
     """
     Table of 25 common materials that comes with the package.
 
-    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public
-    libraries, which the head of ``emissivity_table.csv`` cites. The spectra themselves are not
-    redistributed.
+    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
+    [1]_ [2]_ [3]_, whose spectra are not redistributed.
 
     Returns
     -------
     Dataset
-        Stage `emissivity_table`: `emissivity` (material, band) [1] to 4 decimals and `coverage`
-        (material, band) [1]: some metals and tiles were measured up to 12.5 um only. Coordinates
-        `library` and `source` (material) name the library, and the file or sample in it.
+        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]; some metals and
+        tiles were measured up to 12.5 um only. Coordinates `library` and `source` (material) name
+        the library, and the file or sample in it.
 
     References
     ----------
-    .. [1] Baldridge et al. (2009), Remote Sensing of Environment 113, 711,
-       doi:10.1016/j.rse.2008.11.007
-    .. [2] Meerdink et al. (2019), Remote Sensing of Environment 230, 111196,
-       doi:10.1016/j.rse.2019.05.015
-    .. [3] Kotthaus et al. (2014), ISPRS Journal of Photogrammetry and Remote Sensing 94, 194,
-       doi:10.1016/j.isprsjprs.2014.05.005
+    .. [1] Baldridge et al. (2009), doi:10.1016/j.rse.2008.11.007
+    .. [2] Meerdink et al. (2019), doi:10.1016/j.rse.2019.05.015
+    .. [3] Kotthaus et al. (2014), doi:10.1016/j.isprsjprs.2014.05.005
     """
     text = resources.files("dbthermal").joinpath(_TABLE).read_text(encoding="utf-8")
     rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
@@ -388,12 +379,6 @@ def _average(wavelength: Array, emissivity: Array, band: Band, temperature: floa
     nodes = knots[:-1, np.newaxis] + half * (1.0 + _NODES)
     weights = half * _WEIGHTS * planck.spectral_radiance(nodes, temperature)
     return float(np.sum(weights * np.interp(nodes, wavelength, emissivity)) / np.sum(weights))
-
-
-def _unphysical(wavelength: Array, emissivity: Array, band: Band) -> int:
-    """Count a spectrum's values in a band outside (0, 1]."""
-    inside = (wavelength >= band.lower) & (wavelength <= band.upper)
-    return int(np.sum(inside & ~((emissivity > 0) & (emissivity <= 1))))
 
 
 def _dataset(materials: list[str], names: list[str], values: Array, coverage: Array) -> xr.Dataset:

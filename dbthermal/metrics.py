@@ -40,8 +40,7 @@ def correlation(
     Raises
     ------
     ValueError
-        If coordinates differ, y or x is missing, fewer than two pixels remain, one that counts
-        is not finite, or a map is the same in every pixel.
+        If coordinates differ, fewer than two pixels count, one is not finite, or a map is constant.
     """
     first, second = xr.broadcast(*xr.align(first, second, join="exact"))
     left, right = (_centred(values, mask) for values in (first, second))

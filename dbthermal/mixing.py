@@ -37,6 +37,11 @@ def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:
     -------
     array or tensor
         Signal in the same unit, of the broadcast shape.
+
+    Examples
+    --------
+    >>> mixed(0.9, 60.0, 20.0)
+    56.0
     """
     return reflected + emissivity * (emitted - reflected)
 

@@ -55,9 +55,9 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     r"""
     Noise of two bands from their signals.
 
-    For each pixel, with D the covariance of the trimmed second differences (the smooth part taken
-    out before) and k the ratio of the bands' rapid changes (from their covariance one frame apart,
-    where noise does not enter),
+    For each pixel, with D the covariance of the trimmed second differences of the residual on a
+    smooth curve, and k the ratio of the bands' rapid changes (from their covariance one frame
+    apart, where noise does not enter),
 
     .. math:: s_1^2 = D_{11} - D_{12} / k, \quad s_2^2 = D_{22} - k D_{12}
 
@@ -65,8 +65,8 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 
     With rests and pulses both noises come out within 2 % (the quieter band's within 11 % at
     emissivities 0.95/0.85). Where every pixel's background walks without rest, the quieter band's
-    is too high: for glass by up to a half, at a memory near 10 s, at emissivities 0.3/0.5 by up to
-    three times, at 30 s; for a pixel alone then does not show what the bands share.
+    is too high: for glass by up to a half, at a correlation time near 10 s, at emissivities 0.3/0.5
+    by up to three times, at 30 s.
 
     Parameters
     ----------

@@ -52,8 +52,8 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
 
     .. math:: L(\lambda, T) = \frac{2 h c^2}{\lambda^5 (\exp(c_2 / \lambda T) - 1)}
 
-    The first equation of the paper [1]_ has the factor :math:`\lambda^5` and the :math:`-1` on
-    one level of the denominator; this is the law as Planck gave it.
+    The first equation of the paper (doi:10.48550/arXiv.2509.11334) has the factor :math:`\lambda^5`
+    and the :math:`-1` on one level of the denominator; this is the law as Planck gave it.
 
     Parameters
     ----------
@@ -71,11 +71,6 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
     ------
     ValueError
         If a wavelength or a temperature is not finite and positive.
-
-    References
-    ----------
-    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
-       arXiv, doi:10.48550/arXiv.2509.11334
 
     Examples
     --------
@@ -110,26 +105,11 @@ def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLik
 
 def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -> Array:
     r"""
-    Temperature of the blackbody of a spectral radiance, the exact inverse of Planck's law.
+    Temperature [K] of the blackbody of a spectral radiance, the exact inverse of Planck's law.
 
     .. math:: T = \frac{c_2}{\lambda \ln(1 + 2 h c^2 / \lambda^5 L)}
 
-    Parameters
-    ----------
-    wavelength : array_like
-        Wavelength [m].
-    radiance : array_like
-        Spectral radiance [W m^-2 sr^-1 m^-1].
-
-    Returns
-    -------
-    ndarray
-        Temperature [K].
-
-    Raises
-    ------
-    ValueError
-        If a wavelength or a radiance is not finite and positive.
+    Wavelength [m], spectral radiance [W m^-2 sr^-1 m^-1] and errors as `spectral_radiance`.
     """
     wavelength = require_positive("wavelength [m]", wavelength)
     radiance = require_positive("spectral radiance [W m^-2 sr^-1 m^-1]", radiance)

@@ -37,8 +37,6 @@ __all__ = [
     "status_attrs",
 ]
 
-Dims = tuple[str, ...]
-
 
 def __dir__() -> list[str]:
     return __all__
@@ -52,7 +50,7 @@ class Variable:
     Read, any real type of the same kind passes.
     """
 
-    dims: Dims
+    dims: tuple[str, ...]
     dtype: str
     units: str
     long_name: str
@@ -63,113 +61,90 @@ class Variable:
         return {"units": self.units, "long_name": self.long_name}
 
 
-_MOVIE: Final = ("band", "time", "y", "x")
-_FRAMES: Final = ("time", "y", "x")
-_MAPS: Final = ("band", "y", "x")
-_IMAGE: Final = ("y", "x")
-_BAND: Final = ("band",)
-_MEASUREMENTS: Final = ("band", "measurement")
-_TABLE: Final = ("material", "band")
+def _of(dims: str, units: str, long_name: str, dtype: str = "float64") -> Variable:
+    return Variable(tuple(dims.split()), dtype, units, long_name)
 
 
-def _counts(dims: Dims, dtype: str, long_name: str) -> Variable:
-    return Variable(dims, dtype, "count", long_name)
-
-
-def _temperature(dims: Dims, long_name: str) -> Variable:
-    return Variable(dims, "float64", "K", long_name)
-
-
-def _with_std(name: str, dims: Dims, units: str, long_name: str) -> dict[str, Variable]:
+def _with_std(name: str, dims: str, units: str, long_name: str) -> dict[str, Variable]:
     return {
-        name: Variable(dims, "float32", units, long_name),
-        f"{name}_std": Variable(dims, "float32", units, f"standard deviation of {long_name}"),
+        name: _of(dims, units, long_name, "float32"),
+        f"{name}_std": _of(dims, units, f"standard deviation of {long_name}", "float32"),
     }
 
 
 COORDINATES: Final = MappingProxyType(
     {
-        "time": Variable(("time",), "float64", "s", "time since the first frame"),
-        "temperature": _temperature(("temperature",), "blackbody temperature"),
-        "wavelength": Variable(("wavelength",), "float64", "m", "wavelength"),
+        "time": _of("time", "s", "time since the first frame"),
+        "temperature": _of("temperature", "K", "blackbody temperature"),
+        "wavelength": _of("wavelength", "m", "wavelength"),
     }
 )
 """Coordinates with a unit; they must increase strictly. Coordinate `band` names each band."""
 
-NOISE: Final = _counts(_BAND, "float64", "noise of one pixel and frame")
+NOISE: Final = _of("band", "count", "noise of one pixel and frame")
 """Variable `noise`: standard deviation of one pixel's counts from frame to frame."""
 
-EXPOSURE_TIME: Final = Variable(("band", "time"), "float64", "s", "when the frame was exposed")
+EXPOSURE_TIME: Final = _of("band time", "s", "when the frame was exposed")
 """Variable `exposure_time`: each camera's own stamps, NaN for a frame that is no measurement."""
 
-FRAME_FLAGS: Final = Variable(("band", "time"), "uint16", "1", "flags of the frame, 0 is good")
+FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uint16")
 """Variable `frame_flags` of a recording, bits named by its own CF attributes; see `has_flag`."""
 
 SHUTTER_CLOSED: Final = "shutter_closed"
 """Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
 
-SEGMENT: Final = Variable(("time",), "int32", "1", "shutter events before the frame")
+SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
 """Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
 
-_STATUS: Final = Variable(_IMAGE, "uint32", "1", "validity flags, 0 is good")
+_STATUS: Final = _of("y x", "1", "validity flags, 0 is good", "uint32")
 
 STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
     {
-        "capture": {"counts": _counts(_MOVIE, "uint16", "raw signal")},
-        "corrected": {"counts": _counts(_MOVIE, "float32", "corrected signal")},
+        "capture": {"counts": _of("band time y x", "count", "raw signal", "uint16")},
+        "corrected": {"counts": _of("band time y x", "count", "corrected signal", "float32")},
         "separated": {
-            **_with_std("object_temperature", _FRAMES, "K", "object temperature"),
-            **_with_std("background_temperature", _FRAMES, "K", "background temperature"),
-            **_with_std("emissivity", _MAPS, "1", "band emissivity"),
-            **_with_std("reflection_ratio", _MAPS, "1", "reflection ratio"),
+            **_with_std("object_temperature", "time y x", "K", "object temperature"),
+            **_with_std("background_temperature", "time y x", "K", "background temperature"),
+            **_with_std("emissivity", "band y x", "1", "band emissivity"),
+            **_with_std("reflection_ratio", "band y x", "1", "reflection ratio"),
             "status": _STATUS,
         },
-        "blackbody": {
-            "counts": _counts(("band", "temperature"), "float64", "mean blackbody signal")
-        },
+        "blackbody": {"counts": _of("band temperature", "count", "mean blackbody signal")},
         "blackbody_movies": {
-            "counts": _counts(("band", "temperature", "frame", "y", "x"), "uint16", "raw signal")
+            "counts": _of("band temperature frame y x", "count", "raw signal", "uint16")
         },
         "blackbody_frames": {
-            "counts": _counts(("band", "temperature", "y", "x"), "float64", "mean over the frames")
+            "counts": _of("band temperature y x", "count", "mean over the frames")
         },
         "correction": {
-            "gain": Variable(_MAPS, "float64", "1", "gain of the pixel"),
-            "offset": _counts(_MAPS, "float64", "offset of the pixel"),
+            "gain": _of("band y x", "1", "gain of the pixel"),
+            "offset": _of("band y x", "count", "offset of the pixel"),
         },
         "response": {
-            "amplitude": _counts(_BAND, "float64", "Sakuma-Hattori amplitude"),
-            "effective_wavelength": Variable(
-                _BAND, "float64", "m", "Sakuma-Hattori effective wavelength"
-            ),
-            "wavelength_shift": Variable(
-                _BAND, "float64", "m K", "Sakuma-Hattori wavelength shift"
-            ),
-            "offset": _counts(_BAND, "float64", "Sakuma-Hattori offset"),
-            "linear_slope": Variable(_BAND, "float64", "count K-1", "slope of the linear response"),
-            "linear_intercept": _counts(_BAND, "float64", "intercept of the linear response"),
-            "reference_temperature": _temperature((), "reference temperature"),
-            "temperature_min": _temperature((), "lowest calibrated temperature"),
-            "temperature_max": _temperature((), "highest calibrated temperature"),
+            "amplitude": _of("band", "count", "Sakuma-Hattori amplitude"),
+            "effective_wavelength": _of("band", "m", "Sakuma-Hattori effective wavelength"),
+            "wavelength_shift": _of("band", "m K", "Sakuma-Hattori wavelength shift"),
+            "offset": _of("band", "count", "Sakuma-Hattori offset"),
+            "linear_slope": _of("band", "count K-1", "slope of the linear response"),
+            "linear_intercept": _of("band", "count", "intercept of the linear response"),
+            "reference_temperature": _of("", "K", "reference temperature"),
+            "temperature_min": _of("", "K", "lowest calibrated temperature"),
+            "temperature_max": _of("", "K", "highest calibrated temperature"),
         },
         "contact": {
-            "counts": _counts(_MEASUREMENTS, "float64", "signal"),
-            "object_temperature": _temperature(("measurement",), "object temperature"),
-            "background_temperature": _temperature(("measurement",), "background temperature"),
+            "counts": _of("band measurement", "count", "signal"),
+            "object_temperature": _of("measurement", "K", "object temperature"),
+            "background_temperature": _of("measurement", "K", "background temperature"),
         },
         "reflector": {
-            "counts": _counts(_MEASUREMENTS, "float64", "signal"),
-            "reflected_counts": _counts(_MEASUREMENTS, "float64", "signal of the reflector"),
-            "object_temperature": _temperature(("measurement",), "object temperature"),
+            "counts": _of("band measurement", "count", "signal"),
+            "reflected_counts": _of("band measurement", "count", "signal of the reflector"),
+            "object_temperature": _of("measurement", "K", "object temperature"),
         },
-        "spectrum": {
-            "emissivity": Variable(("wavelength",), "float64", "1", "spectral emissivity")
-        },
+        "spectrum": {"emissivity": _of("wavelength", "1", "spectral emissivity")},
         "emissivity_table": {
-            "emissivity": Variable(_TABLE, "float64", "1", "band emissivity"),
-            "coverage": Variable(
-                _TABLE, "float64", "1", "share of the band that the spectrum covers"
-            ),
+            "emissivity": _of("material band", "1", "band emissivity"),
+            "coverage": _of("material band", "1", "share of the band that the spectrum covers"),
         },
     }
 )
@@ -182,18 +157,18 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "exposure_time": EXPOSURE_TIME,
             "frame_flags": FRAME_FLAGS,
             "segment": SEGMENT,
-            "drift": _counts(("band", "time"), "float64", "drift taken out"),
+            "drift": _of("band time", "count", "drift taken out"),
             "status": _STATUS,
         },
         "blackbody_frames": {"noise": NOISE},
         "correction": {
-            "bad": Variable(_MAPS, "bool", "1", "bad pixel"),
-            "residual": _counts(_BAND, "float64", "RMS residual over the good pixels"),
-            "level": _counts(("band", "temperature"), "float64", "mean over the good pixels"),
+            "bad": _of("band y x", "1", "bad pixel", "bool"),
+            "residual": _of("band", "count", "RMS residual over the good pixels"),
+            "level": _of("band temperature", "count", "mean over the good pixels"),
         },
         "response": {
             "noise": NOISE,
-            "netd": Variable(_BAND, "float64", "K", "noise-equivalent temperature difference"),
+            "netd": _of("band", "K", "noise-equivalent temperature difference"),
         },
     }
 )

@@ -39,6 +39,8 @@ _MINIMUM_FRAMES: Final = 32
 # Groups of pixels whose agreement tells the offset's standard deviation.
 _GROUPS: Final = 16
 _SIGNIFICANCE: Final = 6.0
+# Largest standard deviation of an offset [frame].
+_PRECISION: Final = 0.1
 _ORDER: Final = 8
 _UNUSABLE: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
@@ -81,9 +83,7 @@ class _Covariances:
     auto: Array
 
 
-def time_offset(
-    corrected: xr.Dataset, *, band: str | None = None, search: int = 5, precision: float = 0.1
-) -> float:
+def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int = 5) -> float:
     """
     Estimate the time by which a band is exposed later than the first.
 
@@ -101,8 +101,6 @@ def time_offset(
         Name of the band; by default the second.
     search : int
         Largest lag to search, either way [frame].
-    precision : float
-        Largest standard deviation of the offset [frame], by jackknife over 16 groups of pixels.
 
     Returns
     -------
@@ -114,7 +112,7 @@ def time_offset(
     TypeError, ValueError
         If the band is missing, the search does not fit the capture's length, there are fewer than
         16 usable pixels, nothing moves in both bands, their covariance is greatest at an end of the
-        search, or the offset is less well known than `precision`.
+        search, or the offset is not known within 0.1 frame.
 
     Notes
     -----
@@ -149,10 +147,10 @@ def time_offset(
     delays = [lag + _delay(part) for part in (covariances, *_leave_one_out(covariances))]
     # Jackknife over n groups: var = (n - 1) mean (d_i - mean d)^2.
     std = np.sqrt((_GROUPS - 1) * np.var(delays[1:]))
-    if not std <= precision:
+    if not std <= _PRECISION:
         raise ValueError(
             f"Invalid time offset {label}: {delays[0]:.2f} +- {std:.2f} frames. Must be known "
-            f"within {precision}: too little moves, or in too few pixels; give the offset."
+            f"within {_PRECISION}: too little moves, or in too few pixels; give the offset."
         )
     return float(delays[0] * clocks.frame_period(shared.times))
 

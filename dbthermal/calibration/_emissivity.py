@@ -27,21 +27,20 @@ class Bias:
     r"""
     Errors that all readings of one series have in common, each uniform in a range.
 
-    A range's middle is corrected for, and its standard deviation, the width over
-    :math:`\sqrt{12}`, is carried into the result: a rectangular distribution, clause 4.3.7 of the
-    Guide to the expression of uncertainty in measurement (JCGM 100:2008).
+    A range's middle is corrected for, and its standard deviation, the width over :math:`\sqrt{12}`,
+    is carried into the result: a rectangular distribution, clause 4.3.7 of the Guide to the
+    expression of uncertainty in measurement (JCGM 100:2008).
 
     Attributes
     ----------
-    object_tolerance : float
-        Largest offset of the thermocouple's readings, either way [K].
+    object_tolerance, background_tolerance : float
+        Largest offset of the thermocouple's readings and of the reflected body's temperature,
+        either way [K].
     contact : tuple of float
-        Least and largest fraction of the object's excess over the air that the thermocouple
-        misses, because it conducts heat away [1].
+        Least and largest fraction of the object's excess over the air that the thermocouple misses,
+        because it conducts heat away [1].
     air_temperature : float
         Of the air, and of the room [K].
-    background_tolerance : float
-        Largest offset of the reflected body's temperature, either way [K].
     stray : tuple of float
         Least and largest fraction of the reflection that comes from the room and not from the
         blackbody: a surface that is not quite smooth, a blackbody not quite black [1].
@@ -184,25 +183,23 @@ def fit_emissivity(
 
     .. math:: I_i - U(T_{b,i}) = e \, (U(T_{o,i}) - U(T_{b,i}))
 
-    weighted by the covariance of both sides, of which the independent part is
-    :math:`s_i^2 = s_I^2 + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2` and every common error of the
-    readings adds the outer product of its effects [2]_; iterated in e. As both sides have errors,
-    the differences on the right are weighted as the fit adjusts them [3]_, or their scatter would
-    pass for contrast, and e be too low. Where the object is near the air's temperature and the
-    blackbody far from it, a thermocouple that conducts heat away does little harm: knowing the
-    bias, the fit leans on such measurements.
+    weighted by the covariance of both sides, of which the independent part is :math:`s_i^2 = s_I^2
+    + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2` and every common error of the readings adds the
+    outer product of its effects [2]_; iterated in e. As both sides have errors, the differences on
+    the right are weighted as the fit adjusts them [3]_, or their scatter would pass for contrast,
+    and e be too low. Knowing the bias, the fit leans on measurements that it hardly touches: the
+    object near the air's temperature and the blackbody far from it.
 
     Parameters
     ----------
     measured : Dataset
-        Stage `contact`: `counts` of the material (band, measurement) [count];
-        `object_temperature` by the thermocouple and `background_temperature` of the blackbody
-        (measurement) [K], within the response's range.
+        Stage `contact`: `counts` of the material (band, measurement) [count]; `object_temperature`
+        by the thermocouple and `background_temperature` of the blackbody (measurement) [K].
     response : Dataset
         From `fit_response`, with its noise.
     reading_std : tuple of float
-        Standard deviation of one reading of the thermocouple and of the blackbody [K],
-        independent from reading to reading.
+        Standard deviation of one reading of the thermocouple and of the blackbody [K], independent
+        from reading to reading.
     bias : Bias
         Errors that all readings have in common; by default none.
 
@@ -215,19 +212,18 @@ def fit_emissivity(
     Raises
     ------
     ValueError
-        If dims or sizes differ, a temperature lies outside the response, the response has no
-        noise, a deviation is not positive, or object and background never differ by more than
-        three standard deviations of their difference.
+        If a temperature lies outside the response, the response has no noise, a deviation is not
+        positive, or object and background never differ by more than three standard deviations of
+        their difference.
     ArithmeticError
         If the fit does not converge.
 
     References
     ----------
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334
-    .. [2] Aitken (1936), On least squares and linear combination of observations, Proceedings of
-       the Royal Society of Edinburgh 55, 42, doi:10.1017/S0370164600014346
-    .. [3] York et al. (2004), Unified equations for the slope, intercept, and standard errors of
-       the best straight line, American Journal of Physics 72, 367, doi:10.1119/1.1632486
+    .. [2] Aitken (1936), Proceedings of the Royal Society of Edinburgh 55, 42,
+       doi:10.1017/S0370164600014346
+    .. [3] York et al. (2004), American Journal of Physics 72, 367, doi:10.1119/1.1632486
     """
     warm, stds = _readings(measured, "contact", reading_std, bias)
     if measured.sizes["measurement"] < 2:
@@ -274,38 +270,30 @@ def reflector_emissivity(
     Parameters
     ----------
     measured : Dataset
-        Stage `reflector`: `counts` of the object and `reflected_counts` of the foil
-        (band, measurement) [count]; `object_temperature` by contact (measurement) [K], within the
-        response's range.
+        Stage `reflector`: `counts` of the object and `reflected_counts` of the foil (band,
+        measurement) [count]; `object_temperature` by contact (measurement) [K].
     response : Dataset
         From `fit_response`, with its noise, which both counts have.
     reading_std : tuple of float
         Standard deviation of one reading of the contact thermometer, and of the reflected
         temperature beyond the camera's noise, as from one part of the foil to another [K].
     bias : Bias
-        Errors that all contact readings have in common; by default none. Its terms of the
-        background are those of a blackbody, and are not used.
+        Errors that all contact readings have in common; its terms of the background are not used.
 
     Returns
     -------
     Dataset
-        `emissivity`, `emissivity_std`, `reduced_chi2` (band) [1]; `residual` (band, measurement)
-        [count]. With one measurement the reduced chi-square is NaN.
+        As `fit_emissivity`. With one measurement the reduced chi-square is NaN.
 
     Raises
     ------
-    ValueError
-        If dims or sizes differ, a temperature lies outside the response, the response has no
-        noise, a deviation is not positive, or object and reflection never differ by more than
-        three standard deviations of their difference.
-    ArithmeticError
-        If the fit does not converge.
+    ValueError, ArithmeticError
+        As `fit_emissivity`.
 
     References
     ----------
     .. [1] ISO 18434-1:2008, Condition monitoring and diagnostics of machines, Thermography
-    .. [2] ASTM E1862, reflected temperature; ASTM E1933, emissivity, using infrared imaging
-       radiometers
+    .. [2] ASTM E1862, reflected temperature; ASTM E1933, emissivity
     """
     warm, stds = _readings(measured, "reflector", reading_std, bias)
     foils = dict(zip(_names(measured), measured["reflected_counts"].values, strict=True))

@@ -29,19 +29,14 @@ _CURVATURE_SIGMAS: Final = 5.0
 _CURVATURE: Final = 0.003
 
 
-def fit_response(
-    counts: xr.DataArray,
-    noise: xr.DataArray | None = None,
-    *,
-    linear_range: tuple[float, float] | None = None,
-) -> xr.Dataset:
+def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.Dataset:
     r"""
     Fit the response of each band to blackbody measurements.
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
 
-    C and O enter linearly and are eliminated; A and B are found by nonlinear least squares. The
-    linear pair is the least-squares line.
+    the Sakuma-Hattori curve [1]_ and the least-squares line. C and O enter linearly and are
+    eliminated [2]_; A and B are found by nonlinear least squares.
 
     Parameters
     ----------
@@ -49,41 +44,37 @@ def fit_response(
         Mean counts (band, temperature) [count] of a blackbody, `temperature` [K] increasing, at
         least four.
     noise : DataArray, optional
-        Standard deviation of one pixel's counts from frame to frame, (band) [count]. If given,
-        the response keeps it, and its NETD.
-    linear_range : tuple of float, optional
-        Temperatures [K] between which the line is fitted; all if not given.
+        Standard deviation of one pixel's counts from frame to frame, (band) [count]. The response
+        then has it, and its NETD.
 
     Returns
     -------
     Dataset
-        Stage `response` of `schema`: `amplitude` C, `effective_wavelength` A,
-        `wavelength_shift` B, `offset` O, `linear_slope` a, `linear_intercept` b (band);
-        `residual`, `linear_residual` (band, temperature) [count] and the measured `counts`;
-        `reference_temperature`, `temperature_min`, `temperature_max` [K]; and, with a noise,
-        `noise` (band) [count] and `netd` (band) [K].
+        Stage `response` of `schema`: `amplitude` C, `effective_wavelength` A, `wavelength_shift` B,
+        `offset` O, `linear_slope` a, `linear_intercept` b (band); `residual`, `linear_residual`
+        (band, temperature) [count] and the measured `counts`; `reference_temperature`,
+        `temperature_min`, `temperature_max` [K]; and, with a noise, `noise` (band) [count] and
+        `netd` (band) [K].
 
     Raises
     ------
-    TypeError
-        If the counts are not a DataArray of numbers.
-    ValueError
-        If dims, units or order are wrong, there are too few temperatures, a value is NaN, counts
-        do not grow with temperature, or the noise does not fit the bands or is not positive.
+    TypeError, ValueError
+        If the counts are not a DataArray of numbers, dims, units or order are wrong, there are too
+        few temperatures, a value is NaN, counts do not grow with temperature, or the noise does not
+        fit the bands or is not positive.
 
     References
     ----------
     .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
        Industry 5, 421-427
-    .. [2] Golub, Pereyra (2003), Separable nonlinear least squares, Inverse Problems 19, R1,
-       doi:10.1088/0266-5611/19/2/201
+    .. [2] Golub, Pereyra (2003), Inverse Problems 19, R1, doi:10.1088/0266-5611/19/2/201
 
     Examples
     --------
     Blackbodies from 10 to 70 degrees Celsius, seen in the band 8-14 um at 100 count W^-1 m^2 sr.
 
     >>> import numpy as np, xarray as xr
-    >>> from dbthermal import bands, response
+    >>> from dbthermal import bands
     >>> temperature = np.linspace(283.15, 343.15, 7)
     >>> counts = xr.DataArray(
     ...     [15000 + 100 * bands.get("8-14").radiance(temperature)],
@@ -99,8 +90,7 @@ def fit_response(
     names = [str(name) for name in counts["band"].values]
     temperature = counts["temperature"].values.astype(np.float64)
     values = counts.values.astype(np.float64)
-    line = _linear_mask(temperature, linear_range)
-    rows = [_fit_band(temperature, row, line) for row in values]
+    rows = [_fit_band(temperature, row) for row in values]
     parameters = [*responses.COEFFICIENTS, "linear_slope", "linear_intercept"]
     stage = schema.STAGES["response"]
     variables: dict[str, xr.DataArray] = {
@@ -167,22 +157,7 @@ def _check_curvature(band: str, temperature: Array, counts: Array) -> None:
         )
 
 
-def _linear_mask(
-    temperature: Array, linear_range: tuple[float, float] | None
-) -> npt.NDArray[np.bool_]:
-    if linear_range is None:
-        return np.ones(temperature.shape, dtype=bool)
-    lowest, highest = linear_range
-    inside = (temperature >= lowest) & (temperature <= highest)
-    if inside.sum() < 2:
-        raise ValueError(
-            f"Invalid linear_range ({lowest}, {highest}) K with {inside.sum()} of the blackbody "
-            "temperatures. Must hold at least two."
-        )
-    return np.asarray(inside)
-
-
-def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) -> tuple[float, ...]:
+def _fit_band(temperature: Array, counts: Array) -> tuple[float, ...]:
     """Amplitude, effective wavelength, shift, offset, linear slope and intercept of one band."""
     middle = 0.5 * (temperature[0] + temperature[-1])
     span = counts[-1] - counts[0]
@@ -208,9 +183,7 @@ def _fit_band(temperature: Array, counts: Array, line: npt.NDArray[np.bool_]) ->
         max_nfev=1000,
     )
     amplitude, offset = linear_part(fit.x)[0]
-    slope, intercept = (
-        np.polynomial.Polynomial.fit(temperature[line], counts[line], 1).convert().coef[::-1]
-    )
+    slope, intercept = np.polynomial.Polynomial.fit(temperature, counts, 1).convert().coef[::-1]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle
     shift = _SHAPE_UNIT * fit.x[0] * (1.0 - fit.x[1])
     return (amplitude, wavelength, shift, offset, slope, intercept)

@@ -115,7 +115,7 @@ def correct_capture(
     if time_constant is not None:
         result = undo_lag(result, time_constant)
     if bad_pixels is not None:
-        result = mark_bad(result, threshold=bad_pixels, jump=bad_pixels)
+        result = mark_bad(result, threshold=bad_pixels)
     if drift_reference is not None:
         result = undo_drift(result, drift_reference)
     number = -1 if closed is None else closed.sum("time").values.tolist()

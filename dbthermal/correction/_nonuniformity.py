@@ -38,14 +38,11 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     r"""
     Mean frames and temporal noise of movies of a blackbody.
 
-    The noise of a pixel comes from the differences d of successive frames, so that a drift of the
-    camera or of the blackbody does not enter:
-
-    .. math:: s^2 = \overline{d^2} / 2
-
-    Its median over pixels and temperatures is divided by that of a chi-square distribution of the
-    degrees of freedom that n differences leave, :math:`2 n^2 / (3 n - 1)`: a median of few frames
-    is otherwise too low (by 33 % for two frames, 5 % for ten).
+    The noise of a pixel, :math:`s^2 = \overline{d^2} / 2`, comes from the differences d of
+    successive frames, so that a drift of the camera or of the blackbody does not enter. Its median
+    over pixels and temperatures is divided by that of a chi-square distribution of the degrees of
+    freedom that n differences leave, :math:`2 n^2 / (3 n - 1)`: a median of few frames is otherwise
+    too low (by 33 % for two frames, 5 % for ten).
 
     Parameters
     ----------
@@ -210,7 +207,6 @@ def correct(
     correction: xr.Dataset,
     *,
     after: xr.Dataset | None = None,
-    times: tuple[float, float] | None = None,
     maximum: int = DETECTOR_MAXIMUM,
 ) -> xr.Dataset:
     r"""
@@ -220,21 +216,17 @@ def correct(
 
     .. math:: I' = (1 - w) (g_0 I + f_0) + w (g_1 I + f_1), \quad w = \frac{t - t_0}{t_1 - t_0}
 
-    which is right for a pattern that drifts so, and wrong across a shutter event, where a camera
-    renews its offsets.
+    from the first frame to the last, which is right for a pattern that drifts so, and wrong across
+    a shutter event, where a camera renews its offsets.
 
     Parameters
     ----------
     capture : Dataset
-        Stage `capture` of `schema`: `counts` (band, time, y, x) [count], uint16. Other variables
-        are handed on.
+        Stage `capture` of `schema`, raw uint16. Other variables are handed on.
     correction : Dataset
         From `fit_correction`, of the same pixels; it may hold more bands.
     after : Dataset, optional
         Correction that holds after the capture, e.g. from `renew_offset`.
-    times : tuple of float, optional
-        When the two corrections hold [s], on the capture's clock; by default its first and its last
-        frame. The capture lies between them: nothing is extrapolated.
     maximum : int
         Largest count of the detector [count].
 
@@ -242,26 +234,25 @@ def correct(
     -------
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), uint32,
-        with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample of a band at `maximum` or
-        above, or at 0) of `schema.Status`. The counts of these pixels are kept. Attributes say
-        that gain and offset were corrected (``gain_offset_corrected`` = 1), with which parameters
-        they were fitted (``gain_offset_...``), between which times they were interpolated
-        (``correction_times`` [s]), and how many pixels are marked.
+        with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or
+        at 0) of `schema.Status`. The counts of these pixels are kept. Attributes:
+        ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``),
+        ``offset_interpolated``, and the numbers of marked pixels.
 
     Raises
     ------
     TypeError, ValueError
-        If capture or correction is not as `schema` has it, the capture is not uint16 or was
-        corrected before, a band is missing in the correction, a gain or offset is not finite, the
-        pixels are not the same, or the times do not rise or do not enclose the capture.
+        If the capture is not uint16 or was corrected before, a band is missing in the correction, a
+        gain or offset is not finite, or the pixels are not the same.
     """
     counts = _require_raw(capture)
     names = [str(name) for name in counts["band"].values]
     maps = _maps(correction, counts, names)
-    time = counts["time"].values.astype(np.float64)
-    times = (float(time[0]), float(time[-1])) if times is None else times
     if after is not None:
-        last, weight = _maps(after, counts, names), _weight(time, times)
+        last = _maps(after, counts, names)
+        time = counts["time"].values.astype(np.float64)
+        planck.require_positive("length of the capture [s]", time[-1] - time[0])
+        weight = (time - time[0]) / (time[-1] - time[0])
         change = last[["gain", "offset"]] - maps
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
@@ -291,25 +282,13 @@ def correct(
         result.assign_attrs(
             gain_offset_corrected=1,
             **done,
-            **({} if after is None else {"correction_times": list(times)}),
+            offset_interpolated=int(after is not None),
             detector_maximum=maximum,
             dead_pixels=int(bad.sum()),
             saturated_pixels=int(saturated.sum()),
         ),
         "corrected",
     )
-
-
-def _weight(time: Array, times: tuple[float, float]) -> Array:
-    """Weight of the later correction at each time [1]."""
-    start, stop = times
-    planck.require_positive("time between the corrections [s]", stop - start)
-    if not (start <= time[0] and time[-1] <= stop):
-        raise ValueError(
-            f"Invalid times {start} s and {stop} s of the corrections. Must enclose the capture, "
-            f"{time[0]} s to {time[-1]} s."
-        )
-    return np.asarray((time - start) / (stop - start))
 
 
 def _difference_variance(counts: xr.DataArray) -> Array:

@@ -41,9 +41,7 @@ _ROUNDING = 0.01
 _BLOCK = 8_000_000
 
 
-def mark_bad(
-    corrected: xr.Dataset, *, threshold: float = OUTLIER, jump: float = OUTLIER
-) -> xr.Dataset:
+def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset:
     r"""
     Mark pixels that are noisy, stuck or jump by themselves, in any band.
 
@@ -53,7 +51,7 @@ def mark_bad(
     deviations (1.48 times the median absolute deviation over the image) off the median. A pixel
     that never changes is bad.
 
-    Jumps. A pixel is bad that changes from one frame to the next by more than `jump` standard
+    Jumps. A pixel is bad that changes from one frame to the next by more than `threshold` standard
     deviations of a difference, :math:`\sqrt 2 m`, while none of its eight neighbours changes in the
     same direction by 0.3 of it within 0.2 s or five frames, the longer. Someone walking by is seen
     by neighbours, be it a little later; a detector that blinks is alone. Frames that are NaN, the
@@ -66,27 +64,25 @@ def mark_bad(
     corrected : Dataset
         Stage `corrected` of `schema`, after `mark_shutter`; read in blocks of rows.
     threshold : float
-        Limit of the robust z-score of the noise [1].
-    jump : float
-        Limit of a jump, relative to the noise of a difference [1].
+        Limit of the robust z-score of the noise, and of a jump relative to the noise of a
+        difference [1].
 
     Returns
     -------
     Dataset
         The dataset with the bit `Status.DEAD_PIXEL` set in `status` (y, x), other bits as they
         were, the counts unchanged; and the attributes ``noisy_pixels`` and ``jumping_pixels``,
-        their numbers, ``bad_threshold`` and ``bad_jump``.
+        their numbers, and ``bad_threshold``.
 
     Raises
     ------
     TypeError, ValueError
-        If a limit is not positive, or a band has fewer than 16 frames that are not NaN, or than 0.5
-        s have.
+        If the threshold is not positive, or a band has fewer than 16 frames that are not NaN, or
+        than 0.5 s have.
     """
     counts = schema.check(corrected, "corrected")["counts"]
-    for name, value in (("threshold", threshold), ("jump", jump)):
-        if not value > 0:
-            raise ValueError(f"Invalid {name} {value} of bad pixels. Must be positive.")
+    if not threshold > 0:
+        raise ValueError(f"Invalid threshold {threshold} of bad pixels. Must be positive.")
     segment = corrected["segment"].values if "segment" in corrected else None
     image = (counts.sizes["y"], counts.sizes["x"])
     noisy, jumping = np.zeros(image, dtype=bool), np.zeros(image, dtype=bool)
@@ -99,14 +95,13 @@ def mark_bad(
         level = _noise(movie)
         usual = median_filter(level, size=_WINDOW, mode="mirror")
         noisy |= _outliers(level, usual, threshold)
-        jumping |= _jumps(movie, jump * np.sqrt(2.0) * usual, stepped, reach)
+        jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
     status = before | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
     return corrected.assign(status=(("y", "x"), status, schema.status_attrs())).assign_attrs(
         noisy_pixels=int(noisy.sum()),
         jumping_pixels=int(jumping.sum()),
         bad_threshold=threshold,
-        bad_jump=jump,
     )
 
 

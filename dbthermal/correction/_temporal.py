@@ -16,8 +16,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
 
     A pixel follows :math:`\tau \dot I = z - I`. For z held from each frame to the next, exactly,
 
-    .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad
-              z_n = \frac{I_n - a_n I_{n-1}}{1 - a_n}, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
+    .. math:: z_n = \frac{I_n - a_n I_{n-1}}{1 - a_n}, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
 
     The first frame becomes NaN, and so does a frame after one that is NaN. White noise is raised by
     :math:`\sqrt{1 + a^2} / (1 - a)` (1.00005 at 10 Hz, 1.25 at 60 Hz for 10 ms), and successive
@@ -35,8 +34,8 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     -------
     Dataset
         The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
-        ``lag_noise_amplification`` [1], each by band, the latter at the median interval. A known
-        noise must be multiplied by it.
+        ``lag_noise_amplification`` [1], each by band; a known noise must be multiplied by the
+        latter.
 
     Raises
     ------

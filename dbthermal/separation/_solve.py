@@ -60,17 +60,20 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     r"""
     Separate emission and reflection in a capture of two bands or more.
 
+    Object temperature x, background temperature y and emissivities e are estimated of the image
+    formation (`mixing`), with the responses U of `response`:
+
     .. math:: I_m(t) = e_m U_m(x(t)) + (1 - e_m) U_m(y(t)) + \mathrm{noise}
 
     Parameters
     ----------
     corrected : Dataset
         `counts` (band, time, y, x) [count], `time` [s]; optionally `status` (y, x) from
-        `frames.correct` and `segment` (time) from `frames.mark_shutter`. Samples that are NaN are
-        left out. May be lazy, as from `store.open_dataset`: it is read a few rows at a time, and
-        never whole. "subspace" takes two bands or more, the other methods two.
+        `correction.correct` and `segment` (time) from `correction.mark_shutter`. Samples that are
+        NaN are left out. May be lazy, as from `store.open_dataset`: it is read a few rows at a
+        time, and never whole. "subspace" takes two bands or more, the other methods two.
     response : Dataset
-        From `calibration.fit_response`, with both bands. Its `noise` (band) [count] is used
+        From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
         where present, otherwise the noise is estimated from the capture.
     method : {"subspace", "calibrated", "dbvt", "naive", "ratio", "bcp", "apparent"}
         This project's separator; known emissivities; the paper's optimiser; and to compare with,
@@ -83,7 +86,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     emissivity_std : DataArray, optional
         Its standard deviation, same dims.
     mask : DataArray, optional
-        Which samples to use: (time), (y, x) or (time, y, x), boolean.
+        Samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
         Materials (y, x), integer: the pixels of one label share their emissivities, which makes
         all of them more certain; a negative one shares nothing. Known to the user, or found by
@@ -91,9 +94,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     response_kind : {"exact", "linear"}
         Sakuma-Hattori response, or the paper's linear one.
     workers : int
-        Threads.
+        Number of threads.
     seed : int
-        Of the random starts; the result depends on it and not on `workers`.
+        Seed of random starts; the result depends on it and not on `workers`.
     progress : bool
         Show a bar.
 
@@ -104,34 +107,48 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         (band, y, x) [1] and `reflection_ratio` (band, y, x) [1], the reflectivity over that of the
         quietest band (attribute `reference_band`), each with `_std`; `status` (y, x), bits of
         `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says that they
-        are undefined, at samples that the capture lacks or the mask leaves out, and where a method
-        never estimates them (attribute `not_estimated`); where the status is 0, all others are
-        finite. A given emissivity without a deviation has deviation 0.
+        are undefined, at samples that are invalid or masked, and where a method never estimates
+        them (attribute `not_estimated`); where the status is 0, all others are finite. A known
+        emissivity without a deviation has deviation 0.
 
     Raises
     ------
     TypeError
         If an argument is of the wrong type, or the settings are those of another method.
     ValueError
-        If a dim, unit, band, coordinate, method or emissivity is not as described, or
-        the capture is too short for the method. What is wrong with single pixels is not an
-        error but a bit of `status`.
+        If a dim, unit, band, coordinate, method or emissivity is not as described, or the capture
+        is too short for the method. A bad pixel is not an error but a bit of `status`.
 
     Notes
     -----
-    What no flag of `subspace` tells, because nothing in the bands tells it: that object and
-    background have exchanged their roles, but for emissivities below a half, which are flagged as
-    a suspicion; and a background that drifts along with the object's curve: the temperature holds,
-    and the emissivity's deviation carries a drift that `SubspaceSettings.background_drift` states.
+    Two errors of "subspace" carry no flag, because nothing in the bands shows them: an exchange of
+    object and background, but for emissivities below a half, which are flagged as a suspicion; and
+    a background that drifts along with the object's curve. The temperature holds then, and the
+    emissivity's deviation carries the drift that `SubspaceSettings.background_drift` states.
 
     A `segment` is used by "subspace" alone, and for the object alone: the step that a shutter
     event leaves stays in the background, and makes the emissivity less certain, as its deviation
-    says; the object temperature is free of it. An object that jumps just then is not told.
+    says; the object temperature is free of it. A step of the object during a shutter event is not
+    detected.
 
     References
     ----------
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        doi:10.48550/arXiv.2509.11334
+
+    Examples
+    --------
+    Plate glass that warms up while people walk by, simulated:
+
+    >>> import numpy as np, xarray as xr
+    >>> from dbthermal import simulation
+    >>> rig, rng = simulation.Rig(), np.random.default_rng(1)
+    >>> glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    >>> scene = simulation.walkers(np.arange(200) / 10, (4, 6), glass, rng)
+    >>> result = solve(simulation.observe(scene, rig.response(), rng), rig.response())
+    >>> error = result["object_temperature"] - scene["object_temperature"]
+    >>> bool(abs(error).where(result["status"] == 0).median() < 0.3)  # K
+    True
     """
     if operator.index(workers) < 1:
         raise ValueError(f"Invalid number of workers {workers}. Must be at least 1.")

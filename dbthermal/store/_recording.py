@@ -11,7 +11,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -30,25 +30,18 @@ _COMPRESSOR: Final = BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle")
 
 class Recording:
     """
-    A store that is being written, from `Recording.create`.
+    A recording that is being written, in a new folder ``*.zarr``; FileExistsError if it exists.
+
+    `variables` are of dims (band, time, ...), frame by frame, or (log,), row by row, and `sizes`
+    has their other dims. `chunk` is the number of frames that a kill costs at most, `attrs` are
+    JSON, and `fills` are values behind a band's last frame, instead of NaN or 0.
 
     `frames` is the number of frames of each band and `rows` that of the log, as far as they are
     written; `commit` declares them valid.
     """
 
-    def __init__(self, path: Path, group: zarr.Group, chunk: int, attrs: dict[str, Any]) -> None:
-        self.path, self.chunk = path, chunk
-        # A chunk of zeros is written too: a missing one was never recorded.
-        config: Any = {"write_empty_chunks": True}
-        self._arrays = {name: array.with_config(config) for name, array in group.arrays()}
-        self._attrs = attrs
-        self._closed = False
-        self.frames: dict[str, int] = dict(attrs["frames_written"])
-        self.rows: int = attrs["log_written"]
-
-    @classmethod
-    def create(
-        cls,
+    def __init__(
+        self,
         path: str | Path,
         variables: Mapping[str, Variable],
         sizes: Mapping[str, int],
@@ -57,37 +50,30 @@ class Recording:
         chunk: int,
         attrs: Mapping[str, Any],
         fills: Mapping[str, float] | None = None,
-    ) -> Self:
-        """
-        Make an empty recording in a new folder ``*.zarr``; FileExistsError if it exists.
-
-        `variables` are of dims (band, time, ...), frame by frame, or (log,), row by row, and
-        `sizes` has their other dims. `chunk` is the number of frames that a kill costs at most,
-        `attrs` are JSON, and `fills` are values behind a band's last frame, instead of NaN or 0.
-        """
-        path = Path(path)
-        if path.suffix != ".zarr":
+    ) -> None:
+        self.path, self.chunk, self._closed = Path(path), chunk, False
+        if self.path.suffix != ".zarr":
             raise ValueError(f"Invalid path '{path}'. Must end in '.zarr'.")
-        if path.exists():
+        if self.path.exists():
             raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
-        progress = {
-            "complete": False,
-            "closed": False,
-            "frames_written": dict.fromkeys(bands, 0),
-            "log_written": 0,
-        }
-        values = json.loads(json.dumps({**attrs, **progress}, allow_nan=False))
+        self.frames, self.rows = dict.fromkeys(bands, 0), 0
+        self._attrs = json.loads(
+            json.dumps({**attrs, "complete": False, "closed": False}, allow_nan=False)
+        )
+        self._attrs.update(frames_written=dict(self.frames), log_written=0)
         whole = {**sizes, "band": len(bands), "time": chunk}
-        with made_beside(path, path.absolute().parent) as part:
-            group = zarr.open_group(part, mode="w-", zarr_format=3, attributes=values)
+        with made_beside(self.path, self.path.absolute().parent) as part:
+            group = zarr.open_group(part, mode="w-", zarr_format=3, attributes=self._attrs)
             for name, variable in variables.items():
                 _create(group, name, variable, whole, (fills or {}).get(name))
-            text = np.array(bands, dtype=np.dtypes.StringDType())
             names = group.create_array(
                 "band", shape=(len(bands),), dtype=str, dimension_names=("band",)
             )
-            names[:] = text
-        return cls(path, _open(path), chunk, values)
+            names[:] = np.array(bands, dtype=np.dtypes.StringDType())
+        group = zarr.open_group(DurableStore(self.path), mode="r+", use_consolidated=False)
+        # A chunk of zeros is written too: a missing one was never recorded.
+        config: Any = {"write_empty_chunks": True}
+        self._arrays = {name: array.with_config(config) for name, array in group.arrays()}
 
     def append(self, band: str, block: Mapping[str, Values]) -> None:
         """
@@ -95,28 +81,16 @@ class Recording:
 
         `block` holds every variable of frames, (frame, ...): a whole chunk, or at last less.
         """
-        wanted = {name for name, array in self._arrays.items() if _is_movie(array)}
-        if block.keys() != wanted:
-            raise ValueError(f"Invalid variables {sorted(block)}. Must be {sorted(wanted)}.")
-        lengths = {values.shape[0] for values in block.values()}
-        start, length = self.frames[band], max(lengths)
-        if len(lengths) > 1 or length > self.chunk or start % self.chunk:
-            raise ValueError(
-                f"Invalid block of {sorted(lengths)} frames at frame {start} of band '{band}'. "
-                f"Must be one chunk of {self.chunk} frames, or the last one."
-            )
-        place = list(self.frames).index(band)
+        place, start = list(self.frames).index(band), self.frames[band]
+        stop = start + len(next(iter(block.values())))
         for name, values in block.items():
-            _grow(self._arrays[name], 1, start + length)
-            self._arrays[name][place, start : start + length] = values
+            _grow(self._arrays[name], 1, stop)
+            self._arrays[name][place, start:stop] = values
         self._to_disk(block, [Path("c", str(place), str(start // self.chunk))])
-        self.frames[band] += length
+        self.frames[band] = stop
 
     def append_log(self, columns: Mapping[str, Values]) -> None:
         """Write rows of the log, every variable (row,); valid with the next `commit`."""
-        wanted = {name for name, array in self._arrays.items() if _dims(array) == ("log",)}
-        if columns.keys() != wanted:
-            raise ValueError(f"Invalid columns {sorted(columns)}. Must be {sorted(wanted)}.")
         start, end = self.rows, self.rows + len(next(iter(columns.values())))
         for name, values in columns.items():
             _grow(self._arrays[name], 0, end)
@@ -185,10 +159,6 @@ class Recording:
         tree_to_disk([self.path / name / chunk for name in names for chunk in chunks], self.path)
 
 
-def _open(path: str | Path) -> zarr.Group:
-    return zarr.open_group(DurableStore(path), mode="r+", use_consolidated=False)
-
-
 def attributes(path: str | Path) -> dict[str, Any]:
     """Attributes of a store as they are on the disk, without a look at its arrays."""
     content = json.loads((Path(path) / _GROUP).read_text(encoding="utf-8"))
@@ -213,10 +183,6 @@ def _create(
     group: zarr.Group, name: str, variable: Variable, sizes: dict[str, int], fill: float | None
 ) -> None:
     """Make an empty array with room for one chunk of frames, or for no row of the log."""
-    if variable.dims[:2] != ("band", "time") and variable.dims != ("log",):
-        raise ValueError(
-            f"Invalid dims {variable.dims} of '{name}'. Must be ('band', 'time', ...) or ('log',)."
-        )
     whole, chunks = {**sizes, "log": 0}, {**sizes, "band": 1, "log": _LOG_CHUNK}
     nothing = math.nan if np.dtype(variable.dtype).kind == "f" else 0
     group.create_array(
@@ -233,11 +199,6 @@ def _create(
 
 def _dims(array: Any) -> tuple[str, ...]:
     return tuple(array.metadata.dimension_names)
-
-
-def _is_movie(array: Any) -> bool:
-    """Whether an array grows by frames: dims (band, time, ...)."""
-    return _dims(array)[:2] == ("band", "time")
 
 
 def _grow(array: Any, axis: int, size: int) -> None:

@@ -240,6 +240,7 @@ def test_provenance_is_written(capture: xr.Dataset, correction: xr.Dataset) -> N
         "gain_offset_corrected": 1,
         "gain_offset_threshold": 6.0,
         "detector_maximum": 65535,
+        "offset_interpolated": 0,
         "dead_pixels": 1,
         "saturated_pixels": 0,
     }

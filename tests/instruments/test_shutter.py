@@ -35,7 +35,9 @@ def recorded(path: Path, telemetry_rows: int) -> xr.Dataset:
         limits = Limits(reserve=0, reading_period=0.05, preview_period=0.02)
         record_scene(devices, path, limits=limits, preview=corrector)
         corrector.thread.join()
-    return open_capture(path)
+    capture = open_capture(path)
+    padded = capture["frame_flags"] & int(FrameFlag.PADDED)
+    return capture.isel(time=~padded.any("band").values)
 
 
 class _Corrector:
@@ -54,15 +56,17 @@ class _Corrector:
 def test_a_correction_is_taken_out_of_its_band(telemetry_rows: int, tmp_path: Path) -> None:
     """Telemetry tells the first frozen frame, the serial line and the image a later one."""
     capture = recorded(tmp_path / "a.zarr", telemetry_rows)
-    closed = (capture["frame_flags"].values & int(FrameFlag.SHUTTER_CLOSED)) != 0
-    frozen = round(FFC_DURATION * RATE)
+    flags = capture["frame_flags"].values
+    closed = (flags & int(FrameFlag.SHUTTER_CLOSED)) != 0
+    frozen = np.count_nonzero(flags[1] & int(FrameFlag.IMAGE_REPEATED))
+    assert 10 < frozen <= FFC_DURATION * RATE + 1
     assert not closed[0].any()
-    assert closed[1].sum() == pytest.approx(frozen if telemetry_rows else frozen - 1, abs=1.5)
+    late = frozen - np.count_nonzero(closed[1])
+    assert (late == 0) if telemetry_rows else (0 <= late <= 2)
     kinds = [kind for _, kind, source, _ in notes(tmp_path / "a.zarr") if source == "9.5"]
     assert [kind for kind in kinds if "shutter" in kind] == ["shutter_closed", "shutter_open"]
     unity = xr.DataArray(np.ones((2, *SHAPE)), dims=("band", "y", "x"))
     maps = xr.Dataset({"gain": unity, "offset": 0 * unity, "bad": unity < 0})
     corrected = correction.correct_capture(capture, maps.assign_coords(band=capture["band"]))
-    taken = corrected.attrs["frames_taken_out"]
-    assert taken == [0, pytest.approx(frozen, abs=1)]
+    assert corrected.attrs["frames_taken_out"] == [0, frozen]
     assert (corrected.attrs["shutter_events"], int(corrected["segment"][-1])) == (1, 1)

@@ -6,8 +6,7 @@ import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal import _smooth as smooth
-from dbthermal import limits, mixing, schema, separation
+from dbthermal import mixing, schema, separation
 from dbthermal import response as responses
 from dbthermal.separation._baselines.calibrated import temperature_variance
 from dbthermal.simulation import Rig
@@ -105,21 +104,3 @@ def test_linear_variances_are_the_closed_form() -> None:
     none = np.zeros(2)
     variance = temperature_variance(mixed, (0.04, 0.4), np.array([300.0, 300.0]), none)
     np.testing.assert_allclose(np.sqrt(variance), [0.40, 2.4], rtol=0, atol=0.07)  # [K]
-
-
-def test_bound_of_the_ratio_is_that_of_a_linear_model() -> None:
-    """The bound equals the inverse Fisher information of the model with all its unknowns."""
-    rng = np.random.default_rng(0)
-    time, noise, pair = np.arange(40.0), (0.05, 0.3), (0.86, 0.72)
-    background, functions = rng.normal(0, 3, 40), smooth.polynomial_basis(time, 4)
-    ratio = float(limits.reflection_ratio(pair))
-    # Unknowns: the ratio, four coefficients of each band's smooth part, one reflection a frame.
-    reflection = (1 - pair[0]) * background
-    identity, zero = np.eye(40), np.zeros((40, 4))
-    first = np.hstack([np.zeros((40, 1)), functions, zero, identity]) / noise[0]
-    second = np.hstack([reflection[:, None], zero, functions, ratio * identity]) / noise[1]
-    jacobian = np.vstack([first, second])
-    # One combination of smooth part and reflection is shared: the pseudoinverse leaves it out.
-    expected = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10)[0, 0]
-    found = limits.ratio_variance(pair, noise, background, functions)
-    np.testing.assert_allclose(found, expected, rtol=1e-6)

@@ -302,6 +302,26 @@ def test_cells_cover_what_is_valid(spacing: int) -> None:
     assert 0.7 < cells.max() * spacing**2 / valid.sum() < 2.0
 
 
+def test_mean_signals_have_the_variance_of_their_noise(small: Inputs) -> None:
+    """Means of 120 frames: noise over the root of 120, and a fixed pattern where there is one."""
+    _, capture, response = small
+    flat = capture["counts"].isel(x=slice(0, 40)).mean(("y", "x"))
+    rng, counts = np.random.default_rng(6), response["noise"].values[:, None, None, None]
+    noise = rng.standard_normal((2, 120, 48, 40))
+    pattern = 3.0 * rng.standard_normal((2, 1, 48, 40)) * np.array([0.0, 1.0])[:, None, None, None]
+    for fixed in (0.0, 1.0):
+        values = flat.values[:, :, None, None] + counts * (noise + fixed * pattern)
+        still = xr.Dataset(
+            {"counts": (("band", "time", "y", "x"), values)},
+            coords={"band": capture["band"], "time": capture["time"]},
+        )
+        means, variances = feature_maps.mean_signals(still, response, [0, 1], np.array(NOISE))
+        expected = NOISE[1] ** 2 * (1 / 120 + 9.0 * fixed)
+        assert np.median(variances[1]) == pytest.approx(expected, rel=0.15)
+        assert means[1].var() == pytest.approx(expected, rel=0.15)
+        np.testing.assert_allclose(variances[0], NOISE[0] ** 2 / 120, rtol=1e-12)
+
+
 def test_edges_count_in_standard_deviations() -> None:
     """White noise makes edges of mean square near 1 in each direction, and a step one at its place.
 

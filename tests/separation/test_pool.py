@@ -7,6 +7,8 @@ import pytest
 import xarray as xr
 
 from dbthermal import schema, separation
+from dbthermal.separation._pooling import pool
+from dbthermal.separation._tiles import Material
 from dbthermal.simulation import Rig
 from reproduction import experiments
 
@@ -44,6 +46,26 @@ def case(pixels: int, seed: int, **changes: Any) -> Case:
 def error_of_ratio(result: xr.Dataset, truth: float = 2.0) -> float:
     """Root mean square error of the second band's reflection ratio."""
     return float(np.sqrt(((result["reflection_ratio"].sel(band="9.5") - truth) ** 2).mean()))
+
+
+def test_some_pixels_of_a_large_material_are_surveyed() -> None:
+    """All of a small material, at most `MOST` evenly spread over a large one, none without."""
+    count = 3 * pool.MOST
+    values = np.concatenate([one(5, 1), one(count), one(4, -1)])
+    selected = pool.select(values)
+    assert selected[:5].all()
+    assert not selected[-4:].any()
+    places = np.flatnonzero(selected[5:-4])
+    assert places.size == pool.MOST
+    assert np.all(np.diff(places) == 3)
+
+
+def test_materials_are_spread_over_their_pixels() -> None:
+    """Each pixel has the values of its label's material, and NaN without one."""
+    parts = (np.array([[1.0, 1.0], [2.0, 1.4]]), *np.arange(8.0).reshape(4, 2))
+    expanded = pool.expand(Material(*parts), np.array([1, -1, 0]))
+    np.testing.assert_array_equal(expanded.ratio[1], [1.4, np.nan, 2.0])
+    np.testing.assert_array_equal(expanded.emissivity, [3.0, np.nan, 2.0])
 
 
 def test_four_hundred_pixels_cut_the_error_tenfold() -> None:

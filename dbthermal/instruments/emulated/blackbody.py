@@ -34,13 +34,13 @@ def pictures(session: Session, world: World) -> dict[str, Callable[[float], Coun
     response = rig.response()
 
     def of_band(number: int, band: str) -> Callable[[float], Counts]:
-        curve, own = responses.curve(response, band), detector.sel(band=band)
+        curve, pattern = responses.curve(response, band), detector.sel(band=band)
         noise = float(response["noise"].sel(band=band))
         rng = np.random.default_rng([0, number])
 
         def picture(_: float) -> Counts:
             level = float(curve.counts(np.array(world.blackbody_temperature)))
-            return simulation.digitise(level + rng.normal(0.0, noise, session.shape), own)
+            return simulation.digitise(level + rng.normal(0.0, noise, session.shape), pattern)
 
         return picture
 

@@ -218,7 +218,7 @@ class CaptureFile:
         self._names = [*sources, *readings]
         self._notes: list[tuple[float, int, int, float]] = []
         self.broken = False
-        self.recording = store.Recording.create(
+        self.recording = store.Recording(
             path,
             self._variables,
             self._sizes,

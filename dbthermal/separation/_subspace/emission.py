@@ -53,14 +53,67 @@ class Emission:
     emissivity_variance: Array  # (band, pixel) [1]
     noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
     drift_variance: Array  # of e_1, from the background's slow part (pixel) [1]
-    constant: Mask  # the object changes too little to tell the emissivity (pixel)
+    constant: Mask  # the object changes too little for its emissivity (pixel)
     restless: Mask  # the background hardly rests (pixel)
 
 
 def estimate(
     tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio, background_drift: float
 ) -> Emission:
-    """Alternate the object temperature and the emissivity, steps 2 and 3 of `method`."""
+    """Object temperature and emissivities, steps 2 and 3 of `method`, with their uncertainty."""
+    fit = _alternate(tile, functions, ratios)
+    line, first, noise = fit.line, fit.emissivity, np.array(tile.noise)
+    # Eq. 6 by implicit differentiation: dx/deps = (dh/deps - dq/deps) / h', var x = var q / h'^2.
+    sensitivity = (fit.partial - functions.object_part @ ratios.coefficients[0]) / fit.steepness
+    leverage = functions.leverage()[:, ratios.order - 1]
+    smooth_variance = leverage * ratios.null_variance / fit.steepness**2
+    # What the criterion for the order leaves of the object's curve is as large as the noise that
+    # one more function would have cost, log N times.
+    omitted = smooth_variance * np.log(tile.time.size) / ratios.order
+    epsilon = ratios.inverse_energy * ratios.null_variance
+    # Residual of the line in a frame of rest: s_1^2 + e_1^2 var x.
+    expected = noise[0] ** 2 + first**2 * (sensitivity**2 * epsilon + smooth_variance + omitted)
+    # Variance of the slope: of the ordinate's noise, and of the abscissa's, e_1^2 var q / sum u^2.
+    noise_variance = line.variance + first**2 * ratios.null_variance / line.energy
+    drifting = drift_variance(
+        line, fit.emitted, 1.0 - first, functions, tile.noise[0], background_drift
+    )
+    if tile.material is not None:
+        known = ratios.pooled & np.isfinite(tile.material.emissivity)
+        noise_variance = np.where(known, tile.material.noise_variance, noise_variance)
+        drifting = np.where(known, tile.material.drift_variance, drifting)
+    emissivity = 1.0 - ratios.ratio * (1.0 - first)
+    return Emission(
+        temperature=fit.temperature,
+        temperature_std=np.sqrt(_fieller(sensitivity, epsilon) + smooth_variance),
+        sensitivity=sensitivity,
+        smooth_variance=smooth_variance,
+        emissivity=emissivity,
+        emissivity_variance=_emissivity_variance(
+            emissivity[0], noise_variance + drifting, ratios, noise
+        ),
+        noise_variance=noise_variance,
+        drift_variance=drifting,
+        constant=fit.constant,
+        restless=np.mean(line.residual**2 < _WITHIN**2 * expected, axis=0) < _RESTING,
+    )
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Object and emissivity after the alternation, and the derivatives at the last step."""
+
+    temperature: Array  # of the object (time, pixel) [K]
+    emitted: Array  # u_1(x) of the last regression (time, pixel) [K]
+    emissivity: Array  # of the first band (pixel) [1]
+    constant: Mask  # (pixel)
+    line: residuals.Line
+    steepness: Array  # h'(x) (time, pixel) [1]
+    partial: Array  # see `_newton` (time, pixel) [K]
+
+
+def _alternate(tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio) -> _Fit:
+    """Alternate the object temperature (eq. 6) and the first emissivity (eq. 7)."""
     # Eq. 5: q = w.z, smoothed, less the steps of the camera.
     smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
     target = functions.object_part @ smoothed
@@ -72,7 +125,6 @@ def estimate(
     temperature = _newton(tile, ratios, emissivity, target, temperature)[0]
     line: residuals.Line | None = None
     for _ in range(_ROUNDS):
-        # Eq. 7: the slope of z_1 on u_1(x); of a material, its emissivity.
         emitted = tile.blackbody(0, temperature)
         line = residuals.regress(emitted, tile.signals[0], tile.noise[0], start=line)
         constant = line.energy < _OBJECT_TO_NOISE * ratios.order * ratios.null_variance
@@ -83,43 +135,7 @@ def estimate(
             emissivity = np.where(known, tile.material.emissivity, emissivity)
         temperature, steepness, partial = _newton(tile, ratios, emissivity, target, temperature)
     assert line is not None
-    # Eq. 6 by implicit differentiation: dx/deps = (dh/deps - dq/deps) / h', var x = var q / h'^2.
-    sensitivity = (partial - functions.object_part @ ratios.coefficients[0]) / steepness
-    leverage = functions.leverage()[:, ratios.order - 1]
-    smooth_variance = leverage * ratios.null_variance / steepness**2
-    # What the criterion for the order leaves of the object's curve is as large as the noise that
-    # one more function would have cost, log N times.
-    left_out = smooth_variance * np.log(tile.time.size) / ratios.order
-    # Residual of the line in a frame of rest: s_1^2 + e_1^2 var x.
-    expected = tile.noise[0] ** 2 + emissivity**2 * (
-        sensitivity**2 * ratios.inverse_energy * ratios.null_variance + smooth_variance + left_out
-    )
-    # Variance of the slope: of the ordinate's noise, and of the abscissa's, e_1^2 var q / sum u^2.
-    noise_variance = line.variance + emissivity**2 * ratios.null_variance / line.energy
-    drifting = drift_variance(
-        line, emitted, 1.0 - emissivity, functions, tile.noise[0], background_drift
-    )
-    if tile.material is not None:
-        known = ratios.pooled & np.isfinite(tile.material.emissivity)
-        noise_variance = np.where(known, tile.material.noise_variance, noise_variance)
-        drifting = np.where(known, tile.material.drift_variance, drifting)
-    epsilon = ratios.inverse_energy * ratios.null_variance
-    emissivities = 1.0 - ratios.ratio * (1.0 - emissivity)
-    slope_variance = noise_variance + drifting
-    return Emission(
-        temperature=temperature,
-        temperature_std=np.sqrt(_fieller(sensitivity, epsilon) + smooth_variance),
-        sensitivity=sensitivity,
-        smooth_variance=smooth_variance,
-        emissivity=emissivities,
-        emissivity_variance=_emissivity_variance(
-            emissivities[0], slope_variance, ratios, np.array(tile.noise)
-        ),
-        noise_variance=noise_variance,
-        drift_variance=drifting,
-        constant=constant,
-        restless=np.mean(line.residual**2 < _WITHIN**2 * expected, axis=0) < _RESTING,
-    )
+    return _Fit(temperature, emitted, emissivity, constant, line, steepness, partial)
 
 
 def _plain_slope(abscissa: Array, ordinate: Array) -> Array:
@@ -187,7 +203,7 @@ def drift_variance(
     curve = columns.T @ emitted
     energy = (curve**2).sum(axis=0)
     unit = curve / np.sqrt(energy)
-    # Only what is across the object's curve is the background's alone.
+    # The part orthogonal to the object's curve is the background's alone.
     spectrum = spectrum - unit * (unit * spectrum).sum(axis=0)
     # Energy of a walk at degree 1: j^2 times that at degree j, less the noise's.
     walk = degree**2 * (spectrum**2 - noise**2 / share)
@@ -273,7 +289,7 @@ def bend(tile: Tile, emission: Emission, background: Array) -> Array:
 
 
 def _middle(ratio: Array) -> Array:
-    """Middle of the interval that the ratios leave for e_1, where the object does not tell it."""
+    """Middle of the interval that the ratios leave for e_1, for a constant object."""
     largest = ratio.max(axis=0)
     lowest = np.zeros_like(largest)
     np.divide(largest - 1.0, largest, out=lowest, where=largest > 1.0)

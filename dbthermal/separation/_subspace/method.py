@@ -28,7 +28,7 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
    .. math:: e_1 = \mathrm{d} z_1 / \mathrm{d} u_1(x), \quad
              e_m = 1 - \kappa_m (1 - e_1) \qquad (7)
 
-   Its standard deviation (8) holds what a slow part of the background can do to the slope.
+   Its standard deviation (8) includes the effect of the background's slow part on the slope.
 4. The background minimises, at every frame, with a variance (10) by propagation,
 
    .. math:: \sum_m \frac{(1 - e_m)^2}{s_m^2}
@@ -214,7 +214,7 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     delay = residuals.interband_delay(residual, signals[0], functions, ratios, tile.noise[0])
     frames, others = tile.time.size, len(tile.noise) - 1
     still = ~ratios.pooled & (ratios.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames))
-    # Not even in the quietest band is there more than its noise.
+    # The quietest band holds no more than its noise either.
     still |= ~ratios.pooled & (ratios.scatter[0, 0] <= 0)
     still |= ~np.isfinite(ratios.inverse_energy)
     epsilon = ratios.inverse_energy * ratios.null_variance

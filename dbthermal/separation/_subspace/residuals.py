@@ -245,7 +245,7 @@ def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
     hundred points in single precision are enough to start from.
     """
     every = slice(None, None, max(1, abscissa.shape[0] // _STARTING_POINTS))
-    # About its mean, or single precision would not resolve a small spread.
+    # About its mean, or single precision would not resolve a small range.
     centred, up = abscissa - abscissa.mean(axis=0), ordinate - ordinate.mean(axis=0)
     few = centred[every].astype(np.float32), up[every].astype(np.float32)
     plain = _fit(*few, np.ones_like(few[0]))[2]
