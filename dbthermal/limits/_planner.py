@@ -23,8 +23,8 @@ class CaptureDesign:
     """
     Capture conditions: a warming object before a background of regular pulses.
 
-    The object warms exponentially, with a time constant of a third of the capture. The background
-    rests, then is warmer for the end of each period, as if someone stood there.
+    The object's time constant is a third of the capture. The background is warmer for the end of
+    each period, as if someone stood there, and rests before.
 
     Attributes
     ----------
