@@ -18,8 +18,8 @@ from faulty_camera import Faults
 from rig_devices import BosonBench, LoggerBench, WheelBench
 from rig_take import Read, Take, session
 
-from dbthermal import correction as frames
 from dbthermal import store
+from dbthermal.correction import find_shutter
 from dbthermal.instruments.boson import Boson, BosonReplyError, BosonStatusError, BosonTimeoutError
 from dbthermal.instruments.camera import FrameFlag
 from dbthermal.instruments.devices import Devices, Thermocouples
@@ -67,7 +67,7 @@ def test_a_repeated_image(tmp_path: Path) -> None:
     """The recording keeps it as it came and says so, and afterwards it is found and taken out."""
     take = Take(tmp_path / "a.zarr", {"9.5": Faults(repeated=OFTEN)}).record(0.4)
     capture = open_capture(take.path).isel(time=slice(0, len(take.cameras["9.5"].given)))
-    found = frames.find_shutter(capture).query(event="band == '9.5'")
+    found = find_shutter(capture).query(event="band == '9.5'")
     repeated = np.isin(capture["sequence"].sel(band="9.5"), [*OFTEN])
     flagged = capture["frame_flags"].sel(band="9.5").values & int(FrameFlag.IMAGE_REPEATED)
     np.testing.assert_array_equal(flagged > 0, repeated)

@@ -11,8 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal import _smooth as smooth
-from dbthermal import correction as frames
 from dbthermal import schema, separation, simulation
+from dbthermal.correction import (
+    blackbody_statistics,
+    correct,
+    find_shutter,
+    fit_correction,
+    mark_bad,
+    mark_shutter,
+    renew_offset,
+    undo_drift,
+    undo_lag,
+)
 from dbthermal.simulation import Background, Rig
 from dbthermal.simulation import _nuisances as nuisances
 from reproduction import experiments
@@ -66,11 +76,11 @@ def test_shutter_events_are_found(clean: xr.Dataset) -> None:
     capture = nuisances.fire_shutter(clean, [8.0, 20.04], rng, duration=0.55)
     capture = nuisances.fire_shutter(capture, 30.0, rng, bands=("9.5",))
     both = [(band, first, 5, True) for first in (81, 201) for band in RIG.bands]
-    assert rows(frames.find_shutter(capture)) == [*both, ("9.5", 301, 5, True)]
-    events = frames.find_shutter(capture)
+    assert rows(find_shutter(capture)) == [*both, ("9.5", 301, 5, True)]
+    events = find_shutter(capture)
     np.testing.assert_allclose(events["start"], [8.1, 8.1, 20.1, 20.1, 30.1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(events["stop"] - events["start"], 0.4, rtol=0, atol=1e-9)  # [s]
-    marked = frames.mark_shutter(capture)
+    marked = mark_shutter(capture)
     gone = marked["counts"].isnull().any(("y", "x"))
     np.testing.assert_array_equal(gone.sum("time"), [10, 15])
     np.testing.assert_array_equal(np.flatnonzero(np.diff(marked["segment"])), [85, 205, 305])
@@ -83,8 +93,8 @@ def test_clean_capture_has_no_event(seed: int) -> None:
     capture = walkers(seed, frames=120)
     whole = capture.assign(counts=np.rint(capture["counts"]).astype(np.uint16))
     for made in (capture, whole):
-        assert frames.find_shutter(made).sizes["event"] == 0
-    marked = frames.mark_shutter(capture)
+        assert find_shutter(made).sizes["event"] == 0
+    marked = mark_shutter(capture)
     xr.testing.assert_identical(marked["counts"], capture["counts"])
     assert not marked["segment"].any()
 
@@ -92,14 +102,14 @@ def test_clean_capture_has_no_event(seed: int) -> None:
 def test_repeated_frames_are_found(clean: xr.Dataset) -> None:
     """All of the frames that a driver repeats are found; a lost one starts no segment."""
     capture = nuisances.lose_frames(clean, 0.05, np.random.default_rng(3))
-    marked = frames.mark_shutter(capture)
+    marked = mark_shutter(capture)
     found = np.isnan(marked["counts"].values).all(axis=(2, 3))
     print(f"repeated {int(capture['repeated'].sum())}, found {int(found.sum())}")
     np.testing.assert_array_equal(found, capture["repeated"])
-    events = frames.find_shutter(capture)
+    events = find_shutter(capture)
     np.testing.assert_array_equal(events["renewed"], events["frames"] > 1)
     lost = events.isel(event=~events["renewed"].values)
-    assert not frames.mark_shutter(capture, lost)["segment"].any()
+    assert not mark_shutter(capture, lost)["segment"].any()
     assert marked.attrs["repeated_frames"] == lost.sizes["event"]
 
 
@@ -113,7 +123,7 @@ def test_a_copy_is_a_copy_in_every_pixel() -> None:
         {"counts": (("band", "time", "y", "x"), counts)},
         coords={"band": ["9.5"], "time": np.arange(20.0)},
     )
-    assert rows(frames.find_shutter(capture)) == [("9.5", 7, 1, False)]
+    assert rows(find_shutter(capture)) == [("9.5", 7, 1, False)]
 
 
 def test_frames_known_to_be_closed() -> None:
@@ -121,7 +131,7 @@ def test_frames_known_to_be_closed() -> None:
     capture = still()
     capture["counts"].values[0, 31:34] = capture["counts"].values[0, [30]]
     closed = xr.DataArray(np.isin(np.arange(60), [29, 30, 50]), dims="time")
-    found = rows(frames.find_shutter(capture, closed=closed))
+    found = rows(find_shutter(capture, closed=closed))
     assert sorted(found) == [
         ("8-14", 29, 5, True),
         ("8-14", 50, 1, True),
@@ -129,12 +139,12 @@ def test_frames_known_to_be_closed() -> None:
         ("9.5", 50, 1, True),
     ]
     one = closed.expand_dims(band=list(RIG.bands)) & xr.DataArray([False, True], dims="band")
-    by_band = frames.find_shutter(capture, closed=one.transpose("band", "time"))
+    by_band = find_shutter(capture, closed=one.transpose("band", "time"))
     assert rows(by_band)[-1] == ("9.5", 50, 1, True)
     with pytest.raises(ValueError, match="Invalid closed frames of sizes"):
-        frames.find_shutter(capture, closed=closed[:50])
+        find_shutter(capture, closed=closed[:50])
     with pytest.raises(TypeError, match="Invalid dtype int64 of the closed frames"):
-        frames.find_shutter(capture, closed=closed.astype(int))
+        find_shutter(capture, closed=closed.astype(int))
 
 
 @pytest.mark.parametrize(
@@ -154,7 +164,7 @@ def test_events_that_overlap_are_one(runs: list[tuple[str, int, int]], segments:
     parts = zip(*runs, strict=True)
     columns = {name: ("event", list(part)) for name, part in zip(names, parts, strict=True)}
     events = xr.Dataset(columns).assign(renewed=("event", [True] * len(runs)))
-    segment = frames.mark_shutter(still(), events)["segment"].values
+    segment = mark_shutter(still(), events)["segment"].values
     np.testing.assert_array_equal(1 + np.flatnonzero(np.diff(segment)), segments)
     for _, first, number in runs:
         if first > 0 and first + number < 60:
@@ -165,7 +175,7 @@ def test_shutter_is_marked_once_and_says_so(clean: xr.Dataset) -> None:
     """Provenance is written, the input is left, and a second marking is refused."""
     capture = nuisances.fire_shutter(clean, 20.0, np.random.default_rng(2), bands=("8-14",))
     before = capture.copy(deep=True)
-    marked = frames.mark_shutter(capture)
+    marked = mark_shutter(capture)
     xr.testing.assert_identical(capture, before)
     assert marked.attrs == {
         **capture.attrs,
@@ -176,21 +186,21 @@ def test_shutter_is_marked_once_and_says_so(clean: xr.Dataset) -> None:
     assert marked["counts"].attrs == capture["counts"].attrs
     assert marked["counts"].dtype == np.float32
     with pytest.raises(ValueError, match="marked before"):
-        frames.mark_shutter(marked)
+        mark_shutter(marked)
 
 
 def test_shutter_refuses_nonsense() -> None:
     """An image that never changes, whole numbers, and events elsewhere are refused."""
     capture = still()
     with pytest.raises(ValueError, match=re.escape("Invalid counts of band '8-14': 0 of the 480")):
-        frames.find_shutter(capture.assign(counts=0 * capture["counts"]))
+        find_shutter(capture.assign(counts=0 * capture["counts"]))
     with pytest.raises(TypeError, match="Must be floating"):
-        frames.mark_shutter(capture.astype(int))
-    events = frames.find_shutter(capture, closed=xr.DataArray(np.arange(60) == 59, dims="time"))
+        mark_shutter(capture.astype(int))
+    events = find_shutter(capture, closed=xr.DataArray(np.arange(60) == 59, dims="time"))
     with pytest.raises(ValueError, match=r"Invalid event of frames 59 to 59. Must lie in \[0, 49"):
-        frames.mark_shutter(capture.isel(time=slice(50)), events)
+        mark_shutter(capture.isel(time=slice(50)), events)
     with pytest.raises(ValueError, match="Missing 'renewed' of the events"):
-        frames.mark_shutter(capture, events.drop_vars("renewed"))
+        mark_shutter(capture, events.drop_vars("renewed"))
 
 
 def glass(pixels: int = 400) -> tuple[xr.Dataset, xr.Dataset, np.random.Generator]:
@@ -226,7 +236,7 @@ def test_separation_stands_a_shutter_and_lost_frames(
     """The object temperature is within 20 % of that of the undisturbed capture."""
     scene, capture, rng = glass()
     undisturbed = rmse(scene, capture)
-    marked = rmse(scene, frames.mark_shutter(nuisance(capture, rng)))
+    marked = rmse(scene, mark_shutter(nuisance(capture, rng)))
     print(f"{nuisance.__name__}: {marked:.4f} K, undisturbed {undisturbed:.4f} K")
     assert marked <= 1.2 * undisturbed
 
@@ -252,7 +262,7 @@ def test_common_drift_is_undone() -> None:
     curve = 60.0 * (1.0 - np.exp(-np.arange(350) / 150.0))
     drifting = capture.assign(counts=capture["counts"] + xr.DataArray(curve, dims="time"))
     drifting = drifting.astype(np.float32)
-    undone = frames.undo_drift(drifting, patch())
+    undone = undo_drift(drifting, patch())
     error = (undone["counts"] - capture["counts"]).values
     print(f"largest error of the drift {np.abs(error).max():.2f} count of 60")
     assert np.abs(error).max() < 0.4
@@ -267,8 +277,8 @@ def test_drift_leaves_the_steps() -> None:
     capture = still(count=300)
     drifting = nuisances.drift_pattern(capture, np.random.default_rng(0), common=50.0)
     stepped = nuisances.fire_shutter(drifting, 15.0, np.random.default_rng(1))
-    marked = frames.mark_shutter(stepped)
-    undone = frames.undo_drift(marked, patch(), order=2)
+    marked = mark_shutter(stepped)
+    undone = undo_drift(marked, patch(), order=2)
     gone = np.isnan(undone["drift"])
     np.testing.assert_array_equal(gone, marked["counts"].isnull().any(("y", "x")))
     level = undone["counts"].where(undone["segment"] == 1).mean("time")
@@ -284,21 +294,21 @@ def test_drift_refuses_nonsense() -> None:
     """A patch of no good pixel, of another image, torn, or used twice is refused."""
     capture = still()
     with pytest.raises(ValueError, match="it marks no good pixel"):
-        frames.undo_drift(capture, patch() & False)
+        undo_drift(capture, patch() & False)
     with pytest.raises(ValueError, match=re.escape("Invalid reference of sizes {'y': 20, 'x': 5}")):
-        frames.undo_drift(capture, patch()[:, :5])
+        undo_drift(capture, patch()[:, :5])
     with pytest.raises(TypeError, match="Invalid dtype int64 of the reference"):
-        frames.undo_drift(capture, patch().astype(int))
+        undo_drift(capture, patch().astype(int))
     with pytest.raises(ValueError, match="Invalid order 1 of the drift"):
-        frames.undo_drift(capture, patch(), order=1)
+        undo_drift(capture, patch(), order=1)
     with pytest.raises(ValueError, match="the drift was undone before"):
-        frames.undo_drift(frames.undo_drift(capture, patch()), patch())
+        undo_drift(undo_drift(capture, patch()), patch())
     capture["counts"].values[1, 7, 2, 3] = np.nan
     with pytest.raises(ValueError, match=re.escape("NaN in frame 7 of band '9.5'")):
-        frames.undo_drift(capture, patch())
+        undo_drift(capture, patch())
     status = xr.zeros_like(patch(), dtype=np.uint16)
     status[2, 3] = schema.Status.INVALID_SAMPLES
-    assert frames.undo_drift(capture.assign(status=status), patch()).attrs["drift_pixels"] == 99
+    assert undo_drift(capture.assign(status=status), patch()).attrs["drift_pixels"] == 99
 
 
 @pytest.fixture(scope="module")
@@ -313,14 +323,14 @@ def drifting() -> tuple[xr.Dataset, xr.Dataset, list[xr.Dataset]]:
     moved = nuisances.drift_pattern(seen, rng, pattern_std=25.0)
     last = first.assign(offset=first["offset"] + moved["drifted"] * first["gain"])
     movies = simulation.blackbody_movies(rig, temperatures, 60, first, rng)
-    correction = frames.fit_correction(frames.blackbody_statistics(movies))
+    correction = fit_correction(blackbody_statistics(movies))
     flats = [
         simulation.blackbody_movies(rig, np.array([300.0]), 60, detector, rng)["counts"]
         .isel(temperature=0)
         .mean("frame")
         for detector in (first, last)
     ]
-    ends = [frames.renew_offset(correction, flat) for flat in flats]
+    ends = [renew_offset(correction, flat) for flat in flats]
     return seen, simulation.capture(moved, first), ends
 
 
@@ -335,7 +345,7 @@ def test_pattern_drift_is_interpolated(
 ) -> None:
     """Pictures before and after the capture take a drift of 25 counts a pixel down to the noise."""
     seen, raw, (before, after) = drifting
-    fixed, undone = frames.correct(raw, before), frames.correct(raw, before, after=after)
+    fixed, undone = correct(raw, before), correct(raw, before, after=after)
     errors = pattern_error(fixed, seen), pattern_error(undone, seen)
     print(f"fixed correction {errors[0]:.1f} count, interpolated {errors[1]:.2f} count")
     assert errors[0] > 15.0
@@ -350,15 +360,15 @@ def test_interpolation_has_its_ends(
 ) -> None:
     """The first frame is corrected by the first correction, the last by the last."""
     _, raw, ends = drifting
-    undone = frames.correct(raw, ends[0], after=ends[1])["counts"]
+    undone = correct(raw, ends[0], after=ends[1])["counts"]
     for frame, correction in zip((0, -1), ends, strict=True):
-        expected = frames.correct(raw, correction)["counts"]
+        expected = correct(raw, correction)["counts"]
         np.testing.assert_allclose(undone[:, frame], expected[:, frame], rtol=0, atol=0.01)
-    wide = frames.correct(raw, ends[0], after=ends[0])["counts"]
-    expected = frames.correct(raw, ends[0])["counts"]
+    wide = correct(raw, ends[0], after=ends[0])["counts"]
+    expected = correct(raw, ends[0])["counts"]
     np.testing.assert_allclose(wide, expected, rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="Invalid size 24 of 'y'"):
-        frames.correct(raw, ends[0], after=ends[1].isel(y=slice(3)))
+        correct(raw, ends[0], after=ends[1].isel(y=slice(3)))
 
 
 def test_renewed_offset_evens_the_picture(
@@ -367,7 +377,7 @@ def test_renewed_offset_evens_the_picture(
     """A picture corrected by itself is uniform, and its mean is the one it had."""
     _, raw, (correction, _) = drifting
     flat = raw["counts"].isel(time=3).astype(float)
-    renewed = frames.renew_offset(correction, flat)
+    renewed = renew_offset(correction, flat)
     good = ~correction["bad"]
     seen, even = (
         (part["gain"] * flat + part["offset"]).where(good) for part in (correction, renewed)
@@ -376,18 +386,18 @@ def test_renewed_offset_evens_the_picture(
     np.testing.assert_allclose(even.mean(("y", "x")), seen.mean(("y", "x")), rtol=0, atol=1e-6)
     assert renewed.attrs["offset_renewed"] == 1
     with pytest.raises(ValueError, match="a good pixel is not finite"):
-        frames.renew_offset(correction, flat * np.nan)
+        renew_offset(correction, flat * np.nan)
     with pytest.raises(ValueError, match="Invalid flat image of sizes"):
-        frames.renew_offset(correction, flat.isel(x=slice(3)))
+        renew_offset(correction, flat.isel(x=slice(3)))
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_bad_pixels_are_found(seed: int) -> None:
     """Noisy, blinking and stuck pixels are marked; walkers and edges of materials are not."""
     capture = walkers(seed)
-    false = float((frames.mark_bad(capture)["status"] != 0).mean())
+    false = float((mark_bad(capture)["status"] != 0).mean())
     spoiled = nuisances.spoil_pixels(capture, 0.005, np.random.default_rng(seed))
-    marked = frames.mark_bad(spoiled)["status"].values == DEAD
+    marked = mark_bad(spoiled)["status"].values == DEAD
     kinds = spoiled["spoiled"].max("band").values
     rates = [float(marked[kinds == kind].mean()) for kind in range(len(nuisances.SPOILED))]
     print(f"false alarms {false:.1e}; {dict(zip(nuisances.SPOILED, rates, strict=True))}")
@@ -398,7 +408,7 @@ def test_bad_pixels_are_found(seed: int) -> None:
 
 def test_fast_frames_are_no_bad_pixels() -> None:
     """At 60 Hz an edge of a silhouette creeps, and is still not taken for a blinking pixel."""
-    false = [float((frames.mark_bad(walkers(n, rate=60.0))["status"] != 0).mean()) for n in (2, 4)]
+    false = [float((mark_bad(walkers(n, rate=60.0))["status"] != 0).mean()) for n in (2, 4)]
     print(f"false alarms at 60 Hz {false}")
     assert np.mean(false) < 1e-4
 
@@ -406,8 +416,8 @@ def test_fast_frames_are_no_bad_pixels() -> None:
 def test_shutter_makes_no_bad_pixel(clean: xr.Dataset) -> None:
     """New offsets are steps of every pixel for itself, and known: no pixel blinks."""
     capture = shutter(clean, np.random.default_rng(4))
-    assert float((frames.mark_bad(capture)["status"] != 0).mean()) > 0.01
-    marked = frames.mark_bad(frames.mark_shutter(capture))
+    assert float((mark_bad(capture)["status"] != 0).mean()) > 0.01
+    marked = mark_bad(mark_shutter(capture))
     assert not marked["status"].any()
     assert marked.attrs["jumping_pixels"] == 0
 
@@ -418,7 +428,7 @@ def test_bad_pixels_are_added_to_the_status() -> None:
     capture["counts"].values[1, :, 5, 6] = 16000.0
     before = capture.assign(status=(("y", "x"), np.full((20, 24), 128, dtype=np.uint16)))
     kept = before.copy(deep=True)
-    marked = frames.mark_bad(before)
+    marked = mark_bad(before)
     xr.testing.assert_identical(before, kept)
     xr.testing.assert_identical(marked["counts"], before["counts"])
     np.testing.assert_array_equal(np.argwhere(marked["status"].values != 128), [[5, 6]])
@@ -431,9 +441,9 @@ def test_bad_pixels_refuse_nonsense() -> None:
     """Too few frames, or a limit that is none, is refused."""
     capture = still()
     with pytest.raises(ValueError, match=re.escape("Invalid band '8-14' of 15 frames")):
-        frames.mark_bad(capture.isel(time=slice(15)))
+        mark_bad(capture.isel(time=slice(15)))
     with pytest.raises(ValueError, match="Invalid threshold 0 of bad pixels"):
-        frames.mark_bad(capture, threshold=0)
+        mark_bad(capture, threshold=0)
 
 
 def movie(signal: np.ndarray, time: object) -> xr.Dataset:
@@ -466,7 +476,7 @@ def test_lag_round_trip(steps: list[float], constants: tuple[float, float], seed
     constant = xr.DataArray(
         list(constants[::-1]), dims="band", coords={"band": list(RIG.bands[::-1])}
     )
-    undone = frames.undo_lag(nuisances.lag(scene, constant), constant)
+    undone = undo_lag(nuisances.lag(scene, constant), constant)
     np.testing.assert_allclose(
         undone["counts"][:, 1:], scene["counts"][:, 1:], rtol=0, atol=1e-5
     )  # [count]
@@ -477,7 +487,7 @@ def test_lag_round_trip(steps: list[float], constants: tuple[float, float], seed
 def test_undoing_the_lag_raises_the_noise() -> None:
     """By the factor that is stated, and successive frames are then correlated."""
     rng, time = np.random.default_rng(0), np.arange(40000) / 60.0
-    undone = frames.undo_lag(movie(rng.standard_normal(time.size), time), 0.010)
+    undone = undo_lag(movie(rng.standard_normal(time.size), time), 0.010)
     signal = undone["counts"].values[0, 1:, 0, 0]
     kept = np.exp(-1.0 / 0.6)
     factor, correlation = signal.std(), np.corrcoef(signal[1:], signal[:-1])[0, 1]
@@ -486,7 +496,7 @@ def test_undoing_the_lag_raises_the_noise() -> None:
     assert correlation == pytest.approx(-kept / (1 + kept**2), abs=0.02)
     np.testing.assert_allclose(undone.attrs["lag_noise_amplification"], factor, rtol=0.02)
     movies = [movie(signal[:9], np.arange(9) / rate) for rate in (10.0, 60.0, 100.0)]
-    factors = [frames.undo_lag(one, 0.010).attrs["lag_noise_amplification"][0] for one in movies]
+    factors = [undo_lag(one, 0.010).attrs["lag_noise_amplification"][0] for one in movies]
     np.testing.assert_allclose(factors, [1.0, 1.255, 1.686], rtol=0, atol=0.001)
 
 
@@ -494,7 +504,7 @@ def test_lag_of_marked_frames() -> None:
     """A frame after one that was taken out is lost, too; at 10 Hz the rest hardly changes."""
     capture = still()
     capture["counts"].values[0, 30] = np.nan
-    undone = frames.undo_lag(capture, 0.010)["counts"]
+    undone = undo_lag(capture, 0.010)["counts"]
     gone = [np.flatnonzero(np.isnan(part).all(("y", "x"))).tolist() for part in undone]
     assert gone == [[0, 30, 31], [0]]
     assert float(abs(undone - capture["counts"]).max()) < 0.01  # count
@@ -505,16 +515,16 @@ def test_lag_refuses_nonsense() -> None:
     """No time constant, one frame, whole numbers, and a second time are refused."""
     capture = still()
     with pytest.raises(ValueError, match=re.escape("Invalid time_constant [s] 0.0")):
-        frames.undo_lag(capture, 0.0)
+        undo_lag(capture, 0.0)
     named = xr.DataArray([0.01], dims="band", coords={"band": ["9.5"]})
     with pytest.raises(ValueError, match="Missing band '8-14' in the time constants"):
-        frames.undo_lag(capture, named)
+        undo_lag(capture, named)
     with pytest.raises(ValueError, match="Invalid capture of 1 frame"):
-        frames.undo_lag(capture.isel(time=[0]), 0.01)
+        undo_lag(capture.isel(time=[0]), 0.01)
     with pytest.raises(TypeError, match="Must be floating"):
-        frames.undo_lag(capture.astype(int), 0.01)
+        undo_lag(capture.astype(int), 0.01)
     with pytest.raises(ValueError, match="the lag was undone before"):
-        frames.undo_lag(frames.undo_lag(capture, 0.01), 0.01)
+        undo_lag(undo_lag(capture, 0.01), 0.01)
 
 
 def test_steps_leave_their_input(clean: xr.Dataset) -> None:
@@ -523,7 +533,7 @@ def test_steps_leave_their_input(clean: xr.Dataset) -> None:
     mask = xr.DataArray(np.indices(SHAPE).max(axis=0) < 8, dims=("y", "x"))
     chain = [clean, nuisances.lag(clean, 0.01), nuisances.spoil_pixels(clean, 0.01, rng)]
     chain += [nuisances.drift_pattern(clean, rng, pattern_std=5.0)]
-    chain += [frames.undo_lag(clean, 0.01), frames.undo_drift(clean, mask), frames.mark_bad(clean)]
+    chain += [undo_lag(clean, 0.01), undo_drift(clean, mask), mark_bad(clean)]
     xr.testing.assert_identical(clean, before)
     assert all(one is not other for one, other in pairwise(chain))
 

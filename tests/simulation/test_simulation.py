@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal import bands, response, schema, simulation
-from dbthermal import correction as frames
+from dbthermal.correction import blackbody_statistics, correct, fit_correction
 from dbthermal.simulation import Background, Rig, heating
 
 TIME = np.arange(120) / 10.0  # s
@@ -286,10 +286,10 @@ def test_calibration_undoes_the_detector(
     """Movies, correction, corrected capture: what is left is rounding and the movies' noise."""
     temperatures = np.linspace(283.15, 343.15, 5)
     movies = simulation.blackbody_movies(rig, temperatures, 40, detector, rng)
-    statistics = frames.blackbody_statistics(movies)
-    correction = frames.fit_correction(statistics)
+    statistics = blackbody_statistics(movies)
+    correction = fit_correction(statistics)
     seen = simulation.observe(twin, known, rng)
-    corrected = frames.correct(simulation.capture(seen, detector), correction)
+    corrected = correct(simulation.capture(seen, detector), correction)
     np.testing.assert_array_equal(correction["bad"], detector["dead"])
     np.testing.assert_allclose(statistics["noise"] / known["noise"], 1.0, rtol=0, atol=0.02)
     error = (corrected["counts"] - seen["counts"]).where(~detector["dead"])

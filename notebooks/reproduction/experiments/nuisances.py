@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import alignment, separation, simulation
-from dbthermal import correction as frames
+from dbthermal.correction import mark_shutter
 from dbthermal.simulation import Background, Rig
 from reproduction.experiments.cases import STEPS
 from reproduction.experiments.limits import on_clock
@@ -116,7 +116,7 @@ def disturbed(
     if "shutter" in name:
         last = float(capture["time"][-1])
         spoiled = simulation.fire_shutter(spoiled, last * np.array(nuisance["shutter"]), rng)
-    return _compare(scene, (spoiled, frames.mark_shutter(spoiled), capture), response, TREATMENTS)
+    return _compare(scene, (spoiled, mark_shutter(spoiled), capture), response, TREATMENTS)
 
 
 def parallax(
