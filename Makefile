@@ -72,7 +72,7 @@ interop: ## compare emulators and codecs with independent software, in an enviro
 
 test: .venv/installed ## check lint, types, the quick tests, and every notebook with small values
 	$(parallel) check types
-	$(MAKE) pytest
+	$(MAKE) --no-print-directory pytest
 	$(parallel) smoke
 
 test-slow: .venv/installed ## run the long tests, and the notebooks on the recordings of the emulated rig

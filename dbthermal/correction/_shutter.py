@@ -201,18 +201,14 @@ def _events(runs: list[tuple[str, int, int, bool]], time: Array) -> xr.Dataset:
     runs = sorted(runs, key=lambda run: run[1])
     first = np.array([run[1] for run in runs], dtype=np.int64)
     number = np.array([run[2] for run in runs], dtype=np.int64)
-    columns = {
-        "band": (np.array([run[0] for run in runs], dtype=str), "1", "band"),
-        "first_frame": (first, "1", "position of the first frame"),
-        "frames": (number, "1", "number of frames"),
-        "start": (time[first], "s", "time of the first frame"),
-        "stop": (time[first + number - 1], "s", "time of the last frame"),
-        "renewed": (np.array([run[3] for run in runs], dtype=bool), "1", "offsets are new"),
-    }
     return xr.Dataset(
         {
-            name: ("event", values, {"units": units, "long_name": long_name})
-            for name, (values, units, long_name) in columns.items()
+            "band": ("event", np.array([run[0] for run in runs], dtype=str)),
+            "first_frame": ("event", first),
+            "frames": ("event", number),
+            "start": ("event", time[first], {"units": "s"}),
+            "stop": ("event", time[first + number - 1], {"units": "s"}),
+            "renewed": ("event", np.array([run[3] for run in runs], dtype=bool)),
         }
     )
 

@@ -17,7 +17,7 @@ from dbthermal.figures.drawing import (
 
 def gain_offset_maps(correction: xr.Dataset) -> Figure:
     """
-    Gain and offset of every pixel, a row a band; bad pixels are marked.
+    Maps of gain and offset, one row per band, with the bad pixels marked.
 
     Parameters
     ----------

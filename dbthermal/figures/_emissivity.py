@@ -9,7 +9,7 @@ from dbthermal.figures.drawing import COLORS, band_label, canvas, limits_of, pro
 
 def emissivity_bars(table: xr.Dataset) -> Figure:
     """
-    Band emissivities as bars, a group a material.
+    Band emissivities as bars, one group per material.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = Non
     Returns
     -------
     Figure
-        One point a band and material.
+        One point per band and material.
     """
     figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
     place = np.arange(measured.sizes["material"])

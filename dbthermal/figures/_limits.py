@@ -28,7 +28,7 @@ _MICRO: Final = "\N{MICRO SIGN}m"
 
 def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) -> Figure:
     """
-    Expected accuracy with each filter, and what a longer film gains.
+    Expected accuracy of the object temperature by filter, and by length of the film.
 
     Parameters
     ----------

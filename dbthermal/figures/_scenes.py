@@ -71,7 +71,7 @@ def separated_frames(
     labels: tuple[str, str, str],
 ) -> Figure:
     """
-    For a scene: the two inputs, the emission and the mean-subtracted reflection, a row a time.
+    Inputs, emission and mean-subtracted reflection of a scene, one row per time.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def separated_frames(
     emission, reflection : DataArray
         (time, y, x); pixels without a value are gray.
     title : str
-        What the scene is.
+        Name of the scene.
     labels : tuple of str
         Labels with units of inputs, emission and reflection.
 
@@ -132,9 +132,9 @@ def separated_temperatures(
         Background temperature less its mean over time, or `separation.reflected_change`
         (time, y, x) [K].
     title : str
-        What the scene is.
+        Name of the scene.
     label : str
-        What the change is, with its unit.
+        Label of the change, with its unit.
 
     Returns
     -------
@@ -159,9 +159,9 @@ def separated_film(
     emission : DataArray
         Object temperature (time, y, x) [K]; pixels without a value are gray.
     change : DataArray
-        What the reflection changes, `separation.reflected_change` (time, y, x) [K].
+        Change by the reflection, `separation.reflected_change` (time, y, x) [K].
     title : str
-        What the scene is.
+        Name of the scene.
 
     Yields
     ------

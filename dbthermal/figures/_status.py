@@ -41,7 +41,7 @@ _RIGHT: Final = "#a8d5b0"
 
 def status(result: xr.Dataset) -> Figure:
     """
-    Map of one capture's status in words: which pixels to trust, and for the others why not.
+    Map of the pixels without a flag, and of the most decisive flag of the others, in words.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def _patch(name: str, share: float) -> Patch:
 
 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
-    """Name of the most decisive flag of each pixel; empty where there is none."""
+    """Name of the most decisive flag of each pixel; empty without a flag."""
     unknown = int(np.bitwise_or.reduce(flags.values, axis=None)) & ~sum(schema.Status)
     if unknown:
         raise ValueError(f"Unknown bits {unknown} of a status. Must be of {schema.Status.bits()}.")

@@ -60,7 +60,7 @@ def band_label(name: object) -> str:
 
 def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
     """
-    Say what the data are, for a title.
+    Origin of the data in brackets, for a title.
 
     Parameters
     ----------
@@ -145,5 +145,5 @@ def plain_decades(axis: Axes) -> None:
 
 
 def percent(share: float) -> str:
-    """A share in percent, that is not 0.0 where there is a pixel."""
+    """Share in percent as text; less than 0.1 % is not rounded to zero."""
     return "< 0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"

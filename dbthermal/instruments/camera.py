@@ -168,8 +168,8 @@ class Frame:
     """
     One frame as it came.
 
-    No driver writes to the counts again. A leap of the sequence number is
-    a loss. Metadata are missing without telemetry, or if the frame is damaged.
+    No driver writes to the counts again. A leap of the sequence number is a loss. Metadata are
+    missing without telemetry, or if the frame is damaged.
     """
 
     counts: Counts  # raw signal (y, x) [count]

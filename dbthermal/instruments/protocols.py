@@ -10,7 +10,7 @@ filters, and each of these is a recording of its own, begun only when the temper
 import threading
 import time as system_time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -23,7 +23,6 @@ from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import (
     Limits,
     Preview,
-    Reading,
     Summary,
     record,
 )
@@ -98,11 +97,8 @@ def record_sweep(
     folder: str | Path,
     *,
     set_temperature: Callable[[float], None],
-    read_blackbody: Callable[[], float] | None = None,
     limits: Limits | None = None,
     preview: Callable[[Preview], None] | None = None,
-    clock: Callable[[], float] = system_time.monotonic,
-    sleep: Callable[[float], None] = system_time.sleep,
 ) -> list[Step]:
     """
     Record a blackbody at each of its temperatures, once it is stable, through each filter.
@@ -115,18 +111,14 @@ def record_sweep(
     Parameters
     ----------
     devices : Devices
-        Of a session with a blackbody.
+        Of a session with a blackbody, which the thermocouple of that name reads.
     folder : str or Path
         Where the recordings go: ``<name>_<step>_<band>.zarr``.
     set_temperature : callable
         Sets the blackbody [K], or asks the user to set it.
-    read_blackbody : callable, optional
-        Reads it [K]; by default the thermocouple named ``"blackbody"`` does.
     limits, preview : optional
         As for `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of
         the filter in the beam.
-    clock, sleep : callable
-        Time [s], for the wait.
 
     Returns
     -------
@@ -136,16 +128,15 @@ def record_sweep(
     Raises
     ------
     ValueError
-        If the session has no blackbody, or none is read; or a recording exists that is incomplete,
-        of another temperature, or during which the wheel turned.
+        If the session has no blackbody, or no reading of it; or a recording exists that is
+        incomplete, of another temperature, or during which the wheel turned.
     TimeoutError
         As `wait_stable`; the recordings before are kept.
     SourceLostError
         If a camera is lost on the way.
     """
     session = devices.session
-    extra = {} if read_blackbody is None else {BLACKBODY: Reading(read_blackbody)}
-    readings = {**devices.readings(), **extra}
+    readings = devices.readings()
     if session.blackbody is None or BLACKBODY not in readings:
         raise ValueError(f"Invalid session '{session.name}'. Must have and read a blackbody.")
     plan = _plan(session, folder)
@@ -155,10 +146,10 @@ def record_sweep(
     for (number, temperature, band, path), was in zip(plan, kept, strict=True):
         if was is None and resting != number:
             set_temperature(temperature)
-            wait_stable(session, temperature, readings[BLACKBODY].read, clock=clock, sleep=sleep)
+            wait_stable(session, temperature, readings[BLACKBODY].read)
             devices.correct_offsets()
             resting = number
-        summary = was or _record_step(devices, band, path, extra, limits, preview)
+        summary = was or _record_step(devices, band, path, limits, preview)
         steps.append(Step(number, temperature, mean_reading(path, BLACKBODY), band, summary))
     return steps
 
@@ -250,7 +241,6 @@ def _record_step(
     devices: Devices,
     band: str | None,
     path: Path,
-    extra: Mapping[str, Reading],
     limits: Limits | None,
     preview: Callable[[Preview], None] | None,
 ) -> Summary:
@@ -262,7 +252,7 @@ def _record_step(
         selected.session,
         selected.sources,
         path,
-        readings={**selected.readings(), **extra},
+        readings=selected.readings(),
         identities=identities,
         limits=limits,
         preview=preview,

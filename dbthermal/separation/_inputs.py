@@ -119,7 +119,8 @@ def _checked_settings(method: Method, name: str, settings: Any) -> Any:
         )
     for field in fields(kind):
         value = getattr(settings, field.name)
-        if type(field.default) is int and type(value) is not int:
+        optional = value is None and "None" in str(field.type)
+        if type(field.default) is int and type(value) is not int and not optional:
             raise TypeError(
                 f"Invalid {field.name} {value!r} of method '{name}'. Must be a whole number."
             )

@@ -24,8 +24,8 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     .. math:: (1 - e_1) (y - \bar y)
 
     with the mean over time, in the linear response of small changes. Where the object is constant
-    its emissivity is undefined, but then all that changes is reflected: there it is the apparent
-    temperature less its own mean.
+    its emissivity is undefined, but all that changes is reflected: the apparent temperature less
+    its mean.
 
     Parameters
     ----------
@@ -101,8 +101,8 @@ def uncalibrated_reflection(
     Raises
     ------
     ValueError
-        If dims are wrong, a value is not finite, there are not two bands, the correlation is not
-        in (0, 1), or fewer than 100 pixels are uncorrelated or correlated.
+        If dims or bands are wrong, a value is not finite, the correlation is not in (0, 1), or
+        fewer than 100 pixels are uncorrelated or correlated.
 
     References
     ----------

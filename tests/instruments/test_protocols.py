@@ -19,8 +19,9 @@ from dbthermal.instruments.protocols import Step
 from dbthermal.instruments.recording import Preview, _sweep, notes, open_capture
 from dbthermal.instruments.session import Session
 
-ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"))
-TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"))
+QUICKLY = ("window: 3", "window: 0.02")
+ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)
+TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), QUICKLY)
 
 
 class Clock:
@@ -54,21 +55,15 @@ def swept(
     devices: Devices,
     folder: Path,
     log: list[float] | None = None,
-    read: Callable[[], float] | None = None,
     preview: Callable[[Preview], None] | None = None,
 ) -> list[Step]:
-    """Sweep without waiting: the blackbody is where it is set at once."""
-    clock = Clock()
-    return protocols.record_sweep(
-        devices,
-        folder,
-        set_temperature=setter(devices, log),
-        read_blackbody=read,
-        limits=QUICK,
-        preview=preview,
-        clock=clock,
-        sleep=clock.sleep,
-    )
+    """Sweep a blackbody that is at once where it is set."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(protocols, "STABILITY_PERIOD", 0.01)
+        set_temperature = setter(devices, log)
+        return protocols.record_sweep(
+            devices, folder, set_temperature=set_temperature, limits=QUICK, preview=preview
+        )
 
 
 @pytest.fixture(scope="module")
@@ -202,18 +197,15 @@ def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
     """A recording through two filters is neither taken nor, later, opened."""
     with rig(Session.from_yaml(ONE)) as devices:
         devices.prepare()
-        wheel, world, calls = devices.wheel, devices.world, iter(range(9))
+        wheel = devices.wheel
         assert wheel is not None
-        assert world is not None
 
-        def read() -> float:
-            if next(calls, 9) == 5:  # four readings are waited for
-                wheel.move_to(2)
-            return float(world.blackbody_temperature)
+        def turn(_: Preview) -> None:
+            wheel.move_to(2)
 
         for _ in range(2):
             with pytest.raises(ValueError, match=r"Invalid slots .* of filter '9\.5' throughout"):
-                swept(devices, tmp_path, read=read)
+                swept(devices, tmp_path, preview=turn)
 
 
 def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:

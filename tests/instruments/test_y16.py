@@ -59,6 +59,8 @@ def test_its_shutter_is_told_by_frozen_images(tmp_path: Path) -> None:
     camera = {"kind": "y16", "video": video}
     short = session(cameras={"8-14": camera}, duration=1.8, frame_rate=50.0)
     with open_devices(short) as devices:
+        identity = devices.identities()["8-14"]
+        assert (identity["device"], identity["model"]) == ("sim://y16/wide", "emulated Y16 camera")
         record_scene(devices, tmp_path / "a.zarr", limits=Limits(reserve=0))
     capture = open_capture(tmp_path / "a.zarr")
     repeated = (capture["frame_flags"] & int(FrameFlag.IMAGE_REPEATED)) != 0

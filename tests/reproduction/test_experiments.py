@@ -72,6 +72,7 @@ def test_pixels_without_a_value(truth: xr.Dataset) -> None:
     np.testing.assert_array_equal(found["emissivity_coverage"], [1.0, 1.0])
 
 
+@pytest.mark.slow
 def test_glass_near_the_bound() -> None:
     """On 400 pixels of glass the ratio's scatter is the Cramer-Rao bound, the error bars true."""
     found = experiments.sweep([GLASS], Rig(), TIME, 400, seed=7).isel(case=0)

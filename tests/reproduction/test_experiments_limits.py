@@ -39,6 +39,7 @@ def test_summary_of_known_errors() -> None:
     assert float(found["flagged"]) == pytest.approx(0.1, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_ratio_is_at_the_bound() -> None:
     """Glass, noise and subspace unknown: the ratio scatters by its closed form's bound."""
     found = limits.near_bound(GLASS, [0.03, 0.35], bands=PAIR, pixels=600, seed=3, **COMMON)
@@ -69,6 +70,7 @@ def test_slope_is_the_closed_form() -> None:
     np.testing.assert_allclose(apart, 0, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_pooling_falls_as_the_root() -> None:
     """The bound falls as 1/sqrt(n), and the error follows it."""
     found = [limits.pooled(size, GLASS, pixels=800, seed=7, **COMMON) for size in (1, 16)]
@@ -113,6 +115,7 @@ def test_labels_of_nothing() -> None:
         limits.border_kept(sides, sides * 0)
 
 
+@pytest.mark.slow
 def test_alignment_makes_the_bars_true() -> None:
     """Two frames apart nearly all pixels are flagged; aligned, few are, and the bars hold."""
     case = {"emissivity": GLASS, "start": 20.0, "stop": 45.0, "offset": 2.0}
@@ -128,6 +131,7 @@ def test_alignment_makes_the_bars_true() -> None:
     assert (int(late["frames_lost"]), int(aligned["frames_lost"])) == (0, 2)
 
 
+@pytest.mark.slow
 def test_offset_is_undone() -> None:
     """A frame and a half apart: found within 0.1 frame, undone within 20 % of the error."""
     found = nuisances.apart(1.5, pixels={"pixels": 1000}, seed=3)
@@ -144,7 +148,10 @@ def test_what_is_late_was_not_early() -> None:
         nuisances.apart(-1, pixels={}, seed=1)
 
 
-@pytest.mark.parametrize("name", nuisances.NUISANCES)
+@pytest.mark.parametrize(
+    "name",
+    ["lost frames", *(pytest.param(n, marks=pytest.mark.slow) for n in nuisances.NUISANCES[1:])],
+)
 def test_nuisances_are_undone(name: str) -> None:
     """Marked, they cost a quarter at most; a shutter that is not spoils everything, with a flag."""
     nuisance = {"share": 0.05, "shutter": [0.4]}
@@ -164,6 +171,7 @@ def test_unknown_nuisance() -> None:
         nuisances.disturbed("rain", pixels={}, nuisance={}, seed=1)
 
 
+@pytest.mark.slow
 def test_parallax_costs_and_is_flagged() -> None:
     """With no parallax resampling costs little; two pixels cost much, and are flagged."""
     pytest.importorskip("cv2", exc_type=ImportError)

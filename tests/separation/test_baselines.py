@@ -327,6 +327,15 @@ def test_baselines_behind_solve(method: str, twin: tuple[xr.Dataset, xr.Dataset]
             assert known.any() != (name in result.attrs["not_estimated"].split()), name
 
 
+def test_ratio_behind_solve_may_leave_out_the_smoothing(
+    twin: tuple[xr.Dataset, xr.Dataset],
+) -> None:
+    """An order of None is one of the settings, and leaves the noise of single frames."""
+    plain = separation.solve(*twin, "ratio", settings=separation.RatioSettings(order=None))
+    smooth = separation.solve(*twin, "ratio")
+    assert float(plain["object_temperature"].std()) > float(smooth["object_temperature"].std())
+
+
 def test_bcp_sees_the_whole_image(twin: tuple[xr.Dataset, xr.Dataset]) -> None:
     """Behind solve the image is one tile: the result is that of the whole tile."""
     capture, response = twin

@@ -41,8 +41,13 @@ BUFFERS: Final = 32
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
 
-MODELS: Final = MappingProxyType({"camera": "emulated Boson", "y16": "emulated Y16 camera"})
-"""Model of the emulated camera by the name in its address, ``sim://camera/wide``."""
+MODELS: Final = MappingProxyType(
+    {
+        "camera": "emulated Boson",
+        "y16": "emulated Y16 camera",
+    }
+)
+"""Model of the emulated camera by the kind in its address, ``sim://camera/wide``."""
 
 FFC_PERIODS: Final = (1.0, math.inf)
 """Shortest and longest time between corrections that a camera starts by itself [s]."""
@@ -65,7 +70,7 @@ class EmulatedCamera(Closing):
     frame_rate: float = 60.0  # [Hz]
     telemetry_rows: int = 0
     sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
-    model: str = MODELS["camera"]
+    kind: str = "camera"  # of `MODELS`
     ffc_period: float = math.inf  # between corrections that the camera starts by itself [s]
 
     is_simulated: Final = True
@@ -82,8 +87,8 @@ class EmulatedCamera(Closing):
     def identity(self) -> Mapping[str, str]:
         """Device, model and number, labelled as emulated."""
         return {
-            "device": f"sim://camera/{self.name}",
-            "model": self.model,
+            "device": f"sim://{self.kind}/{self.name}",
+            "model": MODELS[self.kind],
             "serial_number": str(self._state.serial_number),
         }
 
@@ -180,7 +185,7 @@ def open_frames(
         stream.shape,
         stream.frame_rate,
         stream.telemetry_rows,
-        model=MODELS[parts.netloc],
+        kind=parts.netloc,
         ffc_period=number(options, "ffc", math.inf, FFC_PERIODS),
     )
 

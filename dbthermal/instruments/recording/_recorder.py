@@ -15,11 +15,11 @@ import math
 import queue
 import shutil
 import threading
-import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from time import monotonic
 from typing import Final
 
 from dbthermal import store
@@ -96,7 +96,7 @@ class Summary:
     totals: Mapping[str, Mapping[str, int]]
 
 
-def record(  # noqa: PLR0913 - all but the first three are by name
+def record(
     session: Session,
     sources: Mapping[str, FrameSource],
     path: str | Path,
@@ -106,7 +106,6 @@ def record(  # noqa: PLR0913 - all but the first three are by name
     limits: Limits | None = None,
     preview: Callable[[Preview], None] | None = None,
     stop: threading.Event | None = None,
-    clock: Callable[[], float] = system_time.monotonic,
 ) -> Summary:
     """
     Record until the end of the session's duration, a stop, or the loss of the last camera.
@@ -132,8 +131,6 @@ def record(  # noqa: PLR0913 - all but the first three are by name
         Called now and then with a `Preview`, in the caller's thread; it may take its time.
     stop : Event, optional
         Ends the recording when it is set.
-    clock : callable
-        Host's monotonic clock [s], that of the sources' stamps.
 
     Returns
     -------
@@ -154,10 +151,10 @@ def record(  # noqa: PLR0913 - all but the first three are by name
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
-    start = clock()
+    start = monotonic()  # clock of the sources' stamps
     file = _new_file(session, sources, readings, identities or {}, Path(path), start, limits)
-    end, stop = clock() + session.duration, stop or threading.Event()
-    run = _Run(file, sources, readings, limits, clock, start, end, stop)
+    end, stop = monotonic() + session.duration, stop or threading.Event()
+    run = _Run(file, sources, readings, limits, start, end, stop)
     # No daemon: it ends its work whatever becomes of this thread.
     writer = threading.Thread(target=run.write, name="writer")
     try:
@@ -232,13 +229,12 @@ class _Run:
         sources: Mapping[str, FrameSource],
         readings: Mapping[str, Reading],
         limits: Limits,
-        clock: Callable[[], float],
         start: float,
         end: float,
         stop: threading.Event,
     ) -> None:
         self.file, self.readings, self.limits = file, readings, limits
-        self.clock, self.start, self.end, self.stop = clock, start, end, stop
+        self.start, self.end, self.stop = start, end, stop
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = False, ""
@@ -260,7 +256,7 @@ class _Run:
 
     def is_going(self) -> bool:
         """Whether neither end nor stop nor an error has come."""
-        return not (self.over.is_set() or self.stop.is_set() or self.clock() >= self.end)
+        return not (self.over.is_set() or self.stop.is_set() or monotonic() >= self.end)
 
     def fetch(self, band: str, source: FrameSource) -> None:
         """
@@ -275,7 +271,7 @@ class _Run:
                 try:
                     frame = source.read(self.limits.silence)
                 except NoFrameError:
-                    self._notes.put((Note.NO_FRAME, band, self.clock(), self.limits.silence))
+                    self._notes.put((Note.NO_FRAME, band, monotonic(), self.limits.silence))
                     continue
                 if self._room[band].acquire(blocking=False):
                     self._frames.put((band, frame, refused))
@@ -284,7 +280,7 @@ class _Run:
                     refused += 1
         except SourceLostError:
             self._lost_sources.append(band)
-            self._notes.put((Note.SOURCE_LOST, band, self.clock(), math.nan))
+            self._notes.put((Note.SOURCE_LOST, band, monotonic(), math.nan))
         except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
             self.errors.append(error)
             self.over.set()
@@ -300,8 +296,8 @@ class _Run:
                         value, kind = float(reading.read()), Note.READING
                     except (OSError, RuntimeError, ValueError):
                         value, kind = math.nan, Note.READING_FAILED
-                    self._notes.put((kind, name, self.clock(), value))
-                self.over.wait(min(self.limits.reading_period, max(0.0, self.end - self.clock())))
+                    self._notes.put((kind, name, monotonic(), value))
+                self.over.wait(min(self.limits.reading_period, max(0.0, self.end - monotonic())))
         except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
             self.errors.append(error)
             self.over.set()
@@ -314,7 +310,7 @@ class _Run:
         while not self.done.wait(period):
             if preview and self.last_frames and self.is_going():
                 period = max(_SHOW_POLL, self.limits.preview_period)
-                time, totals = self.clock() - self.start, self.totals
+                time, totals = monotonic() - self.start, self.totals
                 frames, readings = dict(self.last_frames), dict(self.last_readings)
                 preview(Preview(time, frames, totals, readings, units))
 
@@ -365,7 +361,7 @@ class _Run:
             self._take(*self._frames.get_nowait())
         self._take_notes()
         for band, number in self._refused_last.items():
-            self.file.refused(band, number, self.clock())
+            self.file.refused(band, number, monotonic())
 
     def _take(self, band: str, frame: Frame, refused: int) -> None:
         """Write a frame, unless the driver held it from before the start."""

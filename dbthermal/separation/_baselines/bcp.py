@@ -1,9 +1,9 @@
 r"""Blackbody channel prior: a labelled reconstruction, on whole images, frame by frame.
 
-Grimming et al. (2023) take the brightest pixels of a neighbourhood for nearly black, and so remove
-reflections from thermal images. No code of theirs is public and their equations could not be had:
-what follows is **our reconstruction**, by analogy with the dark channel prior of He et al. (2011),
-doi:10.1109/TPAMI.2010.168, and no figure published for their method is its target.
+Grimming et al. (2023) take the brightest pixels of a neighbourhood for nearly black. Their code is
+not public and their equations could not be had: this is **our reconstruction**, by analogy with the
+dark channel prior of He et al. (2011), doi:10.1109/TPAMI.2010.168, and no figure published for
+their method is its target.
 
 With I the linearised signal of the quieter band, linear in radiance, and A the reflected signal:
 
@@ -15,8 +15,7 @@ With I the linearised signal of the quieter band, linear in radiance, and A the 
 3. :math:`I' = (I - A) / \max(t, t_0) + A` is the object's signal; its temperature follows from the
    response.
 
-Clipping is part of the algorithm here, as it is of the dark channel prior; nothing else in this
-package clips.
+Clipping is part of the algorithm, as of the dark channel prior; nothing else in this package clips.
 """
 
 from dataclasses import dataclass

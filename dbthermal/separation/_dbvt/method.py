@@ -2,18 +2,14 @@ r"""The paper's optimiser, algorithm DBVT: smooth signals, noise and emissivitie
 
 The smooth signal :math:`\tilde I_1(t)`, the offset :math:`\tilde I_2(0)`, both emissivities and the
 noise of every frame minimise five losses (`objective`); the temperatures follow in closed form
-(`calibrated`). The search is as strong as we could make it (`newton`); it is not the paper's, the
-objective is.
+(`calibrated`). The objective is that of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334; the
+search (`newton`) is ours.
 
-A random start lies on the wrong side of equal emissivities half of the time, and between the sides
-is a ridge, but only as far as the reconstruction counts: the other losses know one valley, that of
-the emission ratio. So a homotopy raises its weight from stage to stage (Allgower, Georg 2003,
-doi:10.1137/1.9780898719154), each stage from the end of the one before, up to the objective itself.
-
-The paper's identities are linear in the temperatures. The nonlinearity of an exact response is
-taken out of the second band with the temperatures as estimated, and the search goes on.
-
-Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334.
+A random start lies on the wrong side of equal emissivities half of the time, behind a ridge that
+only the reconstruction makes: the other losses have one valley, that of the emission ratio. So a
+homotopy raises its weight from stage to stage (Allgower, Georg 2003,
+doi:10.1137/1.9780898719154). The paper's identities are linear in the temperatures: the
+nonlinearity of an exact response is taken out of the second band, and the search goes on.
 """
 
 import threading
@@ -46,12 +42,7 @@ _BEFORE: Final[list[int]] = []
 
 
 def separate(tile: Tile, settings: DbvtSettings) -> Estimate:
-    """
-    Temperatures and emissivities without deviations.
-
-    `not_converged` where the kept start was still improving at the last step, or has no finite
-    objective, which leaves NaN.
-    """
+    """Point estimate of one tile; `not_converged` where the kept start was still improving."""
     ignored = np.errstate(invalid="ignore", divide="ignore", over="ignore")
     with ignored, torch.inference_mode(), _one_thread():
         minimum = _search(tile, settings)
@@ -120,11 +111,8 @@ def _last_stage(unknowns: Unknowns, images: Images, settings: DbvtSettings) -> M
             columns = columns[active]
             if last or not bool(active.any()):
                 break
-            state, progress, part = (
-                state.select(active),
-                progress.select(active),
-                part.select(active),
-            )
+            state, progress = state.select(active), progress.select(active)
+            part = part.select(active)
     converged = (search.stalled >= settings.patience) & torch.isfinite(search.loss)
     return Minimum(unknowns, search.loss, converged)
 

@@ -5,9 +5,8 @@ derivatives have a shape that is solved in a time proportional to the number of 
 of noise for each frame, a band of width five for the smooth signal (Whittaker's smoother), a border
 of three columns for its second offset and the two ratios. A step solves for all of them.
 
-Away from its threshold the Huber loss has no curvature; a share of the curvature of a parabola that
-lies above it (Huber 1981, doi:10.1002/0471725250) is added, as much as it takes for the step to
-lower the objective.
+Beyond its threshold the Huber loss has no curvature: a share of that of a parabola above it (Huber
+1981, doi:10.1002/0471725250) is added, as much as it takes to lower the objective.
 """
 
 from dataclasses import dataclass

@@ -4,10 +4,8 @@ The reflection ratio :math:`k_m = (1-e_m)/(1-e_{ref})` belongs to the material a
 pixel it is known to a few percent only. So the maps propose and the statistics decide:
 
 1. `feature_maps` cuts the image into cells, along the edges of the ratio and of the difference of
-   the bands' mean signals. A pattern of the object's temperature shows in that difference, which is
-   0 for a gray body, far less than a border of emissivity.
-2. A cell whose ratios scatter more than their deviations allow lies across a border: it is cut
-   into smaller ones.
+   the bands' mean signals, in which the object's temperature shows far less than its emissivity.
+2. A cell whose ratios scatter more than their deviations allow lies across a border, and is cut.
 3. Neighbours whose pooled ratios and emissivities agree are joined, the most alike first
    (`region_merging`), as long as a difference that matters would be seen.
 4. A cell whose own ratio is too uncertain, as where nothing moved, joins a neighbour towards which
@@ -174,11 +172,9 @@ def _check(result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolut
     if names != wanted:
         raise ValueError(f"Invalid bands {names} of the result. Must be the capture's, {wanted}.")
     for dim in ("y", "x"):
-        if result.sizes[dim] != corrected.sizes[dim]:
-            raise ValueError(
-                f"Invalid size {result.sizes[dim]} of '{dim}' of the result. "
-                f"Must be the capture's, {corrected.sizes[dim]}."
-            )
+        size, rule = result.sizes[dim], f"the capture's, {corrected.sizes[dim]}"
+        if size != corrected.sizes[dim]:
+            raise ValueError(f"Invalid size {size} of '{dim}' of the result. Must be {rule}.")
 
 
 def _longest_segment(corrected: xr.Dataset) -> Mask:

@@ -75,7 +75,7 @@ def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     known, covered = error.notnull(), abs(error) < result["object_temperature_std"]
     within = (of_emissivity < result["emissivity_std"]).where(of_emissivity.notnull())
     pixels = ("y", "x")
-    found = {
+    scores = {
         "object_temperature_rmse": ((error**2).mean("time") ** 0.5).median(pixels),
         "emissivity_error": of_emissivity.median(pixels),
         "object_coverage": covered.where(known).mean(),
@@ -87,7 +87,7 @@ def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(
         {
             name: value.reset_coords(drop=True).assign_attrs(units=units.get(name, "1"))
-            for name, value in found.items()
+            for name, value in scores.items()
         }
     )
 
@@ -106,8 +106,8 @@ def efficiency(
     functions = smooth.polynomial_basis(truth["time"].values, order)
     pair = (float(emissivity[0]), float(emissivity[1]))
     bound = np.sqrt(limits.ratio_variance(pair, noise, background, functions))
-    found = limits.reflection_ratio(result["emissivity"].values.reshape(2, -1))
-    scaled = (found - limits.reflection_ratio(emissivity)) / bound
+    ratio = limits.reflection_ratio(result["emissivity"].values.reshape(2, -1))
+    scaled = (ratio - limits.reflection_ratio(emissivity)) / bound
     scaled = scaled[np.isfinite(scaled)]
     return float(np.diff(np.quantile(scaled, [0.1587, 0.8413]))[0] / 2)
 

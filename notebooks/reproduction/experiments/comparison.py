@@ -24,18 +24,7 @@ class Plate:
     """
     Size of the scene of `compare`.
 
-    Attributes
-    ----------
-    frames : int
-        Number of frames.
-    rate : float
-        Frame rate [Hz].
-    shape : sequence of int
-        Rows and columns.
-    crossings : int
-        Number of people who walk by.
-    bands : tuple of str
-        Names of the two bands.
+    Frames, their rate [Hz], rows and columns, number of people who walk by, names of the two bands.
     """
 
     frames: int = 350
@@ -57,30 +46,11 @@ def compare(
     """
     Errors of several methods on one simulated scene: a heated plate, people walking by.
 
-    The scene is an image, for methods that use a pixel's neighbours. All are scored on the same
-    pixels, drawn from those in which the reflection varies by more than `MOVING`; methods that
-    treat each pixel alone get these only. The noise is known to all.
-
-    Parameters
-    ----------
-    emissivity : sequence of float
-        Emissivity of the plate in the two bands [1].
-    noise : sequence of float
-        Standard deviation of the two bands' signals [K].
-    variants : mapping
-        Label -> `method` of `separation.solve` and fields of its settings; "calibrated" gets the
-        true emissivities.
-    plate : mapping
-        Fields of `Plate`.
-    pixels : int
-        Number of pixels that are scored.
-    seed : int
-        Seed of scene, noise, pixels and random starts.
-
-    Returns
-    -------
-    Dataset
-        Variables of `judge` (variant, ...).
+    The scene, of the fields of `Plate`, is an image, for methods that use a pixel's neighbours. All
+    variants (label -> `method` of `separation.solve` and fields of its settings) are scored on the
+    same number of pixels, drawn from those in which the reflection varies by more than `MOVING`;
+    methods that treat each pixel alone get these only. The noise of the two bands [K] is known to
+    all, the emissivities [1] to "calibrated" alone. Variables of `judge` over (variant, ...).
     """
     rng, settings = np.random.default_rng(seed), Plate(**plate)
     rig = Rig(bands=settings.bands, noise=tuple(noise))
@@ -96,9 +66,9 @@ def compare(
     rows = []
     for options in variants.values():
         whole = separation.get_method(options["method"]).whole_image
-        given, seen = images if whole else strips
-        found = separation.solve(seen, response, seed=seed, **_known(given, options))
-        rows.append(judge(truth, _strip(found, chosen) if whole else found))
+        truth_seen, seen = images if whole else strips
+        result = separation.solve(seen, response, seed=seed, **_known(truth_seen, options))
+        rows.append(judge(truth, _strip(result, chosen) if whole else result))
     label = xr.DataArray(list(variants), dims="variant", name="variant")
     together = xr.concat(rows, dim=label, coords="minimal", compat="override")
     return together.assign_attrs(origin="simulated", seed=seed)
@@ -113,14 +83,14 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     """
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     of_emissivity = abs(result["emissivity"] - truth["emissivity"])
-    found = {
+    errors = {
         "object_temperature_rmse": (squared.mean("time", skipna=False) ** 0.5).assign_attrs(
             units="K"
         ),
         "emissivity_error": of_emissivity.assign_attrs(units="1"),
         "status": result["status"],
     }
-    flat = xr.Dataset(found).isel(y=0).rename(x="pixel")
+    flat = xr.Dataset(errors).isel(y=0).rename(x="pixel")
     return flat.drop_vars(["y", "pixel"], errors="ignore")
 
 
@@ -155,13 +125,13 @@ def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
 def _choose(scene: xr.Dataset, pixels: int, rng: np.random.Generator) -> np.ndarray:
     """Flat indices of pixels in which the background moves, drawn without replacement."""
     moving = scene["background_temperature"].std("time").values.ravel() > MOVING
-    there = np.flatnonzero(moving)
-    if there.size < pixels:
+    candidates = np.flatnonzero(moving)
+    if candidates.size < pixels:
         raise ValueError(
-            f"Invalid number of pixels {pixels}. Must be at most {there.size}, those in which the "
-            f"background moves by {MOVING} K."
+            f"Invalid number of pixels {pixels}. Must be at most {candidates.size}, those in which "
+            f"the background moves by {MOVING} K."
         )
-    return np.sort(rng.choice(there, pixels, replace=False))
+    return np.sort(rng.choice(candidates, pixels, replace=False))
 
 
 def _strip(dataset: xr.Dataset, chosen: np.ndarray) -> xr.Dataset:
@@ -174,10 +144,10 @@ def _strip(dataset: xr.Dataset, chosen: np.ndarray) -> xr.Dataset:
 
 def _known(scene: xr.Dataset, options: Options) -> dict[str, Any]:
     """Arguments of `solve`, with the true emissivities for a method that must know them."""
-    given = arguments(options)
+    known = arguments(options)
     if separation.get_method(options["method"]).knows_emissivity:
-        given["emissivity"] = scene["emissivity"]
-    return given
+        known["emissivity"] = scene["emissivity"]
+    return known
 
 
 def arguments(variant: Options) -> dict[str, Any]:

@@ -14,18 +14,9 @@ class Bench(World):
     """
     An emulated bench whose thermometers have errors, and whose samples are heated.
 
-    Parameters
-    ----------
-    rng : Generator
-        Source of the errors, and of the samples' temperatures.
-    reading_std : mapping
-        Standard deviation of one reading [K] of the names in `thermocouples`; others have no error.
-    samples : mapping, optional
-        Sample to the lowest and highest temperature to which it is heated [K].
-    touched : mapping, optional
-        Other objects of thermocouples, to their temperature (time) [K] over the scene's time [s].
-    **world
-        As for `World`.
+    By name: standard deviations of one reading [K], 0 for others; lowest and highest temperature to
+    which a sample is heated [K]; temperature (time) [K], over the scene's time [s], of other
+    objects that a thermocouple touches. The rest as for `World`.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Frames of the emulated rig's cameras, from the simulation and with its truth.
 
-The frames of `Views` are mixed, and given noise, fixed pattern and 16 bits, one by one when a
+The frames of `Views` are mixed, with noise, fixed pattern and 16 bits, one by one when a
 camera takes them, from the temperatures that the emulated world has at that moment. Everything
 here is simulated.
 """
@@ -35,16 +35,7 @@ class Views:
     """
     Views of the cameras of a simulated rig.
 
-    Attributes
-    ----------
-    rig : Rig
-        The rig.
-    detector : Dataset
-        From `simulation.pattern`.
-    seed : int
-        Seed of the noise.
-    response : Dataset
-        The rig's.
+    Of a rig, a detector from `simulation.pattern`, and the seed of the noise.
     """
 
     rig: Rig
@@ -70,8 +61,8 @@ class Views:
         """
         looks = {}
         for band, curve in self._curves().items():
-            own = {name: float(emissivity.sel(material=name, band=band)) for name in places}
-            looks[band] = _bench(world, curve, own, places, self._shape)
+            values = {name: float(emissivity.sel(material=name, band=band)) for name in places}
+            looks[band] = _bench(world, curve, values, places, self._shape)
         return self._pictures(looks)
 
     def movie(self, scene: xr.Dataset) -> dict[str, Picture]:
@@ -153,13 +144,13 @@ def shown(scene: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
     Raises a ValueError if the capture begins before the scene, or goes on after it.
     """
     times = capture["time"] + (capture.attrs["clock_origin"] - scene.attrs["began"])
-    found = scene.interp(time=times.values, assume_sorted=True).assign_coords(time=capture["time"])
-    if bool(found["object_temperature"].isnull().any()):
+    truth = scene.interp(time=times.values, assume_sorted=True).assign_coords(time=capture["time"])
+    if bool(truth["object_temperature"].isnull().any()):
         raise ValueError(
             f"Invalid times {float(times[0])} to {float(times[-1])} s of the scene. "
             f"Must lie in {float(scene['time'][0])} to {float(scene['time'][-1])} s."
         )
-    return found
+    return truth
 
 
 def keep_truth(folder: Path, record: Mapping[str, Any], **truth: xr.Dataset) -> None:
@@ -170,8 +161,8 @@ def keep_truth(folder: Path, record: Mapping[str, Any], **truth: xr.Dataset) -> 
 
 def truth(folder: Path) -> dict[str, xr.Dataset]:
     """Open the truth that `keep_truth` left, by name; empty for recordings of hardware."""
-    found = sorted(folder.glob(f"{_TRUTH}*.zarr"))
-    return {path.stem.removeprefix(_TRUTH): store.open_dataset(path).load() for path in found}
+    paths = sorted(folder.glob(f"{_TRUTH}*.zarr"))
+    return {path.stem.removeprefix(_TRUTH): store.open_dataset(path).load() for path in paths}
 
 
 def clear(folder: Path) -> None:

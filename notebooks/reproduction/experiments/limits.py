@@ -53,20 +53,9 @@ def near_bound(
     - "rest": `limits.bounds` that know in which frames the background rests, which the method does
       not.
 
-    Parameters
-    ----------
-    emissivity : sequence of float
-        Emissivity of the bands [1].
-    noise : sequence of float
-        Standard deviation of the bands' signals [K].
-    bands : sequence of str
-        Their names; the first is the reference of the ratio and must be the quietest.
-    ends : sequence of float
-        First and last temperature of the object [degree Celsius].
-    clock : sequence of float
-        Number of frames, and their rate [Hz].
-    pixels, seed : int
-        Number of pixels; seed of the random numbers.
+    Emissivity [1] and noise [K] are of the bands, of which the first is the reference of the ratio
+    and must be the quietest; `ends` are the first and last temperature of the object [degree
+    Celsius], `clock` the number of frames and their rate [Hz].
 
     Returns
     -------
@@ -91,13 +80,13 @@ def near_bound(
     )
     second = (1.0 - truth["emissivity"]) / (1.0 - truth["emissivity"].isel(band=0))
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
-    found = {
+    measured = {
         "reflection_ratio_error": (result["reflection_ratio"] - second).isel(band=1),
         "reflection_ratio_bound": told["reflection_ratio_std"].isel(band=1),
         "object_temperature_error": squared.mean("time", skipna=False) ** 0.5,
         "object_temperature_bound": (told["object_temperature_std"] ** 2).mean("time") ** 0.5,
     }
-    flat = {name: _row(part.where(known), name) for name, part in found.items()}
+    flat = {name: _row(part.where(known), name) for name, part in measured.items()}
     return xr.Dataset(flat | {"status": _row(result["status"], "status")}).assign_attrs(
         origin="simulated", seed=seed
     )
@@ -141,10 +130,9 @@ def pooled(
     r"""
     Error of the reflection ratio in groups of pixels that are known to be of one material.
 
-    All pixels are of one material, in groups of a size that share their ratio; size 1 is no
+    All pixels are of one material, in whole groups of a size that share their ratio; 1 is no
     pooling. The error of a group should fall as :math:`1/\sqrt{n}` down to the bias that all pixels
-    share. Other parameters as for `near_bound`; the bands are those of the default `Rig`. The scene
-    does not depend on the size.
+    share. Other parameters as for `near_bound`, of the default `Rig`.
 
     Returns
     -------
@@ -153,11 +141,6 @@ def pooled(
         groups, and `reflection_ratio_bound`, a single pixel's ("slope") over :math:`\sqrt{n}`;
         `object_temperature_error` [K], root mean square over pixels and time; `stated` [1], the
         separation's own standard deviation of the ratio, root mean square; `flagged` [1].
-
-    Raises
-    ------
-    ValueError
-        If the pixels do not come in whole groups.
     """
     if size < 1 or pixels % size:
         raise ValueError(f"Invalid size {size} of a group. Must divide the {pixels} pixels.")
@@ -172,17 +155,19 @@ def pooled(
         - limits.reflection_ratio(list(emissivity)).item(),
         "stated": result["reflection_ratio_std"],
     }
-    # The median, for a pixel that the separation leaves out of its group keeps a ratio of its own.
-    found = {
+    # The median, for a pixel that the separation excludes from its group keeps a separate ratio.
+    measured = {
         name: _rms(_row(part.isel(band=1).coarsen(x=size).median(), "reflection_ratio"))
         for name, part in of_groups.items()
     }
     single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
     error = result["object_temperature"] - truth["object_temperature"]
-    found["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
-    found["object_temperature_error"] = _rms(error.stack(pixel=error.dims)).assign_attrs(units="K")
-    found["flagged"] = (result["status"] != 0).mean().assign_attrs(units="1")
-    return xr.Dataset(found).drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
+    measured["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
+    measured["object_temperature_error"] = _rms(error.stack(pixel=error.dims)).assign_attrs(
+        units="K"
+    )
+    measured["flagged"] = (result["status"] != 0).mean().assign_attrs(units="1")
+    return xr.Dataset(measured).drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
 
 
 def stressed(
@@ -224,16 +209,16 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
     frequent in their panel; `bleeding` [1], number of labels that are on both sides of a border,
     that far from it. Raises a ValueError if the images differ in size, or there is one panel only.
     """
-    found, panels = labels.values, np.unique(truth.values)
-    if found.shape != truth.shape or panels.size < 2:
+    estimate, panels = labels.values, np.unique(truth.values)
+    if estimate.shape != truth.shape or panels.size < 2:
         raise ValueError(
-            f"Invalid images of {found.shape} and {truth.shape} pixels, {panels.size} panels. "
+            f"Invalid images of {estimate.shape} and {truth.shape} pixels, {panels.size} panels. "
             "Must be alike, of two panels or more."
         )
-    distance = np.zeros(found.shape)
+    distance = np.zeros(estimate.shape)
     for panel in panels:
         distance += distance_transform_edt(truth.values == panel)
-    inner = [found[(truth.values == panel) & (distance > BORDER)] for panel in panels]
+    inner = [estimate[(truth.values == panel) & (distance > BORDER)] for panel in panels]
     right = sum(int(np.bincount(part[part >= 0], minlength=1).max()) for part in inner)
     sides = [set(np.unique(part[part >= 0])) for part in inner]
     bleeding = sum(sum(label in side for side in sides) > 1 for label in set().union(*sides))

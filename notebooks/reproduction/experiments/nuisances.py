@@ -41,18 +41,8 @@ class Pixels:
     """
     Independent pixels of one material before a moving background.
 
-    Attributes
-    ----------
-    emissivity : sequence of float
-        Emissivity in the two bands of the default `Rig` [1].
-    ends : sequence of float
-        First and last temperature of the object [K].
-    clock : sequence of float
-        Number of frames, and their rate [Hz].
-    pixels : int
-        Number of pixels.
-    background : mapping
-        Fields of `simulation.Background`.
+    Emissivity in the two bands of the default `Rig` [1]; first and last temperature of the object
+    [K]; number of frames and their rate [Hz]; number of pixels; fields of `simulation.Background`.
     """
 
     emissivity: Sequence[float] = GLASS
@@ -98,36 +88,22 @@ def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
         ).drop_vars("exposure_time")
         for offsets in ((0, later), (later, later))
     ]
-    found = alignment.time_offset(captures[0])
-    aligned = alignment.align(captures[0], offset=found)
+    offset = alignment.time_offset(captures[0])
+    aligned = alignment.align(captures[0], offset=offset)
     result = _compare(scene, (captures[0], aligned, captures[1]), response, TREATMENTS)
     frame = {"units": "frame", "long_name": "time offset of the second band"}
-    return result.assign(found=((), found * kind.clock[1], frame))
+    return result.assign(found=((), offset * kind.clock[1], frame))
 
 
 def disturbed(
     name: str, *, pixels: Mapping[str, Any], nuisance: Mapping[str, Any], seed: int
 ) -> xr.Dataset:
     """
-    A nuisance put into a capture, and marked.
+    A nuisance, one of `NUISANCES`, put into a capture, and marked by `correction.mark_shutter`.
 
-    Parameters
-    ----------
-    name : {"lost frames", "shutter", "lost frames and shutter"}
-        The nuisance: a share of each band's frames lost, the driver returning the previous one;
-        or both cameras' shutters closing.
-    pixels : mapping
-        Fields of `Pixels`.
-    nuisance : mapping
-        `share` of the frames lost [1]; `shutter`, times of its closing, as shares of the capture
-        [1].
-    seed : int
-        Seed of scene, noise and nuisance.
-
-    Returns
-    -------
-    Dataset
-        Over `treatment`, the variables of `cost`; "undone" is by `correction.mark_shutter`.
+    Lost are a `share` of each band's frames [1], the driver returning the previous one; both
+    cameras' shutters close at `shutter`, times as shares of the capture [1]. `pixels` are fields of
+    `Pixels`. Over `treatment`, the variables of `cost`.
     """
     if name not in NUISANCES:
         raise ValueError(f"Unknown nuisance '{name}'. Must be one of {NUISANCES}.")
@@ -156,36 +132,13 @@ def parallax(
 
     A plate of glass, heated in its middle, people walking by; a second camera sees the plate
     shifted, and its reflection shifted by some pixels more. A registration (translation) brings
-    the plate together and leaves the reflection apart.
+    the plate together and leaves the reflection apart by a distance along x [pixel], a multiple of
+    1 / `COLUMNS`. The clock is the number of frames and their rate [Hz]; the shift is how far the
+    second camera looks to the right, a multiple of 1 / `COLUMNS`, and down, a whole number [pixel];
+    together they stay within the margin of the scene, 12 pixels (ValueError).
 
-    Parameters
-    ----------
-    distance : float
-        Distance of the reflections in the registered views, along x [pixel]; a multiple of
-        1 / `COLUMNS`.
-    shape : sequence of int
-        Rows and columns.
-    clock : sequence of float
-        Number of frames, and their rate [Hz].
-    shift : sequence of float
-        How far the second camera looks to the right, a multiple of 1 / `COLUMNS`, and down, a
-        whole number [pixel].
-    seed : int
-        Seed of scene and noise.
-
-    Returns
-    -------
-    Dataset
-        `misregistered` [pixel], distance of the transform by `registration.register` from the true
-        one; and over `treatment`, one of `VIEWS`, the variables of `cost`.
-
-    Raises
-    ------
-    ImportError
-        If OpenCV is not installed.
-    ValueError
-        If a shift or the parallax is not such a multiple, or they are beyond the margin of the
-        scene, 12 pixels together.
+    `misregistered` [pixel], distance of the transform by `registration.register` from the true one;
+    and over `treatment`, one of `VIEWS`, the variables of `cost`.
     """
     places = np.array([COLUMNS * shift[0], COLUMNS * distance, shift[1]])
     if np.any(places % 1) or max(abs(shift[0]) + abs(distance), abs(shift[1])) > _MARGIN:
@@ -198,14 +151,16 @@ def parallax(
         _two_views(wide, moved, more, known, np.random.default_rng(seed + 1))
         for moved, more in ((shift, distance), ((0.0, 0.0), 0.0))
     )
-    found = alignment.register(capture, model="translation")
-    true = found.copy(data=np.stack([np.eye(3), np.eye(3)]))
+    estimate = alignment.register(capture, model="translation")
+    true = estimate.copy(data=np.stack([np.eye(3), np.eye(3)]))
     true[1, :2, 2] = -np.array(shift)
-    captures = [alignment.align(capture, offset=0.0, transform=matrix) for matrix in (found, true)]
+    captures = [
+        alignment.align(capture, offset=0.0, transform=matrix) for matrix in (estimate, true)
+    ]
     # Bilinear interpolation lowers the noise of a view: it is taken from the capture.
     response = known.drop_vars(["noise", "netd"])
     result = _compare(_view(wide, (0.0, 0.0)), (*captures, single), response, VIEWS)
-    away = float(np.hypot(*(found - true).values[1, :2, 2]))
+    away = float(np.hypot(*(estimate - true).values[1, :2, 2]))
     return result.assign(misregistered=((), away, {"units": "pixel"}))
 
 

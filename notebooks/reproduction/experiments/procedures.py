@@ -34,32 +34,17 @@ def compare_procedures(
     """
     Statistics of many measurements of objects on the bench and by the reflector method.
 
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    rng : Generator
-        Source of the errors; a series' common errors are drawn anew each time.
-    bench : Bench, optional
-        Steps and errors; by default those of `Bench`.
-    samples : tuple of Sample
-        The objects.
-    repeats : int
-        Series of each, two or more.
-
-    Returns
-    -------
-    Dataset
-        `true` (object, band); over (object, procedure, band): `mean` of the estimates, their
-        standard deviation `spread`, their root mean square `error` and `largest` error, root mean
-        square `stated` of the stated standard deviations, and `coverage`, the share of errors
-        within one, 0.68 for a calibrated uncertainty [1].
+    A series' common errors are drawn anew for each of two or more repeats. `true` (object, band);
+    over (object, procedure, band): `mean` of the estimates, their standard deviation `spread`,
+    their root mean square `error` and `largest` error, root mean square `stated` of the stated
+    standard deviations, and `coverage`, the share of errors within one, 0.68 for a calibrated
+    uncertainty [1].
     """
     true, here = _true(response, samples, repeats), Bench() if bench is None else bench
-    found = np.array(
+    estimates = np.array(
         [[_measured(response, sample, here, rng) for _ in range(repeats)] for sample in samples]
     )  # (object, repeat, value or deviation, procedure, band)
-    value, std = found[:, :, 0], found[:, :, 1]
+    value, std = estimates[:, :, 0], estimates[:, :, 1]
     error = value - true.values[:, np.newaxis, np.newaxis]
     statistics = {
         "mean": value.mean(axis=1),
@@ -135,8 +120,8 @@ def _by_reflector(
     """Emissivity (band,) of one series by the reflector method, and its deviation."""
     series = reflector_series(response, sample, bench, rng)
     stds = (bench.reading_std, bench.foil_std)
-    found = calibration.reflector_emissivity(series, response, stds, bench.bias(sample))
-    return found["emissivity"].values, found["emissivity_std"].values
+    estimates = calibration.reflector_emissivity(series, response, stds, bench.bias(sample))
+    return estimates["emissivity"].values, estimates["emissivity_std"].values
 
 
 def _measured(
@@ -146,5 +131,5 @@ def _measured(
     bias, stds = bench.bias(sample), (bench.reading_std, bench.blackbody_std)
     series = bench_series(response, sample, bench, rng)
     fits = [calibration.fit_emissivity(series, response, stds, *known) for known in ((bias,), ())]
-    found = [(fit["emissivity"].values, fit["emissivity_std"].values) for fit in fits]
-    return np.stack([*found, _by_reflector(response, sample, bench, rng)], axis=1)
+    estimates = [(fit["emissivity"].values, fit["emissivity_std"].values) for fit in fits]
+    return np.stack([*estimates, _by_reflector(response, sample, bench, rng)], axis=1)

@@ -54,16 +54,16 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
         - `bad_pixels` (kind): their number; `bad_flagged` (kind): share of them with a flag;
         - `status` (pixel), and `bad` (kind, pixel), true where bad.
     """
-    found = {**_coverage(truth, result), **_flags(result["status"])}
+    statistics = {**_coverage(truth, result), **_flags(result["status"])}
     bad, flagged = _bad(truth, result), _flat(result["status"] != 0)
-    found |= {
+    statistics |= {
         "width": _width(truth, result),
         "bad_pixels": bad.sum("pixel"),
         "bad_flagged": _share(flagged, bad, ("pixel",)),
         "status": _flat(result["status"]),
         "bad": bad,
     }
-    units = {name: value.assign_attrs(units="1") for name, value in found.items()}
+    units = {name: value.assign_attrs(units="1") for name, value in statistics.items()}
     errors = score(truth, result)[["object_temperature_rmse", "emissivity_error"]]
     return xr.Dataset(units).merge(errors).assign_attrs(origin="simulated")
 
@@ -83,13 +83,13 @@ def _coverage(truth: xr.Dataset, result: xr.Dataset) -> dict[str, xr.DataArray]:
     """Share of 95 % intervals that hold the truth, among the unflagged and among all."""
     label = xr.DataArray(list(AMONG), dims="among", coords={"among": list(AMONG)})
     chosen = (result["status"] == 0) | (label == "all")
-    found = {}
+    statistics = {}
     for name, over in (("object", ("time", *_PIXELS)), ("emissivity", _PIXELS)):
         full = "object_temperature" if name == "object" else name
         error, std = abs(result[full] - truth[full]), result[f"{full}_std"]
         counted = error.notnull() & chosen
-        found[f"{name}_coverage"] = _share(error < INTERVAL * std, counted, over)
-    return found
+        statistics[f"{name}_coverage"] = _share(error < INTERVAL * std, counted, over)
+    return statistics
 
 
 def _width(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:

@@ -31,25 +31,10 @@ def judge_twin(
     """
     Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
 
-    Parameters
-    ----------
-    name : str
-        One of `twins.TWINS` with a thermocouple.
-    seed : int
-        Seed of all motion, noise and errors.
-    variants : mapping
-        See `at_thermocouple`; "calibrated" gets the emissivities that the bench found for a
-        piece of the same material, with their deviations.
-    material : str
-        Material of `emissivity.embedded_table`.
-    shape : sequence of int
-        Rows and columns.
-    frames : int
-        Number of frames.
-    rate : float
-        Frame rate [Hz].
-    baseline : float
-        Distance of the two cameras [m].
+    One of `twins.TWINS`, of a material of `emissivity.embedded_table`, of rows and columns, frames
+    and their rate [Hz], by two cameras a baseline apart [m]. Of the variants (see
+    `at_thermocouple`), "calibrated" gets the emissivities that the bench finds for a piece of the
+    same material, with their deviations.
 
     Returns
     -------
@@ -68,17 +53,17 @@ def judge_twin(
     corrected = simulation.observe(scene, response, rng)
     fit = on_bench(response, material, rng)
     known = {"emissivity": fit["emissivity"], "emissivity_std": fit["emissivity_std"]}
-    given = {
+    informed = {
         label: {**options, **(known if options["method"] == "calibrated" else {})}
         for label, options in variants.items()
     }
-    found = separation.solve(corrected, response)
-    good = (found["status"] == 0) & scene["on_object"]
-    apart = abs(found["emissivity"] - fit["emissivity"]).where(good).mean(("y", "x"))
+    separated = separation.solve(corrected, response)
+    good = (separated["status"] == 0) & scene["on_object"]
+    apart = abs(separated["emissivity"] - fit["emissivity"]).where(good).mean(("y", "x"))
     background = scene["background_temperature"]
     first = background.isel(band=0) if "band" in background.dims else background
     moving = (first.std("time") > MOVING) & scene["on_object"]
-    result = at_thermocouple(scene, corrected, response, given, rng)
+    result = at_thermocouple(scene, corrected, response, informed, rng)
     return result.assign(
         emissivity_difference=apart.assign_attrs(units="1"),
         good=((good & moving).sum() / moving.sum()).assign_attrs(units="1"),
@@ -107,20 +92,10 @@ def at_thermocouple(
     Errors of several methods at the first thermocouple of a twin.
 
     The estimate is the mean over the pixels that the bead covers. The reading has the errors of a
-    probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew many times,
-    so that the result does not depend on one probe's error.
-
-    Parameters
-    ----------
-    scene, corrected, response : Dataset
-        The twin, its capture, and the response of the cameras.
-    variants : mapping
-        Label -> `method` of `separation.solve` and its arguments. Methods that treat each pixel
-        alone get the bead's pixels only.
-    rng : Generator
-        Source of the probes' errors.
-    probes : int
-        Number of probes that are drawn.
+    probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
+    number of probes, so that the result does not depend on one probe's error. Variants are label ->
+    `method` of `separation.solve` and its arguments; methods that treat each pixel alone get the
+    bead's pixels only.
 
     Returns
     -------
@@ -136,12 +111,12 @@ def at_thermocouple(
         for _ in range(probes)
     ]
     seed = int(rng.integers(2**32))  # of random starts: each capture has its own
-    found = [
+    estimates = [
         _mean(corrected, response, square, {"seed": seed, **variant})
         for variant in variants.values()
     ]
     label = xr.DataArray(list(variants), dims="variant", name="variant")
-    temperature = xr.concat(found, dim=label)
+    temperature = xr.concat(estimates, dim=label)
     errors = [metrics.relative_error_celsius(temperature, reading) for reading in readings]
     highest = np.median([float(reading.max()) for reading in readings]) - zero_Celsius
     return xr.Dataset(
@@ -172,12 +147,12 @@ def _mean(
     seen = corrected
     if not separation.get_method(variant["method"]).whole_image:
         seen = corrected.isel(square)
-    found = separation.solve(seen, response, **arguments(variant))["object_temperature"]
-    part = found.isel(square) if found.sizes == corrected["counts"][0].sizes else found
+    estimates = separation.solve(seen, response, **arguments(variant))["object_temperature"]
+    part = estimates.isel(square) if estimates.sizes == corrected["counts"][0].sizes else estimates
     return part.mean(("y", "x"), skipna=False)
 
 
-def share(found: xr.DataArray, cause: xr.DataArray) -> float:
+def share(estimate: xr.DataArray, cause: xr.DataArray) -> float:
     r"""
     Share of a change that another one holds: the slope of a regression through their means [1].
 
@@ -186,8 +161,8 @@ def share(found: xr.DataArray, cause: xr.DataArray) -> float:
     with a the first (time, y, x) and b its cause, each less its mean over time, over all samples in
     which the first is known, in one unit. Raises a ValueError if the cause does not change there.
     """
-    a, b = (part - part.where(found.notnull()).mean("time") for part in (found, cause))
-    power = float((b**2).where(found.notnull()).sum())
+    a, b = (part - part.where(estimate.notnull()).mean("time") for part in (estimate, cause))
+    power = float((b**2).where(estimate.notnull()).sum())
     if not power > 0:
-        raise ValueError("Invalid cause without change where anything was found. Must change.")
+        raise ValueError("Invalid cause without change where anything was estimated. Must change.")
     return float((a * b).sum()) / power

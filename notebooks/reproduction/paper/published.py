@@ -81,9 +81,9 @@ class Row:
 
     def ours(self, numbers: Numbers) -> dict[str, float]:
         """Numbers measured here, by label or name; without those that were not measured."""
-        found = numbers.get(self.stem, {})
+        measured = numbers.get(self.stem, {})
         pairs = zip(self.labels or self.names, self.names, strict=True)
-        return {label: float(found[name]) for label, name in pairs if name in found}
+        return {label: float(measured[name]) for label, name in pairs if name in measured}
 
     def verdict(self, numbers: Numbers) -> str:
         """
@@ -92,19 +92,19 @@ class Row:
         "agrees", "better", "worse" or "differs", of a twin with a note that says so, since theirs
         cannot be checked; "not measured"; or the row's note.
         """
-        found = self.ours(numbers)
-        if len(found) < len(self.names):
+        values = self.ours(numbers)
+        if len(values) < len(self.names):
             return "not measured"
         if self.judged == "lowest":
             return (
-                "agrees" if min(found, key=lambda label: found[label]) == self.note else "differs"
+                "agrees" if min(values, key=lambda label: values[label]) == self.note else "differs"
             )
         if self.judged == "alike":
-            first, second = found.values()
+            first, second = values.values()
             return "agrees" if second < self.within * first else "differs"
         if self.published is None or self.judged == "no":
             return self.note
-        word = self._word(next(iter(found.values())), self.published)
+        word = self._word(next(iter(values.values())), self.published)
         return word + _ON_A_TWIN * (self.data == TWIN)
 
     def _word(self, ours: float, theirs: float) -> str:

@@ -23,10 +23,10 @@ _PERCENT: Final = "%"
 def compare(numbers: Numbers) -> Iterator[tuple[str, ...]]:
     """Cells of `COLUMNS` for every published number beside ours."""
     for row in rows():
-        found = row.ours(numbers)
+        values = row.ours(numbers)
         texts = [
             f"{label} {_text(value, row.unit)}" if row.labels else _text(value, row.unit)
-            for label, value in found.items()
+            for label, value in values.items()
         ]
         paper = "-" if row.published is None else f"{row.published:g}{_after(row.unit)}"
         here = ", ".join(texts) or "-"

@@ -39,29 +39,10 @@ def __dir__() -> list[str]:
 
 def twin(name: str, capture: Capture, rng: np.random.Generator, **options: Any) -> xr.Dataset:
     """
-    Scene of a twin.
+    Scene (see `take`) of a twin of `TWINS`, with attribute `twin`.
 
-    Parameters
-    ----------
-    name : str
-        One of `TWINS`.
-    capture : Capture
-        Emissivity of the object, shape, times, baseline of the cameras.
-    rng : Generator
-        Source of all motion.
-    **options
-        Options of the twin's own function: `visitor` of "fingerprint", `scan` of "bunny".
-
-    Returns
-    -------
-    Dataset
-        From `take`: a scene for `simulation.observe`, with `origin = "simulated"` and the
-        attribute `twin`.
-
-    Raises
-    ------
-    ValueError
-        If the name is unknown.
+    The rng is the source of all motion; options are `visitor` of "fingerprint" and `scan` of
+    "bunny".
     """
     if name not in TWINS:
         raise ValueError(f"Unknown twin '{name}'. Must be one of {[*TWINS]}.")

@@ -21,19 +21,10 @@ class Pane:
     """
     An upright plate of glass in the plane y = 0, and the air on both of its sides.
 
-    Attributes
-    ----------
-    width, height : float
-        Size [m].
-    thickness : float
-        Thickness [m].
-    spacing : float
-        Distance of the vertices [m].
-    air : float
-        Coefficient to still air [W m^-2 K^-1]; 2 to 25 for free convection in gases, table 1.1
-        of Bergman et al. (2011), Fundamentals of Heat and Mass Transfer.
-    emissivity : float
-        Total hemispherical emissivity of glass [1], for its radiation alone: about 0.9.
+    Size, thickness and distance of the vertices [m]. The coefficient to still air [W m^-2 K^-1] is
+    one of free convection in gases, 2 to 25, table 1.1 of Bergman et al. (2011), Fundamentals of
+    Heat and Mass Transfer; the total hemispherical emissivity of glass, about 0.9, is for its
+    radiation.
     """
 
     width: float = 0.36
@@ -61,17 +52,9 @@ class Gun:
     """
     A hot-air gun behind the plate.
 
-    Attributes
-    ----------
-    temperature : float
-        Temperature of the jet where it meets the plate [K].
-    coefficient : float
-        Coefficient of its heat transfer in the middle [W m^-2 K^-1]; 25 to 250 for forced
-        convection in gases, table 1.1 of Bergman et al. (2011).
-    radius : float
-        Standard deviation of its Gaussian spot [m].
-    start, rise : float
-        Time at which it is half near, and time in which it is brought near [s].
+    Temperature of the jet at the plate [K]; coefficient in the middle [W m^-2 K^-1], 25 to 250 for
+    forced convection in gases, table 1.1 of Bergman et al. (2011); standard deviation of its
+    Gaussian spot [m]; time at which it is half near, and time in which it is brought near [s].
     """
 
     temperature: float = 423.15
@@ -198,15 +181,9 @@ class Touch:
     """
     Skin pressed on an object before the capture.
 
-    Attributes
-    ----------
-    start, duration : float
-        Beginning and length of the contact [s]; over before the capture starts at 0.
-    skin : float
-        Temperature of the skin [K].
-    contact : float
-        Conductance from the warm tissue to the surface [W m^-2 K^-1]: some 1 mm of outer skin
-        of 0.2 to 0.3 W m^-1 K^-1.
+    Beginning and length of the contact [s], over before the capture starts at 0; temperature of the
+    skin [K]; conductance from the warm tissue to the surface [W m^-2 K^-1]: some 1 mm of outer skin
+    of 0.2 to 0.3 W m^-1 K^-1.
     """
 
     start: float = -6.0

@@ -26,14 +26,7 @@ class Route:
     """
     Walk over the floor in straight lines, at a steady pace between its stops.
 
-    Attributes
-    ----------
-    times : ndarray, shape (stop,)
-        Time at each stop [s], increasing; two or more.
-    places : ndarray, shape (stop, 2)
-        x and y of each stop [m].
-    stride : float
-        Length of a step [m].
+    Times at the stops [s], two or more; x and y of each (stop, 2) [m]; length of a step [m].
     """
 
     times: Array
@@ -89,16 +82,8 @@ class Build:
     """
     Measures and temperatures of a person, who stands with the feet at z = 0 and walks along x.
 
-    Attributes
-    ----------
-    shoulder, hip, crown : float
-        Heights [m].
-    breadth : float
-        From shoulder to shoulder [m].
-    skin, hand, clothes : float
-        Temperatures of the face, the hands and the clothes [K].
-    swing : float
-        Largest angle of legs and arms [rad].
+    Heights of shoulder, hip and crown, and breadth from shoulder to shoulder [m]; temperatures of
+    face, hands and clothes [K]; largest angle of legs and arms [rad].
     """
 
     shoulder: float = 1.42
@@ -144,16 +129,7 @@ def _walking(part: Actor, route: Route, floor: float, joint: float, swing: float
 
 @dataclass(frozen=True)
 class Finger:
-    """
-    Finger of a flat hand in the plane y = 0.
-
-    Attributes
-    ----------
-    root, tip : tuple of float
-        x and z of its two ends [m].
-    radius : float
-        Half its thickness [m].
-    """
+    """Finger of a flat hand in the plane y = 0: x and z of its ends, half its thickness [m]."""
 
     root: tuple[float, float]
     tip: tuple[float, float]

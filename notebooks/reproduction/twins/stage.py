@@ -66,20 +66,8 @@ class Stage:
     """
     Object, camera and surroundings of a twin.
 
-    Attributes
-    ----------
-    name : str
-        Name of the twin.
-    mesh : trimesh.Trimesh
-        The object [m].
-    temperature : ndarray, shape (time, vertex)
-        Its temperature [K].
-    camera : Camera
-        The first camera.
-    actors : sequence of Actor
-        Bodies that move, or stand, around it.
-    thermocouples : ndarray, shape (thermocouple, 3)
-        Points of the surface where thermocouples are [m].
+    Name; mesh of the object [m] and its temperature (time, vertex) [K]; first camera; bodies that
+    move, or stand, around it; points (thermocouple, 3) of the surface with thermocouples [m].
     """
 
     name: str
@@ -110,28 +98,13 @@ def take(stage: Stage, capture: Capture) -> xr.Dataset:
     """
     Scene of a stage, ray-traced.
 
-    Parameters
-    ----------
-    stage : Stage
-        Object, camera and surroundings.
-    capture : Capture
-        How it is recorded.
-
-    Returns
-    -------
-    Dataset
-        A scene for `simulation.observe`, and in addition `on_object` (y, x), and `thermocouple_y`,
-        `thermocouple_x` (thermocouple): rows and columns of the virtual thermocouples. Beside the
-        object, the object temperature is that of the background seen directly there, which makes
-        the emissivity, defined everywhere, irrelevant. With a baseline `background_temperature` is
-        (band, time, y, x), and `hidden_from_second` (y, x) marks the points that the second camera
-        does not see; its background is that of the first there, and off the object. A concave
-        object's reflection in itself is of its own temperature (one bounce).
-
-    Raises
-    ------
-    ValueError
-        If a thermocouple is not seen by the camera.
+    A scene for `simulation.observe`, and in addition `on_object` (y, x), and `thermocouple_y`,
+    `thermocouple_x` (thermocouple): rows and columns of the virtual thermocouples, which the camera
+    must see (ValueError). Beside the object, the object temperature is that of the background seen
+    directly there, which makes the emissivity, defined everywhere, irrelevant. With a baseline
+    `background_temperature` is (band, time, y, x), and `hidden_from_second` (y, x) marks the points
+    that the second camera does not see; its background is that of the first there, and off the
+    object. A concave object's reflection in itself is of its own temperature (one bounce).
     """
     directions = stage.camera.directions()
     origins = np.array(np.broadcast_to(np.asarray(stage.camera.position), directions.shape))
@@ -210,31 +183,11 @@ def thermocouple_readings(
     bead: int = 3,
 ) -> xr.DataArray:
     """
-    Readings of the virtual thermocouples of a twin.
+    Readings (thermocouple, time) [K] of the virtual thermocouples of a twin: means over a bead.
 
-    Parameters
-    ----------
-    scene : Dataset
-        From `take`.
-    rng : Generator
-        Source of the errors.
-    std : float
-        Standard deviation of a single reading [K].
-    offset_std : float
-        Standard deviation of a probe's constant error [K]; 0.1 is a probe that was compared with
-        a reference, 0.5 one that was not.
-    bead : int
-        Pixels along a side of the square that a bead covers; odd.
-
-    Returns
-    -------
-    DataArray
-        Readings (thermocouple, time) [K]: the mean over the bead, with both errors.
-
-    Raises
-    ------
-    ValueError
-        If the bead is not odd and positive, or reaches beyond the object.
+    The errors are of a single reading (`std`) and constant of a probe (`offset_std`) [K]; 0.1 is a
+    probe that was compared with a reference, 0.5 one that was not. A bead covers a square of an odd
+    number of pixels along a side, all on the object; else a ValueError.
     """
     if bead < 1 or bead % 2 == 0:
         raise ValueError(f"Invalid bead {bead} pixels. Must be odd and positive.")
