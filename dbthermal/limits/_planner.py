@@ -118,9 +118,8 @@ def plan(
         `condition_number` [1]. Over (material, filter, band): `emissivity_std` and
         `reflection_ratio_std` [1], over the band always recorded; NaN for a band outside the
         combination. `best` (material): the filter of the smallest object deviation, "none" where
-        each is above that of a uniform number within the capture's range of temperatures;
-        `best_of_all` (): that of the smallest median over the materials. `noise` (band) [K], and
-        the design's numbers as attributes.
+        each is above that of a uniform number within the capture's range of temperatures. `noise`
+        (band) [K], and the design's numbers as attributes.
 
     Raises
     ------
@@ -156,12 +155,12 @@ def plan(
     result = _dataset(table, labels, parts, sets)
     temperatures = [truths[0].object_temperature, truths[0].background_temperature]
     uniform = float(np.ptp(temperatures)) / np.sqrt(12.0)
-    object_std = result["object_temperature_std"]
-    best = _best(object_std, uniform)
-    of_all = _best(object_std.median("material").expand_dims("material"), uniform)[0]
+    best = [
+        labels[int(np.argmin(row))] if np.min(row) < uniform else _NO_FILTER
+        for row in result["object_temperature_std"].values
+    ]
     return result.assign(
         best=("material", best, {"long_name": "filter of the smallest object deviation"}),
-        best_of_all=((), of_all, {"long_name": "filter of its smallest median"}),
         noise=("band", std, {"units": "K", "long_name": "noise-equivalent temperature difference"}),
     ).assign_attrs(vars(design), beside=beside, origin="simulated")
 
@@ -284,12 +283,3 @@ def _dataset(
         variables[name] = (("material", "filter", "band"), values, attrs)
     coords = {"material": table["material"].values, "filter": labels, "band": table["band"].values}
     return xr.Dataset(variables, coords)
-
-
-def _best(std: xr.DataArray, uniform: float) -> list[str]:
-    """Filter of the smallest deviation for each material, if below that of a uniform number."""
-    names = std["filter"].values
-    return [
-        str(names[int(np.argmin(row))]) if np.min(row) < uniform else _NO_FILTER
-        for row in std.values
-    ]

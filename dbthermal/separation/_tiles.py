@@ -255,9 +255,9 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
         counts, valid, status = quality.read(
             block.isel(y=local, x=window[1]), method.minimum_frames
         )
-        filled, usable = quality.bridge(counts, valid, time)
+        counts, usable = quality.bridge(counts, valid, time)
         if method.whole_image or method.every_frame:
-            sets = quality.common_frames(filled, usable, status, method.minimum_frames)
+            sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
         emissivity, std = (
@@ -268,7 +268,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             # The linearised signals (see `response`), less the reference temperature.
             signals=np.stack(
                 [
-                    curve.linearise(filled[band]) - curve.reference
+                    curve.linearise(counts[band]) - curve.reference
                     for band, curve in zip(bands, curves, strict=True)
                 ]
             ),

@@ -1,10 +1,13 @@
 """Simulated captures with known truth, to test a claim: scenes, cameras, nuisances, bench.
 
 Begin with `walkers` and `observe`: a scene, and the counts that a `Rig` records of it. Nuisances
-of real cameras are added one by one (`fire_shutter`, `spoil_pixels`, `lag`, ...). Imported by name:
-`simulation.heat` (transient temperatures), `simulation.rays` and `simulation.surroundings` (ray-
-traced reflections of moving bodies). Everything made here carries `origin = "simulated"`.
+of real cameras are added one by one (`fire_shutter`, `spoil_pixels`, `lag`, ...). For a scene of
+one's own there are transient temperatures (`heat`), and reflections of moving bodies (`rays`,
+`surroundings`). Everything made here carries `origin = "simulated"`.
 """
+
+import importlib
+from types import ModuleType
 
 from dbthermal.simulation._bench import (
     OBJECTS,
@@ -53,19 +56,29 @@ __all__ = [
     "drop_frames",
     "expose",
     "fire_shutter",
+    "heat",
     "heating",
     "independent_pixels",
     "lag",
     "lose_frames",
     "observe",
     "pattern",
+    "rays",
     "reflector_series",
     "repeat_frames",
     "scene",
     "side_by_side",
     "spoil_pixels",
+    "surroundings",
     "walkers",
 ]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import `heat`, `rays` or `surroundings`, which need optional packages, on first use."""
+    if name in {"heat", "rays", "surroundings"}:
+        return importlib.import_module(f"{__name__}.{name}")
+    raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")
 
 
 def __dir__() -> list[str]:

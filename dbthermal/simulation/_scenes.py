@@ -102,21 +102,16 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     Parameters
     ----------
     time : ndarray, shape (time,)
-        Times [s], two or more.
+        Times [s], two or more, increasing.
     start, stop : float
         First and last temperature [K].
     time_constant : array_like, shape (...)
-        Time constants [s].
+        Time constants, positive [s].
 
     Returns
     -------
     ndarray, shape (time, ...)
         Temperature [K].
-
-    Raises
-    ------
-    ValueError
-        If the times do not increase, or a time constant is not positive.
     """
     increasing(time, "a heating")
     constant = planck.require_positive("time_constant [s]", time_constant)
