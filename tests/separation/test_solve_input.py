@@ -1,4 +1,4 @@
-"""What goes into a separation: bad input, bad pixels, and what the status says of them."""
+"""Input of `solve`: invalid arguments, bad pixels, and their status."""
 
 from collections.abc import Callable
 
@@ -61,12 +61,12 @@ def test_result_is_as_the_schema_has_it(
 
 
 def spoil_nan(capture: xr.Dataset) -> None:
-    """Three frames in five are not a number, in one band."""
+    """Set a pixel of one band to NaN in the first 210 of its frames."""
     capture["counts"].values[0, :210, 1, 2] = np.nan
 
 
 def spoil_constant(capture: xr.Dataset) -> None:
-    """One pixel of one band never changes."""
+    """Set one pixel of one band to a constant."""
     capture["counts"].values[1, :, 1, 2] = 16000.0
 
 
@@ -78,7 +78,7 @@ def test_bad_pixel_is_flagged_and_alone(
     spoil: Callable[[xr.Dataset], None],
     name: str,
 ) -> None:
-    """A pixel that nothing can be computed of is NaN with its flag; the others do not change."""
+    """An unusable pixel is NaN with its flag, and the others do not change."""
     _, capture, response = glass
     spoilt = capture.copy(deep=True)
     spoil(spoilt)
@@ -195,7 +195,7 @@ BAD: dict[str, tuple[Callable[[xr.Dataset, xr.Dataset], object], str]] = {
 
 @pytest.mark.parametrize("what", BAD)
 def test_bad_input_is_a_clear_error(glass: Glass, what: str) -> None:
-    """Each error names the thing, the value and the rule."""
+    """Invalid input raises an error with the name, the value and the rule."""
     call, message = BAD[what]
     _, capture, response = glass
     with pytest.raises(ValueError, match=message):
@@ -214,7 +214,7 @@ def test_bad_input_is_a_clear_error(glass: Glass, what: str) -> None:
 def test_good_means_complete(
     seed: int, frames: int, first: float, second: float, loudness: float, method: str
 ) -> None:
-    """Where the status is 0, everything is finite."""
+    """Pixels with a status of 0 are finite in every quantity."""
     rng, rig = np.random.default_rng(seed), Rig(noise=(0.03 * loudness, 0.35 * loudness))
     known = emissivity_of(first, second)
     scene = simulation.independent_pixels(
@@ -266,7 +266,7 @@ def test_frozen_frames_are_flagged(glass: Glass) -> None:
 
 @pytest.mark.parametrize("name", ["gray", None])
 def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> None:
-    """Where no background gives the signals in any frame: outside, unless a flag says why."""
+    """A quantity that is NaN in all frames is flagged as outside the response, or by its cause."""
     before = np.full(1, 0 if name is None else schema.Status.bits()[name], dtype=np.uint32)
     warm, none, share = np.full((9, 1), 300.0), np.full((9, 1), np.nan), np.full((2, 1), 0.5)
     found = Estimate(warm, 0.1 * np.ones((9, 1)), none, none, share, 0.1 * share, before)
