@@ -109,7 +109,7 @@ class Tile:
         return self.curves[band].signal(temperature) - self.reference
 
     def temperature(self, band: int, signal: Array) -> Array:
-        """Temperature [K] of the blackbody with a signal [K]; NaN where there is none."""
+        """Temperature [K] of the blackbody with a signal [K]; NaN where undefined."""
         return self.curves[band].temperature(signal + self.reference)
 
     def mixed(self, emissivity: Array, temperatures: Array) -> Array:
