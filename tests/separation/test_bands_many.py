@@ -16,7 +16,6 @@ TIME = np.arange(350) / 10.0
 BANDS = ("8-14", "9.5", "10.6", "12.1")
 NOISE = (0.03, 0.35, 0.15, 0.4)  # [K]
 VALUES = (0.86, 0.72, 0.88, 0.95)
-OTHERS = [name for name in separation.METHODS if name != "subspace"]
 Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 
@@ -127,12 +126,3 @@ def test_a_gray_third_band_harms_nothing() -> None:
         errors.append(pooled(result["object_temperature"] - scene["object_temperature"]))
     print(f"two bands {errors[0]:.3f} K, with a gray third {errors[1]:.3f} K")
     assert errors[1] < 1.05 * errors[0]
-
-
-@pytest.mark.parametrize("method", OTHERS)
-def test_other_methods_take_two_bands(method: str) -> None:
-    """A third band raises a ValueError in the methods for two bands."""
-    _, capture, response = case(3, 2, seed=8)
-    message = rf"Invalid bands \['8-14', '9.5', '10.6'\] for method '{method}'. Must be exactly two"
-    with pytest.raises(ValueError, match=message):
-        separation.solve(capture, response, method)

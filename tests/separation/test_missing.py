@@ -240,30 +240,6 @@ def test_unequal_gaps_need_a_known_noise(case: Case) -> None:
         separation.solve(without(capture, there), response.drop_vars(["noise", "netd"]))
 
 
-@pytest.mark.parametrize("method", ["subspace", "naive", "ratio", "apparent"])
-def test_one_lost_sample_costs_its_frame_alone(case: Case, method: str) -> None:
-    """A frame that one pixel lacks is NaN there; the pixel's other frames have their values."""
-    _, capture, response = case
-    spoilt = capture.isel(x=slice(0, 6), time=slice(0, 200)).copy(deep=True)
-    spoilt["counts"].values[0, 30, 0, 2] = np.nan
-    temperature = separation.solve(spoilt, response, method)["object_temperature"].values[:, 0]
-    assert np.isnan(temperature[30, 2])
-    assert np.all(np.isfinite(temperature[31:, 2]))
-
-
-@pytest.mark.parametrize("method", ["dbvt", "bcp"])
-def test_pixel_that_lacks_a_frame_is_left_out_where_all_must_have_the_same(method: str) -> None:
-    """A method that needs the same frames of all pixels flags the one that lacks a sample."""
-    _, capture, response = experiments.simulate(GLASS, RIG, TIME[:40], 4, seed=3)
-    spoilt = capture.copy(deep=True)
-    spoilt["counts"].values[1, 7:10, 0, 2] = np.nan  # longer than what is bridged
-    result = separation.solve(spoilt, response, method)
-    lacking = result["status"].values[0] & schema.Status.INVALID_SAMPLES != 0
-    np.testing.assert_array_equal(lacking, [False, False, True, False])
-    given = np.isfinite(result["object_temperature"].values[:, 0]).any(axis=0)
-    np.testing.assert_array_equal(given, ~lacking)
-
-
 def test_short_gaps_are_bridged() -> None:
     """With single samples lost, others in each pixel, the object is as good, and NaN where lost."""
     scene, capture, response = experiments.simulate(GLASS, RIG, TIME, 300, seed=5)
