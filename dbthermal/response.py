@@ -163,7 +163,7 @@ class LinearCurve(Curve):
         return (np.asarray(counts, dtype=np.float64) - self.offset) / self.amplitude
 
 
-def require_range(temperature: npt.ArrayLike, of: Curve, name: str) -> Array:
+def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
     """
     Temperatures as float64, all of which must lie in the calibrated range of a curve.
 
@@ -171,7 +171,7 @@ def require_range(temperature: npt.ArrayLike, of: Curve, name: str) -> Array:
     ----------
     temperature : array_like
         Temperatures [K].
-    of : Curve
+    curve : Curve
         The curve.
     name : str
         Name of the quantity, for the error.
@@ -187,11 +187,11 @@ def require_range(temperature: npt.ArrayLike, of: Curve, name: str) -> Array:
         If one lies outside the range or is NaN; the error names the first.
     """
     values = np.asarray(temperature, dtype=np.float64)
-    bad = ~((values >= of.lowest) & (values <= of.highest))
+    bad = ~((values >= curve.lowest) & (values <= curve.highest))
     if np.any(bad):
         raise ValueError(
-            f"Invalid {name} {values[bad].flat[0]} K in band '{of.band}'. Must lie in the "
-            f"response's range [{of.lowest}, {of.highest}] K."
+            f"Invalid {name} {values[bad].flat[0]} K in band '{curve.band}'. Must lie in the "
+            f"response's range [{curve.lowest}, {curve.highest}] K."
         )
     return values
 

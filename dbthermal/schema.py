@@ -359,9 +359,9 @@ def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
     if dim not in array.coords:
         raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
     coordinate, units = array[dim], COORDINATES[dim].units
-    found = coordinate.attrs.get("units", units)
-    if found != units:
-        raise ValueError(f"Invalid units '{found}' of '{dim}' of {label}. Must be '{units}'.")
+    stated = coordinate.attrs.get("units", units)
+    if stated != units:
+        raise ValueError(f"Invalid units '{stated}' of '{dim}' of {label}. Must be '{units}'.")
     if coordinate.dtype.kind not in "fui":
         raise TypeError(
             f"Invalid dtype {coordinate.dtype} of '{dim}' of {label}. Must be numbers in {units}."

@@ -1,4 +1,4 @@
-"""What all tests share: the mirror of the outside files, what a skip without it means, glass."""
+"""Fixtures of all tests: a mirror of the outside files, and a simulated capture of glass."""
 
 import os
 from collections.abc import Generator

@@ -148,10 +148,10 @@ def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T, counted from 0 at the centre of the first pixel.
     """
     rows, columns = np.indices(shape, dtype=np.float64)
-    across, down, scale = np.einsum(
+    column, row, scale = np.einsum(
         "ij,jyx->iyx", matrix, np.stack([columns, rows, np.ones_like(rows)])
     )
-    return np.asarray(np.round(np.stack([down, across]) / scale, _DIGITS))
+    return np.asarray(np.round(np.stack([row, column]) / scale, _DIGITS))
 
 
 def _offsets(corrected: xr.Dataset, offset: float | xr.DataArray | None, names: list[str]) -> Array:

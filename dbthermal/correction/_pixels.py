@@ -145,7 +145,7 @@ def _noise(movie: xr.DataArray) -> Array:
 
 
 def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
-    """Where the noise is off that of its surroundings."""
+    """Pixels whose noise differs from that of their surroundings by more than the threshold."""
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.log(level / usual)  # minus infinity where nothing changes
     finite = np.isfinite(apart)

@@ -46,15 +46,15 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
     """
     figure, axes = canvas(2, 1, (7.4, 5.6))
     place = {"y": pixel[0], "x": pixel[1]}
-    known, found = truth.isel(place), result.isel(place)
+    true, estimate = truth.isel(place), result.isel(place)
     for axis, name in zip(
         axes[:, 0], ("object_temperature", "background_temperature"), strict=True
     ):
-        value, std = found[name] - zero_Celsius, found[f"{name}_std"]
-        time = found["time"]
+        value, std = estimate[name] - zero_Celsius, estimate[f"{name}_std"]
+        time = estimate["time"]
         axis.fill_between(time, value - 2 * std, value + 2 * std, color=COLORS[0], alpha=0.25)
         axis.plot(time, value, color=COLORS[0], linewidth=1)
-        axis.plot(known["time"], known[name] - zero_Celsius, "--", color="black", linewidth=1)
+        axis.plot(true["time"], true[name] - zero_Celsius, "--", color="black", linewidth=1)
         axis.set(ylabel=name.replace("_", " ") + " [\N{DEGREE SIGN}C]")
     axes[0, 0].legend(["two standard deviations", "estimate", "truth"], frameon=False, fontsize=8)
     axes[-1, 0].set_xlabel("time [s]")
@@ -193,7 +193,7 @@ def _frames(
     parts: list[xr.DataArray],
     heading: tuple[Text, str, xr.DataArray],
 ) -> Iterator[npt.NDArray[np.uint8]]:
-    """Draw what stands still once, and over it the images of each time."""
+    """Draw the axes and labels once, and over them the images of each time."""
     text, title, data = heading
     for artist in (*images, text):
         artist.set_animated(True)

@@ -22,6 +22,8 @@ import numpy.typing as npt
 __all__ = [
     "DAMAGED",
     "FEWEST_COPIES",
+    "FFC_READING",
+    "FPA_READING",
     "FRAME_TIMEOUT",
     "GOOD",
     "KINDS",
@@ -55,6 +57,12 @@ FRAME_TIMEOUT: Final = 1.0
 FEWEST_COPIES: Final = 3
 """Copies in a row from which a camera without telemetry counts as closed, as in
 `dbthermal.correction.find_shutter`: fewer are lost frames."""
+
+FPA_READING: Final = "fpa "
+"""Prefix of the name of a reading of the focal-plane array's temperature; the band follows."""
+
+FFC_READING: Final = "ffc "
+"""Prefix of the name of a reading of the `FfcStatus`; the band follows."""
 
 KINDS: Final = MappingProxyType(
     {

@@ -20,6 +20,8 @@ from typing import Any, Final
 
 from dbthermal.instruments import filterwheel
 from dbthermal.instruments.camera import (
+    FFC_READING,
+    FPA_READING,
     CameraControl,
     Counts,
     FrameFlag,
@@ -122,8 +124,8 @@ class Devices:
             for channel, name in self.thermocouples.names.items():
                 readings[name] = Reading(partial(self.thermocouples.read, channel))
         for band, camera in self.cameras.items():
-            readings[f"fpa {band}"] = Reading(camera.fpa_temperature)
-            readings[f"ffc {band}"] = Reading(camera.ffc_status, "1")
+            readings[FPA_READING + band] = Reading(camera.fpa_temperature)
+            readings[FFC_READING + band] = Reading(camera.ffc_status, "1")
         if self.wheel is not None:
             readings[WHEEL] = Reading(self.wheel.position, "1")
         return readings

@@ -157,7 +157,7 @@ class Decoder:
 
     @property
     def is_open(self) -> bool:
-        """Whether a frame has begun and not yet ended."""
+        """True if a frame has begun and not yet ended."""
         return self._content is not None
 
     def feed(self, received: bytes) -> list[Frame]:

@@ -21,7 +21,14 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments.camera import FfcStatus, Frame, FrameFlag, Metadata
+from dbthermal.instruments.camera import (
+    FFC_READING,
+    FPA_READING,
+    FfcStatus,
+    Frame,
+    FrameFlag,
+    Metadata,
+)
 from dbthermal.instruments.recording import Preview
 
 if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it
@@ -40,8 +47,6 @@ _WINDOW: Final = 3.0  # time over which a frame rate is measured [s]
 _PERIOD: Final = 1.0  # least time from picture to picture [s]; one takes a tenth of it
 _PERCENTILES: Final = (1.0, 99.0)  # of the counts that are black and white in the picture [%]
 _LEAST_SHARE: Final = 0.01  # of pixels at either end of the range, from which a warning comes [1]
-_FPA: Final = "fpa "  # begins the name of a camera's temperature reading; its band follows
-_FFC: Final = "ffc "  # begins the name of a camera's `FfcStatus` reading; its band follows
 _COMPRESSION: Final = 1  # of zlib's 1 to 9
 _RANGE: Final = np.iinfo(np.uint16)
 _STEP: Final = 4  # every fourth pixel of every fourth row is enough for percentiles
@@ -154,7 +159,7 @@ class Watch:
     @staticmethod
     def _fpa_temperature(band: str, preview: Preview) -> float:
         """Temperature of the focal-plane array by its reading, else by the telemetry [K]."""
-        reading = preview.readings.get(_FPA + band, math.nan)
+        reading = preview.readings.get(FPA_READING + band, math.nan)
         return reading if math.isfinite(reading) else _metadata(band, preview).fpa_temperature
 
     def _rate(self, band: str) -> float:
@@ -170,7 +175,7 @@ class Watch:
 
 
 def _is_other(before: Preview, now: Preview) -> bool:
-    """Whether a preview is of another recording than the one before it."""
+    """True if a preview is of another recording than the one before it."""
     return (
         tuple(before.totals) != tuple(now.totals)
         or now.time < before.time
@@ -185,7 +190,7 @@ def _metadata(band: str, preview: Preview | None) -> Metadata:
 
 
 def _corrected(band: str, before: Preview | None, now: Preview) -> bool:
-    """Whether the offsets were renewed between two previews, by the telemetry."""
+    """True if the offsets were renewed between two previews, by the telemetry."""
     earlier, later = (_metadata(band, shown).last_ffc_frame for shown in (before, now))
     return None not in {earlier, later} and earlier != later
 
@@ -195,7 +200,7 @@ def _ffc(band: str, preview: Preview) -> str:
     frame = preview.frames.get(band)
     if frame is not None and FrameFlag.SHUTTER_CLOSED in frame.flags:
         return _IN_PROGRESS
-    reading = preview.readings.get(_FFC + band)
+    reading = preview.readings.get(FFC_READING + band)
     return "unknown" if reading is None else _ffc_state(reading)
 
 
@@ -329,7 +334,7 @@ def _apart(limits: tuple[float, float]) -> tuple[float, float]:
 
 def _foot(preview: Preview) -> str:
     """Readings beside those of the shown bands: of thermocouples, of the blackbody."""
-    used = {prefix + band for prefix in (_FPA, _FFC) for band in preview.totals}
+    used = {prefix + band for prefix in (FPA_READING, FFC_READING) for band in preview.totals}
     return ", ".join(
         f"{name} {_reading(name, value, preview.units.get(name, 'K'))}"
         for name, value in preview.readings.items()
@@ -338,7 +343,7 @@ def _foot(preview: Preview) -> str:
 
 
 def _reading(name: str, value: float, unit: str) -> str:
-    if name.startswith(_FFC):
+    if name.startswith(FFC_READING):
         return _ffc_state(value)
     if math.isnan(value):
         return "no answer"

@@ -50,7 +50,7 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from dbthermal.instruments.camera import KINDS
+from dbthermal.instruments.camera import FFC_READING, FPA_READING, KINDS
 
 __all__ = ["Blackbody", "Camera", "Device", "Session"]
 
@@ -166,7 +166,7 @@ class Session:
         # The readings of a recording have one name each: of the cameras and the wheel, too.
         names = [*self.thermocouples.values(), "filter_wheel", "thermocouples"]
         for band in dict.fromkeys((*self.bands, *self.filters.values())):
-            names += [band, f"fpa {band}", f"ffc {band}"]
+            names += [band, FPA_READING + band, FFC_READING + band]
         _check_unique("thermocouple", names)
         self._require("thermocouples", self.thermocouples)
         return self

@@ -183,8 +183,8 @@ class Capture(Closing):
             if error.errno != errno.ENODEV:  # unplugged: nothing is left to stop
                 raise
         finally:
-            for memory in self._maps:
-                memory.close()
+            for mapped in self._maps:
+                mapped.close()
             self._maps.clear()
             self._kernel.close(file)
 
@@ -299,7 +299,7 @@ def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
 
 
 def _capability(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:
-    """Whether the node captures video (a camera has others, for metadata), and its identity."""
+    """True if the node captures video (others of a camera give metadata), and its identity."""
     capability = bytearray(CAPABILITY.size)
     kernel.ask(file, QUERYCAP, capability)
     *texts, version, _, node = CAPABILITY.unpack(capability)

@@ -34,6 +34,7 @@ class Method:
     knows_emissivity: bool = False  # is given the emissivities, and does not estimate them
     whole_image: bool = False  # looks at a pixel's neighbours: a tile is the whole image
     every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
+    even_times: bool = False  # refuses frames at uneven times, by name
     survey: Callable[..., Any] | None = None  # `Survey` of the same arguments, for pooling
     any_bands: bool = False  # takes more than two bands
     not_estimated: tuple[str, ...] = ()  # variables of the result that are NaN everywhere

@@ -185,7 +185,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         if inputs.labels is not None:
             selected = pooling.select(inputs.labels)
             surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), blocks)
-            material = _pool(inputs, [part for found in surveys for part in found])
+            material = _pool(inputs, [part for survey in surveys for part in survey])
         for _ in threads.map(lambda block: _separate(inputs, block, material, result, bar), blocks):
             pass
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])

@@ -6,7 +6,7 @@ cache. A tile's bands are in the order of their noise, the quietest first: the r
 emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, Self
 
@@ -109,7 +109,7 @@ class Tile:
         return self.curves[band].signal(temperature) - self.reference
 
     def temperature(self, band: int, signal: Array) -> Array:
-        """Temperature [K] of the blackbody with a signal [K]; NaN where there is none."""
+        """Temperature [K] of the blackbody with a signal [K]; NaN where undefined."""
         return self.curves[band].temperature(signal + self.reference)
 
     def mixed(self, emissivity: Array, temperatures: Array) -> Array:
@@ -180,22 +180,25 @@ class Estimate(_Pixels):
                 values[which][used] = part
         return replace(self, **values)
 
-    def check_range(self, curve: Curve, *, deviations: bool = True) -> "Estimate":
+    def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
         Flag temperatures outside the calibrated range of a response, and values without a number.
 
-        Samples without a temperature, or with a useless standard deviation where the method has
-        `deviations`, become NaN. A quantity that is NaN in all samples of a pixel with another
-        status bit needs no further bit.
+        Samples without a temperature, or with a useless standard deviation, become NaN; variables
+        that the method has `not_estimated` may be NaN without a flag. A quantity that is NaN in all
+        samples of a pixel with another status bit needs no further bit.
         """
         values: dict[str, Array] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
         for field in fields(self):
             name = field.name
-            if name == "status" or name.endswith("_std") or getattr(self, name) is None:
+            if name in ("status", *not_estimated) or name.endswith("_std"):
+                continue
+            if getattr(self, name) is None:
                 continue
             value, std = getattr(self, name), getattr(self, f"{name}_std")
-            lost = ~((np.abs(value) < _USELESS) & ((std < _USELESS) | (not deviations)))
+            precise = (std < _USELESS) | (f"{name}_std" in not_estimated)
+            lost = ~((np.abs(value) < _USELESS) & precise)
             explained = np.all(np.isnan(value), axis=0) & (self.status != 0)
             beyond |= np.any(lost, axis=0) & ~explained
             values[name], values[f"{name}_std"] = (

@@ -280,7 +280,7 @@ def walkers(
 
 
 def increasing(times: npt.ArrayLike, name: str) -> Array:
-    """Times (time,) [s] of what `name` says: two or more, finite, increasing; or a ValueError."""
+    """Checked times (time,) [s]: two or more, finite, increasing; `name` is for the ValueError."""
     array = np.asarray(times, dtype=np.float64)
     if array.ndim != 1 or array.size < 2:
         raise ValueError(f"Invalid times of shape {array.shape} of {name}. Must be two or more.")

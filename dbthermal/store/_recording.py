@@ -175,7 +175,7 @@ def _write_attributes(path: Path, attrs: Mapping[str, Any]) -> None:
     """Replace the attributes of a store in one step; if that fails, the old ones stay."""
     content = {"zarr_format": 3, "node_type": "group", "attributes": dict(attrs)}
     text = json.dumps(content, allow_nan=False)
-    # Written beside the store: what a kill leaves of it is no part of the store.
+    # Written beside the store: a file cut short by a kill is no part of the store.
     replace(path / _GROUP, text.encode(), path.parent / f".{path.name}.part")
 
 

@@ -152,8 +152,8 @@ def fetch_collection(collection: str) -> dict[str, Path]:
     """Verified files of a collection, name to path, several downloads at a time; see `fetch`."""
     listed, folder = load()[collection], _folder(collection)
     with ThreadPoolExecutor(_CONNECTIONS) as pool:
-        found = pool.map(lambda file: _fetch(listed, file, folder), listed.files.values())
-        return dict(zip(listed.files, found, strict=True))
+        paths = pool.map(lambda file: _fetch(listed, file, folder), listed.files.values())
+        return dict(zip(listed.files, paths, strict=True))
 
 
 def provenance(collection: str) -> dict[str, str]:

@@ -89,7 +89,7 @@ def cells(stem: str) -> Path:
 
 
 def _stem(stem: str) -> str:
-    """Stem, such as ``"03_simulation"``; ValueError if it is none."""
+    """Checked stem, such as ``"03_simulation"``; ValueError if it is malformed."""
     if not re.fullmatch(r"[0-9]{2}_[a-z0-9_]+", stem):
         raise ValueError(f"Invalid stem {stem!r}. Must be two digits, '_' and a lower-case name.")
     return stem

@@ -96,7 +96,7 @@ def test_end_of_the_search(scene: xr.Dataset) -> None:
 
 
 def test_shutter_steps_are_no_motion(scene: xr.Dataset) -> None:
-    """A step in both bands at once, after a shutter event, does not pull the offset to zero."""
+    """A step in both bands after a shutter event does not pull the offset to zero."""
     capture = recorded(scene, 1.5)
     segment = (np.arange(FRAMES) >= 150).astype(np.int64)
     capture["counts"].values[...] += 60.0 * segment[:, np.newaxis, np.newaxis]
@@ -106,7 +106,7 @@ def test_shutter_steps_are_no_motion(scene: xr.Dataset) -> None:
 
 
 def test_a_still_background_gives_no_offset_by_chance() -> None:
-    """In 20 captures in which nothing moves, none gives an offset."""
+    """None of 20 captures with a still background gives an offset."""
     found = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -207,7 +207,7 @@ def test_whole_frames_are_a_pure_shift(frames: int) -> None:
 )
 @settings(max_examples=30)
 def test_a_line_is_kept(offset: float, jitter: list[float]) -> None:
-    """What rises evenly is interpolated exactly, at any stamps and offset; never extrapolated."""
+    """A linear ramp is interpolated exactly at any stamps and offset, and never extrapolated."""
     capture = ramp()
     stamps = capture["time"].values + np.reshape(jitter, (2, 40))
     seen = stamps + np.array([[0.0], [offset]])
@@ -259,7 +259,7 @@ def test_three_bands() -> None:
 
 
 def test_what_was_done_is_written_down(scene: xr.Dataset) -> None:
-    """Attributes name the clock, the offsets and the frames lost; the capture is not changed."""
+    """Attributes hold the clock, the offsets and the lost frames; the capture is not changed."""
     capture = recorded(scene, 0.5, stamped=True)
     before = capture.copy(deep=True)
     aligned = alignment.align(capture)
@@ -272,7 +272,7 @@ def test_what_was_done_is_written_down(scene: xr.Dataset) -> None:
 
 
 def test_wrong_options() -> None:
-    """An offset that is no number, and a clock that is no band, are refused by name."""
+    """An invalid offset, clock, band or search range raises a ValueError that names it."""
     with pytest.raises(ValueError, match=r"Invalid offset \[0\.0, nan\] s"):
         alignment.align(ramp(), offset=np.nan)
     with pytest.raises(ValueError, match=r"Unknown clock '7'\. Must be one of"):
@@ -284,13 +284,13 @@ def test_wrong_options() -> None:
 
 
 def test_an_offset_beyond_the_capture_leaves_nothing() -> None:
-    """Frames that never saw the same time are all NaN, and counted."""
+    """With an offset beyond the capture all frames of the shifted band count as lost."""
     aligned = alignment.align(ramp(), offset=10.0, clock="b1")
     assert aligned.attrs["frames_lost"] == [40, 0]
 
 
 def test_wrong_stamps() -> None:
-    """Stamps that go back are refused, and say where."""
+    """Decreasing time stamps raise a ValueError that gives the place."""
     capture = ramp()
     stamps = np.tile(capture["time"].values, (2, 1))
     stamps[1, 5] = 0.0
@@ -320,7 +320,7 @@ def test_lost_frames_of_the_simulation(scene: xr.Dataset) -> None:
 
 
 def test_nothing_is_left_on_the_clocks_before(scene: xr.Dataset) -> None:
-    """What was told frame by frame is not handed on beside other times; an offset is in seconds."""
+    """Variables on the old clock are dropped; an offset in another unit than seconds raises."""
     capture = simulation.observe(scene, Rig().response(), np.random.default_rng(0))
     told = (("band", "time"), np.zeros(capture["counts"].shape[:2]), {"units": "count"})
     aligned = alignment.align(capture.assign(drift=told), offset=0.02)

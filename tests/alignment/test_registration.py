@@ -1,4 +1,4 @@
-"""Views of one object onto one grid; what a reflection costs that does not register with it."""
+"""Registration of views onto one grid, and the cost of a reflection that does not register."""
 
 from typing import Any
 
@@ -116,7 +116,7 @@ def test_a_shift_by_whole_pixels_moves_samples() -> None:
     ],
 )
 def test_views_that_do_not_match(change: dict[str, Any], what: str) -> None:
-    """Views of different things are refused, and so is an unknown model."""
+    """Views of different scenes and an unknown model raise a ValueError."""
     capture = views(np.eye(3))
     rng = np.random.default_rng(5)
     if "noise" in change:
@@ -161,7 +161,7 @@ def test_what_parallax_costs() -> None:
 
 
 def test_parallax_looks_like_a_time_offset() -> None:
-    """What walkers of both directions leave of it is less than half a frame, at 2 pixels."""
+    """A parallax of 2 pixels of the reflection is taken for an offset of at most half a frame."""
     _, capture = parallax(2.0, np.random.default_rng(1))
     offset = alignment.time_offset(capture)
     print(f"reflection 2 pixels apart: {offset / 0.1:.2f} frames")

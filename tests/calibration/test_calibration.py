@@ -117,7 +117,7 @@ def test_netd_is_noise_over_slope(two_bands: xr.Dataset) -> None:
 
 
 def test_noise_goes_by_the_band_s_name(two_bands: xr.Dataset) -> None:
-    """Noise in another order, or of more bands, arrives at its own."""
+    """Noise is assigned to the bands by name, in any order and beside other bands."""
     noise = xr.DataArray([9.0, 4.0, 3.0], dims="band", coords={"band": ["10.6", "9.5", "8-14"]})
     fitted = calibration.fit_response(blackbody(), noise)
     np.testing.assert_array_equal(fitted["noise"], two_bands["noise"])
@@ -195,7 +195,7 @@ def test_straight_counts_are_followed() -> None:
     ],
 )
 def test_bad_counts(change: Change, message: str) -> None:
-    """Counts that are no blackbody's are refused."""
+    """Counts that cannot come from a blackbody raise a ValueError with the reason."""
     with pytest.raises(ValueError, match=re.escape(message)):
         calibration.fit_response(change(blackbody()))
 
@@ -219,7 +219,7 @@ def test_bad_noise(noise: xr.DataArray, message: str) -> None:
 
 
 def test_not_a_data_array() -> None:
-    """Bare arrays have neither bands nor temperatures."""
+    """Bare arrays in place of labelled ones raise a TypeError."""
     counts, bare = blackbody(4), np.ones(2)
     with pytest.raises(TypeError, match="Invalid counts of type ndarray"):
         calibration.fit_response(counts.values)  # type: ignore[arg-type]
@@ -276,7 +276,7 @@ def test_emissivity_is_the_weighted_slope(two_bands: xr.Dataset, measured: xr.Da
 
 
 def test_emissivity_s_error_bar_is_true(two_bands: xr.Dataset) -> None:
-    """Over 250 repeats error over deviation has variance 1 and no bias; reduced chi-square is 1."""
+    """Over 250 repeats the normalised error has variance 1 and no bias; reduced chi-square is 1."""
     rng = np.random.default_rng(0)
     fits = [
         calibration.fit_emissivity(readings(two_bands, rng), two_bands, STDS) for _ in range(250)
@@ -325,13 +325,13 @@ def test_bad_measurements(
     change: Callable[[xr.Dataset], xr.Dataset],
     message: str,
 ) -> None:
-    """Measurements that carry no emissivity are refused."""
+    """Measurements that do not determine an emissivity raise a ValueError."""
     with pytest.raises(ValueError, match=re.escape(message)):
         calibration.fit_emissivity(change(measured), two_bands, STDS)
 
 
 def test_emissivity_needs_noise_and_deviations(two_bands: xr.Dataset, measured: xr.Dataset) -> None:
-    """Without them there is no weight and no error bar."""
+    """A missing noise or an invalid standard deviation raises a ValueError."""
     with pytest.raises(ValueError, match="Missing noise of the response"):
         calibration.fit_emissivity(measured, two_bands.drop_vars("noise"), STDS)
     for stds in ((0.0, 0.05), (0.1, -0.05), (np.nan, 0.05)):

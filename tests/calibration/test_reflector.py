@@ -1,4 +1,4 @@
-"""Emissivity by the reflector method and on the bench: exact without errors, true error bars."""
+"""Emissivity by the reflector method and on the bench: without errors, and its uncertainty."""
 
 import re
 from collections.abc import Callable
@@ -115,7 +115,7 @@ def test_deviation_is_true(known: xr.Dataset) -> None:
 def test_bad_measurements(
     known: xr.Dataset, change: Callable[[xr.Dataset], xr.Dataset], message: str
 ) -> None:
-    """Measurements that carry no emissivity are refused."""
+    """Measurements that do not determine an emissivity raise a ValueError."""
     with pytest.raises(ValueError, match=re.escape(message)):
         calibration.reflector_emissivity(change(measured(known, 325.0, 295.0)), known, STDS)
 
@@ -148,7 +148,7 @@ def test_bench_is_within_three_hundredths(table: xr.Dataset) -> None:
 
 
 def test_bench_s_error_bars_are_true(table: xr.Dataset) -> None:
-    """Knowing the common errors 68 % are within one deviation; not knowing them, far fewer."""
+    """Coverage is 68 % when the common errors are stated, and far less when they are not."""
     coverage = table["coverage"].mean(("object", "band"))
     print("coverage", dict(zip(coverage["procedure"].values, coverage.values, strict=True)))
     assert float(coverage.sel(procedure="bench")) == pytest.approx(0.68, abs=0.06)
@@ -171,7 +171,7 @@ def test_reflector_method_fails_at_low_emissivity(table: xr.Dataset) -> None:
 def test_its_failure_is_the_mirrored_direction(
     known: xr.Dataset, excess: tuple[float, ...]
 ) -> None:
-    """In a room of one temperature it is right within 0.015; each kelvin mirrored adds to that."""
+    """In a uniform room its error is below 0.015; it grows with the mirrored direction's excess."""
     found = reflector_sensitivity(known, np.random.default_rng(1), excess, repeats=60)
     print(found["mean"].sel(band="8-14").to_pandas())
     assert found["mean"].dims == ("object", "excess", "band")
@@ -220,7 +220,7 @@ def test_common_errors_do_not_average_out(known: xr.Dataset) -> None:
 
 
 def test_scatter_does_not_pass_for_contrast(known: xr.Dataset) -> None:
-    """Readings that scatter by 0.5 K at a contrast of 2 K: no bias, and the spread is stated."""
+    """Readings that scatter by 0.5 K at a contrast of 2 K give no bias; the scatter is stated."""
     rng, number = np.random.default_rng(3), 60
     true = xr.DataArray([0.9, 0.8], dims="band", coords={"band": ["8-14", "9.5"]})
     warm, stds = np.full(200, 300.0), (0.5, 0.05)
@@ -251,7 +251,7 @@ def test_deviations_grow_with_the_correction(known: xr.Dataset) -> None:
 
 
 def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fit that is stopped before it stands still names its band."""
+    """A fit that is stopped before convergence raises an error with the band's name."""
     monkeypatch.setattr("dbthermal.calibration._emissivity._ITERATIONS", 1)
     rng = np.random.default_rng(0)
     series = bench_series(known, OBJECTS[0], Bench(), rng)
@@ -269,7 +269,7 @@ def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.Monke
     ],
 )
 def test_bad_bias(options: dict[str, object], message: str) -> None:
-    """Ranges that are none are refused."""
+    """Ranges of a bias outside their limits raise a ValueError that names them."""
     with pytest.raises(ValueError, match=message):
         Bias(**options)  # type: ignore[arg-type]
 
@@ -293,13 +293,13 @@ def test_bad_bias(options: dict[str, object], message: str) -> None:
     ],
 )
 def test_numbers_that_are_no_bench(options: dict[str, object], message: str) -> None:
-    """Each is refused by its name, with the rule."""
+    """Invalid settings of a bench raise a ValueError with their name and the rule."""
     with pytest.raises(ValueError, match=message):
         Bench(**options)  # type: ignore[arg-type]
 
 
 def test_bad_bench(known: xr.Dataset) -> None:
-    """Objects, steps and repeats that are none are refused."""
+    """Invalid emissivities, stray fractions, temperatures and repeats raise a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid emissivity 1\.2 of 'tin'"):
         Sample("tin", 1.2, "brass plate", 0.0)
     with pytest.raises(ValueError, match=r"Invalid stray 2\.0 of 'tin'"):

@@ -125,7 +125,7 @@ def flagged(raw: xr.Dataset, band: int, frames: slice) -> xr.Dataset:
 
 
 def test_recorded_flags_tell_the_shutter(recorded: Recorded) -> None:
-    """Frames that the camera reports as closed are left out though their images differ."""
+    """Frames with the recorded flag of a closed shutter are left out though their images differ."""
     raw = flagged(recorded.raw.isel(time=slice(100)), 1, slice(40, 45))
     corrected = correct_capture(raw, recorded.correction)
     lost = corrected["counts"].isnull().all(("y", "x")).values
@@ -152,7 +152,7 @@ def test_damaged_frames_are_left_out(recorded: Recorded) -> None:
 
 
 def test_offsets_in_proportion_to_time(recorded: Recorded) -> None:
-    """Offsets go from one flat image to the other; across a shutter event that is refused."""
+    """Offsets are interpolated linearly in time; interpolation over a shutter event raises."""
     raw, flat = recorded.raw.isel(time=slice(100)), recorded.options["flat"]
     later = flat + np.random.default_rng(1).normal(0.0, 30.0, flat.shape)
     corrected = correct_capture(raw, recorded.correction, flat=flat, flat_after=later)

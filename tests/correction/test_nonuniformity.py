@@ -28,7 +28,7 @@ def blackbody(gain: object, offset: object, levels: object = LEVELS) -> xr.Datas
 
 
 def centred(gain: object, offset: object) -> xr.Dataset:
-    """Frames of pixels whose mean is the ideal pixel's: what makes gain and offset identifiable."""
+    """Frames of pixels whose mean is the ideal pixel's, to make gain and offset identifiable."""
     slope = 1.0 / np.asarray(gain, dtype=float)
     shift = -np.asarray(offset, dtype=float) * slope
     return blackbody(slope.mean() / slope, (shift.mean() - shift) / slope)
@@ -144,14 +144,14 @@ def test_bad_pixel_is_found_and_left_out(ideal: xr.Dataset, samples: np.ndarray)
 
 
 def test_pixels_that_are_alike_are_all_good() -> None:
-    """Where no pixel differs from another, rounding makes no outlier."""
+    """Identical pixels are all good: rounding does not mark an outlier."""
     fitted = fit_correction(blackbody(np.ones((5, 5)), np.zeros((5, 5))))
     assert not fitted["bad"].any()
     np.testing.assert_allclose(fitted["gain"], 1.0, rtol=0, atol=1e-12)
 
 
 def test_threshold_is_the_caller_s(ideal: xr.Dataset) -> None:
-    """A lower threshold marks the pixel of the largest gain; one of zero or less is refused."""
+    """A lower threshold marks the pixel of largest gain; zero or less raises a ValueError."""
     gain = fit_correction(ideal)["gain"].values
     marked = fit_correction(ideal, threshold=2.0)["bad"].values
     assert marked.flat[np.argmax(gain)]
@@ -168,13 +168,13 @@ def test_fit_leaves_its_input(ideal: xr.Dataset) -> None:
 
 
 def test_one_temperature_is_not_enough() -> None:
-    """A gain needs two levels."""
+    """A single temperature raises a ValueError: a gain needs two levels."""
     with pytest.raises(ValueError, match="Invalid blackbody frames of 1 temperature"):
         fit_correction(blackbody([[1.0]], [[0.0]], LEVELS[:1]))
 
 
 def test_most_pixels_must_be_usable() -> None:
-    """A median over a minority of pixels would say what is normal, and be wrong."""
+    """Fewer than half of the pixels usable raises a ValueError: the median would be biased."""
     made = blackbody(np.ones((2, 2)), np.zeros((2, 2)))
     made["counts"][0, 1, 0] = np.nan
     with pytest.raises(ValueError, match=re.escape("band '8-14': 2 of 4 pixels are usable")):
@@ -182,7 +182,7 @@ def test_most_pixels_must_be_usable() -> None:
 
 
 def test_level_must_rise_with_temperature() -> None:
-    """Frames under another's temperature are refused."""
+    """Frames labelled with another temperature raise a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid levels .* Must rise"):
         fit_correction(blackbody(np.ones((2, 2)), np.zeros((2, 2)), LEVELS[[1, 0, 2]]))
 
@@ -200,7 +200,7 @@ def test_correct_applies_gain_and_offset(capture: xr.Dataset, correction: xr.Dat
 
 
 def test_corrected_blackbody_is_uniform(rng: np.random.Generator) -> None:
-    """What the fit learned from noisy frames makes a new frame of the blackbody even."""
+    """A correction fitted to noisy frames makes a new frame of the blackbody uniform."""
     gain, offset = 1.0 + 0.03 * rng.standard_normal((12, 16)), 200 * rng.standard_normal((12, 16))
     made = centred(gain, offset)
     fitted = fit_correction(made + 0.5 * rng.standard_normal(made["counts"].shape))
@@ -212,7 +212,7 @@ def test_corrected_blackbody_is_uniform(rng: np.random.Generator) -> None:
 
 
 def test_status_tells_dead_from_saturated(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """A bit a cause, from whichever band it comes; the counts stay as they are."""
+    """Dead and saturated pixels of any band get a bit each, and the counts do not change."""
     capture["counts"][1, 2, 0, 1] = 65535
     capture["counts"][0, 1, 1, 3] = 0
     result = correct(capture, correction)
@@ -227,7 +227,7 @@ def test_status_tells_dead_from_saturated(capture: xr.Dataset, correction: xr.Da
 
 
 def test_maximum_is_the_detector_s(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """A detector of fewer bits saturates lower."""
+    """A detector of fewer bits saturates at a lower count."""
     result = correct(capture, correction.assign(bad=correction["bad"] & False), maximum=20047)
     np.testing.assert_array_equal(result["status"], [[0, 0, 0, 0], [0, 0, 0, 128]])
 
@@ -247,7 +247,7 @@ def test_provenance_is_written(capture: xr.Dataset, correction: xr.Dataset) -> N
 
 
 def test_correct_leaves_its_input(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """Neither capture nor correction is changed, and other variables are handed on."""
+    """Capture and correction are not changed, and other variables are kept."""
     capture["fpa_temperature"] = ("time", [300.0, 300.1, 300.2])
     before = capture.copy(deep=True), correction.copy(deep=True)
     result = correct(capture, correction)
@@ -257,7 +257,7 @@ def test_correct_leaves_its_input(capture: xr.Dataset, correction: xr.Dataset) -
 
 
 def test_corrected_twice_is_refused(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """A second correction would undo the first; scaled counts are no raw ones."""
+    """Correcting a corrected or scaled capture raises a ValueError."""
     corrected = correct(capture, correction)
     with pytest.raises(ValueError, match="corrected before"):
         correct(corrected, correction)
@@ -266,13 +266,13 @@ def test_corrected_twice_is_refused(capture: xr.Dataset, correction: xr.Dataset)
 
 
 def test_unordered_time_is_refused(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """The stage's own rules hold."""
+    """A capture with unordered times raises the error of its stage."""
     with pytest.raises(ValueError, match="Unordered 'time'"):
         correct(capture.isel(time=[0, 2, 1]), correction)
 
 
 def test_band_must_be_corrected(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """A band without a correction is named."""
+    """A band without a correction raises an error with its name."""
     with pytest.raises(ValueError, match=re.escape("Missing band '9.5' in the correction")):
         correct(capture, correction.isel(band=[1, 2]))
 
@@ -286,7 +286,7 @@ def test_pixels_must_be_the_same(capture: xr.Dataset, correction: xr.Dataset) ->
 
 
 def test_correction_must_be_whole(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """A gain of NaN would pass in silence; bad pixels that are not marked, too."""
+    """A NaN gain or missing bad pixels raise a ValueError."""
     with pytest.raises(ValueError, match="Invalid gain of the correction: not finite"):
         correct(capture, correction.assign(gain=correction["gain"] * np.nan))
     with pytest.raises(ValueError, match="Missing 'bad'"):
@@ -322,7 +322,7 @@ def test_noise_of_few_frames(movies: xr.Dataset, count: int) -> None:
 
 
 def test_drift_is_no_noise(movies: xr.Dataset) -> None:
-    """A drift of 200 counts over the movie is not taken for noise."""
+    """A drift of 200 counts over the movie does not enter the noise."""
     drift = xr.DataArray(np.linspace(0.0, 200.0, 12).round().astype(np.uint16), dims="frame")
     drifting = movies + drift
     noise = blackbody_statistics(drifting.transpose(*movies["counts"].dims))["noise"]
@@ -337,7 +337,7 @@ def test_statistics_feed_the_fit(movies: xr.Dataset) -> None:
 
 
 def test_movies_must_vary(movies: xr.Dataset) -> None:
-    """One frame, or a frozen image, has no noise."""
+    """A movie of one frame or of identical frames raises a ValueError."""
     with pytest.raises(ValueError, match="Invalid movies of 1 frame"):
         blackbody_statistics(movies.isel(frame=[0]))
     with pytest.raises(ValueError, match=re.escape("Invalid noise 0.0 count")):

@@ -80,7 +80,7 @@ def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
 
 
 def draw_plan(**attrs: object) -> Figure:
-    """Draw what two materials let expect behind two filters, and of two lengths."""
+    """Draw the expected accuracy of two materials by filter and by length of the film."""
     names = {"material": ["glass", "slate"], "filter": ["9.5", "10.6"]}
     std = array("material filter", 2, 2).assign_coords(names) - 300
     best = xr.DataArray(["9.5", "none"], dims="material", coords={"material": names["material"]})
@@ -131,7 +131,7 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
 
 
 def test_every_figure_is_tested() -> None:
-    """The list above is complete."""
+    """The table of figures above holds every public figure."""
     elsewhere = {"LiveFigure", "Panel", "REASONS", "drawing", "first_reason", "separated_film"}
     assert {*figures.__all__} - elsewhere == DRAWN.keys()
 
@@ -145,7 +145,7 @@ def test_figure(name: str) -> None:
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_title_says_what_the_data_are(name: str) -> None:
-    """Simulated data and pictures are called so."""
+    """The title names simulated data and drawn pictures as such."""
     draw, _ = DRAWN[name]
     assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
 
@@ -154,7 +154,7 @@ def test_title_says_what_the_data_are(name: str) -> None:
     "name", ["gain_offset_maps", "separated_frames", "truth_and_estimate", "condition_matrix"]
 )
 def test_nothing_but_nan(name: str) -> None:
-    """Where no pixel has a value, the empty figure is drawn without a warning."""
+    """A figure of nothing but NaN is drawn empty and without a warning."""
     figure = DRAWN[name][0](fill=np.nan)
     figure.draw_without_rendering()
     assert figure.axes

@@ -1,4 +1,4 @@
-"""A device in a byte dialogue: it answers what a test writes down, and nothing may be left over.
+"""A device in a byte dialogue that a test writes down; any unread or unwritten byte fails.
 
 The idea is pymeasure's ``expected_protocol``.
 """
@@ -15,7 +15,7 @@ Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]
 
 class Dialogue(Closing):
     """
-    A transport that expects certain bytes, gives certain answers, and allows no rest.
+    A transport that expects certain bytes, gives certain answers, and fails on leftovers.
 
     Used as a context manager it checks at its end, unless something else went wrong, that all was
     written and all was read. An answer in several pieces takes one read for each; an empty piece
@@ -44,7 +44,7 @@ class Dialogue(Closing):
             self._answer()
 
     def read(self, size: int, timeout: float) -> bytes:  # noqa: ARG002 - no time goes by
-        """Give the next piece of the answer, at most `size` bytes of it; none if none is left."""
+        """Give the next piece of the answer, at most `size` bytes; empty if all is read."""
         if not self._answers:
             return b""
         piece = self._answers.pop(0)
@@ -55,7 +55,7 @@ class Dialogue(Closing):
         return piece[:size]
 
     def close(self) -> None:
-        """Do nothing, so that a driver's own end does not hide what is left."""
+        """Do nothing, so that a driver's own clean-up does not hide leftovers."""
 
     def finish(self) -> None:
         """Fail if something was not written or not read."""
@@ -81,7 +81,7 @@ class Dialogue(Closing):
             self._next()
 
     def _next(self) -> None:
-        """Let the device speak, if it is to do so unasked."""
+        """Let the device send without a request where the dialogue says so."""
         if self._pairs and self._pairs[0][0] is None:
             self._answer()
 

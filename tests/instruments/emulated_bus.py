@@ -1,4 +1,4 @@
-"""An emulated USB bus for pyusb, Linux's sysfs of it, and its serial ports: for the inventory.
+"""An emulated USB bus for pyusb, with its sysfs tree and serial ports, to test the inventory.
 
 Everything that would disturb a live device is refused with an error, so that a test sees it. No
 device's own protocol is emulated here.
@@ -128,7 +128,7 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         )
 
     def get_configuration_descriptor(self, dev: EmulatedDevice, config: int) -> SimpleNamespace:
-        """Give the only configuration there is, without interfaces."""
+        """Give the only configuration of a device, without interfaces."""
         del dev, config
         return SimpleNamespace(
             bLength=9,
@@ -143,7 +143,7 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         )
 
     def open_device(self, dev: EmulatedDevice) -> EmulatedDevice:
-        """Open a device, if one may."""
+        """Open a device, or raise the error of its fault."""
         if dev.fault == "permission":
             raise usb.core.USBError("Access denied (emulated)", -3, errno.EACCES)
         if dev.fault == "unplugged":
@@ -177,27 +177,27 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         return len(answer)
 
     def set_configuration(self, *_: Any) -> NoReturn:
-        """Refuse: it resets the device."""
+        """Fail: this would reset the device."""
         self._refuse("set_configuration")
 
     def set_interface_altsetting(self, *_: Any) -> NoReturn:
-        """Refuse: it stops the stream."""
+        """Fail: this would stop the stream."""
         self._refuse("set_interface_altsetting")
 
     def claim_interface(self, *_: Any) -> NoReturn:
-        """Refuse: the kernel has it."""
+        """Fail: the kernel's driver has the interface."""
         self._refuse("claim_interface")
 
     def detach_kernel_driver(self, *_: Any) -> NoReturn:
-        """Refuse: the nodes would vanish."""
+        """Fail: the device's nodes would vanish."""
         self._refuse("detach_kernel_driver")
 
     def reset_device(self, *_: Any) -> NoReturn:
-        """Refuse."""
+        """Fail: this would disturb the device."""
         self._refuse("reset_device")
 
     def clear_halt(self, *_: Any) -> NoReturn:
-        """Refuse."""
+        """Fail: this would disturb the device."""
         self._refuse("clear_halt")
 
     def _refuse(self, function: str) -> NoReturn:

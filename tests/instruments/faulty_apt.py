@@ -1,4 +1,4 @@
-"""An emulated filter wheel in which things go wrong: each attribute of `faults` is one of them."""
+"""An emulated filter wheel with faults, each set by an attribute of `faults`."""
 
 import math
 from dataclasses import dataclass, field, fields, replace
@@ -14,7 +14,7 @@ _NONE = StatusBits(0)
 @dataclass
 class Faults:
     """
-    What goes wrong; may be set at any time.
+    Faults of the wheel and its line; may be changed at any time.
 
     Attributes
     ----------
@@ -81,11 +81,11 @@ class StandingDrive(Drive):
 
     @property
     def duration(self) -> float:
-        """For ever."""
+        """Infinite: the motion never ends."""
         return math.inf
 
     def place(self, time: float) -> float:
-        """On to where it stands."""
+        """Position at rest: the wheel does not move."""
         way = min(self._rise(time - self.start), self.way)
         return self.origin + math.copysign(way, self.distance)
 
@@ -109,7 +109,7 @@ class FaultyApt(EmulatedApt):
         self._waiting: list[tuple[float, bytes]] = []
 
     def obey(self, message: apt.Message) -> None:
-        """Obey, or not."""
+        """Carry out a message, or ignore it by a fault."""
         self.received.append(message)
         if self.faults.silent or message.id in self.faults.deaf_to:
             return
@@ -125,7 +125,7 @@ class FaultyApt(EmulatedApt):
         super().obey(message)
 
     def poll(self) -> list[bytes]:
-        """Send in other pieces, and later."""
+        """Messages that are due, split, merged or delayed by a fault."""
         now = self.world.clock()
         self._waiting += [(now + self.faults.late, piece) for piece in super().poll()]
         due = [data for time, data in self._waiting if time <= now]
@@ -141,7 +141,7 @@ class FaultyApt(EmulatedApt):
         return max(0.0, min([super().next_due(), *times]))
 
     def reply(self, identifier: Id, *arguments: Any, **options: Any) -> None:
-        """Lose, or add to, an answer."""
+        """Send an answer, or lose it or add to it by a fault."""
         if self.faults.drop > 0:
             self.faults.drop -= 1
             return
@@ -152,14 +152,14 @@ class FaultyApt(EmulatedApt):
         super().reply(identifier, *arguments, **options)
 
     def report(self, identifier: Id) -> None:
-        """Report the end of a motion in another form, or not."""
+        """Report the end of a motion, in another form or not at all by a fault."""
         if self.faults.long_reports and identifier != Id.MOT_MOVE_HOMED:
             self.reply(identifier, self.status().pack())
         elif not self.faults.unreported:
             super().report(identifier)
 
     def plan(self, drive: Drive) -> Drive:
-        """Slower, shorter, or without an end."""
+        """Motion that is slower, shorter or endless by a fault."""
         degree = self.model.turn / 360.0
         faults, way = self.faults, abs(drive.distance)
         short = 0.0 if drive.homing else min(faults.stops_short * degree, way)

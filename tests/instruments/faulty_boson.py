@@ -1,4 +1,4 @@
-"""An emulated Boson in which things go wrong, as is reported of real ones."""
+"""An emulated Boson with the faults that are reported of real cameras."""
 
 import math
 from collections import deque

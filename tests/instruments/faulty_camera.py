@@ -1,4 +1,4 @@
-"""An emulated camera in which things go wrong, and a movie for it to see."""
+"""An emulated camera with faults, and a movie as its scene."""
 
 import math
 from collections.abc import Iterator
@@ -92,14 +92,14 @@ class FaultyCamera(EmulatedCamera):
         self._offsets: tuple[int, npt.NDArray[np.int32]] = 0, np.zeros(self.shape, np.int32)
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
-        """Give the next frame, unless mute."""
+        """Give the next frame, unless the camera is mute."""
         if self.faults.mute:
             self.sleep(timeout)
             raise NoFrameError(f"No frame from emulated camera '{self.name}': it is mute.")
         return super().read(timeout)
 
     def next_number(self, number: int, elapsed: float) -> int:
-        """Pass over the frames that never come; pull the plug."""
+        """Skip the frames that are dropped, and unplug the camera when its fault says so."""
         number = super().next_number(number, elapsed)
         while number in self.faults.dropped:
             number += 1

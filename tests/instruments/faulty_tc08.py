@@ -1,4 +1,4 @@
-"""An emulated TC-08 in which things go wrong: each attribute of `faults` is one of them."""
+"""An emulated TC-08 with faults, each set by an attribute of `faults`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ FULL_SCALE = 673.15
 @dataclass
 class Faults:
     """
-    What goes wrong; may be set at any time.
+    Faults of the unit and its library; may be changed at any time.
 
     Attributes
     ----------

@@ -100,7 +100,7 @@ class WheelBench:
         self.device.receive(apt.command(apt.Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
 
     def sent(self, identifier: apt.Id) -> list[apt.Message]:
-        """What the driver sent of one kind."""
+        """Messages of one identifier that the driver has sent."""
         return [message for message in self.device.received if message.id == identifier]
 
 

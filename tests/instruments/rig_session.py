@@ -68,7 +68,7 @@ def bench(session: Session, **settings: float) -> World:
 
 
 def pictures(world: World) -> dict[str, Picture]:
-    """What is seen: the band's level and the blackbody, with a pattern of columns."""
+    """Counts of the emulated bands: a level, ten times the blackbody's kelvin, and stripes."""
 
     def seen(level: int) -> Picture:
         pattern = np.arange(SHAPE[1]) % 2

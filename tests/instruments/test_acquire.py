@@ -37,7 +37,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written(path: Path, text: str) -> str:
-    """Path of a session that is written there."""
+    """Write a session to a file, and return its path."""
     path.write_text(text, encoding="utf-8")
     return str(path)
 
@@ -69,7 +69,7 @@ def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
 
 
 def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The devices are opened and named, and no more."""
+    """A dry run opens and names the devices, and records nothing."""
     arguments = [written(tmp_path / "a.yaml", TEXT), str(tmp_path / "b"), "--dry-run"]
     assert acquire.main(arguments) == 0
     said = capsys.readouterr().out
@@ -88,7 +88,7 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_failures_have_a_status(
     text: str, status: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What is wrong is said, and other programs are told."""
+    """A failure prints its message and exits with the documented status."""
     file = written(tmp_path / "a.yaml", text)
     assert acquire.main([file, str(tmp_path)]) == status
     assert message in capsys.readouterr().err
@@ -107,7 +107,7 @@ def test_recorded_scene_is_refused_at_once(
 
 
 def test_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A file that is not there is named."""
+    """A missing session file is reported as an invalid session, with exit status 2."""
     assert acquire.main([str(tmp_path / "a.yaml"), str(tmp_path)]) == 2
     assert "Invalid session: " in capsys.readouterr().err
 
@@ -115,7 +115,7 @@ def test_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 def test_interrupted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who interrupts it is told that nothing is lost."""
+    """An interrupted recording keeps its frames, says so, and exits with status 130."""
 
     def interrupt(*_: object) -> str:
         raise KeyboardInterrupt
@@ -130,7 +130,7 @@ def test_interrupted(
 def test_hardware_is_looked_for_and_asked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a rig that is not there the bus and the first address say so."""
+    """Without the rig the report of the bus and the first address name the missing devices."""
     monkeypatch.setattr(inventory, "find", lambda **_: [])
     real = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
     assert acquire.main([written(tmp_path / "a.yaml", real), str(tmp_path)]) == 1
@@ -140,7 +140,7 @@ def test_hardware_is_looked_for_and_asked(
 
 
 def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without an emulated one, the user is asked to set it, in degrees Celsius."""
+    """A real blackbody is set by the user, who gets the temperature in degrees Celsius."""
     asked: list[str] = []
     monkeypatch.setattr("builtins.input", asked.append)
     devices = Devices(Session.from_yaml(TEXT), {})
@@ -152,7 +152,7 @@ def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("error", [EOFError, NotImplementedError])
 def test_nobody_at_the_keyboard(error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nothing can be typed, as under papermill, the error says where it can."""
+    """Without a keyboard, as under papermill, the error says where to run the session."""
 
     def refuse(_: str) -> str:
         raise error
@@ -163,7 +163,7 @@ def test_nobody_at_the_keyboard(error: type[Exception], monkeypatch: pytest.Monk
 
 
 def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without libusb that is said, and is no end: the devices are opened by their nodes."""
+    """A missing libusb is reported, and the devices are opened by their nodes."""
 
     def missing(**_: object) -> list[inventory.Device]:
         raise inventory.LibusbMissingError("no libusb")

@@ -98,7 +98,7 @@ def decode(text: str | bytes) -> apt.Message:
 
 @pytest.mark.parametrize("expected", REQUESTS)
 def test_requests_have_the_published_bytes(expected: str) -> None:
-    """What a host sends is what others say that it sends."""
+    """Requests have the bytes that independent sources publish."""
     assert REQUESTS[expected].hex(" ").upper() == expected
 
 
@@ -113,13 +113,13 @@ def test_move_completed_has_two_forms() -> None:
 @pytest.mark.parametrize("identifier", ["64 04", "66 04"])
 @pytest.mark.parametrize("form", [" 01 00 01 22", LONG_COMPLETED[5:]])
 def test_completed_and_stopped_are_alike(identifier: str, form: str) -> None:
-    """The end of a move and a stop have the same two forms, and both go back to their bytes."""
+    """The end of a move and a stop have the same two forms, and both are encoded back."""
     assert apt.encode(decode(identifier + form)) == bytes.fromhex(identifier + form)
 
 
 @pytest.mark.parametrize("text", [STATUS, LONG_STATUS])
 def test_status_of_either_length(text: str) -> None:
-    """A status says position and bits; what a K10CR2 has behind is not read."""
+    """A status of either length gives position and bits; a K10CR2's further fields are not read."""
     assert apt.Status.parse(decode(text)) == apt.Status(1, position=1, encoder=0, bits=LIMITS)
 
 
@@ -145,7 +145,7 @@ def test_info_of_the_documentation() -> None:
 def test_payloads_come_back(
     payload: apt.Position | apt.Status | apt.Notice | apt.Info, identifier: apt.Id
 ) -> None:
-    """What a record packs, it reads, and it reads nothing else."""
+    """A record reads back the data that it packs, and rejects other messages and lengths."""
     message = apt.Message(identifier, 0, 0, apt.HOST, apt.BAY_1, payload.pack())
     assert type(payload).parse(decode(apt.encode(message))) == payload
     with pytest.raises(ValueError, match="Invalid message 0x0444"):
@@ -174,7 +174,7 @@ def test_answers_in_a_parameter() -> None:
     ],
 )
 def test_what_does_not_fit_is_refused(message: apt.Message, error: str) -> None:
-    """A message whose numbers do not fit its fields is an error, and nothing is cut."""
+    """A number that does not fit its field raises a ValueError."""
     with pytest.raises(ValueError, match=error):
         apt.encode(message)
     with pytest.raises(ValueError, match=r"Invalid Position\(channel=1, position=2147483648\)"):
@@ -185,7 +185,7 @@ def test_what_does_not_fit_is_refused(message: apt.Message, error: str) -> None:
 
 @pytest.mark.parametrize("wrong", [1.5, float("nan"), "1", None])
 def test_a_number_must_be_whole(wrong: object) -> None:
-    """Nothing is rounded into a field."""
+    """A fractional number raises an error rather than being rounded into a field."""
     with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
         command(Id.MOT_MOVE_HOME, wrong, destination=apt.UNIT)  # type: ignore[arg-type]
 
@@ -211,7 +211,7 @@ def test_arbitrary_bytes(stream: bytes, cuts: list[int]) -> None:
 
 @given(st.lists(st.tuples(st.sampled_from([b"", b"\xff", b"\xfe\xfe\xff"]), known), max_size=6))
 def test_messages_are_found_behind_noise(parts: list[tuple[bytes, bytes]]) -> None:
-    """Bytes that begin no message cost themselves only, and are counted."""
+    """Noise before a message is dropped and counted, and the message is decoded."""
     decoder = apt.Decoder()
     messages = decoder.feed(b"".join(noise + message for noise, message in parts))
     assert [apt.encode(message) for message in messages] == [message for _, message in parts]
@@ -220,7 +220,7 @@ def test_messages_are_found_behind_noise(parts: list[tuple[bytes, bytes]]) -> No
 
 @given(st.binary(max_size=90), st.sampled_from(list(apt.Id)))
 def test_parsers_meet_arbitrary_data(data: bytes, identifier: apt.Id) -> None:
-    """A parser returns its record, or raises ValueError."""
+    """A parser returns its record or raises a ValueError, for any data."""
     message = apt.Message(identifier, 1, 1, apt.HOST, apt.BAY_1, data)
     parsers = (apt.Info, apt.Status, apt.Position, apt.HomeParameters, apt.Notice)
     for parse in (*(parser.parse for parser in parsers), apt.is_enabled):
@@ -231,7 +231,7 @@ def test_parsers_meet_arbitrary_data(data: bytes, identifier: apt.Id) -> None:
 
 
 def test_half_a_message_is_given_up() -> None:
-    """What pends can be dropped, and is counted; the next message is then found."""
+    """Pending bytes can be discarded, and are counted; the next message is then decoded."""
     decoder = apt.Decoder()
     assert decoder.feed(INFO[:50]) == []
     decoder.discard()
@@ -241,14 +241,14 @@ def test_half_a_message_is_given_up() -> None:
 
 @pytest.mark.parametrize("header", ["64 04 00 00 81 21", "81 04 00 00 81 21", "81 04 0E 00 01 21"])
 def test_lengths_that_no_message_has(header: str) -> None:
-    """Data of no bytes, or none where there must be some, are no message."""
+    """Impossible data lengths are dropped as noise."""
     decoder = apt.Decoder()
     assert decoder.feed(bytes.fromhex(header)) == []
     assert decoder.dropped == 1
 
 
 def test_what_a_host_sends_is_not_heard_by_a_host() -> None:
-    """An echo of the host's own messages is no answer."""
+    """An echo of the host's own messages is not decoded as an answer."""
     decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
     assert decoder.feed(command(Id.HW_REQ_INFO, destination=apt.UNIT) + bytes(6)) == []
     assert decoder.dropped == 7
@@ -256,7 +256,7 @@ def test_what_a_host_sends_is_not_heard_by_a_host() -> None:
 
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
 def test_a_line_is_read_in_both_directions(kind: type) -> None:
-    """Every request, and the reply to it, is found on a line that was noted, byte by byte."""
+    """Requests and replies on a logged line are all decoded, byte by byte."""
     decoder, reply = apt.Decoder(), bytes.fromhex(LONG_COMPLETED)
     for expected in REQUESTS:
         line = bytes.fromhex(expected) + reply
@@ -281,7 +281,7 @@ def test_bits_are_the_published_ones() -> None:
     ("source", "heard"), [(0x11, 1), (0x21, 1), (0x2A, 1), (0x50, 1), (0x2B, 0), (0x01, 0)]
 )
 def test_a_computer_hears_controllers_alone(source: int, heard: int) -> None:
-    """The rack, its ten bays and a unit are heard; from any other address it is noise."""
+    """Messages of the rack, its ten bays and a unit are decoded; all other addresses are noise."""
     decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
     assert len(decoder.feed(bytes((0x64, 0x04, 1, 0, 1, source)))) == heard
     assert decoder.dropped == 1 - heard
@@ -299,6 +299,6 @@ def test_a_computer_hears_controllers_alone(source: int, heard: int) -> None:
 def test_numbers_that_do_not_fit_a_reply(
     payload: apt.Status | apt.Notice | apt.Info, message: str
 ) -> None:
-    """A record whose numbers do not fit its fields is an error that shows it."""
+    """A record with a number that does not fit its field raises an error that shows it."""
     with pytest.raises(ValueError, match=message):
         payload.pack()

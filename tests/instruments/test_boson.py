@@ -1,4 +1,4 @@
-"""The Boson's driver: byte dialogues, and what it makes of bytes that are no answer."""
+"""The Boson's driver: byte dialogues, and its errors for invalid replies."""
 
 from contextlib import suppress
 from typing import Any
@@ -59,7 +59,7 @@ def test_a_temperature_below_zero_celsius_has_a_sign() -> None:
 
 
 def test_a_late_reply_is_not_taken_for_the_next() -> None:
-    """A reply that comes after its time is discarded, and the question asked anew."""
+    """A late reply is discarded, and the request is sent again."""
     both = reply(1, FPA, b"\x00\x01") + reply(2, FPA, b"\x01\x7c")
     with Dialogue([(fslp.encode(1, FPA), None), (fslp.encode(2, FPA), both)]) as line:
         camera = camera_of(line)
@@ -68,7 +68,7 @@ def test_a_late_reply_is_not_taken_for_the_next() -> None:
 
 
 def test_frames_of_other_channels_and_echoes_are_discarded() -> None:
-    """Debug text and the request itself are no reply."""
+    """Frames of the debug channel and echoes of the request are discarded."""
     text = fslp.encode(1, SERIAL, b"text", 0, channel=DEBUG_CHANNEL)
     with Dialogue([(SERIAL_REQUEST, text + SERIAL_REQUEST + SERIAL_REPLY)]) as line:
         camera = camera_of(line)
@@ -77,7 +77,7 @@ def test_frames_of_other_channels_and_echoes_are_discarded() -> None:
 
 
 def test_a_damaged_reply_is_asked_for_again() -> None:
-    """A wrong checksum is as good as no reply, and is counted."""
+    """A reply with a wrong checksum is counted, and requested again."""
     spoilt = SERIAL_REPLY[:-2] + b"\x11\xae"
     again = (fslp.encode(2, SERIAL), reply(2, SERIAL, b"\x00\x00\x00\x07"))
     with Dialogue([(SERIAL_REQUEST, spoilt), again]) as line:
@@ -87,14 +87,14 @@ def test_a_damaged_reply_is_asked_for_again() -> None:
 
 
 def test_a_mute_camera_is_asked_three_times() -> None:
-    """Readings are asked for again twice, then it is an error that says how long it took."""
+    """A reading is requested three times, and then raises a timeout error."""
     line = Dialogue([(fslp.encode(n, SERIAL), None) for n in (1, 2, 3)])
     with line, pytest.raises(BosonTimeoutError, match="No reply to 'serial number' within 1 s"):
         camera_of(line).serial_number()
 
 
 def test_a_change_is_sent_once() -> None:
-    """What changes the camera is never repeated: it may have been done."""
+    """A command that changes the camera is never sent twice."""
     line = Dialogue([(fslp.encode(1, SET_GAIN, b"\x00\x00\x00\x01"), None)])
     with line, pytest.raises(BosonTimeoutError, match="No reply to 'set gain mode'"):
         camera_of(line).set(commands.GAIN_MODE, GainMode.LOW)
@@ -105,7 +105,7 @@ def test_a_change_is_sent_once() -> None:
     [(0x203, "value out of range"), (0x283, "camera busy"), (0x6A4, "flash"), (0x999, "unknown")],
 )
 def test_a_refusal_says_why(status: int, text: str) -> None:
-    """The status of an error is in the exception, and its meaning in the message."""
+    """A status of failure is in the exception, and its meaning in the message."""
     line = Dialogue([(SERIAL_REQUEST, reply(1, SERIAL, status=status))])
     with line, pytest.raises(BosonStatusError, match=f"0x{status:X}, {text}") as refusal:
         camera_of(line).serial_number()
@@ -121,14 +121,14 @@ def test_a_refusal_says_why(status: int, text: str) -> None:
     ],
 )
 def test_a_reply_that_is_none_is_an_error(answer: bytes, message: str) -> None:
-    """A reply to another command, or of the wrong size, is not believed."""
+    """A reply to another command, or of the wrong size, raises an error."""
     line = Dialogue([(SERIAL_REQUEST, answer)])
     with line, pytest.raises(BosonReplyError, match=message.replace(".", r"\.")):
         camera_of(line).serial_number()
 
 
 def test_a_value_without_meaning_is_an_error() -> None:
-    """A status of 9 and a part number that is no text are errors."""
+    """An unknown status and a part number that is not text raise an error."""
     wrong = reply(1, 0x00050054, b"\x00\x00\x00\x09")
     line = Dialogue([(fslp.encode(1, 0x00050054), wrong)])
     with line, pytest.raises(BosonReplyError, match="9 is not a valid FfcStatus"):
@@ -147,7 +147,7 @@ def test_an_acknowledgement_with_data_is_an_error() -> None:
 
 
 def test_a_line_that_never_ends_is_an_error() -> None:
-    """However much comes that is no reply, the wait for one has an end."""
+    """The wait for a reply ends after a maximum number of other bytes."""
     line = Dialogue([(SERIAL_REQUEST, [bytes(4096)] * (MAXIMUM_RECEIVED // 4096 + 1))])
     with line, pytest.raises(BosonReplyError, match="within 65536 bytes"):
         camera_of(line).serial_number()
@@ -155,7 +155,7 @@ def test_a_line_that_never_ends_is_an_error() -> None:
 
 @given(st.lists(st.binary(max_size=60), max_size=6))
 def test_any_answer_is_a_value_or_a_documented_error(answer: list[bytes]) -> None:
-    """Whatever bytes come, the driver gives a number or one of its own errors, and ends."""
+    """Any bytes give a number or a documented error, in bounded time."""
     camera = camera_of(Dialogue([(SERIAL_REQUEST, answer)]))
     with suppress(BosonError):
         assert 0 <= camera.read(commands.SERIAL_NUMBER, repeats=0) < 2**32
@@ -163,7 +163,7 @@ def test_any_answer_is_a_value_or_a_documented_error(answer: list[bytes]) -> Non
 
 @pytest.mark.parametrize("setting", commands.SETTINGS, ids=lambda setting: setting.name)
 def test_what_is_not_allowed_is_not_sent(setting: Setting[Any]) -> None:
-    """A value outside the range of a setting is refused before a byte is written."""
+    """A value outside the range of a setting raises an error before a byte is sent."""
     line = Dialogue([])
     with line, pytest.raises(ValueError, match=r"Invalid .* -1\. Must be one of"):
         camera_of(line).set(setting, -1)

@@ -84,7 +84,7 @@ def test_a_temperature_in_celsius_has_a_sign() -> None:
 
 
 def test_the_message_of_a_wrong_value_names_the_right_ones() -> None:
-    """The choices are in the message."""
+    """The error of an invalid value lists the valid ones."""
     choices = r"Invalid gain mode 7\. Must be one of 0 \(HIGH\), 1 \(LOW\), 2 \(AUTO\)"
     wrong: Any = 7
     with pytest.raises(ValueError, match=choices):
@@ -92,7 +92,7 @@ def test_the_message_of_a_wrong_value_names_the_right_ones() -> None:
 
 
 def test_no_identifier_is_used_twice() -> None:
-    """Whatever is asked, set or done has an identifier of its own."""
+    """All readings, settings and actions have different identifiers."""
     used = [reading.command for reading in commands.READINGS]
     used += [number for s in commands.SETTINGS for number in (s.reading.command, s.set_command)]
     used.append(commands.RUN_FFC)

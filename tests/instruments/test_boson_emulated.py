@@ -1,4 +1,4 @@
-"""The Boson's driver on its emulator: what faults look like to a user, and how true it is."""
+"""The Boson's driver on its emulator: faults as a user sees them, and the emulator's fidelity."""
 
 from collections import deque
 from typing import Any
@@ -37,7 +37,7 @@ def bench() -> BosonBench:
 
 @pytest.mark.parametrize("setting", commands.SETTINGS, ids=lambda setting: setting.name)
 def test_every_setting_is_kept(bench: BosonBench, setting: Setting[Any]) -> None:
-    """What is set is read back."""
+    """Every value of every setting is read back as set."""
     for value in setting.kind:
         bench.camera.set(setting, value)
         assert bench.camera.get(setting) == value
@@ -83,14 +83,14 @@ def test_the_emulator_refuses_as_a_camera_does(
     "noise", [b"\x00\x11", SERIAL_REQUEST[:9], SERIAL_REQUEST[:-2] + b"\0\xae"]
 )
 def test_the_emulator_listens_on_after_noise(bench: BosonBench, noise: bytes) -> None:
-    """Rubbish, a frame cut short, and one with a wrong checksum are not answered."""
+    """Noise, incomplete frames and frames with a wrong checksum are not answered."""
     other = fslp.encode(5, SERIAL, channel=1)
     assert [f.sequence for f in bench.exchange(noise + other + SERIAL_REQUEST)] == [1]
 
 
 @given(st.lists(st.binary(max_size=60), max_size=6))
 def test_the_emulator_takes_any_bytes(pieces: list[bytes]) -> None:
-    """Whatever is written, it does not fail, and answers the next good request."""
+    """After any bytes the emulator answers the next valid request."""
     bench = BosonBench()
     for piece in pieces:
         bench.loop.write(piece)
@@ -113,7 +113,7 @@ def test_the_emulator_takes_any_bytes(pieces: list[bytes]) -> None:
 def test_a_fault_of_the_line_is_overcome_and_counted(
     bench: BosonBench, fault: Fault, timeouts: int, discarded: int, damaged: int
 ) -> None:
-    """The right value is read in spite of it, and the next one too; the statistics tell."""
+    """A fault of the line is counted, and this and the next reading are right."""
     bench.spoil(fault)
     assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
     assert bench.camera.serial_number() == 93588
@@ -140,7 +140,7 @@ def test_a_fault_of_the_camera_is_an_error(
 
 
 def test_a_change_that_is_answered_late_is_done_once(bench: BosonBench) -> None:
-    """The user is told that no reply came, and finds the change made."""
+    """A late acknowledgement raises a timeout error, and the change is made once."""
     bench.spoil(Fault.LATE)
     with pytest.raises(BosonTimeoutError, match="set gain mode"):
         bench.camera.set(commands.GAIN_MODE, GainMode.LOW)
@@ -155,7 +155,7 @@ def test_replies_may_come_byte_by_byte(bench: BosonBench) -> None:
 
 @pytest.mark.parametrize("stalls", [False, True])
 def test_a_correction_is_waited_for(bench: BosonBench, stalls: bool) -> None:
-    """It takes as long as the shutter does, whether or not the camera answers meanwhile."""
+    """A correction is awaited for the shutter's time, also while the camera does not answer."""
     bench.device.faults.ffc_stalls = stalls
     for number in (1, 2):
         start = bench.clock.now
@@ -176,13 +176,13 @@ def test_a_correction_that_stalls_past_the_timeout_shifts_no_reply(bench: BosonB
 
 
 def test_a_correction_that_takes_too_long_is_an_error(bench: BosonBench) -> None:
-    """The wait has an end that the message names."""
+    """A correction beyond its time limit raises an error that gives the limit."""
     with pytest.raises(BosonTimeoutError, match=r"No flat-field correction within 0\.2 s"):
         bench.camera.run_ffc(timeout=0.2)
 
 
 def test_an_unplugged_camera_is_an_error(bench: BosonBench) -> None:
-    """No question is repeated to a camera that is gone."""
+    """A reading of an unplugged camera raises a TransportError."""
     bench.state.plugged = False
     with pytest.raises(TransportError):
         bench.camera.serial_number()

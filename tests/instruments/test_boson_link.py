@@ -152,7 +152,7 @@ def test_closing_waits_for_an_exchange_of_another_thread() -> None:
 
 
 def test_a_camera_may_be_closed_twice() -> None:
-    """A second time does nothing."""
+    """A second close does nothing."""
     camera = Boson(Slow())
     for _ in range(2):
         camera.close()

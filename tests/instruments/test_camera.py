@@ -1,4 +1,4 @@
-"""The interface of a camera: its shutter from what it tells, its kinds by their names."""
+"""The interface of a camera: state of the shutter, and kinds of cameras by name."""
 
 from collections.abc import Sequence
 
@@ -42,13 +42,13 @@ def test_a_renewal_at_the_end_of_a_correction_marks_the_frame_after_it() -> None
 
 
 def test_a_renewal_whose_frozen_frames_were_lost_is_marked() -> None:
-    """One frame is marked, though no image is repeated; a damaged frame's telemetry is none."""
+    """A correction marks one frame without a repeated image; damaged telemetry is not used."""
     assert closed(".....", [0, 0, 3, 3, 3]) == "..x.."
     assert closed(".....", [0, 0, None, 3, 3]) == "...x."
 
 
 def test_repeated_images_of_a_camera_with_telemetry_are_no_shutter() -> None:
-    """Without a renewal a lost frame, or a saturated view, stays what it is."""
+    """With telemetry, repeated images without a correction are not marked as a shutter."""
     assert closed("..x.xxxxx.", [5] * 10) == ".........."
 
 
@@ -61,7 +61,7 @@ def test_the_serial_line_closes_a_frozen_image(status: FfcStatus) -> None:
 
 
 def test_without_telemetry_a_run_of_copies_is_the_shutter() -> None:
-    """Fewer copies are lost frames; a serial line that is asked too seldom changes nothing."""
+    """Without telemetry three copies or more mark a closed shutter, fewer are lost frames."""
     expected = "....xx."
     assert closed("..xxxx.") == expected
     assert closed("..xxxx.", status=[DONE] * 7) == expected
@@ -81,7 +81,7 @@ def test_without_telemetry_a_run_of_copies_is_the_shutter() -> None:
 def test_a_changing_image_is_closed_by_a_renewal_alone(
     frames: list[tuple[bool, int | None, FfcStatus | None]],
 ) -> None:
-    """Whatever is told, a frame that is no copy is marked if the last correction changed, only."""
+    """A frame with a new image is marked only if the number of the last correction changed."""
     state = Shutter()
     for repeated, last, status in frames:
         after = next_shutter(state, repeated=repeated, last_ffc_frame=last, ffc_status=status)
@@ -92,6 +92,6 @@ def test_a_changing_image_is_closed_by_a_renewal_alone(
 
 
 def test_an_unknown_kind_is_named() -> None:
-    """The error lists the kinds that there are."""
+    """An unknown kind of camera raises an error that lists the known ones."""
     with pytest.raises(ValueError, match=r"Unknown kind of camera 'lepton'\. Must be one of \["):
         camera_kind("lepton")

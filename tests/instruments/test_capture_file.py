@@ -1,4 +1,4 @@
-"""A capture file believes no impossible stamp and no impossible telemetry, and flags both."""
+"""A capture file flags impossible time stamps and telemetry, and does not use them."""
 
 import errno
 import math
@@ -48,7 +48,7 @@ def rows(last_correction: int, number: int = 0) -> np.ndarray[Any, np.dtype[np.u
 
 @pytest.mark.parametrize("wrong", [500.0, -500.0])
 def test_a_stamp_that_cannot_be_spoils_its_own_frame_alone(wrong: float, tmp_path: Path) -> None:
-    """A stamp after the host's, or of before the start, is no time; those that follow it are."""
+    """A stamp after the host's, or before the start, is invalid for its own frame alone."""
     file = begun(tmp_path / "a.zarr")
     for frame in (shot(0), shot(1, device_time=wrong), shot(2), shot(3)):
         file.frame(BANDS[0], frame)
@@ -94,7 +94,7 @@ def test_a_correction_is_noted(tmp_path: Path) -> None:
 
 
 def test_copies_of_the_last_frame_say_so(tmp_path: Path) -> None:
-    """Where a band has no frame any more, or never had one, its flags and numbers tell."""
+    """Padding after a band's last frame is flagged, and has the sequence number -1."""
     file = begun(tmp_path / "a.zarr")
     for number in range(6):
         file.frame(BANDS[0], shot(number))
@@ -107,7 +107,7 @@ def test_copies_of_the_last_frame_say_so(tmp_path: Path) -> None:
 
 
 def test_an_image_that_was_not_taken_anew_says_so(tmp_path: Path) -> None:
-    """Not a pixel changed, whatever number and time say: flagged, with its time; one pixel does."""
+    """An unchanged image is flagged and keeps its time; one changed pixel clears the flag."""
     file = begun(tmp_path / "a.zarr")
     other = shot(0).counts.copy()
     other[-1, -1] += 1
@@ -121,7 +121,7 @@ def test_an_image_that_was_not_taken_anew_says_so(tmp_path: Path) -> None:
 
 
 def test_the_cameras_own_number_is_kept(tmp_path: Path) -> None:
-    """What the camera lost before the driver saw it shows beside the driver's number."""
+    """The camera's frame counter is stored beside the driver's sequence number."""
     file = begun(tmp_path / "a.zarr", telemetry.ROWS)
     cut = {"flags": FrameFlag.WRONG_SIZE}
     for number, (counter, changes) in enumerate(((40, {}), (42, {}), (0, cut))):
@@ -144,7 +144,7 @@ def test_flags_explain_themselves(tmp_path: Path) -> None:
 
 
 def test_the_store_explains_itself(tmp_path: Path) -> None:
-    """Every attribute of the store that its comment names is there, and each kind of note said."""
+    """The store has every attribute that its comment names, and a sentence for each note."""
     begun(tmp_path / "a.zarr", telemetry.ROWS).close(complete=True, ended="stopped")
     opened = store.open_dataset(tmp_path / "a.zarr")
     named = {"clock_origin", "frames_written", "log_sources", "log_units", "totals", "ended"}
@@ -159,7 +159,7 @@ def test_the_store_explains_itself(tmp_path: Path) -> None:
 
 
 def test_notes_do_not_wait_for_frames(tmp_path: Path) -> None:
-    """While no frame comes, readings are in the store after a second, and not only at its end."""
+    """Readings are stored within a second even while no frame comes."""
     file = begun(tmp_path / "a.zarr")
     for number in range(5):
         file.note(Note.READING, "plate", 0.3 * number, 300.0)

@@ -1,4 +1,4 @@
-"""What every device keeps, whatever is behind its driver: a stub, an emulator, or hardware.
+"""Contracts that every device keeps on a stub, on its emulator and on hardware.
 
 To hold hardware against it, name the devices in DBTHERMAL_BOSON (serial:///dev/ttyACM0),
 DBTHERMAL_WHEEL (serial:///dev/ttyUSB0), DBTHERMAL_TC08 (tc08:) and DBTHERMAL_VIDEO
@@ -35,7 +35,7 @@ NAMES = {"model", "part_number", "serial_number"}
 
 
 def opens(*ways: Opening) -> pytest.MarkDecorator:
-    """For each of these ways to open a device; on hardware only if asked for."""
+    """Parametrise a test by ways to open a device; those on hardware are marked `hardware`."""
     marks = {True: [pytest.mark.hardware], False: []}
     cases = [
         pytest.param(way, id=way.__name__, marks=marks[way.__name__.startswith("real")])
@@ -54,7 +54,7 @@ def opened(request: pytest.FixtureRequest) -> Iterator[Opened]:
 
 
 def identity(device: Any) -> Mapping[str, object]:
-    """What a device says it is, by name."""
+    """Identity of a device, by name."""
     if isinstance(device, Boson):
         return device.identity()
     return vars(device.identity()) if isinstance(device, FilterWheel | TC08) else device.identity
@@ -109,7 +109,7 @@ def test_a_device_is_a_context_manager(opened: Opened) -> None:
 
 @opens(*CAMERAS[2:], *WHEELS[2:], *LOGGERS)
 def test_a_device_has_one_client(opened: Opened) -> None:
-    """A second client is refused with what to do, and the first is not disturbed."""
+    """A second client gets an error with a remedy, and the first is not disturbed."""
     assert opened.again is not None
     with pytest.raises(OSError, match="other program"):
         opened.again()
@@ -140,7 +140,7 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
 
 @opens(*CAMERAS)
 def test_a_camera_keeps_a_mode(opened: Opened) -> None:
-    """The shutter's mode is set and read back; one that there is not is refused."""
+    """The FFC mode is set and read back; an unknown mode raises a ValueError."""
     camera: Boson = opened.device
     before = camera.get(commands.FFC_MODE)
     camera.set(commands.FFC_MODE, FfcMode.MANUAL)
@@ -154,7 +154,7 @@ def test_a_camera_keeps_a_mode(opened: Opened) -> None:
 
 @opens(*WHEELS)
 def test_a_wheel_goes_to_every_slot(opened: Opened) -> None:
-    """Homed, it finds every slot, and the band in the beam; one that there is not is refused."""
+    """A homed wheel reaches every slot and reports its band; slot 7 raises a ValueError."""
     wheel: FilterWheel = opened.device
     wheel.home()
     for position in (1, 4, 2, 6, 3, 5):
@@ -179,7 +179,7 @@ def test_a_logger_reads_a_room(opened: Opened) -> None:
 
 @opens(*LOGGERS)
 def test_a_logger_has_eight_sockets(opened: Opened) -> None:
-    """Channel 9 is refused."""
+    """Channel 9 raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid channel 9\. Must lie in 1 to 8"):
         opened.device.set_channels({9: "T"})
 
@@ -198,7 +198,7 @@ def test_frames_follow_one_another(opened: Opened) -> None:
 
 @opens(*VIDEOS)
 def test_silence_is_no_loss(opened: Opened) -> None:
-    """After a wait without a frame the source is as before."""
+    """A wait without a frame raises a NoFrameError, and the source stays open."""
     source: FrameSource = opened.device
     list(frames(source, 10))
     with pytest.raises(NoFrameError, match="No frame from"):

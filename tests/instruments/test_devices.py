@@ -50,7 +50,7 @@ def test_whole_rig_is_opened_and_closed() -> None:
 
 
 def test_opening_changes_nothing(devices: Devices) -> None:
-    """Cameras are as they were switched on, and the wheel was neither homed nor turned."""
+    """Opening leaves the cameras' settings, and neither homes nor turns the wheel."""
     assert devices.cameras["9.5"].ffc_mode() == FfcMode.AUTO
     assert devices.cameras["9.5"].ffc_status() == FfcStatus.NONE_PERFORMED
     assert devices.wheel is not None
@@ -73,7 +73,7 @@ def test_every_device_says_what_it_is(devices: Devices) -> None:
 
 
 def test_readings_are_named(devices: Devices) -> None:
-    """Thermocouples, focal planes, shutters and the wheel's slot are asked through the drivers."""
+    """Thermocouples, focal planes, shutters and wheel are read by their drivers, with units."""
     assert devices.world is not None
     devices.world.blackbody_temperature = 300.0
     devices.world.camera("narrow").fpa_temperature = 311.25
@@ -114,7 +114,7 @@ class Kept(dict[int, int]):
 
 
 def test_setting_that_is_not_taken_is_an_error() -> None:
-    """A camera that acknowledges and stays as it was is not recorded with."""
+    """A camera that acknowledges a setting but does not change raises an error."""
     bench = BosonBench()
     bench.device.settings = Kept({**bench.device.settings, commands.IR16_MODE.set_command: 2})
     message = r"Invalid IR16 mode .*TLINEAR.* of camera 93588, set to .*COUNTS_16.* Must be"
@@ -136,7 +136,7 @@ def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:
 
 
 def test_no_wheel_to_turn() -> None:
-    """Where there is no wheel no filter is selected."""
+    """Selecting a filter without a wheel raises a ValueError."""
     devices = Devices(Session.from_yaml(TEXT), {})
     with pytest.raises(ValueError, match="Invalid band '11' of a session without a wheel"):
         devices.select("11")
@@ -197,7 +197,7 @@ def test_instrument_that_fails_is_a_failed_reading(devices: Devices) -> None:
 
 
 def test_frames_and_commands_of_two_cameras_are_told(devices: Devices) -> None:
-    """Cables that were exchanged do not go unnoticed, where the frames say whose they are."""
+    """Exchanged cables are detected where the frames carry a serial number."""
     crossed = dict(zip(devices.cameras, list(devices.cameras.values())[::-1], strict=True))
     wrong = Devices(devices.session, devices.sources, crossed)
     with pytest.raises(ValueError, match=r"Invalid cameras \('93588', '93589'\) of band '8-14'"):
@@ -233,7 +233,7 @@ VIDEO, CONTROL = (f'{key}: {{simulated: "sim://boson/wide"' for key in ("video",
     ],
 )
 def test_other_addresses_are_refused(change: tuple[str, str], message: str) -> None:
-    """What is not of the rig, or of its kind, is named; nothing stays open."""
+    """An address invalid for the rig or the kind is named, and no device stays open."""
     world = bench(Session.from_yaml(TEXT))
     before = threading.active_count()
     with (
@@ -245,7 +245,7 @@ def test_other_addresses_are_refused(change: tuple[str, str], message: str) -> N
 
 
 def test_hardware_has_no_emulated_world() -> None:
-    """A session of hardware never gets emulated frames."""
+    """A session of hardware with an emulated world raises an error."""
     real = Session.from_yaml(replaced(("simulated: true", "simulated: false")))
     world = bench(real)
     for extra in ((world, None), (None, pictures(world))):

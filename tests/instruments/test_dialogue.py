@@ -1,4 +1,4 @@
-"""Dialogues that allow no rest."""
+"""Byte dialogues that fail on leftovers."""
 
 import pytest
 from dialogue import Dialogue, Pair
@@ -17,7 +17,7 @@ from dialogue import Dialogue, Pair
     ],
 )
 def test_a_dialogue_allows_no_rest(pairs: list[Pair], steps: list[str], message: str) -> None:
-    """What is not read, not written, or not expected fails."""
+    """Unread, unwritten and unexpected bytes fail the test."""
 
     def talk() -> None:
         with Dialogue(pairs) as line:

@@ -66,7 +66,7 @@ def test_frames_come_at_their_rate() -> None:
 
 
 def test_it_says_that_it_is_emulated() -> None:
-    """Nobody takes it for a camera."""
+    """Identity and `is_simulated` label the camera as emulated."""
     assert camera().is_simulated
     assert "emulated" in camera().identity["model"]
     assert camera().identity["device"].startswith("sim://")
@@ -122,7 +122,7 @@ def test_dropped_frames_leave_a_gap() -> None:
 
 
 def test_nobody_reads() -> None:
-    """The buffers hold some frames; if nobody reads, the others are lost, and it shows."""
+    """Frames beyond the buffers are lost while nobody reads, and leave a gap in the numbers."""
     source = camera()
     source.read()
     source.sleep(0.75)
@@ -207,7 +207,7 @@ def test_scene_begins_when_it_is_told() -> None:
     ],
 )
 def test_pictures_are_counts(picture: Counts, message: str) -> None:
-    """A picture of another size or kind is not bent to fit."""
+    """A picture of another size or type raises an error."""
     source = camera()
     source.pictures = {"8-14": lambda _: picture}
     with pytest.raises(ValueError, match=message):

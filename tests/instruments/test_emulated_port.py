@@ -1,4 +1,4 @@
-"""Where emulated devices meet their drivers: what a line does when it ends, and leaves nothing."""
+"""The line between an emulated device and its driver: its end, and released resources."""
 
 import gc
 import threading

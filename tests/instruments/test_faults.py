@@ -1,4 +1,4 @@
-"""Every fault of the rig: what its user sees, and that it costs a recording no frame and no truth.
+"""Every fault of the rig: its error or its mark in a recording, and no frame lost for it.
 
 What is asked of an instrument goes through its driver to its emulator, on a clock of its own; the
 frames come from two emulated cameras in real time, and each picture tells when it was seen. Frames
@@ -53,7 +53,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_frames(name: str, tmp_path: Path) -> None:
-    """What happens to frames is in their flags and in the log, of their camera and no other."""
+    """Damage is flagged and noted for its own camera, and for no other."""
     faults, flag, kind = DAMAGES[name]
     take = Take(tmp_path / "a.zarr", {"9.5": faults}).record(0.5)
     flags = [FrameFlag(int(value)) for value in take.stored("9.5")["frame_flags"]]
@@ -76,7 +76,7 @@ def test_a_repeated_image(tmp_path: Path) -> None:
 
 
 def test_a_corrupt_frame_that_nobody_tells(tmp_path: Path) -> None:
-    """Where the driver says nothing of it, a corrupt frame passes for a good one."""
+    """A corrupt frame that the driver does not report is not detected."""
     take = Take(tmp_path / "a.zarr", {"9.5": Faults(unseen=OFTEN)}).record(0.4)
     kept = take.stored("9.5")
     corrupt = np.isin(kept["sequence"], [*OFTEN])
@@ -223,14 +223,14 @@ TROUBLES: dict[str, tuple[Callable[[], Instrument], float | Error]] = {
 
 
 def asked(device: Instrument) -> Read:
-    """How a user asks an instrument."""
+    """Function with which a user reads an instrument."""
     if isinstance(device, TC08):
         return lambda: float(device.single().temperature[1])
     return device.fpa_temperature if isinstance(device, Boson) else device.position
 
 
 def read_beside_frames(device: Instrument) -> Read:
-    """How a recording asks it."""
+    """Function with which a recording reads an instrument."""
     if isinstance(device, FilterWheel):
         return device.position
     if isinstance(device, Boson):
@@ -241,7 +241,7 @@ def read_beside_frames(device: Instrument) -> Read:
 
 @pytest.mark.parametrize("name", TROUBLES)
 def test_what_the_user_sees(name: str) -> None:
-    """A fault is overcome, time after time, or is an error that says what it is."""
+    """A fault is overcome repeatedly, or raises an error that names it."""
     make, sees = TROUBLES[name]
     ask = asked(make())
     for _ in range(3):
@@ -254,7 +254,7 @@ def test_what_the_user_sees(name: str) -> None:
 
 @pytest.fixture(scope="module")
 def troubled(tmp_path_factory: pytest.TempPathFactory) -> Take:
-    """One recording beside which every instrument is in trouble, and takes its time."""
+    """One recording during which every instrument has faults and is slow."""
 
     def slowly(read: Read) -> Read:
         def wait_and_read() -> float:
@@ -269,7 +269,7 @@ def troubled(tmp_path_factory: pytest.TempPathFactory) -> Take:
 
 @pytest.mark.parametrize("name", TROUBLES)
 def test_what_is_recorded(name: str, troubled: Take) -> None:
-    """A number that is one is in the log, all else is noted as failed; no frame was lost for it."""
+    """Valid readings are in the log, all others are noted as failed, and no frame is lost."""
     sees, found = TROUBLES[name][1], troubled.noted(name)
     if isinstance(sees, float) and not math.isnan(sees):
         kind, value = "reading", sees

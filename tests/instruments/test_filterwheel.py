@@ -85,7 +85,7 @@ def test_the_beam_is_empty_while_the_wheel_turns() -> None:
 
 
 def test_offset_from_the_home_switch() -> None:
-    """Where slot 1 is not at the home switch, a setting says so; what it says is not checked."""
+    """An offset of slot 1 from the home switch is a setting; a wrong one is not detected."""
     right, wrong = WheelBench(slot_offset=12.5, home_offset=12.5), WheelBench(slot_offset=12.5)
     right.homed().move_to(2)
     wrong.homed().move_to(2)
@@ -94,7 +94,7 @@ def test_offset_from_the_home_switch() -> None:
 
 
 def test_home_direction_is_a_setting() -> None:
-    """What is given is set, the rest stays as the controller has it."""
+    """Home settings that are stated are sent, and the others stay as in the controller."""
     bench = WheelBench(home_direction=1, home_limit_switch=4)
     bench.homed().move_to(2)
     parameters = apt.HomeParameters.parse(bench.sent(apt.Id.MOT_SET_HOMEPARAMS)[-1])
@@ -154,7 +154,7 @@ def test_motor_at_another_address() -> None:
 
 
 def test_wrong_devices() -> None:
-    """Another model and another number are each refused by name."""
+    """Another model or serial number raises an error that names it."""
     with pytest.raises(WrongDeviceError, match="Wrong device 'KDC101', number 40000000"):
         WheelBench("KDC101").wheel.connect()
     with pytest.raises(WrongDeviceError, match=r"Wrong controller 40000000. Must be 7"):
@@ -178,7 +178,7 @@ def test_wrong_devices() -> None:
     ],
 )
 def test_settings_are_checked(options: dict[str, object], error: str) -> None:
-    """What a wheel cannot have is refused before anything moves."""
+    """Invalid settings and slots raise a ValueError before the wheel moves."""
     with pytest.raises(ValueError, match=error):
         Settings(**options)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="Invalid filter position 0"):

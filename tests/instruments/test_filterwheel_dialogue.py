@@ -1,4 +1,4 @@
-"""The filter wheel's driver byte for byte, and among answers that are none."""
+"""The filter wheel's driver byte for byte, and among foreign and invalid answers."""
 
 import pytest
 from dialogue import Dialogue, Pair
@@ -23,7 +23,7 @@ def _reply(identifier: Id, data: bytes, *, source: int = apt.BAY_1) -> bytes:
 
 
 def _connection() -> list[Pair]:
-    """What a driver and a BSC201 say to each other, byte for byte, until it is connected."""
+    """Bytes between a driver and a BSC201 until it is connected."""
     to, info = apt.BAY_1, apt.Info(40_000_000, "BSC201", 45, "1.0.0", 1, 0, 1)
     speeds = apt.VelocityParameters(1, 0, 4506, 21_987_328)
     before, home = apt.HomeParameters(1, 2, 1, 0, 0), apt.HomeParameters(1, 2, 1, 4_397_466, 0)
@@ -74,7 +74,7 @@ def test_dialogue_of_a_move() -> None:
 
 
 def test_answers_of_others() -> None:
-    """What came before a question, from another bay or of another channel is no answer to it."""
+    """Stale answers and those of other bays or channels are ignored."""
     ask, answer = bytes.fromhex("80 04 01 00 21 01"), _status(3, 0)
     old, other_bay = _status(1, 0), _status(2, 0)[:5] + b"\x22" + _status(2, 0)[6:]
     other_channel = answer[:6] + b"\x02" + answer[7:10] + b"\x01" + answer[11:]
@@ -89,11 +89,11 @@ def test_answers_of_others() -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=40), max_size=6))
 def test_arbitrary_answers(answers: list[bytes]) -> None:
-    """Whatever a device says, connecting ends, and fails with an error that is documented."""
+    """Connecting ends with a documented error for arbitrary answers."""
     clock = Clock()
 
     class Babbler(Dialogue):
-        """A device that says what it likes."""
+        """A device that sends arbitrary bytes."""
 
         def write(self, data: bytes) -> None:
             """Take anything."""
@@ -105,7 +105,7 @@ def test_arbitrary_answers(answers: list[bytes]) -> None:
 
 @pytest.mark.parametrize("bits", [b"\x12\x02\x01\x00\x01\x21", b"\x12\x02\x01\x03\x01\x21"])
 def test_neither_enabled_nor_not(bits: bytes) -> None:
-    """An answer that is neither yes nor no is an error of the wheel, not of the program."""
+    """An invalid state of the channel raises an error of the wheel."""
     dialogue = Dialogue([*_connection()[:-1], (_connection()[-1][0], bits)])
     with dialogue, pytest.raises(WheelError, match="does not say what the motor does"):
         FilterWheel(dialogue, SETTINGS).connect()

@@ -1,4 +1,4 @@
-"""What goes wrong with a filter wheel: which faults are overcome, and what the others look like."""
+"""Faults of a filter wheel: those that are overcome, and the errors of the others."""
 
 import logging
 
@@ -23,7 +23,7 @@ from dbthermal.instruments.transport import Closing, TransportError
 
 
 def test_unset_speeds_make_homing_do_nothing() -> None:
-    """A controller that does not take the speeds is found out before it is asked to home."""
+    """A controller that ignores the speeds fails on connecting, before it is homed."""
     bench = WheelBench()
     bench.device.faults.deaf_to = {apt.Id.MOT_SET_VELPARAMS}
     with pytest.raises(WheelError, match=r"velocity 0. Must be 21987328"):
@@ -49,7 +49,7 @@ def test_an_earlier_search_for_home_does_not_count() -> None:
 
 
 def test_motor_that_is_not_enabled() -> None:
-    """A controller that gives the motor no current is found out when it is connected."""
+    """A controller that does not power the motor is detected on connecting."""
     bench = WheelBench()
     bench.device.faults.deaf_to = {apt.Id.MOD_SET_CHANENABLESTATE}
     with pytest.raises(WheelError, match="did not enable the motor"):
@@ -84,7 +84,7 @@ def test_harmless_faults(faults: dict[str, object]) -> None:
 
 
 def test_moving_bits_that_stick() -> None:
-    """Where the bits of a move stick, its report ends it; the next one is refused."""
+    """With stuck motion bits a move ends by its report, and the next move raises an error."""
     bench = WheelBench()
     wheel = bench.homed()
 
@@ -116,7 +116,7 @@ def test_stall() -> None:
 
 
 def test_move_that_ends_elsewhere() -> None:
-    """That the controller says it is done is not believed where the wheel is elsewhere."""
+    """A reported end of a move away from its target raises an error."""
     bench = WheelBench()
     wheel = bench.homed()
     bench.device.faults.stops_short = 1.5
@@ -151,7 +151,7 @@ def test_slow_wheel() -> None:
 
 
 def test_lost_steps_are_seen_by_nobody() -> None:
-    """Without an encoder a slip goes unnoticed, which the driver says; homing undoes it."""
+    """Without an encoder lost steps are not detected; homing restores the position."""
     bench = WheelBench()
     wheel = bench.homed()
     bench.device.faults.slips = 5.0
@@ -164,7 +164,7 @@ def test_lost_steps_are_seen_by_nobody() -> None:
 
 
 def test_errors_of_the_controller() -> None:
-    """What the controller reports by itself stops what is to come, with its text, once."""
+    """An error that the controller reports stops the next command once, with its text."""
     bench = WheelBench()
     wheel = bench.homed()
     bench.device.faults.notice = "motor hot"
@@ -276,7 +276,7 @@ class Endless(Closing):
 
 
 def test_a_device_that_never_ends_is_another_one() -> None:
-    """Where more comes unasked than a controller says in its life, the wait ends and says why."""
+    """An endless stream of bytes ends the wait with an error."""
     clock = Clock()
     line = Endless(2 * MAXIMUM_UNSOLICITED)
     wheel = FilterWheel(line, Settings(), clock=clock, sleep=clock.sleep)
@@ -314,7 +314,7 @@ class Unplugged(Closing):
 
 @pytest.mark.parametrize("steps", [*range(0, 90, 3)])
 def test_unplugging_at_any_step(steps: int) -> None:
-    """Wherever the cable is pulled out, the error is the documented one, and closing works."""
+    """Unplugging at any step raises the documented error, and closing still works."""
     bench = WheelBench()
     line = Unplugged(bench.wheel._transport, steps)  # type: ignore[arg-type]
     wheel = FilterWheel(line, bench.wheel.settings, clock=bench.clock, sleep=bench.clock.sleep)
@@ -354,7 +354,7 @@ def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptu
 
 
 def test_a_speed_that_is_a_little_off_is_refused() -> None:
-    """A controller that takes 2 % less than it was told is not the one that was described."""
+    """A controller that sets a speed 2 % lower raises an error."""
     bench = WheelBench()
     bench.device.faults.weak = 0.98
     with pytest.raises(WheelError, match=r"The controller has velocity \d+\. Must be 21987328"):

@@ -65,7 +65,7 @@ def test_whole_rig(tmp_path: Path) -> None:
 
 
 def test_nothing_plugged_in(tmp_path: Path) -> None:
-    """An empty bus gives an empty list, and the description says what is missing."""
+    """An empty bus gives an empty list, and the description names the missing devices."""
     assert look(tmp_path) == []
     told = inventory.describe([]).splitlines()
     assert told[0] == (
@@ -75,7 +75,7 @@ def test_nothing_plugged_in(tmp_path: Path) -> None:
 
 
 def test_other_devices_are_not_listed(tmp_path: Path) -> None:
-    """A mouse is none of the rig's, nor is another of FLIR's devices."""
+    """A mouse, and FLIR's devices of another kind, are not listed."""
     others = (
         emulated.EmulatedDevice(0x046D, 0xC077, ""),
         emulated.EmulatedDevice(0x09CB, 0x0100, ""),
@@ -115,7 +115,7 @@ def test_missing_driver(tmp_path: Path) -> None:
 
 
 def test_permission(tmp_path: Path) -> None:
-    """What may not be opened gives the line to type; who has nodes and a number needs none."""
+    """A device without permission gets a udev rule, unless its nodes and number are known."""
     found = look(tmp_path, tc08(fault="permission"), boson(fault="permission"))
     assert [device.serial for device in found] == ["EMULATED1", None]
     assert (found[0].warnings, len(found[1].warnings)) == ((), 1)
@@ -129,7 +129,7 @@ def test_permission(tmp_path: Path) -> None:
 def test_permission_where_no_port_is_listed(
     kind: Callable[..., emulated.EmulatedDevice],
 ) -> None:
-    """Whose number is known nowhere gets the rule, nodes or not."""
+    """A device without permission and serial number gets the udev rule, with or without nodes."""
     device = kind(fault="permission")
     found = find_bare(EmulatedBackend(device))[0]
     assert f'ATTR{{idVendor}}=="{device.vendor:04x}"' in found.warnings[0]
@@ -146,7 +146,7 @@ def test_permission_where_no_port_is_listed(
     ],
 )
 def test_device_that_does_not_tell_its_number(fault: emulated.Fault, message: str) -> None:
-    """Each way in which a device does not tell its number is a warning; the others are listed."""
+    """A failure to read a serial number is a warning, and the other devices are listed."""
     backend = EmulatedBackend(tc08(fault=fault), tc08(ports=(5,)))
     found = find_bare(backend)
     assert message in found[0].warnings[0]
@@ -154,7 +154,7 @@ def test_device_that_does_not_tell_its_number(fault: emulated.Fault, message: st
 
 
 def test_device_without_a_number(tmp_path: Path) -> None:
-    """A device that has no serial number is not asked for one."""
+    """A device without a serial number is listed without a warning."""
     found = look(tmp_path, tc08(serial="", fault="permission"))
     assert (found[0].serial, found[0].warnings) == (None, ())
     assert "without serial number" in inventory.describe(found)
@@ -213,7 +213,7 @@ def test_node_that_may_not_be_used(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_node_that_only_root_may_use(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int, group: int
 ) -> None:
-    """Nobody is told to join the group root, or one that does not help: a rule is needed."""
+    """A node of the group root, or without group access, gets the udev rule as advice."""
     denied_nodes(tmp_path, monkeypatch, mode, group=group, own={1000})
     warnings = look(tmp_path, boson())[0].warnings
     assert ["video4linux" in warning for warning in warnings] == [True, False]
@@ -222,25 +222,25 @@ def test_node_that_only_root_may_use(
 
 
 def test_node_of_the_own_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who is in the group already is not told to join it."""
+    """A user who is in the node's group is not advised to join it."""
     denied_nodes(tmp_path, monkeypatch, 0o660, group=44, own={44})
     assert "Its group 'video' is yours, yet" in look(tmp_path, boson())[0].warnings[0]
 
 
 def test_node_of_a_group_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the system has no name for a node's group, its number is given."""
+    """A group without a name is given by its number."""
     denied_nodes(tmp_path, monkeypatch, 0o660, group=4321, own={1000})
     assert "in its group '4321'" in look(tmp_path, boson())[0].warnings[0]
 
 
 def test_system_without_sysfs() -> None:
-    """Where there is no sysfs, the devices are found and their nodes are said to be unknown."""
+    """Without sysfs the devices are listed, and their nodes are reported as unknown."""
     (found,) = find_bare(EmulatedBackend(boson()))
     assert found.warnings == ("Its nodes are not known: there is no /nowhere.",)
 
 
 def test_ports_of_this_machine() -> None:
-    """What pyserial lists here is none of an emulated bus that it does not know."""
+    """Serial ports of this machine are not listed for a device on an emulated bus."""
     (found,) = inventory.find(EmulatedBackend(apt(bus=99)))
     assert found.serial_nodes == ()
 
@@ -265,7 +265,7 @@ def test_description(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("order", ["set_configuration", "reset", "detach_kernel_driver"])
 def test_emulated_bus_refuses_what_disturbs(order: str) -> None:
-    """The emulated bus would notice if a live device were disturbed."""
+    """The emulated bus raises an error for any request that would disturb a live device."""
     device = next(usb.core.find(find_all=True, backend=EmulatedBackend(boson())))
     with pytest.raises(AssertionError, match=r"on a live device\. Must only be looked at"):
         getattr(device, order)(*([0] if order.startswith("detach") else []))
@@ -273,7 +273,7 @@ def test_emulated_bus_refuses_what_disturbs(order: str) -> None:
 
 @given(st.binary(max_size=80))
 def test_any_string_descriptor(answer: bytes) -> None:
-    """Whatever bytes a device sends as its number, it is text or a warning, never an exception."""
+    """Any bytes of a serial number give text or a warning, never an exception."""
     backend = EmulatedBackend(tc08())
     backend.answer = lambda *_: answer
     found = find_bare(backend)[0]

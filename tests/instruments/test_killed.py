@@ -1,4 +1,4 @@
-"""What a kill or a power loss leaves: a store that opens, and all frames but the last chunk's."""
+"""A recording after a kill or a power loss opens, with all frames but the last chunk's."""
 
 import multiprocessing
 import os
@@ -121,7 +121,7 @@ def test_kill_while_it_is_closed(tmp_path: Path, kills: int) -> None:
 
 
 class Disk:
-    """What is on a disk for certain: contents of files and names in folders, as last synced."""
+    """Durable state of a disk: contents of files and names in folders, as last synced."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -141,7 +141,7 @@ class Disk:
         self.contents[number] = path.read_bytes()
 
     def power_loss(self, left: Path, *, early: bool) -> None:
-        """Make what is left: names that were not synced are there already, or not yet."""
+        """Write the durable state to a folder; with `early` also names that were not synced."""
         folders = [self.root, *(path for path in self.root.rglob("*") if path.is_dir())]
         now = {path.stat().st_ino: listed(path) for path in folders}
         self._restore(left, self.root.stat().st_ino, now if early else self.names)
@@ -178,7 +178,7 @@ def two_bands(path: Path) -> CaptureFile:
 
 
 def check_left(left: Path, committed: list[int]) -> None:
-    """All that was declared valid is there, frames and notes."""
+    """Check that all frames and notes that were declared valid are in the store."""
     opened = store.open_dataset(left)
     written = list(opened.attrs["frames_written"].values())
     assert all(np.greater_equal(written, committed))
@@ -196,7 +196,7 @@ def check_left(left: Path, committed: list[int]) -> None:
 def test_power_loss_costs_the_last_chunk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, early: bool, every: int
 ) -> None:
-    """Whatever the disk had not been asked to keep is lost: what was declared valid is there."""
+    """After a power loss all that was declared valid is on the disk."""
     (tmp_path / "disk").mkdir()
     disk, committed, syncs = Disk(tmp_path / "disk"), [0, 0], 0
 

@@ -35,7 +35,7 @@ def frame(
 
 
 def preview(at: float = 0.0, shown: Frame | None = None, **readings: float) -> Preview:
-    """What a recording of 60 frames/s in one band shows at a time [s]."""
+    """Preview of a recording of 60 frames/s in one band at a time [s]."""
     last = replace(shown or frame(), host_time=1000 + round(60 * at) / 60)
     totals = {"9.5": {"frames": round(60 * at) + 1, "lost": 2, "refused": 3, "damaged": 4}}
     return Preview(at, {"9.5": last}, totals, readings)
@@ -47,7 +47,7 @@ def ffc(at: float = 0.0, shown: Frame | None = None, *, ffc: float, fpa: float =
 
 
 def status(*previews: Preview, window: float = 3.0) -> live.Status:
-    """How the band is after the last of them."""
+    """Status of the band after the last of the previews."""
     watch = live.Watch(window)
     for one in previews:
         watch.note(one)
@@ -55,7 +55,7 @@ def status(*previews: Preview, window: float = 3.0) -> live.Status:
 
 
 def texts(view: live.View) -> list[str]:
-    """All that is written in the figure of a view, outside its axes' numbers."""
+    """All texts in the figure of a view except tick labels."""
     figure = view.figure
     assert figure is not None
     below = [axis.get_xlabel() for axis in figure.axes]
@@ -183,7 +183,7 @@ def test_camera_temperature() -> None:
 
 
 def test_lines() -> None:
-    """Two lines say it, in degrees Celsius, and say what is not known."""
+    """Two lines of text give the state in degrees Celsius, and mark unknown values."""
     expected = f"FPA 35.0 {DEGREE}, FFC complete, last 4 s ago"
     lines = status(ffc(0.0, ffc=2.0), ffc(4.0, ffc=3.0)).text.splitlines()
     assert lines == ["60.0 frames/s, 2 lost, 3 refused, 4 damaged", expected]
@@ -203,7 +203,7 @@ def test_lines() -> None:
     ],
 )
 def test_bad_pictures_are_told(value: int, pixels: int, warning: str) -> None:
-    """More than one pixel in a hundred at an end of the range is told, and so is a blank."""
+    """Saturation of more than one pixel in a hundred, and a uniform frame, give a warning."""
     counts = RAMP.copy()
     counts.flat[:pixels] = value
     assert status(preview(shown=frame(counts))).warning == warning
@@ -211,7 +211,7 @@ def test_bad_pictures_are_told(value: int, pixels: int, warning: str) -> None:
 
 @pytest.mark.parametrize("bad", [{"period": -1.0}, {"period": math.nan}, {"window": 0.0}])
 def test_bad_settings_are_refused(bad: dict[str, float]) -> None:
-    """Times that are none are a clear error."""
+    """An invalid period or window raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid (period|window) .* s\. Must be"):
         live.View(is_simulated=True, **bad)  # type: ignore[arg-type]
 
@@ -281,7 +281,7 @@ def test_updates_keep_the_period() -> None:
 
 
 def test_what_a_display_is_handed() -> None:
-    """A notebook gets a PNG of the figure, a terminal the same in words."""
+    """A display gets a PNG of the figure, and the same in words for a terminal."""
     display = Recorder()
     live.View(display, title="pot", is_simulated=True)(preview(plate=303.15))
     picture = display.displayed[0]
@@ -328,7 +328,7 @@ def test_import_is_light() -> None:
 
 @pytest.mark.bench
 def test_cost_of_an_update() -> None:
-    """What an update of two full pictures takes; the queue bridges 2 s."""
+    """An update of two full frames takes less than 1 s of processor time; the queue bridges 2 s."""
     noise = np.random.default_rng(0).normal(20_000, 15, (8, 512, 640)).astype(np.uint16)
     view, spent = live.View(Recorder(), is_simulated=True, period=0.0), []
     for number, counts in enumerate(noise):

@@ -139,7 +139,7 @@ def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Step]]) 
 
 
 def test_what_is_missing_is_named(recorded: tuple[Path, list[Step]], tmp_path: Path) -> None:
-    """No sweep, too few frames, readings that differ, recordings that are not there."""
+    """Missing sweeps, frames, readings and recordings each raise an error that names them."""
     folder, _ = recorded
     with pytest.raises(FileNotFoundError, match="No recording of a sweep 'dish'"):
         recording.open_sweep(folder, "dish", frames=8)
@@ -161,7 +161,7 @@ def test_recordings_of_a_step_must_agree(
 
 
 def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
-    """What is complete is kept, what is cut short is refused by its name, the rest is recorded."""
+    """A resumed sweep keeps complete recordings, names an incomplete one, and records the rest."""
     log: list[float] = []
 
     def interrupt(_: Preview) -> None:
@@ -194,7 +194,7 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
 
 
 def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
-    """A recording through two filters is neither taken nor, later, opened."""
+    """A wheel that turns during a recording raises an error, then and when the sweep is opened."""
     with rig(Session.from_yaml(ONE)) as devices:
         devices.prepare()
         wheel = devices.wheel
@@ -224,7 +224,7 @@ def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
 
 
 def test_blackbody_must_be_read(tmp_path: Path) -> None:
-    """Without a thermocouple at the blackbody, or a function that reads it, nothing begins."""
+    """A sweep without a reading of the blackbody raises an error before it begins."""
     text = replaced(("{1: blackbody, 4: plate}", "{4: plate}"))
     with (
         rig(Session.from_yaml(text)) as devices,
@@ -280,7 +280,7 @@ def wait(readings: list[float], clock: Clock) -> float:
 
 
 def test_rest_is_waited_for() -> None:
-    """A window of readings near the goal and near one another is rest, and its mean is given."""
+    """A window of readings near the set point and near one another ends the wait with its mean."""
     clock = Clock()
     found = wait([299.0, 299.5, 300.02, 300.0, 300.04, 300.02], clock)
     assert found == pytest.approx(300.02)
@@ -288,7 +288,7 @@ def test_rest_is_waited_for() -> None:
 
 
 def test_thermocouple_may_be_off() -> None:
-    """A rest half a kelvin from where it was set is one: what counts is what is read."""
+    """A stable reading half a kelvin off the set point counts as reached."""
     clock = Clock()
     assert wait([300.6], clock) == pytest.approx(300.6)
     assert clock.now == 3.0
@@ -296,7 +296,7 @@ def test_thermocouple_may_be_off() -> None:
 
 @pytest.mark.parametrize("readings", [[301.6], [300.0, 300.3] * 20])
 def test_no_rest_is_an_error(readings: list[float]) -> None:
-    """A temperature that rests elsewhere, or swings, is not taken for the step."""
+    """A temperature that settles elsewhere or oscillates raises an error."""
     with pytest.raises(TimeoutError, match=r"No rest at 300\.0 K within 20 s"):
         wait(readings, Clock())
 

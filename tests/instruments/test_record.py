@@ -1,4 +1,4 @@
-"""A recording keeps every frame that came, says which did not, and survives whatever ends it."""
+"""A recording keeps every frame, counts the lost ones, and survives faults and interrupts."""
 
 import errno
 import threading
@@ -106,7 +106,7 @@ def test_recording_says_what_made_it(tmp_path: Path) -> None:
 
 
 def test_identities_beside_those_of_the_sources(tmp_path: Path) -> None:
-    """What else is known of a camera is added to what its frames say, and other devices too."""
+    """Further identities of cameras and devices are added to those of the frame sources."""
     camera: dict[str, str | bool] = {"software_revision": "1.2.3", "is_simulated": True}
     known: dict[str, dict[str, str | bool]] = {"9.5": camera, "wheel": {"model": "a"}}
     path = tmp_path / "a.zarr"
@@ -122,7 +122,7 @@ def test_identities_beside_those_of_the_sources(tmp_path: Path) -> None:
 
 
 def test_frames_from_before_are_not_taken(tmp_path: Path) -> None:
-    """What a driver held since an earlier look is of another time, and maybe another filter."""
+    """Frames that the driver held from before the start are discarded."""
     sources = bench()
     for source in sources.values():
         source.read()
@@ -201,7 +201,7 @@ def test_recording_goes_on_to_alignment(telemetry_rows: int, tmp_path: Path) -> 
     ],
 )
 def test_faults_are_noted(faults: Faults, kind: str, value: int, tmp_path: Path) -> None:
-    """What goes wrong is in the log, of the camera it happened to, and of no other."""
+    """A fault is in the log for its own camera, and for no other."""
     record(session(), bench(None, faults), tmp_path / "a.zarr", limits=SMALL)
     found = [note[1:] for note in notes(tmp_path / "a.zarr")]
     assert found == [(kind, "9.5", value)]
@@ -232,7 +232,7 @@ def test_unplugged_camera_leaves_the_other(tmp_path: Path) -> None:
 
 
 def test_last_source_lost_ends_it(tmp_path: Path) -> None:
-    """Without a camera there is nothing to wait for."""
+    """The loss of the last camera ends the recording."""
     gone = Faults(unplugged=6)
     start = time.monotonic()
     summary = record(session(60.0), bench(gone, gone), tmp_path / "a.zarr", limits=SMALL)
@@ -251,7 +251,7 @@ def test_clock_of_its_own_is_fitted(tmp_path: Path) -> None:
 
 
 def test_numbers_that_stand_are_flagged(tmp_path: Path) -> None:
-    """A repeated number or time makes no exposure time; a restart of the numbers goes on."""
+    """A repeated sequence number or time is flagged, and a restart of the numbers is not lost."""
     short = short_file(tmp_path / "a.zarr")
     for frame in (shot(0), shot(1), shot(1), shot(2, at=0.005), shot(3), shot(0, at=0.04)):
         short.frame("8-14", frame)
@@ -303,7 +303,7 @@ def test_errors_end_it_and_keep_what_came(tmp_path: Path) -> None:
 
 
 def test_stopped_by_the_user(tmp_path: Path) -> None:
-    """A stop is an end as good as any."""
+    """A recording that the user stops is complete."""
     stop = threading.Event()
     limits = Limits(chunk=CHUNK, reserve=0, preview_period=0.2)
     summary = record(
@@ -319,14 +319,14 @@ def test_stopped_by_the_user(tmp_path: Path) -> None:
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    """What is there stays, whatever it is."""
+    """An existing folder raises a FileExistsError and is not overwritten."""
     (tmp_path / "a.zarr").mkdir()
     with pytest.raises(FileExistsError, match="Must be a new recording"):
         record(session(), bench(), tmp_path / "a.zarr", limits=SMALL)
 
 
 def test_wrong_sources_are_refused(tmp_path: Path) -> None:
-    """Emulated frames are never recorded as a camera's, nor one band as another."""
+    """Emulated frames in a session of hardware, and wrong bands, raise a ValueError."""
     hardware = Session("test", False, "scene", 1.0, session().cameras, RATE, SHAPE)
     with pytest.raises(ValueError, match=r"is_simulated is True\. Must be False, as the session"):
         record(hardware, bench(), tmp_path / "a.zarr")
@@ -364,7 +364,7 @@ def test_device_that_hangs(tmp_path: Path) -> None:
 
 
 def test_no_frames_at_all(tmp_path: Path) -> None:
-    """A recording without a frame is closed, opens, and is no capture."""
+    """A recording without frames is closed and opens, but is not a valid capture."""
     gone = Faults(unplugged=0)
     record(session(), bench(gone, gone), tmp_path / "a.zarr", limits=SMALL)
     assert store.open_dataset(tmp_path / "a.zarr").sizes["time"] == 0

@@ -1,4 +1,4 @@
-"""A recording is written to its end, whoever looks on or interrupts, and says how it ended."""
+"""Ends of a recording: full queues, interrupts, lost cameras and failed threads."""
 
 import signal
 import threading
@@ -132,7 +132,7 @@ def state(sources: dict[str, FrameSource], band: str) -> CameraState:
 
 
 def test_a_lost_camera_is_told_though_it_was_stopped(tmp_path: Path) -> None:
-    """Who stops a recording that lost a camera has none that is complete."""
+    """A recording that lost a camera is not complete, even if the user stopped it."""
     stop, path, sources = threading.Event(), tmp_path / "a.zarr", bench(Faults(unplugged=5))
 
     def look(_: Preview) -> None:
@@ -144,7 +144,7 @@ def test_a_lost_camera_is_told_though_it_was_stopped(tmp_path: Path) -> None:
 
 
 def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
-    """A band without a frame is no complete recording, and the log says how long it was mute."""
+    """A camera without a frame makes the recording incomplete, and its silence is in the log."""
     sources, path = bench(None, Faults(mute=True)), tmp_path / "a.zarr"
     summary = record(session(), sources, path, limits=SMALL)
     assert (summary.ended, summary.totals["9.5"]["frames"]) == ("no frames", 0)
@@ -191,7 +191,7 @@ def test_second_interrupt_stops_no_writing(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_thread_that_exits_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What ends a camera's thread without a usual error is no end as planned, either."""
+    """A SystemExit in a camera's thread ends the recording with the state "error"."""
 
     def leave(*_: object) -> Frame:
         raise SystemExit("left")

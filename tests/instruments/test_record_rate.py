@@ -1,4 +1,4 @@
-"""How fast the emulated rig records, and with how much memory.
+"""Frame rate, processor load and memory of recordings on the emulated rig.
 
 ``pytest -m bench tests/test_record_rate.py --capture=no`` prints it. The cameras are emulated: what
 is measured is the way from a frame that is there to the disk, not USB.
@@ -31,7 +31,7 @@ TRIAL = 5.0  # how long each of these is recorded [s]
 
 @dataclass(frozen=True)
 class Measured:
-    """What two cameras at one rate took: frames, share of all cores, peak of memory [MB]."""
+    """Result of one recording: frames, share of all cores, peak of memory [MB]."""
 
     rate: float
     seconds: float
@@ -74,7 +74,7 @@ def measure(rate: float, seconds: float, path: Path) -> Measured:
 
 
 def fresh(rate: float, seconds: float, folder: Path) -> Measured:
-    """Measure in a process of its own, whose memory nothing else has used; print it."""
+    """Measure in a new process, so that the memory is its own, and print the result."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         found = pool.submit(measure, rate, seconds, folder / f"{rate}-{seconds}.zarr").result()
     print(found)

@@ -1,4 +1,4 @@
-"""A session says what it is, and its steps wait for what they need."""
+"""Sessions: their description in YAML, and the checks of its keys."""
 
 import re
 import textwrap
@@ -94,13 +94,13 @@ def test_session_is_read(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_sessions_are_refused(old: str, new: str, message: str) -> None:
-    """The error names the key, the value and the rule."""
+    """An invalid session raises a ValueError with the key, the value and the rule."""
     with pytest.raises(ValueError, match=re.escape(message)):
         Session.from_yaml(replaced((old, new)))
 
 
 def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
-    """What several sessions share is read from the file that they name; no key is in both."""
+    """Shared keys come from the rig's file; a key in both files raises a ValueError."""
     own, shared = ["name: plate", "rig: rig.yaml"], list[str]()
     for line in TEXT.splitlines():
         of_session = line.startswith(("simulated", "protocol", "duration", "blackbody", "sweep"))
@@ -154,7 +154,7 @@ def test_camera_behind_the_wheel() -> None:
 
 
 def test_one_temperature_is_no_calibration_twice() -> None:
-    """A bench may repeat a temperature of the blackbody, a calibration may not."""
+    """A bench may repeat a temperature of the blackbody; a calibration raises a ValueError."""
     twice = ("[300.0, 290.0, 310.0]", "[300.0, 290.0, 300.0]")
     bench = replaced(twice, ("protocol: response", "protocol: emissivity_bench"))
     assert Session.from_yaml(bench).blackbody is not None

@@ -41,7 +41,7 @@ def test_time_of_a_single_reading(rig: LoggerBench) -> None:
 
 
 def test_open_thermocouple_is_no_number(rig: LoggerBench) -> None:
-    """An open thermocouple is NaN and flagged, and its neighbour is not touched."""
+    """An open thermocouple is NaN and flagged, and its neighbour is not affected."""
     rig.unit.faults.open = {1}
     scan = rig.ready().single()
     assert np.isnan(scan.temperature[1])
@@ -50,7 +50,7 @@ def test_open_thermocouple_is_no_number(rig: LoggerBench) -> None:
 
 
 def test_open_thermocouple_that_reads_ambient_is_not_detected(rig: LoggerBench) -> None:
-    """Where the unit itself gives a plausible number, no driver can tell: it is the junction's."""
+    """An open thermocouple that reads the cold junction's temperature is not detected."""
     rig.unit.faults.open, rig.unit.faults.reads_ambient = {1}, True
     scan = rig.ready().single()
     assert scan.flag[1] == Flag.GOOD
@@ -59,7 +59,7 @@ def test_open_thermocouple_that_reads_ambient_is_not_detected(rig: LoggerBench) 
 
 @pytest.mark.parametrize("channel", [1, 8])
 def test_overflow_is_no_number(rig: LoggerBench, channel: int) -> None:
-    """A converter that overflowed gives no temperature, whatever number came with the bit."""
+    """A converter overflow gives NaN and a flag, whatever value comes with it."""
     rig.unit.faults.overflow = {channel}
     rig.driver.open().set_channels({channel: "T"})
     scan = rig.driver.single()
@@ -69,7 +69,7 @@ def test_overflow_is_no_number(rig: LoggerBench, channel: int) -> None:
 
 @given(st.lists(st.floats(width=32), min_size=9, max_size=9), st.integers(-(2**15), 2**15 - 1))
 def test_any_answer_of_the_library(raw: list[float], bits: int) -> None:
-    """Whatever the library writes, a temperature is finite and positive, or flagged and NaN."""
+    """Any raw values give a finite positive temperature, or NaN with a flag."""
     temperature, flag = tc08.flagged(np.array(raw), bits)
     assert np.all(temperature[flag == 0] > 0.0)
     assert np.isfinite(temperature[flag == 0]).all()
@@ -118,7 +118,7 @@ def test_opening_gives_up(rig: LoggerBench) -> None:
 
 
 def test_no_unit(rig: LoggerBench) -> None:
-    """Where nothing is plugged in, that is what is said."""
+    """A missing unit raises a ConnectionError that says so."""
     rig.unit.faults.no_unit = True
     with pytest.raises(ConnectionError, match=r"No TC-08\. Must be plugged in, and free"):
         rig.driver.open()

@@ -1,4 +1,4 @@
-"""Telemetry rows: the public vectors, the round trip, and what no telemetry does."""
+"""Telemetry rows: public vectors, round trip, and refused inputs."""
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ def test_vectors(values: dict[str, float], offset: int, expected: str) -> None:
 
 @given(st.fixed_dictionaries({name: numbers(field) for name, field in telemetry.FIELDS.items()}))
 def test_fields_come_back(fields: dict[str, float]) -> None:
-    """What the emulator writes is what is read, and the metadata are of them."""
+    """Encoded fields are decoded unchanged, and give the metadata of a frame."""
     rows = telemetry.encode(fields, COLUMNS)
     assert telemetry.decode(rows) == pytest.approx(fields, rel=0, abs=1e-6)
     found = telemetry.metadata(rows)
@@ -59,7 +59,7 @@ def test_the_order_of_the_words_may_be_the_other() -> None:
 
 @given(rows=arrays(np.uint16, (2, 80)))
 def test_anything_is_read(rows: npt.NDArray[np.uint16]) -> None:
-    """Any words give a record: there is no checksum that could tell."""
+    """Any words give a record, as the rows have no checksum."""
     assert 0 <= telemetry.decode(rows)["frame_counter"] < 2**32
 
 
@@ -70,7 +70,7 @@ def test_short_rows_are_refused() -> None:
 
 
 def test_other_numbers_are_refused() -> None:
-    """Rows that were converted are no telemetry."""
+    """Rows of another type than uint16 raise a TypeError."""
     with pytest.raises(TypeError, match=r"Invalid telemetry of float32\. Must be uint16"):
         telemetry.decode(np.zeros((2, COLUMNS), dtype=np.float32))
 

@@ -24,7 +24,7 @@ AWKWARD = bytes.fromhex("8E 0A 0D 11 13 00 FF AE 03 04 1A 7F")
 
 
 class Echo:
-    """A device that says what it is told."""
+    """A device that echoes its input."""
 
     def __init__(self) -> None:
         self.plugged = True
@@ -73,7 +73,7 @@ def test_a_pseudo_terminal_changes_no_byte(line: SerialTransport) -> None:
 
 
 def test_reads_are_short_and_time_out(line: SerialTransport) -> None:
-    """A read gives at most what is asked for, and nothing once its time is up."""
+    """A read gives at most the requested size, and nothing after its timeout."""
     line.write(b"abc")
     assert line.read(1, 1.0) == b"a"
     assert read_all(line, 2) == b"bc"
@@ -108,14 +108,14 @@ def test_closing_twice_is_the_same_as_once(port: EmulatedPort) -> None:
 
 
 def test_a_line_is_one_programs(port: EmulatedPort, line: SerialTransport) -> None:
-    """What is open cannot be opened again: two programs would take each other's replies."""
+    """A port that is open cannot be opened again."""
     assert line.is_simulated
     with pytest.raises(TransportError, match="in no other program's use"):
         open_serial(f"pty://{port.path}", baudrate=115200)
 
 
 def test_a_pseudo_terminal_has_no_rts(line: SerialTransport) -> None:
-    """Setting a line that is not there says so, and is no error."""
+    """Setting RTS on a pseudo-terminal returns False."""
     assert not line.set_rts(level=True)
 
 
@@ -153,7 +153,7 @@ def test_a_wrong_name_is_refused(url: str, message: str) -> None:
     ],
 )
 def test_a_name_says_nothing_in_vain(url: str, message: str) -> None:
-    """What is not understood in a name is an error that shows it, and nothing is left out."""
+    """An unknown option or part of a name raises a ValueError that shows it."""
     with pytest.raises(ValueError, match=message):
         open_serial(url, baudrate=115200)
 
@@ -168,7 +168,7 @@ def test_the_path_of_an_emulator_is_its_name() -> None:
 
 
 def test_an_emulator_cannot_pass_for_hardware(port: EmulatedPort) -> None:
-    """A pseudo-terminal under the name of a serial port is refused."""
+    """A pseudo-terminal as a `serial://` address raises an error."""
     with pytest.raises(ValueError, match=r"a pseudo-terminal\. Must begin with pty://"):
         open_serial(f"serial://{port.path}", baudrate=115200)
 
@@ -189,7 +189,7 @@ def test_a_simulated_device_ends_with_its_line() -> None:
 
 
 def test_a_line_that_takes_no_bytes_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Writing ends, too, where nobody reads."""
+    """A write that nobody reads ends with an error after its timeout."""
     monkeypatch.setattr(transport, "WRITE_TIMEOUT", 0.05)
     master, slave = pty.openpty()
     try:
@@ -204,7 +204,7 @@ def test_a_line_that_takes_no_bytes_is_an_error(monkeypatch: pytest.MonkeyPatch)
 
 
 class Port:
-    """A serial port that fails as it is told."""
+    """A serial port that fails with a certain error."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -231,7 +231,7 @@ def test_only_a_missing_line_is_no_rts() -> None:
 
 
 def test_an_emulator_ends_though_its_port_does_not_close() -> None:
-    """Whatever happens at the end of a line, its emulator does not go on."""
+    """An emulator is ended even if its port fails to close."""
     ended = []
     line = SerialTransport(
         Port(errno.EIO), "sim://boson", is_simulated=True, after=lambda: ended.append(1)
@@ -242,7 +242,7 @@ def test_an_emulator_ends_though_its_port_does_not_close() -> None:
 
 
 def test_what_went_wrong_is_not_hidden_by_closing() -> None:
-    """Where a line does not close after an error, the error is raised, and says so."""
+    """A failure to close is added as a note to the error that came before it."""
     line = SerialTransport(Port(errno.EIO), "serial:///dev/ttyUSB0", is_simulated=False)
     with pytest.raises(KeyError, match="first thing") as caught, line:
         raise KeyError("the first thing that went wrong")

@@ -1,4 +1,4 @@
-"""Capture by Video4Linux2: what is asked of the kernel, and what of its answers is seen."""
+"""Capture by Video4Linux2: calls to the kernel, and frames with its stamps and flags."""
 
 import errno
 import struct
@@ -189,7 +189,7 @@ def test_calls_come_in_order() -> None:
     ],
 )
 def test_damage_is_told(used: int, flags: int, expected: FrameFlag) -> None:
-    """A damaged frame comes, and says what is wrong with it; what is missing is 0."""
+    """A damaged frame has its flags, and zeros in place of missing bytes."""
     driver = Driver(answers=[(used, flags, 0, 5)])
     with opened(driver) as capture:
         frame = capture.read()
@@ -284,7 +284,7 @@ def test_waits_on_after_a_false_announcement() -> None:
     ],
 )
 def test_other_streams_are_refused(driver: Driver, message: str) -> None:
-    """What the driver sets instead of what was asked is an error, and the node is closed."""
+    """A format or rate other than the requested one raises a ValueError, and the node is closed."""
     with pytest.raises(ValueError, match=message):
         opened(driver)
     assert driver.open_files == 0

@@ -27,7 +27,7 @@ def session(**changes: object) -> Session:
 
 
 def test_hardware_gives_frames_without_telemetry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All rows of the frame are image, and the kernel is the only one who says who it is."""
+    """All rows of a frame are image, and the identity comes from the kernel alone."""
     kernel = Driver(answers=[(BYTES, GOOD, 1000, 7)]).kernel()
     monkeypatch.setattr(v4l2, "Kernel", lambda: kernel)
     with y16.KIND.open_frames("v4l2:///dev/video0", Stream((6, 8))) as source:
@@ -51,7 +51,7 @@ def test_hardware_is_opened_by_its_kind(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_it_has_neither_telemetry_nor_command_port() -> None:
-    """A session that asks for one is refused before a device is opened."""
+    """A session with telemetry or a command port raises an error before a device is opened."""
     with (
         pytest.raises(ValueError, match=r"telemetry_rows of camera kind 'y16' 2\. Must be one of"),
         open_devices(session(telemetry_rows=2)),

@@ -232,7 +232,7 @@ def test_order_leaves_little() -> None:
 
 
 def test_more_is_known_the_less_is_assumed() -> None:
-    """Rests, known emissivities and a smaller subspace each lower the bound."""
+    """Frames at rest, known emissivities and a smaller subspace each lower the bound."""
     scene, response = scene_of(0.86, 0.72), RIG.response()
     plain = limits.bounds(scene, response, order=6)
     cases: tuple[tuple[dict[str, Any], bool], ...] = (
@@ -299,7 +299,7 @@ def test_glass_is_as_designed() -> None:
 def test_bad_scene_is_a_clear_error(
     spoil: Callable[[xr.Dataset], xr.Dataset], options: dict[str, Any], message: str
 ) -> None:
-    """What has no bound is named, with its value and the rule."""
+    """A scene without a bound raises a ValueError with the value and the rule."""
     scene = spoil(scene_of(0.86, 0.72))
     with pytest.raises(ValueError, match=message):
         limits.bounds(scene, RIG.response(), **options)

@@ -1,4 +1,4 @@
-"""The planner: the bounds of a film not yet made, the best filter, and the figures of both."""
+"""The planner: bounds of a capture before it is recorded, the best filter, and its figures."""
 
 from dataclasses import replace
 from typing import Any
@@ -51,7 +51,7 @@ def test_plan_is_the_bound(materials: Materials) -> None:
 
 
 def test_plan_finds_the_filter(materials: Materials) -> None:
-    """Silicates by their reststrahlen bands, and none for metals that are nearly gray."""
+    """Silicates get a filter in their reststrahlen bands, nearly gray metals get none."""
     expected = limits.plan(*materials)
     best = dict(zip(expected["material"].values, expected["best"].values, strict=True))
     print(expected["object_temperature_std"].to_pandas().round(2).assign(best=expected["best"]))
@@ -77,7 +77,7 @@ def test_more_bands_and_more_seconds_help(materials: Materials) -> None:
 
 
 def test_gray_table_has_no_filter(materials: Materials) -> None:
-    """Where all emissivities are equal nothing is finite and no filter is the best."""
+    """For a gray material the condition number is infinite and no filter is the best."""
     table, noise = materials
     gray = table.isel(material=[0]).copy(deep=True)
     gray["emissivity"][:] = 0.8
@@ -100,7 +100,7 @@ def test_gray_table_has_no_filter(materials: Materials) -> None:
 def test_bad_plan_is_a_clear_error(
     materials: Materials, options: dict[str, Any], message: str
 ) -> None:
-    """What cannot be planned is named, with its value and the rule."""
+    """Invalid materials, noise and durations raise an error with the value and the rule."""
     table, noise = materials[0].copy(deep=True), materials[1].copy(deep=True)
     table["emissivity"][0, 0] = options.pop("emissivity", 0.8)
     noise[0] = options.pop("noise", 0.03)
@@ -113,7 +113,7 @@ def test_bad_plan_is_a_clear_error(
     "change", [{"seconds": 0.0}, {"rate": -1.0}, {"duration": 6.0}, {"seconds": 0.1}]
 )
 def test_bad_design_is_a_clear_error(change: dict[str, float]) -> None:
-    """Conditions that are no capture are refused."""
+    """Invalid capture conditions raise a ValueError with the rule."""
     with pytest.raises(ValueError, match="Must"):
         replace(limits.CaptureDesign(), **change)
 

@@ -1,4 +1,4 @@
-"""The readers give what a file holds, in SI units, and refuse a file that is not what it says."""
+"""Readers give a file's contents in SI units, and refuse inconsistent files."""
 
 import subprocess
 import sys
@@ -106,7 +106,7 @@ def test_ecostress_is_kirchhoff_over_increasing_metres(
     start=st.floats(0.3, 15),
 )
 def test_ecostress_round_trip(reflectance: list[float], start: float) -> None:
-    """What is written is read, to the four digits of the file."""
+    """A written spectrum is read back to the four digits of the file."""
     wavelength = [start + 0.1 * step for step in range(len(reflectance))]
     with TemporaryDirectory() as folder:
         spectrum = readers.ecostress(library_file(Path(folder), wavelength, reflectance))
@@ -115,7 +115,7 @@ def test_ecostress_round_trip(reflectance: list[float], start: float) -> None:
 
 
 def test_ecostress_notes(tmp_path: Path) -> None:
-    """The header's text is kept, Latin-1 letters too; what it does not say is empty."""
+    """The header's text is kept, also in Latin-1; missing entries are empty."""
     notes = readers.ecostress(library_file(tmp_path, [8, 9], [5, 5])).attrs
     assert notes["name"] == "Plate Glass"
     assert notes["description"] == "a pane: clear, Na\xb7Ca"
@@ -152,7 +152,7 @@ def test_ecostress_keeps_and_counts_values_outside_the_physical_range(tmp_path: 
     ],
 )
 def test_ecostress_refuses(tmp_path: Path, change: Callable[[str], str], message: str) -> None:
-    """A file that is cut, or no reflectance in percent over micrometres, is named and refused."""
+    """A truncated file, or one without reflectance [%] over micrometres, is refused by name."""
     path = library_file(tmp_path, [8, 9.5, 14], [5, 20, 10])
     path.write_text(change(path.read_text("latin-1")), encoding="latin-1")
     with pytest.raises(ValueError, match=message) as error:
@@ -281,7 +281,7 @@ def test_truncated_video(plasma: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"no video", b"\0" * 5000])
 def test_no_video(tmp_path: Path, content: bytes) -> None:
-    """A file that is no video is refused by name."""
+    """A file that cannot be decoded as video raises a ValueError with its name."""
     path = tmp_path / "text.mp4"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"Damaged video 'text\.mp4'"):

@@ -1,4 +1,4 @@
-"""Cache of experiments: a result is computed once, and again where it cannot be trusted."""
+"""Cache of experiments: a result is computed once, and again if code or file changed."""
 
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def test_an_interruption_keeps_what_was_done(tmp_path: Path, marks: Path) -> Non
 @pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "removed"])
 @pytest.mark.filterwarnings("ignore")
 def test_a_damaged_file_is_computed_again(tmp_path: Path, marks: Path, damage: str) -> None:
-    """Half a file, none, and a single wrong bit anywhere in it: the result is the same."""
+    """A truncated, empty or corrupted file is computed again."""
     experiment = cache.memory(tmp_path / "cells").cache(counted)
     first = experiment(str(marks), 1.0, 1)
     (path,) = (tmp_path / "cells").rglob("output.pkl")
@@ -87,7 +87,7 @@ def test_changed_code_starts_anew(
 
 @pytest.mark.slow
 def test_several_processes_find_the_same(tmp_path: Path) -> None:
-    """The number of processes changes nothing."""
+    """The number of processes does not change the results."""
     variants = {"subspace": {"method": "subspace"}}
     common = {"emissivity": [0.86, 0.72], "noise": [0.03, 0.35], "plate": PLATE, "pixels": 4}
     alone, shared = (
@@ -104,7 +104,7 @@ def test_several_processes_find_the_same(tmp_path: Path) -> None:
 
 
 def test_grid_of_results() -> None:
-    """The last coordinate varies fastest; a missing result is refused."""
+    """The last coordinate varies fastest; a missing result raises an error."""
     results = [xr.Dataset({"value": ((), float(number))}) for number in range(6)]
     coords: dict[str, list[float]] = {"noise": [0.1, 0.2], "seed": [1, 2, 3]}
     together = cache.gridded(results, coords)

@@ -25,7 +25,7 @@ CELL: dict[str, Any] = {
 
 
 def test_all_methods_see_the_same_pixels() -> None:
-    """Each has its errors at each pixel; known emissivities have none."""
+    """Every method has its errors at each pixel; known emissivities have no error."""
     found = experiments.compare(**CELL)
     assert found.attrs["origin"] == "simulated"
     assert dict(found.sizes) == {"variant": 3, "pixel": 20, "band": 2}
@@ -34,13 +34,13 @@ def test_all_methods_see_the_same_pixels() -> None:
 
 
 def test_pixels_without_reflection_take_no_part() -> None:
-    """More pixels than those in which somebody is reflected are refused, with their number."""
+    """More pixels than have a moving reflection raise an error with their number."""
     with pytest.raises(ValueError, match=r"Invalid number of pixels 240\. Must be at most"):
         experiments.compare(**{**CELL, "pixels": 240})
 
 
 def test_medians_count_what_the_default_solves() -> None:
-    """A pixel that the default gives up is left out; one that another loses is its worst."""
+    """Medians omit pixels that the default does not solve, and count others' failures as worst."""
     rmse = [[0.1, 0.3, np.nan, 0.2], [1.0, np.nan, 90.0, 2.0]]
     comparison = xr.Dataset(
         {

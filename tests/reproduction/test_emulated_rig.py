@@ -1,4 +1,4 @@
-"""The emulated cameras see what the simulation says; its truth lies beside the recordings."""
+"""Emulated cameras show the simulation, and its truth is kept beside the recordings."""
 
 from pathlib import Path
 
@@ -90,7 +90,7 @@ def scene() -> xr.Dataset:
 
 
 def test_movie_goes_on_between_its_frames() -> None:
-    """At and between the frames the counts are those of the simulation, at no other time any."""
+    """Counts at and between the frames are the simulation's; other times raise a ValueError."""
     quiet = simulation.Rig(gain_std=0.0, offset_std=0.0, bad_fraction=0.0, noise=(1e-4, 1e-4))
     clean = simulation.observe(scene(), quiet.response(), np.random.default_rng(0))["counts"]
     for band, picture in views(quiet).movie(scene()).items():
@@ -106,7 +106,7 @@ def test_movie_goes_on_between_its_frames() -> None:
 
 
 def test_truth_at_the_times_of_a_capture() -> None:
-    """The truth is put on the clock of the recording, and is not made up outside of it."""
+    """Truth is interpolated to the recording's clock, and not extrapolated."""
     began = scene().assign_attrs(began=100.0)
     capture = xr.Dataset(coords={"time": [0.05, 0.15]}, attrs={"clock_origin": 100.2})
     found = emulated_rig.shown(began, capture)
@@ -117,7 +117,7 @@ def test_truth_at_the_times_of_a_capture() -> None:
 
 
 def test_thermometers_have_their_errors() -> None:
-    """Readings scatter as stated where it is stated, and are exact elsewhere."""
+    """Readings scatter by the stated deviation, and are exact without one."""
     world = Bench(np.random.default_rng(3), {"blackbody": 0.1})
     world.thermocouples.update({1: "blackbody", 2: "room"})
     read = np.array([world.thermocouple_temperature(1) for _ in range(2000)])
@@ -128,7 +128,7 @@ def test_thermometers_have_their_errors() -> None:
 
 
 def test_samples_are_heated_step_by_step() -> None:
-    """Each step sets the blackbody, and the samples anywhere within their ends."""
+    """Each step sets the blackbody, and samples within their limits."""
     ends = dict.fromkeys(MATERIALS, (318.0, 343.0))
     world = Bench(np.random.default_rng(4), {}, ends)
     seen = []
@@ -142,7 +142,7 @@ def test_samples_are_heated_step_by_step() -> None:
 
 
 def test_thermocouple_follows_what_it_touches() -> None:
-    """A course over the scene's time is read where the scene is, and rests before it begins."""
+    """A thermocouple reads the scene's course from its beginning, and the start before it."""
     now = [100.0]
     course = xr.DataArray([300.0, 310.0], dims="time", coords={"time": [0.0, 10.0]})
     world = Bench(
@@ -157,7 +157,7 @@ def test_thermocouple_follows_what_it_touches() -> None:
 
 
 def test_truth_lies_beside_the_recordings(tmp_path: Path) -> None:
-    """What was kept is found by its name, and is cleared with what was emulated."""
+    """Truth is kept and opened by name, and cleared with the emulated recordings."""
     folder = tmp_path / "made"
     emulated_rig.clear(folder)
     assert emulated_rig.truth(folder) == {}
@@ -171,7 +171,7 @@ def test_truth_lies_beside_the_recordings(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["scene.zarr", "notes.txt"])
 def test_what_was_measured_is_not_cleared(tmp_path: Path, name: str) -> None:
-    """One recording of hardware, or a file of somebody's, and nothing is removed."""
+    """A folder with a recording of hardware or a foreign file is not cleared."""
     emulated_rig.keep_truth(tmp_path, {}, response=RIG.response())
     if name.endswith(".zarr"):
         store.save(RIG.response().assign_attrs(is_simulated=False), tmp_path / name, {})

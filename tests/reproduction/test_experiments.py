@@ -1,4 +1,4 @@
-"""Experiments: their scores on results whose errors are known, and one run against the bound."""
+"""Experiments: scores of results with known errors, and one run against the bound."""
 
 import re
 from typing import Any
@@ -37,7 +37,7 @@ def perfect(truth: xr.Dataset) -> xr.Dataset:
 
 
 def test_perfect_result(truth: xr.Dataset) -> None:
-    """It has no error, and every error bar holds the truth."""
+    """A perfect result has no error, and full coverage."""
     found = experiments.score(truth, perfect(truth))
     assert float(found["object_temperature_rmse"]) == 0.0
     np.testing.assert_array_equal(found["emissivity_error"], [0.0, 0.0])
@@ -59,7 +59,7 @@ def test_known_errors(truth: xr.Dataset) -> None:
 
 
 def test_pixels_without_a_value(truth: xr.Dataset) -> None:
-    """They enter the shares and nothing else."""
+    """Pixels without a value count in the shares alone."""
     result = perfect(truth)
     result["object_temperature"] = result["object_temperature"].where(result["x"] >= 10)
     result["emissivity"] = result["emissivity"].where(result["x"] >= 20)
@@ -74,7 +74,7 @@ def test_pixels_without_a_value(truth: xr.Dataset) -> None:
 
 @pytest.mark.slow
 def test_glass_near_the_bound() -> None:
-    """On 400 pixels of glass the ratio's scatter is the Cramer-Rao bound, the error bars true."""
+    """On 400 pixels of glass the ratio reaches the Cramer-Rao bound with 68 % coverage."""
     found = experiments.sweep([GLASS], Rig(), TIME, 400, seed=7).isel(case=0)
     assert float(found["efficiency"]) == pytest.approx(1.0, abs=0.2)
     assert float(found["object_coverage"]) == pytest.approx(0.683, abs=0.06)
@@ -94,7 +94,7 @@ def test_sweep_names_its_cases() -> None:
 
 
 def test_options_of_a_case() -> None:
-    """The background, the noise and the response's kind arrive."""
+    """Background, noise and kind of response of a case are applied."""
     case = GLASS | {"background": {"kind": "still", "level": 290.0}}
     scene, _ = experiments.run_case(case, Rig(), TIME[:60], 5, 1)
     assert (scene["background_temperature"] == 290.0).all()
@@ -108,12 +108,12 @@ def test_options_of_a_case() -> None:
 
 
 def drawn(**changes: Any) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
-    """Scene, capture and response of glass with something else in the case."""
+    """Scene, capture and response of a case of glass with changes."""
     return simulate(GLASS | changes, Rig(), TIME, 20, seed=4)
 
 
 def test_jump_of_the_object() -> None:
-    """Sudden or not, it begins where the case says, stays, and changes nothing else."""
+    """A sudden or gradual jump begins where the case says, and changes nothing else."""
     plain = drawn()[0]
     for duration, partly in ((0.0, 0), (2.0, 19)):
         jump = {"height": 6.0, "between": [12.0, 15.0], "duration": duration}
@@ -129,7 +129,7 @@ def test_jump_of_the_object() -> None:
 
 
 def test_background_that_follows() -> None:
-    """It drifts by a share of what the object changes."""
+    """The background drifts by a share of the object's change."""
     plain, scene = drawn()[0], drawn(following=0.2)[0]
     added = scene["background_temperature"] - plain["background_temperature"]
     rise = plain["object_temperature"] - plain["object_temperature"][0]
@@ -138,7 +138,7 @@ def test_background_that_follows() -> None:
 
 
 def test_swapped_roles() -> None:
-    """The object moves as the background did, and the other way round."""
+    """Object and background exchange their temperatures."""
     plain, scene = drawn()[0], drawn(swapped=True)[0]
     names = ("object_temperature", "background_temperature")
     for here, there in zip(names, reversed(names), strict=True):
@@ -146,7 +146,7 @@ def test_swapped_roles() -> None:
 
 
 def test_fewer_frames_and_another_noise() -> None:
-    """The first frames of the times, and the noise of the case in place of the rig's."""
+    """A case may have fewer frames and another noise than the rig's."""
     scene, capture, response = drawn(frames=100, noise=[0.1, 0.2])
     assert scene.sizes["time"] == capture.sizes["time"] == 100
     np.testing.assert_array_equal(capture["time"], TIME[:100])
@@ -181,13 +181,13 @@ def test_bands_apart(offset: float) -> None:
     ],
 )
 def test_values_of_a_case(change: dict[str, Any], message: str) -> None:
-    """What cannot be simulated as it is said is not simulated."""
+    """Invalid values of a case raise a ValueError."""
     with pytest.raises(ValueError, match=message):
         drawn(**change)
 
 
 def test_uneven_times_have_no_finer_clock() -> None:
-    """Bands that are exposed apart need even times."""
+    """Bands exposed apart on uneven times raise a ValueError."""
     uneven = np.append(TIME[:-1], TIME[-1] + 0.05)
     with pytest.raises(ValueError, match="Invalid times of bands that are exposed apart"):
         simulate(GLASS | {"offset": 1.0}, Rig(), uneven, 5, 0)
@@ -195,7 +195,7 @@ def test_uneven_times_have_no_finer_clock() -> None:
 
 @pytest.mark.parametrize("change", [{"emisivity": [0.9, 0.8]}, {"method": "naive"}])
 def test_unknown_key(change: dict[str, Any]) -> None:
-    """A key that nothing reads would be an experiment that was not made."""
+    """An unknown key of a case raises an error."""
     keys = re.escape(str(sorted(GLASS | change)))
     with pytest.raises(ValueError, match=f"Invalid case with keys {keys}. Must have"):
         experiments.run_case(GLASS | change, Rig(), TIME, 5, 0)
@@ -203,7 +203,7 @@ def test_unknown_key(change: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", ["emissivity", "start", "stop"])
 def test_missing_key(name: str) -> None:
-    """Emissivity, start and stop are needed."""
+    """A case without emissivity, start or stop raises an error."""
     case = {key: value for key, value in GLASS.items() if key != name}
     with pytest.raises(ValueError, match=r"Must have \['emissivity', 'start', 'stop'\]"):
         experiments.run_case(case, Rig(), TIME, 5, 0)

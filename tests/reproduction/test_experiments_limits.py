@@ -1,4 +1,4 @@
-"""Experiments on limits and nuisances: their numbers where they are known, one run of each."""
+"""Experiments on limits and nuisances: known numbers, and one run of each."""
 
 import numpy as np
 import pytest
@@ -83,13 +83,13 @@ def test_pooling_falls_as_the_root() -> None:
 
 
 def test_groups_are_whole() -> None:
-    """Pixels that are left over would be pooled with too few others."""
+    """A number of pixels that is not a multiple of the group raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid size 3 of a group. Must divide the 400 pixels"):
         limits.pooled(3, GLASS, pixels=400, seed=1, **COMMON)
 
 
 def test_truth_on_another_clock() -> None:
-    """Between its times the truth is on the line, and past its end there is none."""
+    """Truth is interpolated between its times, and NaN past its end."""
     ramp = xr.Dataset({"x": ("time", [0.0, 1.0, 2.0])}, {"time": [0.0, 0.1, 0.2]})
     wanted = xr.DataArray([0.05, 0.25], dims="time")
     np.testing.assert_allclose(limits.on_clock(ramp, wanted)["x"], [0.5, np.nan], atol=1e-12)
@@ -108,7 +108,7 @@ def test_border_is_judged_beyond_two_pixels(moved: int, right: float, bleeding: 
 
 
 def test_labels_of_nothing() -> None:
-    """Where no material is found none is right; one panel has no border."""
+    """Labels without a material score 0; one panel raises a ValueError."""
     sides = xr.DataArray([[0] * 5 + [1] * 5], dims=("y", "x"))
     assert float(limits.border_kept(sides * 0 - 1, sides)["right"]) == 0.0
     with pytest.raises(ValueError, match=r"1 panels. Must be alike, of two panels or more"):
@@ -117,7 +117,7 @@ def test_labels_of_nothing() -> None:
 
 @pytest.mark.slow
 def test_alignment_makes_the_bars_true() -> None:
-    """Two frames apart nearly all pixels are flagged; aligned, few are, and the bars hold."""
+    """Two frames apart nearly all pixels are flagged; aligned, few are, and intervals hold."""
     case = {"emissivity": GLASS, "start": 20.0, "stop": 45.0, "offset": 2.0}
     late, aligned = (
         limits.stressed(case, clock=CLOCK, pixels=200, seed=7, aligned=aligned)
@@ -133,7 +133,7 @@ def test_alignment_makes_the_bars_true() -> None:
 
 @pytest.mark.slow
 def test_offset_is_undone() -> None:
-    """A frame and a half apart: found within 0.1 frame, undone within 20 % of the error."""
+    """An offset of 1.5 frames is estimated to 0.1 frame, and undone to 20 % of the error."""
     found = nuisances.apart(1.5, pixels={"pixels": 1000}, seed=3)
     rmse = found["object_temperature_rmse"].values
     print(f"found {float(found['found']):.3f} frames; {nuisances.TREATMENTS}: {rmse.round(3)} K")
@@ -143,7 +143,7 @@ def test_offset_is_undone() -> None:
 
 
 def test_what_is_late_was_not_early() -> None:
-    """A delay is not negative."""
+    """A negative delay raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid delay -1 frames. Must be zero or positive"):
         nuisances.apart(-1, pixels={}, seed=1)
 
@@ -153,7 +153,7 @@ def test_what_is_late_was_not_early() -> None:
     ["lost frames", *(pytest.param(n, marks=pytest.mark.slow) for n in nuisances.NUISANCES[1:])],
 )
 def test_nuisances_are_undone(name: str) -> None:
-    """Marked, they cost a quarter at most; a shutter that is not spoils everything, with a flag."""
+    """A marked nuisance costs at most a quarter; an unmarked shutter event flags the pixels."""
     nuisance = {"share": 0.05, "shutter": [0.4]}
     found = nuisances.disturbed(name, pixels={"pixels": 800}, nuisance=nuisance, seed=3)
     rmse, flagged = found["object_temperature_rmse"].values, found["flagged"].values
@@ -166,7 +166,7 @@ def test_nuisances_are_undone(name: str) -> None:
 
 
 def test_unknown_nuisance() -> None:
-    """A nuisance that is none is refused by its name."""
+    """An unknown nuisance raises a ValueError with its name."""
     with pytest.raises(ValueError, match=r"Unknown nuisance 'rain'. Must be one of"):
         nuisances.disturbed("rain", pixels={}, nuisance={}, seed=1)
 
@@ -196,7 +196,7 @@ def test_views_stay_in_the_scene(distance: float, shift: list[float]) -> None:
 
 
 def test_cost_of_the_truth() -> None:
-    """The truth with a constant error of 0.1 K costs that; what is flagged is not covered."""
+    """A constant error of 0.1 K costs as much; flagged pixels do not count in the coverage."""
     emissivity = xr.DataArray(GLASS, dims="band", coords={"band": PAIR})
     rng = np.random.default_rng(0)
     truth = simulation.independent_pixels(

@@ -1,4 +1,4 @@
-"""Figures of the experiments: drawn, labelled with a unit, and called what the data are."""
+"""Figures of the experiments are drawn with units and name the kind of their data."""
 
 from collections.abc import Callable
 
@@ -47,7 +47,7 @@ def draw_emissivity(**attrs: object) -> Figure:
 
 
 def draw_reductions(**attrs: object) -> Figure:
-    """Draw what two loss terms are worth."""
+    """Draw the error reduced by two loss terms."""
     return figures.reductions(array("term", 2, **attrs).assign_coords(term=["a", "b"]), [90.0, 5.0])
 
 
@@ -257,7 +257,7 @@ def test_title_says_what_the_data_are(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["compared_reflections", "pooled_materials"])
 def test_nothing_but_nan(name: str) -> None:
-    """Where no pixel has a value, the empty figure is drawn without a warning."""
+    """A figure of nothing but NaN is drawn empty and without a warning."""
     figure = DRAWN[name][0](fill=np.nan)
     figure.draw_without_rendering()
     assert figure.axes

@@ -115,7 +115,7 @@ def test_the_list_notes_short_and_repeated_spectra() -> None:
 
 
 def test_a_space_in_an_address_is_quoted() -> None:
-    """The folder 'other files' is asked for as 'other%20files'."""
+    """A space in the folder 'other files' is quoted in its address."""
     url = manifest.load()["slum"].url("LUMA_SLUM_IR.csv")
     assert re.fullmatch(r"https://[\w./-]+/other%20files/LUMA_SLUM_IR\.csv", url)
 
@@ -130,7 +130,7 @@ def test_mirror(copies: Path) -> None:
 
 
 def test_provenance_is_the_checksums(copies: Path) -> None:
-    """The record of a result gets what the files have been held against."""
+    """Provenance holds the checksums that the files were verified against."""
     found = {
         name: hashlib.sha256(path.read_bytes()).hexdigest()
         for name, path in manifest.local("notes").items()
@@ -140,7 +140,7 @@ def test_provenance_is_the_checksums(copies: Path) -> None:
 
 
 def test_mirror_with_an_altered_file(copies: Path) -> None:
-    """A wrong checksum is refused, naming the file, what it has and what it must have."""
+    """A wrong checksum raises an error with the file, its checksum and the listed one."""
     (copies / "two.txt").write_bytes(b"seconds")
     got, expected = (hashlib.sha256(text).hexdigest() for text in (b"seconds", b"second"))
     for read in (manifest.local, manifest.fetch_collection):
@@ -149,7 +149,7 @@ def test_mirror_with_an_altered_file(copies: Path) -> None:
 
 
 def test_mirror_without_a_file(copies: Path, project: Path) -> None:
-    """What a mirror lacks is named, and not downloaded."""
+    """A file that the mirror lacks raises an error with its name, and is not downloaded."""
     (copies / "two.txt").unlink()
     assert not manifest.available("notes")
     with pytest.raises(FileNotFoundError, match=r"Missing 1 of 2 files of 'notes'.*'two\.txt'"):
@@ -160,7 +160,7 @@ def test_mirror_without_a_file(copies: Path, project: Path) -> None:
 
 
 def test_mirror_that_is_no_folder(copies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mirror's name that leads nowhere is refused, not passed over."""
+    """A mirror that is not a folder raises an error."""
     monkeypatch.setenv(manifest.MIRROR, str(copies / "absent"))
     with pytest.raises(ValueError, match=r"Invalid DBTHERMAL_DATA '.*absent'\. Must name a folder"):
         manifest.available("notes")
@@ -186,7 +186,7 @@ def test_download_of_an_altered_file(served: Path, project: Path) -> None:
 
 
 def test_only_fetch_downloads(served: Path, project: Path) -> None:
-    """Asking what is at hand changes nothing."""
+    """A query of available files downloads nothing."""
     assert served.is_dir()
     assert not manifest.available("notes")
     with pytest.raises(FileNotFoundError, match="Missing 2 of 2 files"):
@@ -196,20 +196,20 @@ def test_only_fetch_downloads(served: Path, project: Path) -> None:
 
 @pytest.mark.usefixtures("copies")
 def test_main(capsys: pytest.CaptureFixture[str]) -> None:
-    """The command says in one line that a collection is whole."""
+    """The command prints one line for a complete collection."""
     assert manifest.main() == 0
     assert re.fullmatch(r"notes: 2 files, 0\.0 MB, in .*notes\n", capsys.readouterr().out)
 
 
 @pytest.mark.usefixtures("project")
 def test_main_fails(capsys: pytest.CaptureFixture[str]) -> None:
-    """The command fails where a collection is not whole, and says which."""
+    """The command fails for an incomplete collection, and names it."""
     assert manifest.main() == 1
     assert capsys.readouterr().err.startswith("notes: ")
 
 
 def test_unknown_names(copies: Path) -> None:
-    """A file or a collection that is not listed is refused."""
+    """A file or collection that is not listed raises an error."""
     assert copies.is_dir()
     with pytest.raises(ValueError, match=r"Unknown collection 'notices'. Must be one of .'notes'."):
         manifest.local("notices")
@@ -231,7 +231,7 @@ def test_unknown_names(copies: Path) -> None:
     ],
 )
 def test_a_malformed_list_is_refused(project: Path, old: str, new: str, message: str) -> None:
-    """A list that could not be checked against is refused by name."""
+    """A malformed list raises an error with its name."""
     edit(project, old, new)
     with pytest.raises(ValueError, match=rf"(?s)Invalid 'data_manifest\.yaml'.*{message}"):
         manifest.load()

@@ -1,4 +1,4 @@
-"""The rules of the notebooks that running them does not show."""
+"""Rules of the notebooks that do not show when they run."""
 
 import ast
 import re
@@ -31,7 +31,7 @@ def cells(path: Path, kind: str) -> list[NotebookNode]:
 
 
 def test_stems_are_equal() -> None:
-    """Every notebook has its parameters, and there are no others."""
+    """Notebooks and parameter files have the same stems."""
     names = {path.stem for path in (ROOT / "params").glob("*.yaml")}
     assert names == {path.stem for path in NOTEBOOKS}
 
@@ -64,7 +64,7 @@ def test_notebook_is_stored_without_outputs(path: Path) -> None:
 
 @each_notebook
 def test_cells_compose(path: Path) -> None:
-    """A cell is short and defines nothing: what is worth a name belongs in the package."""
+    """A cell is short, and defines neither functions nor classes."""
     for cell in cells(path, "code"):
         definitions = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
         tree = ast.parse(cell.source)
@@ -95,7 +95,7 @@ def code_lines(path: Path) -> list[str]:
 
 
 def test_bookkeeping_is_a_small_share(capsys: pytest.CaptureFixture[str]) -> None:
-    """Few of all code lines say where an input or a result lies; printed for each notebook."""
+    """Few code lines are about the paths of inputs and results; printed for each notebook."""
     counts = {}
     for path in NOTEBOOKS:
         lines = code_lines(path)

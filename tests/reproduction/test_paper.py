@@ -1,4 +1,4 @@
-"""The paper's numbers: complete, and judged by what the words say."""
+"""The paper's numbers: complete, and judged by their stated rule."""
 
 import json
 from pathlib import Path
@@ -38,13 +38,13 @@ def test_verdict(ours: float, judged: str, more: dict[str, float], verdict: str)
 
 
 def test_what_was_not_measured_says_so() -> None:
-    """A number that no notebook gave is not measured, and is no dash of agreement."""
+    """A number that no notebook gave is shown as not measured."""
     assert row(1.0, "error").verdict({}) == "not measured"
 
 
 @pytest.mark.parametrize(("lowest", "verdict"), [(1.0, "differs"), (9.0, "agrees")])
 def test_lowest(lowest: float, verdict: str) -> None:
-    """The one that the paper names must be the lowest of all, and all must be there."""
+    """The method that the paper names must have the lowest error, and all must be measured."""
     part = Row(
         "Fig.", "", "02_a", ("a", "b"), "", judged="lowest", note="9.5", labels=("8.5", "9.5")
     )
@@ -54,13 +54,13 @@ def test_lowest(lowest: float, verdict: str) -> None:
 
 @pytest.mark.parametrize(("second", "verdict"), [(1.5, "agrees"), (4.0, "differs")])
 def test_alike(second: float, verdict: str) -> None:
-    """The second must not be far above the first."""
+    """The second error must not be far above the first."""
     part = Row("Fig.", "", "01_a", ("a", "b"), "", judged="alike", within=2.0)
     assert part.verdict({"01_a": {"a": 1.0, "b": second}}) == verdict
 
 
 def test_half_a_row_is_shown() -> None:
-    """What of a row was measured is shown with its label, though the row is not judged."""
+    """A row with a part of its numbers shows them with labels, and is not judged."""
     some = {"05_methods": {"naive: error at moderate noise [K]": 2.0}}
     (line,) = [cells for cells in paper.compare(some) if cells[0] == "Figs. 2 left, 10"]
     assert line[3] == "naive 2.00 K"
@@ -68,7 +68,7 @@ def test_half_a_row_is_shown() -> None:
 
 
 def test_every_published_number_is_there() -> None:
-    """As many rows with a number as the paper has: 10 emissivities, 4 terms, 10 of scenes, 4."""
+    """The table has a row for each of the paper's numbers: 10 emissivities, 4 terms, 14 others."""
     numbers = [part.published for part in paper.rows() if part.published is not None]
     assert len(numbers) == 10 + 4 + 10 + 4
     given = (0.43, 0.16, 90.10, 56.73, 11.31, 11.64, 63.6, 63.1, 1.72, 5.04, 14.6, 31.68)
@@ -106,6 +106,6 @@ def test_page_holds_the_table() -> None:
 
 
 def test_page_without_marks_is_refused() -> None:
-    """There must be a place for the table."""
+    """A page without marks for the table raises an error."""
     with pytest.raises(ValueError, match="Missing marks"):
         verify.with_table("nothing", {})

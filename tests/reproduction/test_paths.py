@@ -1,4 +1,4 @@
-"""The project's folders are found from inside it, and from outside through the package."""
+"""The project's folders are located from inside the project, or through the package."""
 
 from pathlib import Path
 
@@ -57,7 +57,7 @@ def test_fixed_places(project: Path) -> None:
 
 
 def test_what_was_measured_lies_apart(project: Path) -> None:
-    """No task removes recordings of hardware; emulated ones go with their notebook's results."""
+    """Recordings of hardware lie apart from the results that tasks remove."""
     assert paths.recordings("lab") == project / "recordings" / "lab"
     made = paths.emulated("full", "00_acquisition")
     assert made == project / "results" / "full" / "00_acquisition"
@@ -69,7 +69,7 @@ def test_what_was_measured_lies_apart(project: Path) -> None:
 @pytest.mark.usefixtures("project")
 @pytest.mark.parametrize("run", ["", "..", "a/b", "Full"])
 def test_run_is_one_folder_name(run: str) -> None:
-    """A run cannot lead out of the results."""
+    """A run's name with a path in it raises an error."""
     with pytest.raises(ValueError, match=f"Invalid run '{run}'. Must be"):
         paths.results(run)
 
@@ -83,6 +83,6 @@ def test_stem_is_numbered(stem: str) -> None:
 
 @pytest.mark.parametrize("ending", ["", "zarr", "/../a.json", "_scene"])
 def test_ending_has_a_suffix(ending: str) -> None:
-    """A result's kind is told by its suffix, and it lies in its run's folder."""
+    """A result's ending has a suffix and no folder."""
     with pytest.raises(ValueError, match=f"Invalid ending '{ending}'. Must be"):
         paths.result("full", "03_simulation", ending)

@@ -1,4 +1,4 @@
-"""What moves around the twins: writing, cups, hands, routes, and what is refused of them."""
+"""Moving bodies around the twins: writing, cups, hands, routes, and invalid settings."""
 
 import numpy as np
 import pytest
@@ -58,14 +58,14 @@ def test_pacing_keeps_its_pace() -> None:
 
 
 def test_who_stands_faces_where_he_came_to() -> None:
-    """A walk along y heads for y, a pause after it too."""
+    """A walk along y heads for y, and so does the pause after it."""
     route = Route(np.array([0.0, 1.0, 2.0, 3.0]), np.array([[0, 0], [0, 1], [0, 1], [1.0, 1]]))
     headings = [route.heading(time) for time in (-1.0, 0.5, 1.5, 2.5, 9.0)]
     np.testing.assert_allclose(headings, [np.pi / 2] * 3 + [0.0] * 2, rtol=0, atol=1e-12)
 
 
 def test_a_hand_touches_under_palm_and_fingers() -> None:
-    """The print is 1 at the palm and on a finger, 0 between spread fingers and beyond."""
+    """The print is 1 at the palm and on a finger, 0 between the fingers and beyond."""
     share = imprint([(0.0, 0.0), (-0.010, 0.10), (-0.06, 0.06), (0.0, 0.2)])
     np.testing.assert_allclose(share, [1, 1, 0, 0], rtol=0, atol=1e-3)
 
@@ -83,6 +83,6 @@ def test_a_hand_touches_under_palm_and_fingers() -> None:
     ],
 )
 def test_refusals(wrong: object, message: str) -> None:
-    """What is wrong is refused, with the rule."""
+    """Invalid letters, motions and temperatures raise a ValueError with the rule."""
     with pytest.raises(ValueError, match=message):
         wrong()  # type: ignore[operator]

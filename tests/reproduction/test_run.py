@@ -1,4 +1,4 @@
-"""A notebook's results lie under its stem, and say what made them."""
+"""Results of a notebook are named after its stem, and have their provenance."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def dataset() -> xr.Dataset:
 
 
 def doubled(value: float) -> xr.Dataset:
-    """Experiment."""
+    """Example of an experiment."""
     return xr.Dataset({"value": 2 * value})
 
 
@@ -56,7 +56,7 @@ def test_results_lie_under_the_stem(run: Run, dataset: xr.Dataset, tmp_path: Pat
 
 
 def test_an_opened_result_is_an_input(run: Run, dataset: xr.Dataset, tmp_path: Path) -> None:
-    """What another notebook saved is noted with its checksum."""
+    """A result of another notebook is noted as an input with its checksum."""
     path = tmp_path / "results" / "smoke" / "01_calibration_response.zarr"
     store.save(dataset, path, {})
     assert run.open("01_calibration", "_response").equals(dataset)
@@ -64,14 +64,14 @@ def test_an_opened_result_is_an_input(run: Run, dataset: xr.Dataset, tmp_path: P
 
 
 def test_missing_files_are_no_error(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A collection that is not at hand is empty, and no input."""
+    """A collection that is not available is empty, and not noted as an input."""
     monkeypatch.setattr(manifest, "available", lambda _: False)
     assert run.data("scenes") == {}
     assert run.provenance["inputs"] == {}
 
 
 def test_experiment_is_cached(run: Run, tmp_path: Path) -> None:
-    """Its results are kept in the notebook's own folder."""
+    """Results of an experiment are cached in the notebook's own folder."""
     twice = run.cached(doubled)
     assert [float(part["value"]) for part in joblib.Parallel(1)([twice(3.0)])] == [6.0]
     assert len(list((tmp_path / "results" / "cells" / "03_simulation").rglob("output.pkl"))) == 1

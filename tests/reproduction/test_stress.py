@@ -1,4 +1,4 @@
-"""Error bars and flags judged on results whose errors are known, and the figures of validity."""
+"""Error bars and flags of results with known errors, and the figures of validity."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -68,7 +68,7 @@ def test_normal_errors(scale: float, share: float) -> None:
 
 
 def test_an_unflagged_pixel_is_told_from_all() -> None:
-    """Errors of ten deviations in flagged pixels count among all, and not among the unflagged."""
+    """Errors in flagged pixels lower the coverage of all, and not of the unflagged."""
     truth = scene()
     result = with_flag(normal(truth), "gray", slice(0, 500))
     off = 1.0 * (truth["x"] < 500)
@@ -96,7 +96,7 @@ def test_bad_pixels_are_counted_by_kind() -> None:
 
 
 def test_just_below_four_deviations_is_not_bad() -> None:
-    """The limit is on the root mean square over time, so one frame far off is none."""
+    """A pixel is bad by its RMS error over time, and not by one frame."""
     truth = scene(pixels=3)
     result = normal(truth)
     result["object_temperature"] = truth["object_temperature"] + 0.399  # K
@@ -116,7 +116,7 @@ def test_each_flag_has_its_share() -> None:
 
 
 def test_nothing_to_count() -> None:
-    """Where all is flagged and without a value, a share is NaN and no pixel is bad."""
+    """With every pixel flagged and NaN the shares are NaN and no pixel is bad."""
     truth = scene(pixels=5)
     result = normal(truth)
     values = {name: result[name] * np.nan for name in result.data_vars if name != "status"}
@@ -140,7 +140,7 @@ def test_missing_samples_are_left_out() -> None:
 @settings(max_examples=20, deadline=None)
 @given(factor=st.floats(0.01, 100.0), seed=st.integers(0, 1000))
 def test_only_the_ratio_counts(factor: float, seed: int) -> None:
-    """Errors and deviations larger by one factor are judged alike."""
+    """Errors and deviations scaled by one factor give the same scores."""
     truth = scene(10, 50)
     result = with_flag(normal(truth, 0.6, seed), "gray", slice(0, 20))
     grown = result.copy()
@@ -153,7 +153,7 @@ def test_only_the_ratio_counts(factor: float, seed: int) -> None:
 
 
 def test_units_and_inputs() -> None:
-    """Every variable has a unit, and what is judged is not changed."""
+    """Every variable has a unit, and the inputs are not changed."""
     truth = scene(pixels=5)
     result = normal(truth)
     copies = truth.copy(deep=True), result.copy(deep=True)
@@ -165,7 +165,7 @@ def test_units_and_inputs() -> None:
 
 
 def test_clean_glass() -> None:
-    """Of clean glass at most one pixel in ten is flagged, and the object's intervals are true."""
+    """Clean glass has at most 10 % of its pixels flagged, and the stated coverage of the object."""
     found = stress.judge(*run_case(GLASS, Rig(), TIME, 400, seed=7))
     covered, width = found["object_coverage"].values, found["width"].values
     print(f"flagged {float(found['flagged']):.3f}, object {covered}, widths {width}")
@@ -215,7 +215,7 @@ def test_validity_counts_a_pixel_once() -> None:
 
 
 def test_validity_shows_low_coverage_as_an_arrow() -> None:
-    """No dot is lost: what lies left of the axis is drawn at its edge."""
+    """A coverage below the axis is drawn at its edge."""
     stressed = judged({})
     stressed["object_coverage"] = stressed["object_coverage"] * 0.1
     axis = validity(stressed).axes[1]
@@ -226,7 +226,7 @@ def test_validity_shows_low_coverage_as_an_arrow() -> None:
 
 
 def test_validity_of_nothing() -> None:
-    """Where every pixel is flagged and none has a value, the row says so."""
+    """A row with every pixel flagged and NaN is labelled as having none to judge."""
     stressed = judged({"gray": slice(None)})
     for name in ("object_coverage", "emissivity_coverage"):
         stressed[name] = stressed[name] * np.nan
@@ -236,7 +236,7 @@ def test_validity_of_nothing() -> None:
 
 
 def test_status_in_words() -> None:
-    """Each flag that occurs has its colour on the map, its words and its share; others do not."""
+    """Each flag that occurs has its colour, its words and its share; others are left out."""
     flags = xr.DataArray(np.array([[0, 0, 1, 64], [0, 5, 4, 0]], dtype=np.uint16), dims=("y", "x"))
     figure = status(xr.Dataset({"status": flags}, attrs={"origin": "simulated"}))
     figure.draw_without_rendering()
@@ -257,7 +257,7 @@ def test_status_in_words() -> None:
 
 
 def test_a_few_pixels_are_not_none() -> None:
-    """One of 10,000 is not drawn as a share of zero."""
+    """One pixel in 10,000 is not shown as a share of zero."""
     flags = np.zeros((100, 100), dtype=np.uint16)
     flags[3, 4] = schema.Status.DEAD_PIXEL
     legend = status(xr.Dataset({"status": (("y", "x"), flags)})).axes[1].get_legend()
@@ -266,7 +266,7 @@ def test_a_few_pixels_are_not_none() -> None:
 
 
 def test_unknown_bit() -> None:
-    """A bit without a meaning cannot be put into words."""
+    """An unknown status bit raises an error."""
     unknown = 1 << 20
     flags = xr.DataArray(np.array([[0, unknown | 1]], dtype=np.uint32), dims=("y", "x"))
     with pytest.raises(ValueError, match=f"Unknown bits {unknown} of a status"):
@@ -274,7 +274,7 @@ def test_unknown_bit() -> None:
 
 
 def test_every_flag_has_words_and_a_colour() -> None:
-    """No two have the same, and none has the colours of right and wrong."""
+    """Every flag has words and a colour of its own."""
     assert schema.Status.bits().keys() <= REASONS.keys()
     words, colors = zip(*REASONS.values(), strict=True)
     assert len({*words}) == len({*colors}) == len(REASONS)

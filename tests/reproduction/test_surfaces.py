@@ -34,7 +34,7 @@ def test_topology(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["wineglass", "coffee_pot", "bulb"])
 def test_vessels_face_outward(name: str) -> None:
-    """Where a vessel's wall stands, its normals point away from the axis."""
+    """Normals of a vessel's upright wall point away from the axis."""
     mesh = SHAPES[name]()
     radial = mesh.triangles_center[:, :2]
     radial = radial / np.linalg.norm(radial, axis=1, keepdims=True)
@@ -127,7 +127,7 @@ def test_normals_of_a_sphere() -> None:
     ],
 )
 def test_wrong_sizes(call: Callable[[], object], message: str) -> None:
-    """A size that is not positive is refused."""
+    """A size that is not positive raises an error."""
     with pytest.raises(ValueError, match=message):
         call()
 

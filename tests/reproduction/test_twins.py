@@ -1,4 +1,4 @@
-"""The twins: scenes that satisfy the schema, are what they say, and can be separated."""
+"""Twins: scenes that satisfy the schema, match their description, and can be separated."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -61,14 +61,14 @@ def test_scene_is_complete(scene: xr.Dataset) -> None:
 
 
 def test_temperatures_are_those_of_a_room(scene: xr.Dataset) -> None:
-    """Nothing is colder than a wet finger's stroke, nor warmer than a drink."""
+    """Temperatures lie between a wet finger's stroke and a hot drink."""
     for name in ("object_temperature", "background_temperature"):
         assert float(scene[name].min()) > AMBIENT - Writing().drop - 0.1
         assert float(scene[name].max()) < 345.0
 
 
 def test_beside_the_object_the_background_is_seen(scene: xr.Dataset) -> None:
-    """Where the object is not, both temperatures are one; a plate leaves no such place."""
+    """Beside the object both temperatures are equal; a plate fills the view."""
     beyond = ~scene["on_object"].values
     assert (scene.attrs["twin"] in FILLED) == (not beyond.any())
     np.testing.assert_array_equal(
@@ -95,7 +95,7 @@ def test_the_seed_makes_the_scene(name: str) -> None:
 
 
 def obstructed(stage: Stage, time: np.ndarray) -> bool:
-    """Whether an actor hides a pixel of the object from the camera at some time."""
+    """True if an actor hides a pixel of the object from the camera at some time."""
     directions = stage.camera.directions()
     origins = np.broadcast_to(stage.camera.position, directions.shape)
     hits = Caster(stage.mesh).cast(origins, directions)
@@ -121,18 +121,18 @@ LONG = replace(SHORT, time=clock(70, rate=2.0))
     ],
 )
 def test_nothing_comes_before_the_object(name: str, seed: int) -> None:
-    """No actor hides the object from the camera in 35 s, which a scene could not say."""
+    """No actor hides the object from the camera in 35 s."""
     assert not obstructed(TWINS[name](LONG, rng(seed)), LONG.time)
 
 
 @pytest.mark.data
 def test_nothing_comes_before_the_scan(scan: trimesh.Trimesh) -> None:
-    """Nor is the scanned bunny hidden, whose ears reach higher."""
+    """No actor hides the scanned bunny, whose ears reach higher."""
     assert not obstructed(solids.bunny(LONG, rng(), scan=scan), LONG.time)
 
 
 def inside(stage: Stage) -> bool:
-    """Whether every vertex of the object lies within the image."""
+    """True if every vertex of the object lies within the image."""
     places = stage.camera.project(stage.mesh.vertices)
     return bool(np.all((places > -0.5) & (places < np.array(stage.camera.shape) - 0.5)))
 
@@ -336,6 +336,6 @@ def vessel(**changes: object) -> Vessel:
     ],
 )
 def test_refusals(wrong: object, message: str) -> None:
-    """What is wrong is refused, with the rule."""
+    """Invalid twins, vessels, baselines and beads raise a ValueError with the rule."""
     with pytest.raises(ValueError, match=message):
         wrong()  # type: ignore[operator]

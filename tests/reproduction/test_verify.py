@@ -43,7 +43,7 @@ def test_same_run_agrees(project: Path, capsys: pytest.CaptureFixture[str]) -> N
     ],
 )
 def test_difference_is_found(project: Path, numbers: dict[str, float], code: int) -> None:
-    """Within 1 % is the same; more, another whole number, a missing or a new one is not."""
+    """Floats agree within 1 %; other, missing and additional numbers do not agree."""
     store.save_numbers(numbers, project / "results/full/01_calibration.json", RECORD)
     assert verify.main([]) == code
 
@@ -55,7 +55,7 @@ def test_other_kind_of_run_has_no_reference(project: Path) -> None:
 
 
 def test_run_without_numbers_is_an_error(project: Path) -> None:
-    """Nothing to compare is no success."""
+    """A run without numbers raises a FileNotFoundError."""
     with pytest.raises(FileNotFoundError, match="Missing numbers of run 'smoke'"):
         verify.main(["--run", "smoke"])
     assert project.exists()

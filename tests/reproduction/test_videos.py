@@ -1,4 +1,4 @@
-"""The published scenes: films made here for the rules, the real ones for the figures."""
+"""The published scenes: synthetic films for the rules, the real ones for the figures."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -38,7 +38,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
 
 def test_inputs(toy: Files) -> None:
-    """The asked frames of both bands, marked as pictures of a scene."""
+    """The selected frames of both bands come as uncalibrated pictures of a scene."""
     movie = published.inputs(toy, "toy", 2, 5)
     assert dict(movie.sizes) == {"band": 2, "time": 3, "y": 48, "x": 64}
     assert movie["band"].values.tolist() == ["8-14", "9.5"]
@@ -49,20 +49,20 @@ def test_inputs(toy: Files) -> None:
 
 @pytest.mark.parametrize(("first", "last"), [(0, 7), (-1, 3), (3, 3), (4, 2)])
 def test_frames_out_of_range(toy: Files, first: int, last: int) -> None:
-    """Frames that the video does not have are refused, with those that it has."""
+    """Frames beyond the video raise an error with the available range."""
     message = rf"Invalid frames {first} to {last} of scene 'toy'. Must lie in \[0, 6\]"
     with pytest.raises(ValueError, match=message):
         published.inputs(toy, "toy", first, last)
 
 
 def test_bands_must_agree(toy: Files) -> None:
-    """Two bands of different size are no scene."""
+    """Bands of different shape raise a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid shapes \(6, 48, 64\), \(6, 48, 32\) of scene"):
         published.inputs(toy, "odd", 0, 6)
 
 
 def test_missing_video(toy: Files) -> None:
-    """A scene that is not at hand is named, with what is."""
+    """A missing scene raises an error that lists the available ones."""
     with pytest.raises(FileNotFoundError, match=r"Missing video 'plate-0-bg.mp4'. .*toy-0-bg.mp4"):
         published.inputs(toy, "plate", 0, 1)
     with pytest.raises(FileNotFoundError, match=r"Missing video 'toy_calib_Tbdiff_video.mp4'"):

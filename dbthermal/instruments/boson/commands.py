@@ -98,7 +98,7 @@ class Setting(Generic[EnumT]):
 
     @property
     def reading(self) -> Reading[EnumT]:
-        """How it is read."""
+        """Command that reads the mode back."""
         return Reading(self.name, self.set_command + 1, ">i", self.kind)
 
     def data(self, value: EnumT) -> bytes:

@@ -135,7 +135,7 @@ class EmulatedApt:
         return max(0.0, self._drive.start + self._drive.duration - self.world.clock())
 
     def obey(self, message: apt.Message) -> None:
-        """Do what a message asks for; an unknown one is ignored."""
+        """Carry out a message; an unknown one is ignored."""
         match message.id:
             case Id.HW_REQ_INFO:
                 self.reply(Id.HW_GET_INFO, self.info.pack(), source=message.destination)
@@ -194,7 +194,7 @@ class EmulatedApt:
         self.report(Id.MOT_MOVE_HOMED if drive.homing else Id.MOT_MOVE_COMPLETED)
 
     def report(self, identifier: Id) -> None:
-        """Report the end of a motion, unasked."""
+        """Report the end of a motion, without a request."""
         self.reply(identifier, param1=1)
 
     def reply(

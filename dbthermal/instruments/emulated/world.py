@@ -188,7 +188,7 @@ class World:
             state.last_ffc_temperature = state.fpa_temperature
 
     def ffc_in_progress(self, name: str) -> bool:
-        """Whether a camera's shutter is closed."""
+        """True while a camera's shutter is closed for a correction."""
         return self.time < self.camera(name).ffc_until
 
 

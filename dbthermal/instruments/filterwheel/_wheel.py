@@ -185,7 +185,7 @@ class FilterWheel(Closing):
         target = scale.target(position, settings.home_offset)
         self._require_home(self._require_rest())
 
-        def is_there(motion: _Motion, status: apt.Status) -> bool:
+        def has_arrived(motion: _Motion, status: apt.Status) -> bool:
             distance = abs(scale.degrees(status.position - target))
             return distance <= settings.tolerance and (motion.reported or motion.rests > 0)
 
@@ -193,7 +193,7 @@ class FilterWheel(Closing):
         limits = settings.move_timeout, settings.stall_timeout
         self._controller.start_move(target)
         try:
-            self._follow(_Motion(name, apt.Id.MOT_MOVE_COMPLETED, *limits), is_there)
+            self._follow(_Motion(name, apt.Id.MOT_MOVE_COMPLETED, *limits), has_arrived)
         except StalledWheelError:
             self._is_lost = True
             raise

@@ -24,6 +24,7 @@ from dbthermal.alignment import fill_times
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import (
     DAMAGED,
+    FFC_READING,
     GOOD,
     MEANINGS,
     UNTIMED,
@@ -278,7 +279,7 @@ class CaptureFile:
 
     def note(self, kind: Note, source: str, time: float, value: float = math.nan) -> None:
         """Put a line into the log: a kind, a band or the name of a reading, time [s], value."""
-        band = source.removeprefix("ffc ")
+        band = source.removeprefix(FFC_READING)
         if kind is Note.READING and source != band and band in self._bands:
             status = FfcStatus(int(value)) if value in set(FfcStatus) else None
             self._bands[band].ffc_status = time, status

@@ -261,7 +261,7 @@ class _Run:
         self._reading = threading.Thread(target=self.read, name="readings", daemon=True)
 
     def is_going(self) -> bool:
-        """Whether neither end nor stop nor an error has come."""
+        """True until the end of the duration, a stop or an error."""
         return not (self.over.is_set() or self.stop.is_set() or monotonic() >= self.end)
 
     def fetch(self, band: str, source: FrameSource) -> None:
@@ -387,7 +387,7 @@ class _Run:
                 self.last_readings[source] = value
 
     def _reason(self) -> str:
-        """Why the recording ended."""
+        """Reason for the end of the recording, in one or two words."""
         if self.errors:
             return "no space" if getattr(self.errors[0], "errno", 0) == errno.ENOSPC else "error"
         if self.interrupted:

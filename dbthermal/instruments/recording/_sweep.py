@@ -42,7 +42,7 @@ def require_filter(path: str | Path, band: str | None) -> None:
 
 
 def is_complete(path: str | Path) -> bool:
-    """Whether a recording went to its planned end; False, too, if the folder does not exist."""
+    """True if a recording exists and went to its planned end."""
     try:
         return bool(store.open_dataset(path).attrs.get("complete", False))
     except FileNotFoundError:

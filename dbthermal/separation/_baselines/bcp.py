@@ -26,7 +26,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from dbthermal import planck
 from dbthermal.response import require_range
-from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._tiles import Array, Estimate, Tile
 
@@ -96,8 +96,8 @@ def separate(tile: Tile, settings: BcpSettings) -> Estimate:
     temperature = np.where(usable, tile.temperature(0, object_signal), np.nan)
     background = np.tile(tile.temperature(0, reflected)[:, np.newaxis], temperature.shape[1])
     status = np.zeros(temperature.shape[1], dtype=np.uint32)
-    estimate = point_estimate(temperature, status, transmissions, background)
-    return estimate.check_range(tile.curves[0], deviations=False)
+    estimate = point_estimate(tile, temperature, status, transmissions, background)
+    return estimate.check_range(tile.curves[0], not_estimated=WITHOUT_STD)
 
 
 def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array, Array]:
@@ -163,6 +163,6 @@ METHOD: Final = Method(
     separate,
     settings=BcpSettings,
     whole_image=True,
-    not_estimated=("object_temperature_std", "background_temperature_std", "emissivity_std"),
+    not_estimated=WITHOUT_STD,
 )
 """The reconstructed blackbody channel prior, for `solve`."""

@@ -22,7 +22,7 @@ from scipy.special import expit, logit
 
 from dbthermal import mixing, planck
 from dbthermal.schema import Status
-from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
@@ -99,8 +99,10 @@ def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
         (temperature, background), emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
     status = status_bits({Status.NOT_CONVERGED: kept.active | lost})
-    estimate = point_estimate(temperature, status, emissivity, background)
-    return estimate.undefine(lost, lost, lost).check_range(tile.curves[0], deviations=False)
+    estimate = point_estimate(tile, temperature, status, emissivity, background)
+    return estimate.undefine(lost, lost, lost).check_range(
+        tile.curves[0], not_estimated=WITHOUT_STD
+    )
 
 
 def _search(tile: Tile, settings: NaiveSettings) -> _State:
@@ -210,6 +212,6 @@ def _symmetric(matrix: tuple[Array, Array, Array], right: Array) -> Array:
 METHOD: Final = Method(
     separate,
     settings=NaiveSettings,
-    not_estimated=("object_temperature_std", "background_temperature_std", "emissivity_std"),
+    not_estimated=WITHOUT_STD,
 )
 """Least squares without a prior, for `solve`."""

@@ -23,7 +23,7 @@ from dbthermal import _smooth as smooth
 from dbthermal import bands, planck
 from dbthermal.response import Curve
 from dbthermal.schema import Status
-from dbthermal.separation._baselines import point_estimate
+from dbthermal.separation._baselines import WITHOUT_BACKGROUND, point_estimate
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Tile
@@ -37,7 +37,10 @@ def apparent(tile: Tile) -> Estimate:
     """Apparent temperature in the quieter band; NaN where no temperature gives the signal."""
     temperature = tile.temperature(0, tile.signals[0])
     missing = np.any(np.isnan(temperature), axis=0)
-    return point_estimate(temperature, status_bits({Status.OUTSIDE_RESPONSE: missing}))
+    status = status_bits({Status.OUTSIDE_RESPONSE: missing})
+    return point_estimate(tile, temperature, status).check_range(
+        tile.curves[0], not_estimated=APPARENT.not_estimated
+    )
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,9 @@ def ratio(tile: Tile, settings: RatioSettings) -> Estimate:
             Status.NONPHYSICAL_EMISSIVITY: (mean <= 0) | (mean >= 1),
         }
     )
-    return point_estimate(temperature, status, np.stack([mean, mean]))
+    return point_estimate(tile, temperature, status, np.stack([mean, mean])).check_range(
+        first, not_estimated=WITHOUT_BACKGROUND
+    )
 
 
 def _radiances(tile: Tile, settings: RatioSettings) -> Array:
@@ -145,13 +150,7 @@ def _inverse(curves: tuple[Curve, Curve], kind: str) -> Callable[[Array], Array]
     return lambda value: np.asarray(1.0 / spline(value))
 
 
-_WITHOUT_BACKGROUND: Final = (
-    "object_temperature_std",
-    "background_temperature",
-    "background_temperature_std",
-    "emissivity_std",
-)
-APPARENT: Final = Method(apparent, not_estimated=(*_WITHOUT_BACKGROUND, "emissivity"))
+APPARENT: Final = Method(apparent, not_estimated=(*WITHOUT_BACKGROUND, "emissivity"))
 """The camera's own reading, for `solve`."""
-RATIO: Final = Method(ratio, settings=RatioSettings, not_estimated=_WITHOUT_BACKGROUND)
+RATIO: Final = Method(ratio, settings=RatioSettings, not_estimated=WITHOUT_BACKGROUND)
 """Dual-wavelength pyrometry, for `solve`."""

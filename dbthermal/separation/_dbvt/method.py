@@ -24,7 +24,7 @@ from torch import Tensor
 
 from dbthermal import mixing
 from dbthermal.schema import Status
-from dbthermal.separation._baselines import calibrated
+from dbthermal.separation._baselines import WITHOUT_STD, calibrated
 from dbthermal.separation._dbvt import DbvtSettings, newton, objective
 from dbthermal.separation._dbvt.objective import Images, Unknowns
 from dbthermal.separation._inputs import Method
@@ -260,6 +260,7 @@ METHOD: Final = Method(
     settings=DbvtSettings,
     minimum_frames=8,
     every_frame=True,
-    not_estimated=("object_temperature_std", "background_temperature_std", "emissivity_std"),
+    even_times=True,
+    not_estimated=WITHOUT_STD,
 )
 """The paper's optimiser, for `solve`."""

@@ -21,7 +21,7 @@ from dbthermal.separation._dbvt.objective import Columns, Images, Unknowns
 # Unknowns of a step: noise of both bands, smooth signal, and the border.
 _FIRST, _SECOND, _SMOOTH, _OFFSET, _EMISSION, _REFLECTION = range(6)
 _BORDER: Final = (_OFFSET, _EMISSION, _REFLECTION)
-# Weight of the noise where none is modelled.
+# Weight of the noise where it is not modelled.
 _NO_NOISE: Final = 1e8
 # Damping of the emissivities, per frame: first, range, and its factors after a step that lowers the
 # objective and one that does not. The same for the share of the parabola's curvature.

@@ -35,7 +35,7 @@ NONE: Final = -1
 
 # Sizes of the cells, and of those that a mixed cell is cut into [pixel].
 _SPACINGS: Final = (8, 4, 2)
-# Probability that a step is seen where there is none [1]. A link that is refused in error is made
+# False-alarm probability of a step [1]. A link that is refused in error is made
 # elsewhere; one that is made in error bleeds: this is no small number.
 _STEP_RATE: Final = 0.1
 # Probability that two cells without a border are said to hold one [1].

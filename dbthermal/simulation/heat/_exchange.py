@@ -35,7 +35,7 @@ class Balance:
         return self.constant - (self.linear + self.quartic * temperature**3) * temperature
 
     def slope(self, temperature: Array) -> Array:
-        """How fast the flux falls with the temperature, (vertex,) [W m^-2 K^-1]."""
+        """Negative derivative of the flux with the temperature, (vertex,) [W m^-2 K^-1]."""
         return self.linear + 4.0 * self.quartic * temperature**3
 
 

@@ -17,6 +17,7 @@ import xarray as xr
 
 from dbthermal import mixing, store
 from dbthermal import response as responses
+from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.world import World
 from dbthermal.response import Curve
 from dbthermal.simulation import Rig, digitise
@@ -49,8 +50,7 @@ class Views:
 
     def blackbody(self, world: World) -> dict[str, Picture]:
         """Frames, by band, of the world's blackbody, which fills the view."""
-        curves = self._curves().items()
-        return self._pictures({band: _bench(world, it, {}, {}, self._shape) for band, it in curves})
+        return blackbody.of_rig(self.rig, self.detector, self.seed, world)
 
     def samples(self, world: World, emissivity: xr.DataArray, places: Places) -> dict[str, Picture]:
         """
@@ -105,11 +105,11 @@ def _bench(
 
     def look(_: float) -> Array:
         here = world.scene_temperatures()
-        blackbody = curve.counts(np.array(here["blackbody"]))
-        counts = np.full(shape, float(blackbody))
+        reflected = curve.counts(np.array(here["blackbody"]))
+        counts = np.full(shape, float(reflected))
         for name, place in places.items():
             emitted = curve.counts(np.array(here[name]))
-            counts[place] = mixing.leaving(emissivity[name], emitted, blackbody)
+            counts[place] = mixing.leaving(emissivity[name], emitted, reflected)
         return counts
 
     return look

@@ -104,7 +104,7 @@ def summary(measured: xr.Dataset) -> xr.Dataset:
     """
     parts = {
         name: _rms(measured[name])
-        for name in (f"{what}_{which}" for what in _BOUNDED for which in ("error", "bound"))
+        for name in (f"{quantity}_{which}" for quantity in _BOUNDED for which in ("error", "bound"))
     }
     shares = {
         "scatter": (measured["reflection_ratio_error"] / measured["reflection_ratio_bound"]).std(

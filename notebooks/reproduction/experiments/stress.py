@@ -107,7 +107,7 @@ def _width(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
 
 
 def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
-    """Where an error exceeds four standard deviations (kind, pixel)."""
+    """Pixels (kind, pixel) with an error beyond four standard deviations."""
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     allowed = (result["object_temperature_std"] ** 2).where(squared.notnull())
     of_object = squared.mean("time") > FAR**2 * allowed.mean("time")

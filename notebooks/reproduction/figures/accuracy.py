@@ -86,11 +86,11 @@ def validity(stress: xr.Dataset) -> Figure:
     left, right = axes[0]
     left.get_gridspec().set_width_ratios([1.4, 1.0])
     _bars(left, stress["status"], stress["bad"].sel(kind="any"))
-    found = {"object temperature, no flag": stress["object_coverage"].sel(among="unflagged")}
+    coverage = {"object temperature, no flag": stress["object_coverage"].sel(among="unflagged")}
     for band in stress["band"].values:
         among_all = stress["emissivity_coverage"].sel(among="all", band=band)
-        found[f"emissivity, {band_label(band)}, all with a value"] = among_all
-    _dots(right, found)
+        coverage[f"emissivity, {band_label(band)}, all with a value"] = among_all
+    _dots(right, coverage)
     place = np.arange(stress.sizes["case"])
     left.set_yticks(place, stress["case"].values, fontsize=8)
     right.set_yticks(place, [""] * place.size)

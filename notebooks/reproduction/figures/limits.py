@@ -127,9 +127,9 @@ def pooled_materials(
         draw_image(
             figure, axis, ratio, title, "reflection ratio [1]", cmap="viridis", limits=limits
         )
-    found = labels.where(labels >= 0)
-    title = f"materials found: {np.unique(found.values[found.notnull().values]).size}"
-    right.imshow(found % 10, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
+    labelled = labels.where(labels >= 0)
+    title = f"materials found: {np.unique(labelled.values[labelled.notnull().values]).size}"
+    right.imshow(labelled % 10, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
     right.set_facecolor("0.8")
     right.set_title(title, fontsize=9)
     for axis in (left, middle, right):

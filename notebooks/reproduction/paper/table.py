@@ -48,9 +48,9 @@ def rows() -> tuple[Row, ...]:
 
 def _terms() -> Iterator[Row]:
     for term, value in REDUCTIONS.items():
-        names, what = (f"{term}: reduction [%]",), f"error saved by the {term} term"
+        names, quantity = (f"{term}: reduction [%]",), f"error saved by the {term} term"
         yield Row(
-            "Table 1", what, "06_optimiser", names, "simulated", value, _PERCENT, "value", 10.0
+            "Table 1", quantity, "06_optimiser", names, "simulated", value, _PERCENT, "value", 10.0
         )
 
 
@@ -74,15 +74,15 @@ def _scenes() -> Iterator[Row]:
     for scene, errors in SCENE_ERRORS.items():
         shown = scene.replace("_", " ")
         highest = (f"{scene}: highest reading [degC]",)
-        what = f"{shown}: highest reading of the thermocouple"
+        quantity = f"{shown}: highest reading of the thermocouple"
         common = ("08_twins", highest, TWIN, PEAKS[scene], "\N{DEGREE SIGN}C")
-        yield Row("Fig. 6", what, *common, note="by construction")
+        yield Row("Fig. 6", quantity, *common, note="by construction")
         for method, error in errors.items():
-            what = f"{shown}: error at the thermocouple, {_ROLES.get(method, method)}"
+            quantity = f"{shown}: error at the thermocouple, {_ROLES.get(method, method)}"
             names = (f"{scene}: error of {method} [%]",)
             judged = "error" if method in _ROLES else "no"
             ours = ("08_twins", names, TWIN, error, _PERCENT)
-            yield Row("Fig. 6", what, *ours, judged, note="another scene, no target")
+            yield Row("Fig. 6", quantity, *ours, judged, note="another scene, no target")
 
 
 _ROLES: Final = {"subspace": "emissivities unknown", "calibrated": "emissivities calibrated"}

@@ -31,7 +31,7 @@ def clock(frames: int = 350, rate: float = 10.0) -> Array:
 @dataclass(frozen=True)
 class Capture:
     """
-    How a twin is recorded.
+    Recording conditions of a twin: emissivity, image size, times and baseline.
 
     Attributes
     ----------

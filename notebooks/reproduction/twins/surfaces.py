@@ -98,8 +98,8 @@ def capsule(
     """Cylinder with round ends, centred at two points: a finger, an arm, a leg."""
     axis = np.asarray(end, dtype=np.float64) - np.asarray(start, dtype=np.float64)
     angle = np.linspace(0.0, np.pi / 2.0, _SAMPLES // 4)
-    across, along = radius * np.sin(angle), radius * np.cos(angle)
-    below, above = np.stack([across, -along], 1), np.stack([across, along], 1)[::-1]
+    radial, axial = radius * np.sin(angle), radius * np.cos(angle)
+    below, above = np.stack([radial, -axial], 1), np.stack([radial, axial], 1)[::-1]
     profile = np.concatenate([below, above + np.array([0.0, np.linalg.norm(axis)])])
     turn, _ = Rotation.align_vectors([axis], [(0.0, 0.0, 1.0)])
     return moved(revolved(profile, spacing), turn, start)
