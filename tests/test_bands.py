@@ -118,7 +118,7 @@ def test_nodes_span_the_band() -> None:
 
 @pytest.mark.parametrize("temperature", [99.9, 2000.1, np.nan, 25.0])
 def test_temperature_outside_the_range(temperature: float) -> None:
-    """A temperature outside the range is named; 25 degrees Celsius are no kelvin."""
+    """A temperature outside the range raises a ValueError that gives it, the band and the range."""
     message = f"Invalid temperature {temperature} K in band '9.5'. Must lie in [100.0, 2000.0] K."
     for function in (FILTERS["9.5"].radiance, FILTERS["9.5"].slope):
         with pytest.raises(ValueError, match=re.escape(message)):
@@ -127,7 +127,7 @@ def test_temperature_outside_the_range(temperature: float) -> None:
 
 @pytest.mark.parametrize("radiance", [-1.0, 0.0, np.nan, 1e9])
 def test_radiance_outside_the_range(radiance: float) -> None:
-    """A radiance of no temperature within the range is named; nothing saturates."""
+    """A radiance outside the range raises a ValueError; it is not clipped."""
     message = f"Invalid radiance {radiance} W m-2 sr-1 in band '8-14'. Must lie in ["
     with pytest.raises(ValueError, match=re.escape(message)):
         FILTERS["8-14"].temperature([50.0, radiance])
@@ -135,7 +135,7 @@ def test_radiance_outside_the_range(radiance: float) -> None:
 
 @pytest.mark.parametrize("edges", [(9e-6, 8e-6), (0.0, 8e-6), (8e-6, 8e-6), (8e-6, np.inf)])
 def test_edges_that_are_no_band(edges: tuple[float, float]) -> None:
-    """A band has a positive, finite width."""
+    """A band without a positive, finite width raises a ValueError."""
     with pytest.raises(ValueError, match=re.escape("of band 'odd'. Must be finite")):
         Band("odd", *edges)
 
@@ -157,6 +157,6 @@ def test_filters_of_the_paper() -> None:
 
 
 def test_unknown_filter() -> None:
-    """An unknown name is told the known ones."""
+    """An unknown filter raises an error that lists the known ones."""
     with pytest.raises(KeyError, match=re.escape("Unknown band '9.25'. Must be one of ['10.6'")):
         get("9.25")

@@ -95,7 +95,7 @@ def test_weight_moves_with_temperature() -> None:
 
 @pytest.mark.parametrize("bands", [FILTERS, FILTERS.values(), list(FILTERS), tuple(FILTERS)])
 def test_bands_by_name_or_as_such(bands: list[str]) -> None:
-    """Bands come as a mapping, as objects or by name."""
+    """Bands are given as a mapping, as objects or by name."""
     made = emissivity.band_table({"gray": spectrum([8, 14], [0.5, 0.5])}, bands)
     assert made["band"].values.tolist() == list(FILTERS)
     assert schema.check(made, "emissivity_table") is made
@@ -112,7 +112,7 @@ def test_short_spectrum_is_refused() -> None:
 
 
 def test_short_spectrum_is_averaged_if_asked() -> None:
-    """The average runs over what is covered, extrapolates nothing, and tells how much that is."""
+    """On request the average runs over the covered part, and the result states its share."""
     short = {"metal": spectrum([8, 12.5], [0.1, 0.4]), "whole": spectrum([8, 14], [0.1, 0.5])}
     made = emissivity.band_table(short, FILTERS, minimum_coverage=0.7)
     alone = emissivity.band_table(short, [Band("part", 8e-6, 12.5e-6)])
@@ -171,7 +171,7 @@ def test_wrong_spectrum_is_named() -> None:
     ],
 )
 def test_bad_arguments(change: dict[str, object], error: type[Exception], message: str) -> None:
-    """Each argument's rule is said."""
+    """Invalid arguments raise an error with the rule."""
     arguments: dict[str, object] = {"spectra": {"m": spectrum([8, 14], [1, 1])}, "bands": FILTERS}
     with pytest.raises(error, match=re.escape(message)):
         emissivity.band_table(**(arguments | change))  # type: ignore[arg-type]
@@ -226,7 +226,7 @@ def test_single_frame_std_of_glass() -> None:
 
 
 def test_single_frame_std_against_draws() -> None:
-    """The closed form is the spread of the two equations' solution under drawn noise."""
+    """The closed form is the scatter of the two equations' solution under drawn noise."""
     noise = xr.DataArray([0.05, 0.2], coords={"band": ["8-14", "9.5"]}, dims="band")
     mixing = np.array([[0.3, 0.7], [0.5, 0.5]])
     drawn = np.random.default_rng(2).standard_normal((2, 200_000)) * [[0.05], [0.2]]
@@ -236,7 +236,7 @@ def test_single_frame_std_against_draws() -> None:
 
 
 def test_choice_weighs_condition_against_noise() -> None:
-    """The best-conditioned filter comes first; a quieter one may still measure better."""
+    """Filters are ordered by condition number; the lowest deviation may belong to another."""
     made = table(a=[0.90, 0.70, 0.75], b=[0.85, 0.60, 0.66])
     noise = xr.DataArray([0.03, 0.6, 0.1], coords={"band": made["band"]}, dims="band")
     choice = emissivity.rank_filters(made, noise)
@@ -263,7 +263,7 @@ def test_bad_noise(bands: list[str], values: list[float], units: str, message: s
 
 
 def test_one_band_is_no_pair() -> None:
-    """A pair needs two bands, and the choice the band that is given."""
+    """Pairs need two bands, and the choice of a filter needs its band in the table."""
     alone = table(m=[0.9])
     with pytest.raises(ValueError, match="Must be at least two"):
         emissivity.condition_numbers(alone)
@@ -274,7 +274,7 @@ def test_one_band_is_no_pair() -> None:
 
 
 def test_embedded_table_is_whole() -> None:
-    """The table that comes with the package has what its users count on."""
+    """The embedded table has 25 materials of three libraries in five bands."""
     made = schema.check(emissivity.embedded_table(), "emissivity_table")
     assert dict(made.sizes) == {"material": 25, "band": 5}
     assert made["band"].values.tolist() == list(FILTERS)

@@ -1,4 +1,4 @@
-"""An import points strictly down the layers; the heavy and the optional have one place each."""
+"""Imports point strictly down the layers; heavy and optional packages have one place each."""
 
 import ast
 import re
@@ -47,7 +47,7 @@ def inner_imports() -> set[tuple[str, str]]:
 
 
 def test_every_module_has_a_layer() -> None:
-    """A module is placed before it is used."""
+    """Every module has a place in the table of layers."""
     modules = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
     assert modules - {"__init__", "__pycache__"} <= LEVEL.keys()
 
@@ -59,7 +59,7 @@ def test_imports_point_strictly_down() -> None:
 
 
 def test_optional_packages_have_one_place() -> None:
-    """What is optional or heavy is imported where it is needed, and nowhere else."""
+    """Heavy and optional packages are imported only in their listed modules."""
     places = [(target.split(".")[0], module) for module, target in imports()]
     assert {pair for pair in places if pair[1] not in PLACES.get(pair[0], {pair[1]})} == set()
 

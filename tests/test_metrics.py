@@ -1,4 +1,4 @@
-"""Measures: against sums done by hand, and nothing left out in silence."""
+"""Metrics against sums by hand, and errors for missing values."""
 
 import re
 
@@ -74,21 +74,21 @@ def test_relative_error_needs_kelvin_above_zero(
 
 
 def test_nothing_left_is_an_error(truth: xr.DataArray) -> None:
-    """An empty mask has no correlation."""
+    """An empty mask raises an error."""
     mask = xr.zeros_like(truth.isel(time=0), dtype=bool)
     with pytest.raises(ValueError, match="Invalid mask: 0 pixels remain"):
         metrics.correlation(truth, truth, mask)
 
 
 def test_lost_values_are_an_error(truth: xr.DataArray) -> None:
-    """A NaN that counts is not averaged away."""
+    """A NaN inside the mask raises an error."""
     estimate = truth.where(truth != 305.0)
     with pytest.raises(ValueError, match="1 of 24 values that count are not finite"):
         metrics.correlation(estimate, truth)
 
 
 def test_coordinates_must_agree(truth: xr.DataArray) -> None:
-    """Frames at other times are not joined to the few that match."""
+    """Maps at different times raise an error."""
     first = truth.assign_coords(time=[0.0, 1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match="time"):
         metrics.correlation(first, first.assign_coords(time=[1.0, 2.0, 3.0, 4.0]))
@@ -104,7 +104,7 @@ def test_coordinates_must_agree(truth: xr.DataArray) -> None:
 def test_mask_is_bool_over_the_same_dims(
     truth: xr.DataArray, mask: xr.DataArray, message: str
 ) -> None:
-    """Weights, or a mask over another dimension, are no mask."""
+    """Weights in place of a mask, and a mask of other dimensions, raise a ValueError."""
     with pytest.raises(ValueError, match=re.escape(message)):
         metrics.correlation(truth, truth, mask)
 
@@ -126,6 +126,6 @@ def test_one_pixel_has_no_correlation(truth: xr.DataArray) -> None:
 
 
 def test_missing_dimension(truth: xr.DataArray) -> None:
-    """Curves are no maps."""
+    """Maps without one of their dimensions raise a ValueError."""
     with pytest.raises(ValueError, match="Must hold y and x"):
         metrics.correlation(truth.isel(x=0), truth.isel(x=0))

@@ -77,7 +77,7 @@ def test_white_noise(white: Signals) -> None:
 
 
 def test_object_does_not_enter(white: Signals) -> None:
-    """An object that heats by 30 K and cools again is no noise."""
+    """An object that heats by 30 K and cools again does not enter the noise."""
     first, second = (signal + curve() for signal in white)
     assert noise.estimate(first, second, TIME) == pytest.approx(NOISE, rel=TOLERANCE)
 
@@ -93,7 +93,7 @@ def test_pulses_do_not_enter(white: Signals, rng: np.random.Generator, share: fl
 def test_restless_background(
     white: Signals, rng: np.random.Generator, memory: float, tolerance: float
 ) -> None:
-    """A background that never rests is told from noise by what the bands share.
+    """A background that never rests is separated from the noise by its covariance in the bands.
 
     At 0.3 s it makes the quiet band's differences 6.6 times too large; 4 % are left. At 30 s a
     fifth is: one pixel does not show what the bands share.
@@ -127,7 +127,7 @@ def test_few_frames_are_refused(white: Signals) -> None:
 
 
 def test_frozen_signal_has_no_noise(white: Signals) -> None:
-    """A signal that does not change is refused, not given a noise of zero."""
+    """A constant signal raises an error instead of a noise of zero."""
     with pytest.raises(ValueError, match="Must be positive: the signals vary"):
         noise.estimate(np.zeros_like(white[0]), white[1], TIME)
 

@@ -56,7 +56,7 @@ def test_rayleigh_jeans_limit() -> None:
 
 
 def test_far_wien_side_does_not_overflow() -> None:
-    """Where exp(c2 / lambda T) is beyond a float, the radiance is zero and no warning is given."""
+    """The radiance is zero, without a warning, if exp(c2 / lambda T) overflows."""
     assert float(planck.spectral_radiance(1e-6, 4.0)) == 0.0
 
 

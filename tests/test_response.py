@@ -113,13 +113,13 @@ def test_exact_kind_is_not() -> None:
 
 
 def test_no_temperature_has_such_counts() -> None:
-    """At or below the offset the inverse is NaN, elsewhere not."""
+    """The inverse is NaN at and below the offset, and finite above."""
     result = BOSON.inverse([15499.0, 15500.0, 15501.0])
     assert np.isnan(result).tolist() == [True, True, False]
 
 
 def test_curve_of_a_response(two_bands: xr.Dataset) -> None:
-    """The coefficients of the asked band and kind arrive in the curve."""
+    """The curve of a band has the coefficients of its kind."""
     exact, linear = (response.curve(two_bands, "9.5", kind) for kind in response.KINDS)
     assert exact == Curve("9.5", 1.5e5, 9.5e-6, 0.0, 17000.0, 298.15, 280.0, 340.0)
     assert isinstance(linear, LinearCurve)
@@ -166,7 +166,7 @@ def test_range_holds_its_ends(two_bands: xr.Dataset) -> None:
 def test_bad_response(
     two_bands: xr.Dataset, change: dict[str, float], band: str, kind: str, message: str
 ) -> None:
-    """Each way in which a response gives no curve is said."""
+    """Each invalid response raises an error with the reason."""
     for name, value in change.items():
         two_bands[name][1] = value
     with pytest.raises(ValueError, match=re.escape(message)):

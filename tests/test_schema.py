@@ -1,4 +1,4 @@
-"""The glossary: what a stage takes, and each way in which it refuses."""
+"""The glossary: valid datasets of each stage, and the error of each violated rule."""
 
 import re
 from collections.abc import Callable
@@ -52,7 +52,7 @@ def test_every_stage_takes_its_own(stage: str) -> None:
 
 @pytest.mark.parametrize("stage", schema.STAGES)
 def test_every_variable_is_needed(stage: str) -> None:
-    """Each variable that is missing is named."""
+    """A missing variable raises an error with its name."""
     for name in schema.STAGES[stage]:
         with pytest.raises(ValueError, match=f"Missing variable '{name}' in the {stage}"):
             schema.check(example(stage).drop_vars(name), stage)
@@ -102,7 +102,7 @@ Change = Callable[[xr.Dataset], xr.Dataset]
     ],
 )
 def test_bad_capture(capture: xr.Dataset, change: Change, message: str) -> None:
-    """Each rule has its error, with the thing, the value and the rule."""
+    """Each rule of a capture has its error, with the name, the value and the rule."""
     with pytest.raises(ValueError, match=re.escape(message)):
         schema.check(change(capture), "capture")
 
@@ -122,19 +122,19 @@ def test_bad_capture(capture: xr.Dataset, change: Change, message: str) -> None:
     ],
 )
 def test_bad_types(capture: xr.Dataset, change: Change, message: str) -> None:
-    """What is not a real number, or not a dataset, is an error of type."""
+    """Arrays that are not real numbers, and objects that are not datasets, raise a TypeError."""
     with pytest.raises(TypeError, match=re.escape(message)):
         schema.check(change(capture), "capture")
 
 
 def test_unknown_stage(capture: xr.Dataset) -> None:
-    """An unknown stage is told the known ones."""
+    """An unknown stage raises an error that lists the known ones."""
     with pytest.raises(ValueError, match=re.escape("Unknown stage 'raw'. Must be one of ['black")):
         schema.check(capture, "raw")
 
 
 def test_coordinates_of_other_stages() -> None:
-    """Temperature and wavelength increase, too."""
+    """Unordered temperatures and wavelengths raise an error, as times do."""
     for stage, name in (("blackbody", "temperature"), ("spectrum", "wavelength")):
         turned = example(stage)
         with pytest.raises(ValueError, match=f"Unordered '{name}' of"):

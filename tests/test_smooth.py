@@ -53,7 +53,7 @@ def test_single_frame() -> None:
 
 @pytest.mark.parametrize("order", [0, -1, 6])
 def test_bad_order(order: int) -> None:
-    """An order of nothing, or of more functions than frames, is refused."""
+    """An order of zero, or above the number of frames, raises an error."""
     with pytest.raises(ValueError, match=re.escape(f"Invalid order {order} of the smooth")):
         smooth.polynomial_basis(np.arange(5.0), order)
 
@@ -98,7 +98,7 @@ def test_steps_and_a_jump_are_in_the_subspace(
     st.lists(st.integers(5, 55), min_size=1, max_size=3, unique=True).map(sorted),
 )
 def test_own_part_is_without_the_steps_of_the_camera(height: float, events: list[int]) -> None:
-    """A curve with steps of the camera on it: the object's part is the curve alone."""
+    """The object's part of a curve with steps of the camera is the curve alone."""
     time = np.arange(60.0)
     curve = 0.01 * (time - 20.0) ** 2
     signal = curve + height * segmented(60, *events)
@@ -108,7 +108,7 @@ def test_own_part_is_without_the_steps_of_the_camera(height: float, events: list
 
 
 def test_own_part_keeps_a_jump() -> None:
-    """What the object does is its own, a jump included; what the camera does is not."""
+    """The object's part holds its jump, and not the camera's step."""
     time = np.arange(60.0)
     jump, shutter = 5.0 * (time >= 40), 3.0 * (time >= 15)
     functions = smooth.subspace(time, 3, segment=segmented(60, 15), jump=40)
@@ -141,7 +141,7 @@ def test_without_steps_the_subspace_is_the_basis() -> None:
 
 
 def test_more_steps_than_frames() -> None:
-    """Functions that outnumber the frames are refused, with both numbers."""
+    """More functions than frames raise an error with both numbers."""
     with pytest.raises(ValueError, match="Invalid order 6 with 19 steps over 20 frames"):
         smooth.subspace(np.arange(20.0), 6, segment=np.arange(20))
 

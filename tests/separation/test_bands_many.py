@@ -47,7 +47,7 @@ def test_error_falls_as_the_bound_says() -> None:
 
 @pytest.mark.parametrize("number", [3, 4])
 def test_error_bars_are_true(number: int) -> None:
-    """Object and ratios scatter as they say, in every band; clean pixels have no flag."""
+    """Object and ratios scatter as stated in every band; clean pixels are not flagged."""
     scene, capture, response = case(number, 600, seed=2)
     result = separation.solve(capture, response)
     truth = (1 - scene["emissivity"]) / (1 - scene["emissivity"].sel(band="8-14"))
@@ -85,7 +85,7 @@ def test_order_of_bands_does_not_matter(order: list[int]) -> None:
 
 
 def test_the_quietest_band_is_the_reference() -> None:
-    """There the ratio is 1 and its deviation 0, exactly."""
+    """The quietest band has a reflection ratio of 1 with a deviation of 0."""
     _, capture, response = case(3, 20, seed=4)
     result = separation.solve(capture.isel(band=[2, 0, 1]), response)
     assert np.all(result["reflection_ratio"].sel(band="8-14") == 1)
@@ -112,7 +112,7 @@ def test_noise_of_many_bands_is_found() -> None:
 
 
 def test_a_gray_third_band_harms_nothing() -> None:
-    """A band in which the body is as in the first adds no information and costs none."""
+    """A third band with the emissivity of the first leaves the object's error as it is."""
     rig = Rig(bands=BANDS[:3], noise=(0.03, 0.35, 0.15))
     errors = []
     for bands in (2, 3):

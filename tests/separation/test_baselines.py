@@ -1,4 +1,4 @@
-"""Baselines: each does what its own assumptions allow, exactly, and no more."""
+"""Baselines: exact under their own assumptions, and undefined or wrong beyond them."""
 
 from dataclasses import replace
 
@@ -99,7 +99,7 @@ def test_naive_follows_its_random_numbers(glass: Tile) -> None:
 
 
 def test_naive_says_when_it_stopped_early(glass: Tile) -> None:
-    """After a single step a start is not done; after a hundred all are."""
+    """A pixel is flagged as not converged after one step, and not after a hundred."""
     bit = schema.Status.NOT_CONVERGED
     early = naive.separate(fresh(glass), naive.NaiveSettings(iterations=1))
     late = naive.separate(fresh(glass), naive.NaiveSettings())
@@ -117,7 +117,7 @@ def test_naive_says_when_it_stopped_early(glass: Tile) -> None:
     ],
 )
 def test_naive_refuses_what_is_no_search(options: dict[str, float], message: str) -> None:
-    """No starts, no steps, no spread, no tolerance."""
+    """Settings of the naive search outside their range raise a ValueError."""
     with pytest.raises(ValueError, match=message):
         naive.NaiveSettings(**options)  # type: ignore[arg-type]
 
@@ -192,7 +192,7 @@ def test_ratio_refuses_a_stationary_pair() -> None:
 
 
 def test_ratio_out_of_range_is_undefined() -> None:
-    """Where emissivities differ strongly no temperature has the ratio: NaN, and a flag."""
+    """A radiance ratio outside the response's range gives NaN and a flag."""
     tile = seen(WARM + 20.0, np.full_like(WARM, 290.0), (0.9, 0.4))
     found = pyrometry.ratio(tile, pyrometry.RatioSettings(order=None))
     assert np.isnan(found.object_temperature).any()
@@ -207,7 +207,7 @@ def test_ratio_out_of_range_is_undefined() -> None:
     ],
 )
 def test_ratio_refuses_other_settings(options: dict[str, object], message: str) -> None:
-    """Kinds that do not exist, smoothing by no function."""
+    """Unknown kinds of radiance and invalid orders of the smoothing raise a ValueError."""
     with pytest.raises(ValueError, match=message):
         pyrometry.RatioSettings(**options)  # type: ignore[arg-type]
 
@@ -275,7 +275,7 @@ def test_bcp_passes_over_dead_pixels() -> None:
 
 
 def test_guided_filter_follows_its_guide() -> None:
-    """What is linear in the guide passes; what the guide does not show is averaged."""
+    """A linear function of the guide passes; variations that the guide lacks are averaged."""
     rng = np.random.default_rng(0)
     guide = rng.standard_normal((30, 40))
     kept = bcp.guided_filter(guide, 3.0 * guide - 1.0, 9, 1e-12)
@@ -295,13 +295,13 @@ def test_guided_filter_follows_its_guide() -> None:
     ],
 )
 def test_bcp_refuses_other_settings(options: dict[str, float], message: str) -> None:
-    """Windows without a centre, and fractions that are none."""
+    """Even window sizes and fractions outside their range raise a ValueError."""
     with pytest.raises(ValueError, match=message):
         bcp.BcpSettings(**options)  # type: ignore[arg-type]
 
 
 def test_bcp_refuses_a_room_beyond_the_response() -> None:
-    """A reflected temperature must lie in the response's range."""
+    """A reflected temperature outside the response's range raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid reflected_temperature 500\.0 K"):
         bcp.separate(half_black(), bcp.BcpSettings(reflected_temperature=500.0))
 
@@ -317,7 +317,7 @@ def twin() -> tuple[xr.Dataset, xr.Dataset]:
 def test_ratio_behind_solve_may_leave_out_the_smoothing(
     twin: tuple[xr.Dataset, xr.Dataset],
 ) -> None:
-    """An order of None is one of the settings, and leaves the noise of single frames."""
+    """An order of None switches the smoothing off, and leaves the noise of single frames."""
     plain = separation.solve(*twin, "ratio", settings=separation.RatioSettings(order=None))
     smooth = separation.solve(*twin, "ratio")
     assert float(plain["object_temperature"].std()) > float(smooth["object_temperature"].std())

@@ -1,4 +1,4 @@
-"""Known emissivities: two equations a frame, the noise is the price."""
+"""Separation with known emissivities: exact without noise, and at its closed-form variance."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_one_frame_can_be_calibrated(glass: Glass) -> None:
 
 
 def test_nonsense_in_one_pixel_stays_there(glass: Glass) -> None:
-    """Counts that no two temperatures give are flagged, not cast into infinity."""
+    """Counts that no two temperatures give are flagged, and other pixels are not affected."""
     _, capture, response = glass
     wild = capture.copy(deep=True)
     wild["counts"].values[1, :, 0, 0] = wild["counts"].values[0, :, 0, 0]

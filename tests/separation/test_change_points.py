@@ -1,4 +1,4 @@
-"""Objects that jump: found, modelled, flagged; and never where there is none."""
+"""Objects that jump: the jump is found, modelled and flagged, without false alarms."""
 
 from typing import Any
 
@@ -76,7 +76,7 @@ def test_intervals_hold_beside_a_jump() -> None:
     ids=str,
 )
 def test_nothing_jumps_where_nothing_jumps(background: dict[str, Any]) -> None:
-    """Fewer than one clean pixel in a hundred is said to jump, whatever the background does."""
+    """Fewer than 1 % of clean pixels are flagged as jumping, for any background."""
     case = {**GLASS, "stop": 60, "background": background}
     _, result = experiments.run_case(case, Rig(highest=370.0), TIME, 400, seed=3)
     share = float((result["status"].values & JUMP != 0).mean())
@@ -102,7 +102,7 @@ def test_a_jump_needs_no_least_length(frames: int, rate: float, seed: int) -> No
 
 
 def test_candidates_leave_room() -> None:
-    """There are enough frames on both sides, not counting those next to the jump."""
+    """Candidate frames of a jump leave enough frames on both sides."""
     time = np.arange(120) / 20.0
     inside = residuals.candidates(time)
     assert inside.size > 0
@@ -116,7 +116,7 @@ def test_candidates_leave_room() -> None:
 
 @pytest.mark.parametrize("height", [0, 30])
 def test_jump_beside_a_shutter_event(height: int) -> None:
-    """A jump 0.3 s after a shutter event: flagged, and what has a value has a true error bar."""
+    """A jump 0.3 s after a shutter event is flagged, and its values have calibrated uncertainty."""
     scene, capture, response = experiments.simulate(GLASS, RIG, TIME, 100, seed=5)
     step = 6.0 * (scene["time"] >= 20.3)
     moved = scene.assign(object_temperature=scene["object_temperature"] + step)

@@ -1,4 +1,4 @@
-"""The way of the data from `solve` to the object temperature: few rooms, few returns.
+"""Path of the data from `solve` to the object temperature: few modules, few returns.
 
 A reader follows the calls of one solve and reads every function when it is first called. A room is
 a module of the package. A return is a step back into a room of `separation` that was left before,

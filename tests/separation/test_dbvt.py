@@ -1,4 +1,4 @@
-"""The paper's optimiser: its losses one by one, its descent, and what it finds from any start."""
+"""The paper's optimiser: its losses one by one, its Newton steps, and its minima."""
 
 from dataclasses import replace
 from typing import Any
@@ -60,7 +60,7 @@ def linear(noise: tuple[float, float], pixels: int) -> tuple[Tile, Unknowns]:
 
 
 def anywhere(frames: int = 12, columns: int = 3) -> tuple[Unknowns, Images]:
-    """A point without any symmetry, and signals."""
+    """A point without symmetry in the unknowns, and signals."""
     rng = np.random.default_rng(2)
 
     def draw(*shape: int) -> torch.Tensor:
@@ -132,7 +132,7 @@ def test_huber_loss_has_slope_one_beyond_its_threshold() -> None:
 def directional(
     unknowns: Unknowns, images: Images, weights: DbvtSettings, way: Unknowns
 ) -> np.ndarray:
-    """Derivative of the objective along a way, from the forms that the descent solves with."""
+    """Derivative of the objective along a direction, from the forms of the Newton step."""
     emission, _ = objective.ratios(unknowns.emissivity)
     first, second = unknowns.emissivity
     to_first, to_second = way.emissivity
@@ -274,7 +274,7 @@ def test_exact_response_is_taken_out() -> None:
 
 
 def test_too_few_steps_are_flagged() -> None:
-    """A pixel that is still improving at its last step says so."""
+    """A pixel that still improves at its last step is flagged as not converged."""
     _, capture, response = glass(QUIET, 8)
     result = separation.solve(capture, response, "dbvt", settings=DbvtSettings(stages=1, steps=2))
     assert np.all(result["status"].values & schema.Status.NOT_CONVERGED)
@@ -322,6 +322,6 @@ def test_each_loss_can_be_left_out(name: str) -> None:
     ],
 )
 def test_settings_refuse_nonsense(options: dict[str, float], message: str) -> None:
-    """What is no search is refused, by name, value and rule."""
+    """Settings outside their range raise a ValueError with the name, the value and the rule."""
     with pytest.raises(ValueError, match=message):
         DbvtSettings(**options)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The prior on the background's slow part: emissivity bars that hold where nothing can be seen."""
+"""Prior on the background's drift: the emissivity's intervals hold on slow backgrounds."""
 
 from typing import Any
 
@@ -43,7 +43,7 @@ def test_intervals_hold_on_slow_backgrounds(background: dict[str, Any], stop: in
 
 @pytest.mark.parametrize("stop", [45, 60])
 def test_clean_intervals_are_not_too_wide(stop: int) -> None:
-    """Where nothing is slow they are at most three times as wide as they need be."""
+    """Without a slow background the intervals are at most three times too wide."""
     scene, result = experiments.run_case({**GLASS, "stop": stop}, RIG, TIME, 1000, seed=2)
     error = (result["emissivity"] - scene["emissivity"]).values[:, 0]
     spread = np.diff(np.nanquantile(error, [0.1587, 0.8413], axis=1), axis=0)[0] / 2

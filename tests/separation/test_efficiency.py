@@ -1,4 +1,4 @@
-"""As good as the data allow: against the exact model's maximum of likelihood, and the bounds."""
+"""Efficiency against the maximum likelihood of the exact model and the Cramer-Rao bounds."""
 
 from typing import Any
 
@@ -115,7 +115,7 @@ def test_efficiency_at_any_noise(scale: float) -> None:
 
 
 def unknown_background(scene: xr.Dataset, noise: tuple[float, float], order: Array) -> Array:
-    """Bound of k2 in each pixel where nothing is known of the background, in any frame."""
+    """Bound of k2 in each pixel with an unknown background in every frame."""
     cold = scene["background_temperature"].values[:, 0]
     result = np.empty(order.size)
     for one in np.unique(order):

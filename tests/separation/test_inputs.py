@@ -1,4 +1,4 @@
-"""Inputs of a separation: what the user gives, as checked arrays."""
+"""Inputs of a separation: the user's arguments as checked arrays."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_noise_is_that_of_the_response() -> None:
 
 @pytest.mark.parametrize("dims", [("band",), ("band", "y", "x")])
 def test_emissivity_is_spread_over_the_image(dims: tuple[str, ...]) -> None:
-    """By the names of the bands, whatever their order; without a deviation it is zero."""
+    """Emissivities are matched by band name; without a deviation it is zero."""
     values = np.array([0.7, 0.8]).reshape(2, *(1,) * (len(dims) - 1))
     shape = tuple(SHAPE[("band", "time", "y", "x").index(dim)] for dim in dims)
     names = {"band": list(RIG.bands)[::-1]}
@@ -51,7 +51,7 @@ def test_emissivity_is_spread_over_the_image(dims: tuple[str, ...]) -> None:
 
 
 def test_labels_are_numbered_without_gaps() -> None:
-    """Any whole numbers name materials; a negative one shares nothing."""
+    """Any whole numbers name materials; pixels with a negative one are not pooled."""
     pool = np.array([[7, 7, 100, -5], [7, 100, 100, -1], [40, 40, 40, 40]])
     inputs = checked(pool=xr.DataArray(pool, dims=("y", "x")))
     np.testing.assert_array_equal(inputs.labels, [0, 0, 2, -1, 0, 2, 2, -1, 1, 1, 1, 1])

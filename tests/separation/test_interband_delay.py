@@ -1,4 +1,4 @@
-"""What only a suspicion can be told of: bands that are not simultaneous, roles that are swapped."""
+"""Flags of suspicion: bands that are not simultaneous, and object and background swapped."""
 
 from typing import Any
 
@@ -24,12 +24,12 @@ def share(flag: str, pixels: int = 400, seed: int = 1, rig: Rig = RIG, **changes
 
 @pytest.mark.parametrize("offset", [1.0, 2.0])
 def test_a_frame_apart_is_told(offset: float) -> None:
-    """Bands a frame or two apart are told in 95 pixels of 100."""
+    """Bands a frame or two apart are flagged in 95 % of the pixels."""
     assert share("bands_apart", offset=offset) >= 0.95
 
 
 def test_the_flag_grows_with_the_offset() -> None:
-    """A tenth of a frame costs less than the noise and passes; what matters is flagged."""
+    """An offset of a tenth of a frame costs less than the noise; a harmful one is flagged."""
     shares = [share("bands_apart", offset=offset) for offset in (0.1, 0.3, 0.5, 1.0)]
     assert np.all(np.diff(shares) >= 0)
     assert shares[0] < 0.05
@@ -52,15 +52,15 @@ def test_simultaneous_bands_are_not_suspected(
 
 
 def test_swapped_roles_are_suspected() -> None:
-    """Where the object moves like a background 90 pixels in 100 carry the suspicion."""
+    """An object that moves like a background is flagged in 90 % of the pixels."""
     assert share("roles_may_be_swapped", swapped=True) >= 0.9
 
 
 def test_honest_roles_are_not_suspected() -> None:
-    """Emissivities that sum to more than 1 by some deviations are not suspected."""
+    """Emissivities that sum to clearly more than 1 are not flagged as swapped."""
     assert share("roles_may_be_swapped") < 0.005
 
 
 def test_the_suspicion_is_of_the_sum_alone() -> None:
-    """A true 0.3 and 0.5 carries it, too: nothing in the data tells the two cases apart."""
+    """True emissivities of 0.3 and 0.5 are flagged too, as the data cannot tell the cases apart."""
     assert share("roles_may_be_swapped", emissivity=[0.3, 0.5]) > 0.9

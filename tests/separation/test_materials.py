@@ -1,4 +1,4 @@
-"""Materials found from the data: a border is kept, and one material stays one."""
+"""Materials from the data: borders are kept, and one material stays one region."""
 
 from collections.abc import Callable
 
@@ -30,7 +30,7 @@ SHAPES: dict[str, Callable[[Array, Array], Array]] = {
 
 
 def where(name: str, shape: tuple[int, int]) -> Array:
-    """Where the second material is; the image reaches from -1 to 1 in both directions."""
+    """Mask of the second material; the image reaches from -1 to 1 in both directions."""
     return SHAPES[name](*np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij"))
 
 
@@ -166,7 +166,7 @@ def test_order_of_bands_does_not_matter(small: Inputs) -> None:
 
 
 def test_three_bands(small: Inputs) -> None:
-    """A third band adds a ratio and a picture, and the border stays."""
+    """A third band adds a ratio and a feature map, and the border stays."""
     names = [*RIG.bands, "10.6"]
     three = [part.isel(band=[0, 1, 1]).assign_coords(band=names) for part in small]
     labels = materials(*three)
@@ -188,14 +188,14 @@ def test_pixels_without_a_signal_have_no_material(small: Inputs) -> None:
 
 
 def test_where_nothing_moved_is_no_material(small: Inputs) -> None:
-    """Without a single ratio there is nothing to pool, and every pixel is -1."""
+    """Without a reflection ratio every pixel is -1."""
     result, capture, response = small
     nothing = result.assign(reflection_ratio=result["reflection_ratio"] * np.nan)
     assert np.all(materials(nothing, capture, response) == NONE)
 
 
 def test_silence_is_no_agreement(small: Inputs) -> None:
-    """Where nothing moved on the right, what is warm there is not taken into the left material."""
+    """Warm pixels with a still background on the right are not added to the left material."""
     result, capture, response = small
     right = xr.DataArray(where("side by side", SMALL), dims=("y", "x"))
     left = result.assign(reflection_ratio=result["reflection_ratio"].where(~right))
@@ -206,7 +206,7 @@ def test_silence_is_no_agreement(small: Inputs) -> None:
 
 
 def test_error_rate_is_kept() -> None:
-    """Of images of one material as many are cut, and as many held apart, as the rate allows."""
+    """Images of one material are split no more often than the stated error rate."""
     rng, rate, tries = np.random.default_rng(8), 0.2, 300
     cells = feature_maps.connected(np.add.outer(np.arange(24) // 8 * 3, np.arange(24) // 8) + 1)
     cut = apart = 0
@@ -224,7 +224,7 @@ def test_error_rate_is_kept() -> None:
 
 
 def test_a_cell_across_a_border_is_mixed() -> None:
-    """Five pixels of concrete in a cell of glass are seen, where one pixel's ratio is 3 % off."""
+    """Five pixels of concrete in a cell of glass are detected at a ratio's deviation of 3 %."""
     rng, found = np.random.default_rng(9), 0
     cells = np.ones((8, 8), dtype=np.intp)
     for _ in range(100):
@@ -283,7 +283,7 @@ def test_step_counts_in_standard_deviations() -> None:
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000), name=st.sampled_from(list(SHAPES)))
 def test_labels_are_connected_and_ordered(seed: int, name: str) -> None:
-    """Whatever the scene, labels are 0, 1, ... by size, and each is one connected region."""
+    """Labels are ordered by size, and each is one connected region."""
     labels = materials(*drawn(scene_of(where(name, (24, 40)), seed, frames=64), seed)).values
     sizes = np.bincount(labels[labels != NONE], minlength=1)
     assert np.all(np.diff(sizes) <= 0)

@@ -78,7 +78,7 @@ def estimated(result: xr.Dataset) -> set[str]:
 
 @every_method
 def test_record(method: str) -> None:
-    """A function of a tile, settings that can be built, and no estimate that is no variable."""
+    """A method is a function of a tile, with default settings and known variables not estimated."""
     record = separation.get_method(method)
     assert callable(record.separate)
     assert record.settings is None or record.settings() == record.settings()
@@ -117,7 +117,7 @@ def test_only_the_estimated_has_values(pair: Pair, method: str) -> None:
 def test_good_means_complete(
     seed: int, frames: int, first: float, second: float, loudness: float, method: str
 ) -> None:
-    """Where the status is 0, everything that the method estimates is finite."""
+    """Pixels with a status of 0 are finite in every quantity that the method estimates."""
     rng, rig = np.random.default_rng(seed), Rig(noise=(0.03 * loudness, 0.35 * loudness))
     known = emissivity_of(first, second)
     knows = separation.get_method(method).knows_emissivity

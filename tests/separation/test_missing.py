@@ -1,4 +1,4 @@
-"""Samples that are not there: NaN, masks, shutter events; the rest is as without them."""
+"""Missing samples (NaN, masks, shutter events) leave the other values as they are."""
 
 from typing import Any
 
@@ -28,14 +28,14 @@ def case() -> Case:
 
 
 def without(capture: xr.Dataset, there: np.ndarray) -> xr.Dataset:
-    """The capture with NaN where samples (..., time, y, x) are not there, in all bands."""
+    """The capture with NaN in place of missing samples (..., time, y, x), in all bands."""
     return capture.assign(
         counts=capture["counts"].where(xr.DataArray(there, dims=("time", "y", "x")))
     )
 
 
 def assert_agree(found: xr.Dataset, expected: xr.Dataset, frames: np.ndarray) -> None:
-    """The frames that are there have the values of the shorter capture, the others none."""
+    """Assert the values of the shorter capture at its frames, and NaN at the others."""
     for name in schema.STAGES["separated"]:
         values = found[name].values
         if name.startswith(FRAMES):
@@ -45,7 +45,7 @@ def assert_agree(found: xr.Dataset, expected: xr.Dataset, frames: np.ndarray) ->
 
 
 def lost(fraction: float, seed: int = 0) -> np.ndarray:
-    """Frames (time) that are there, some lost at random and one long gap."""
+    """Mask of the frames (time): some missing at random, and one long gap."""
     there = np.random.default_rng(seed).random(350) >= fraction
     there[120:150] = False
     return np.asarray(there)
@@ -105,7 +105,7 @@ def test_masks_of_samples_are_nan(case: Case) -> None:
 
 @pytest.mark.parametrize(("missing", "good"), [(170, True), (180, False)])
 def test_half_of_the_frames_must_be_there(case: Case, missing: int, good: bool) -> None:
-    """A pixel with less than half of its frames is flagged and NaN."""
+    """A pixel with less than half of its frames is NaN and flagged."""
     _, capture, response = case
     there = np.ones((350, 1, PIXELS), dtype=bool)
     there[np.random.default_rng(5).permutation(350)[:missing], 0, 3] = False
@@ -164,7 +164,7 @@ def test_shutter_steps_are_undone(events: tuple[int, ...]) -> None:
 
 
 def test_a_segment_without_a_step_costs_little(case: Case) -> None:
-    """An event that changed nothing leaves a true error bar and no flag."""
+    """An event without a step changes the object by less than 0.15 K, and sets no flag."""
     _, capture, response = case
     plain = separation.solve(capture, response)
     freed = separation.solve(capture.assign(segment=("time", np.repeat([3, 4], 175))), response)
@@ -193,7 +193,7 @@ BAD: dict[str, tuple[dict[str, Any], Any, type[Exception], str]] = {
 
 @pytest.mark.parametrize("what", BAD)
 def test_bad_masks_and_segments(case: Case, what: str) -> None:
-    """Masks are booleans of the capture's sizes, segments whole numbers that do not fall."""
+    """Invalid masks and numbers of segments raise an error with the rule."""
     new, mask, error, message = BAD[what]
     _, capture, response = case
     with pytest.raises(error, match=message):
@@ -212,7 +212,7 @@ def test_bad_masks_and_segments(case: Case, what: str) -> None:
 def test_nothing_missing_raises(
     seed: int, frames: int, share: float, common: bool, events: int, materials: int
 ) -> None:
-    """Random gaps, events and labels: what is good is finite wherever the capture has samples."""
+    """Random gaps, events and labels raise no error; good pixels are finite at valid samples."""
     rng = np.random.default_rng(seed)
     _, capture, response = experiments.simulate(GLASS, RIG, TIME[:frames], 12, seed)
     there = rng.random((frames, 1, 1 if common else 12)) >= share
@@ -233,7 +233,7 @@ def test_nothing_missing_raises(
 
 
 def test_unequal_gaps_need_a_known_noise(case: Case) -> None:
-    """Where every pixel lacks other frames the noise cannot be estimated, and the error says so."""
+    """Gaps in different frames of every pixel raise a ValueError that asks for the noise."""
     _, capture, response = case
     there = np.random.default_rng(8).random((350, 1, PIXELS)) > 0.02
     with pytest.raises(ValueError, match=r"0 usable pixels .* or give the noise"):

@@ -1,4 +1,4 @@
-"""Pixels of one material share what they tell: smaller errors, and no bleeding."""
+"""Pooling over the pixels of a material: smaller errors, and no bleeding over borders."""
 
 from typing import Any
 
@@ -49,7 +49,7 @@ def error_of_ratio(result: xr.Dataset, truth: float = 2.0) -> float:
 
 
 def test_some_pixels_of_a_large_material_are_surveyed() -> None:
-    """All of a small material, at most `MOST` evenly spread over a large one, none without."""
+    """All of a small material, and `MOST` evenly spaced pixels of a large one, are surveyed."""
     count = 3 * pool.MOST
     values = np.concatenate([one(5, 1), one(count), one(4, -1)])
     selected = pool.select(values)
@@ -61,7 +61,7 @@ def test_some_pixels_of_a_large_material_are_surveyed() -> None:
 
 
 def test_materials_are_spread_over_their_pixels() -> None:
-    """Each pixel has the values of its label's material, and NaN without one."""
+    """Each pixel has the values of its label's material, and NaN without a label."""
     parts = (np.array([[1.0, 1.0], [2.0, 1.4]]), *np.arange(8.0).reshape(4, 2))
     expanded = pool.expand(Material(*parts), np.array([1, -1, 0]))
     np.testing.assert_array_equal(expanded.ratio[1], [1.4, np.nan, 2.0])
@@ -90,7 +90,7 @@ def test_four_hundred_pixels_cut_the_error_tenfold() -> None:
 
 
 def test_shared_error_bars_are_true() -> None:
-    """Errors of materials of ten pixels are as large as their standard deviations say."""
+    """Errors of materials of ten pixels scatter as their standard deviations state."""
     scene, capture, response = case(1000, 3)
     pool = labels(np.repeat(np.arange(100), 10))
     result = separation.solve(capture, response, pool=pool)
@@ -110,7 +110,7 @@ def test_shared_error_bars_are_true() -> None:
 
 
 def test_a_material_of_one_pixel_is_that_pixel() -> None:
-    """Labels that none share change nothing, error bars included."""
+    """A label for each pixel changes neither values nor deviations."""
     _, capture, response = case(30, 4)
     alone = separation.solve(capture, response)
     shared = separation.solve(capture, response, pool=labels(np.arange(30)))
@@ -121,7 +121,7 @@ def test_a_material_of_one_pixel_is_that_pixel() -> None:
 
 
 def test_still_pixels_of_a_material_get_a_temperature() -> None:
-    """Without motion a pixel alone tells nothing; what its material tells is enough."""
+    """Pixels with a still background get a temperature by the ratio of their material."""
     together = beside(case(60, 5), case(20, 6, background={"kind": "still"}))
     scene, capture, response = together
     still = {"x": slice(60, None)}
@@ -138,7 +138,7 @@ def test_still_pixels_of_a_material_get_a_temperature() -> None:
 
 @pytest.mark.parametrize("kind", [{"background": {"kind": "still"}}, {"emissivity": [0.8, 0.8]}])
 def test_a_material_that_tells_nothing_says_so(kind: dict[str, Any]) -> None:
-    """Where no pixel tells anything nothing is claimed, and every pixel has a flag."""
+    """A material without information is NaN with a flag in every pixel."""
     _, capture, response = case(20, 7, **kind)
     shared = separation.solve(capture, response, pool=labels(one(20)))
     assert np.all(shared["status"] != 0)
@@ -146,7 +146,7 @@ def test_a_material_that_tells_nothing_says_so(kind: dict[str, Any]) -> None:
 
 
 def test_wrong_labels_do_not_pull() -> None:
-    """A clear pixel of another material keeps its own ratio, and its material keeps its own."""
+    """A pixel labelled with another's material keeps its own ratio, and so does the material."""
     loud = {"background": {"amplitude": 9.0}}
     scene, capture, response = beside(
         case(60, 8, **loud), case(3, 9, emissivity=[0.6, 0.45], **loud)
@@ -179,7 +179,7 @@ def test_two_materials_stay_apart() -> None:
 
 
 def test_labels_of_nothing_share_nothing() -> None:
-    """Negative labels alone are no pool."""
+    """Negative labels leave every pixel as it is without a pool."""
     _, capture, response = case(20, 13)
     shared = separation.solve(capture, response, pool=labels(one(20, -1)))
     alone = separation.solve(capture, response)
@@ -206,7 +206,7 @@ def test_result_does_not_depend_on_workers_or_tiles() -> None:
 
 
 def test_a_capture_of_nothing_can_be_pooled() -> None:
-    """Without one usable sample every pixel is flagged, and nothing raises."""
+    """A capture without a valid sample is flagged in every pixel, without an error."""
     _, capture, response = case(4, 15)
     empty = capture.assign(counts=capture["counts"] * np.nan)
     result = separation.solve(empty, response, pool=labels(one(4)))
@@ -223,14 +223,14 @@ def test_a_capture_of_nothing_can_be_pooled() -> None:
     ],
 )
 def test_bad_labels_are_a_clear_error(pool: Any, error: type[Exception], message: str) -> None:
-    """Labels are whole numbers, one for each pixel."""
+    """Invalid labels raise an error with the rule."""
     _, capture, response = case(20, 16)
     with pytest.raises(error, match=message):
         separation.solve(capture, response, pool=pool)
 
 
 def test_other_methods_do_not_pool() -> None:
-    """It is refused by a method that would not use it."""
+    """A pool raises a ValueError in a method that does not use it."""
     _, capture, response = case(20, 17)
     with pytest.raises(ValueError, match="Invalid pool for method 'ratio'"):
         separation.solve(capture, response, "ratio", pool=labels(one(20)))

@@ -43,7 +43,7 @@ def test_good_samples_pass_unchanged() -> None:
 
 
 def test_bits_of_bad_pixels() -> None:
-    """NaN in one band makes a sample invalid in all; too few, constant or frozen is told."""
+    """NaN in one band is invalid in all; pixels of few, constant or frozen frames are flagged."""
     every, some = slice(None), slice(0, 11)
     bad = spoilt(
         ((0, 3, 0), np.nan),
@@ -63,7 +63,7 @@ def test_bits_of_bad_pixels() -> None:
 
 
 def test_saturation_is_of_whole_numbers_in_use() -> None:
-    """An end of the type is told for whole numbers, but not in a masked sample."""
+    """Whole-number counts at an end of their type are flagged, except in masked samples."""
     wild = spoilt(((1, 5, 4), 65535), ((1, 6, 5), 65535), dtype="uint16")
     mask = np.ones((FRAMES, 1, 6), dtype=bool)
     mask[6, 0, 5] = False
@@ -82,7 +82,7 @@ def test_status_of_the_capture_is_kept() -> None:
 
 
 def test_short_gaps_are_bridged_by_a_line() -> None:
-    """Gaps of one and two frames follow the clock; one of three, or at an end, stays."""
+    """Gaps of one and two frames are interpolated in time; longer ones and ends are not."""
     time = np.cumsum(np.r_[1.0, np.full(FRAMES - 1, 0.1)])
     time[7:] += 0.3  # an uneven clock
     counts = np.stack([5.0 * time, -3.0 * time])[..., np.newaxis] * np.ones(6)
@@ -107,7 +107,7 @@ def test_pixels_of_the_same_frames_are_one_set() -> None:
 
 
 def test_common_frames_leave_out_who_lacks_one() -> None:
-    """A frame that most lack is dropped for all; a pixel that lacks another is not solved."""
+    """A frame that most pixels lack is left out for all; pixels that lack another are unsolved."""
     valid = np.ones((FRAMES, 6), dtype=bool)
     valid[3, :5] = valid[9, 2] = False
     counts, status = np.ones((2, FRAMES, 6)), bits()
@@ -121,7 +121,7 @@ def test_common_frames_leave_out_who_lacks_one() -> None:
 
 
 def test_sample_is_even_and_good() -> None:
-    """About the number of pixels asked for, none with a bit, at the frames that most have."""
+    """A sample has about the requested number of unflagged pixels, at their common frames."""
     whole = part(pixels=600)
     whole["counts"].values[0, 4, 0, :] = np.nan
     whole["counts"].values[0, 7, 0, :60] = np.nan

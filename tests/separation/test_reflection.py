@@ -1,4 +1,4 @@
-"""Reflections as pictures: made movies whose ratio, noise and scaling are known, and a result's."""
+"""Reflections as pictures: simulated movies with known ratio, noise and scaling, and a result."""
 
 import re
 from collections.abc import Callable
@@ -22,7 +22,7 @@ FILM = np.arange(350) / 10.0  # s
 
 
 def pulses() -> Floats:
-    """What the left half reflects, in the first band's unit (time, y, x)."""
+    """Reflection in the left half, in the first band's unit (time, y, x)."""
     rng = np.random.default_rng(4)
     start = rng.uniform(0.0, 22.0, (6, 1, HEIGHT, WIDTH))
     inside = (TIME[:, np.newaxis, np.newaxis] - start > 0) & (
@@ -58,7 +58,7 @@ def signal() -> xr.DataArray:
 
 @pytest.fixture(scope="module")
 def found(signal: xr.DataArray) -> xr.Dataset:
-    """Its reflections."""
+    """Emission and reflection of the movie."""
     return separation.uncalibrated_reflection(signal)
 
 
@@ -72,7 +72,7 @@ def test_ratio_and_noise(scaling: float) -> None:
 
 
 def test_ratio_of_each_pixel(found: xr.Dataset) -> None:
-    """Where something is reflected each pixel has the ratio without bias; elsewhere no movement."""
+    """Pixels with a reflection have its ratio without bias; the others have no correlation."""
     left = {"x": slice(WIDTH // 2)}
     ratio = found["ratio"].isel(left)
     assert float(ratio.mean()) == pytest.approx(RATIO, rel=0.02)
@@ -127,7 +127,7 @@ def test_unit_does_not_matter(signal: xr.DataArray, found: xr.Dataset) -> None:
 
 
 def test_mask(signal: xr.DataArray, found: xr.Dataset) -> None:
-    """What lies outside the mask has no part in ratio and noise, but is separated, too."""
+    """Pixels outside the mask do not enter ratio and noise, but are separated."""
     mask = xr.DataArray(np.arange(HEIGHT) < 18, dims="y").expand_dims(x=WIDTH, axis=1)
     spoiled = signal.where(mask, signal * xr.DataArray([1.0, 0.2], dims="band"))
     masked = separation.uncalibrated_reflection(spoiled.transpose(*signal.dims), mask=mask)
@@ -161,7 +161,7 @@ def test_refused(
     options: dict[str, float],
     message: str,
 ) -> None:
-    """Other dims, NaN, and movies without enough pixels to tell noise from reflection."""
+    """Other dimensions, NaN, and movies with too few pixels raise an error."""
     with pytest.raises(ValueError, match=re.escape(message)):
         separation.uncalibrated_reflection(change(signal), **options)  # type: ignore[arg-type]
 
@@ -196,7 +196,7 @@ def test_reflected_change() -> None:
 
 
 def test_reflected_change_of_another_band() -> None:
-    """Bands in another order are refused."""
+    """Bands in another order raise a ValueError."""
     result = xr.Dataset(coords={"band": ["8-14", "9.5"]})
     apparent = xr.DataArray(np.zeros((2, 1, 1, 1)), dims=("band", "time", "y", "x"))
     with pytest.raises(ValueError, match=r"Invalid first band '9\.5'. Must be '8-14'"):

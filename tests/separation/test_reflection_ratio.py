@@ -62,7 +62,7 @@ def test_variance_is_that_of_the_scatter_and_near_the_bound() -> None:
 
 
 def test_reduced_chi2_is_one_on_the_model() -> None:
-    """What lies across the axis is the noise, and the contrast is the background's."""
+    """On the model the reduced chi-square is 1, and the contrast is the background's."""
     found = reflection_ratio.estimate(changes((1.0, 2.0), NOISE, 400), FUNCTIONS, NOISE)
     assert np.mean(found.reduced_chi2) == pytest.approx(1.0, abs=0.02)
     expected = 1.0 + 1.0 / NOISE[0] ** 2 + (2.0 / NOISE[1]) ** 2
@@ -79,7 +79,7 @@ def test_null_combination_of_two_bands() -> None:
 
 
 def test_null_combination_of_three_bands_is_the_best() -> None:
-    """It cancels the background, keeps the object, and no other such combination is quieter."""
+    """It cancels the background, keeps the object, and has the lowest variance of all such."""
     ratio, noise = np.array([[1.0], [2.0], [1.4]]), np.array([0.03, 0.35, 0.2])
     weights, variance = reflection_ratio.null_combination(ratio, noise)
     assert weights.sum() == pytest.approx(1.0)
@@ -107,7 +107,7 @@ def test_inverse_energy() -> None:
 
 @pytest.mark.parametrize(("ratio", "pooled"), [(2.0, True), (2.5, False), (np.nan, False)])
 def test_material_is_used_unless_contradicted(ratio: float, pooled: bool) -> None:
-    """A known ratio is taken, but not against the pixel's own changes, and not where it is NaN."""
+    """A material's ratio is used unless it is NaN or the pixel's own changes contradict it."""
     one = np.ones(5)
     known = Material(np.stack([one, ratio * one]), 1e-4 * one, 0.8 * one, 0 * one, 0 * one)
     signals = changes((1.0, 2.0), NOISE, 5)

@@ -77,7 +77,7 @@ def test_autocorrelation_of_white_noise_is_a_standard_score() -> None:
 
 
 def test_autocorrelation_of_nothing_is_zero() -> None:
-    """A residual of zeros has no correlation, and divides by nothing."""
+    """A residual of zeros has an autocorrelation of zero."""
     np.testing.assert_array_equal(residuals.autocorrelation(np.zeros((50, 3))), 0.0)
 
 
@@ -112,7 +112,7 @@ def test_null_residual_is_white_noise_of_the_null_variance() -> None:
 
 
 def test_change_point_is_at_the_step() -> None:
-    """A step along the object's direction is found at its frame; noise alone gains nothing."""
+    """A step along the object's direction is found at its frame; noise alone has no gain."""
     step = np.where(np.arange(TIME.size) >= 140, 1.0, 0.0)[:, np.newaxis]
     rng = np.random.default_rng(7)
     moved = np.stack([0.86 * step, 0.72 * step]) * np.ones(20)
@@ -143,7 +143,7 @@ def test_ramp_takes_a_second() -> None:
 
 
 def test_shutter_event_beside_a_jump_leaves_one_side() -> None:
-    """Where a shutter event hides the jump's height, the longer side alone is kept."""
+    """With a shutter event at the jump only its longer side is kept."""
     segment = (TIME >= 20.2).astype(np.intp)
     both, longer = (residuals.beside_jump(TIME, 200, part) for part in (None, segment))
     assert both[:190].all()

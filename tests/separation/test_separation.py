@@ -1,4 +1,4 @@
-"""Separation: forward against inverse, at the statistical limit, with true error bars."""
+"""Separation of simulated captures: accuracy at the bound, and calibrated uncertainty."""
 
 import numpy as np
 import pytest
@@ -100,7 +100,7 @@ def test_intervals_of_the_object_hold(noise_known: bool) -> None:
     ],
 )
 def test_temperature_is_robust(background: dict[str, object], limit: float) -> None:
-    """A background that never rests or drifts leaves the temperature as good as the prototype's."""
+    """A background that never rests, or drifts, leaves the temperature's accuracy as it is."""
     case = glass_case(stop=45, background=background)
     scene, result = experiments.run_case(case, RIG, TIME, 400, seed=9)
     rmse = float(experiments.score(scene, result)["object_temperature_rmse"])
@@ -119,7 +119,7 @@ def test_constant_object_keeps_its_temperature() -> None:
 
 
 def test_still_background_is_flagged() -> None:
-    """Without motion nothing is claimed: NaN in every pixel, and the flag."""
+    """A still background gives NaN and a flag in every pixel."""
     case = glass_case(background={"kind": "still"})
     _, result = experiments.run_case(case, RIG, TIME, 200, seed=2)
     flagged = result["status"].values & schema.Status.NO_BACKGROUND_MOTION != 0
@@ -172,7 +172,7 @@ def test_linear_response_costs_kelvins() -> None:
 
 
 def test_large_changes_of_the_background_do_not_bias() -> None:
-    """Pulses of 12 K bend the responses apart; that is taken out: no bias, true error bars."""
+    """Pulses of 12 K on a curved response give no bias, and calibrated uncertainty."""
     case = glass_case(background={"amplitude": 12.0})
     scene, capture, response = experiments.simulate(case, Rig(highest=370.0), TIME, 400, seed=5)
     result = separation.solve(capture, response, settings=separation.SubspaceSettings(0.0))

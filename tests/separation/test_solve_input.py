@@ -1,4 +1,4 @@
-"""What goes into a separation: bad input, bad pixels, and what the status says of them."""
+"""Input of `solve`: invalid arguments, bad pixels, and their status."""
 
 from collections.abc import Callable
 
@@ -124,7 +124,7 @@ BAD: dict[str, tuple[Callable[[xr.Dataset, xr.Dataset], object], str]] = {
 
 @pytest.mark.parametrize("what", BAD)
 def test_bad_input_is_a_clear_error(glass: Glass, what: str) -> None:
-    """Each error names the thing, the value and the rule."""
+    """Invalid input raises an error with the name, the value and the rule."""
     call, message = BAD[what]
     _, capture, response = glass
     with pytest.raises(ValueError, match=message):
@@ -165,7 +165,7 @@ def test_frozen_frames_are_flagged(glass: Glass) -> None:
 
 @pytest.mark.parametrize("name", ["gray", None])
 def test_a_quantity_that_is_nan_in_all_frames_has_a_flag(name: str | None) -> None:
-    """Where no background gives the signals in any frame: outside, unless a flag says why."""
+    """A quantity that is NaN in all frames is flagged as outside the response, or by its cause."""
     before = np.full(1, 0 if name is None else schema.Status.bits()[name], dtype=np.uint32)
     warm, none, share = np.full((9, 1), 300.0), np.full((9, 1), np.nan), np.full((2, 1), 0.5)
     found = Estimate(warm, 0.1 * np.ones((9, 1)), none, none, share, 0.1 * share, before)

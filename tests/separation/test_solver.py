@@ -1,4 +1,4 @@
-"""The one entrance to all methods: options, randomness, truth, pixels that cannot be used."""
+"""`solve` for all methods: settings, randomness, tiles and unusable pixels."""
 
 from typing import Any
 
@@ -23,12 +23,12 @@ def scene() -> xr.Dataset:
 
 @pytest.fixture(scope="module")
 def capture(scene: xr.Dataset) -> xr.Dataset:
-    """What the rig sees of it."""
+    """Corrected counts of the scene."""
     return simulation.observe(scene, Rig().response(), np.random.default_rng(2))
 
 
 def test_tiles_draw_for_themselves() -> None:
-    """No tile shares its numbers with another, nor the first with the seed's own generator."""
+    """Random numbers differ between tiles, and from the seed's own generator."""
     places = [(slice(row, row + 1), slice(0, 4)) for row in (0, 1)]
     first, second = (tiles.generator(7, place).random(4) for place in places)
     assert not np.any(np.isin(first, second))
@@ -37,7 +37,7 @@ def test_tiles_draw_for_themselves() -> None:
 
 @pytest.mark.parametrize("method", ["naive", "dbvt"])
 def test_random_starts_hang_on_the_seed_alone(capture: xr.Dataset, method: str) -> None:
-    """The same seed gives the same result, another seed another."""
+    """Random starts depend on the seed alone, not on the number of threads."""
     response = Rig().response()
     few = separation.DbvtSettings(steps=3, stages=1) if method == "dbvt" else None
     first, again, other = (
@@ -86,13 +86,13 @@ def test_bad_settings_are_named(capture: xr.Dataset, case: str) -> None:
 
 
 def test_a_missing_device_is_named() -> None:
-    """Where there is no second graphics processor the optimiser says so."""
+    """A graphics processor that does not exist raises a ValueError with its name."""
     with pytest.raises(ValueError, match="Invalid device 'cuda:9'"):
         separation.DbvtSettings(device="cuda:9")
 
 
 def test_a_dead_pixel_harms_no_neighbour() -> None:
-    """The channel prior looks around itself: a pixel marked as dead, however hot, is not seen."""
+    """A pixel marked as dead, however hot, does not change the channel prior's other pixels."""
     emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
     rng, response = np.random.default_rng(3), Rig().response()
     scene = simulation.walkers(TIME[:8], (20, 24), emissivity, rng, crossings=2)
@@ -121,7 +121,7 @@ def test_progress_is_shown(capture: xr.Dataset, capsys: pytest.CaptureFixture[st
 
 
 def test_options_are_recorded(capture: xr.Dataset) -> None:
-    """The result says which options made it."""
+    """The result records its settings, and the quantities that are not estimated."""
     result = separation.solve(
         capture, Rig().response(), "ratio", settings=separation.RatioSettings("narrow")
     )
@@ -129,7 +129,7 @@ def test_options_are_recorded(capture: xr.Dataset) -> None:
 
 
 def test_apparent_is_the_reading_of_the_quieter_band(capture: xr.Dataset) -> None:
-    """Nothing is separated: a blackbody at that temperature has the first band's counts."""
+    """Method "apparent" gives the blackbody temperature of the quieter band's counts."""
     response = Rig().response()
     found = separation.solve(capture, response, "apparent")["object_temperature"]
     counts = responses.curve(response, "8-14").counts(found.values.astype(np.float64))

@@ -1,4 +1,4 @@
-"""Tiles: they cover the image, hold its signals, and their estimates come back to their places."""
+"""Tiles cover the image, hold its signals, and their estimates return to their places."""
 
 import numpy as np
 import numpy.typing as npt
@@ -124,7 +124,7 @@ def test_pixels_and_frames_come_back_to_their_places() -> None:
 
 
 def test_undefined_quantities_lose_their_deviation_too() -> None:
-    """NaN in value and standard deviation, where asked for and nowhere else."""
+    """An undefined quantity is NaN with its standard deviation, in its own pixels alone."""
     nowhere = selected()
     found = estimate(4).undefine(selected(1), nowhere, selected(2))
     for name, pixel in (("object_temperature", 1), ("background_temperature", 2)):
@@ -135,7 +135,7 @@ def test_undefined_quantities_lose_their_deviation_too() -> None:
 
 
 def test_range_allows_for_the_noise() -> None:
-    """Five standard deviations beyond the calibrated range are a flag, less is not."""
+    """A temperature is flagged from five standard deviations beyond the calibrated range."""
     curve = response.curve(RIG.response(), "8-14")
     found = estimate(4)
     found.object_temperature[2] = curve.highest + np.array([0.0, 0.4, 0.6, np.nan])

@@ -130,7 +130,7 @@ def test_radiative_cooling() -> None:
 
 
 def test_radiative_balance() -> None:
-    """Given heat q ends where it is radiated: T^4 = T_s^4 + q / (2 eps sigma), both sides."""
+    """A prescribed flux q is radiated by both sides: T^4 = T_s^4 + q / (2 eps sigma)."""
     sides = [heat.Radiation(0.9, AMBIENT), heat.Radiation(0.9, AMBIENT), heat.Heating(800.0)]
     found = heat.simulate(shell(SPOT), [0.0, 1e4, 2e4], AMBIENT, sides, step=200.0)[-1]
     exact = (AMBIENT**4 + 800.0 / (2.0 * 0.9 * SIGMA)) ** 0.25
@@ -240,7 +240,7 @@ def test_stiff_step_is_damped() -> None:
 
 
 def test_insulated_body_keeps_its_heat() -> None:
-    """Conduction moves heat and makes none: the sum of capacity times temperature stays."""
+    """Conduction conserves heat: the sum of capacity times temperature is constant."""
     glass = surfaces.wineglass(0.004)
     body = shell(glass)
     first = AMBIENT + 40.0 * (glass.vertices[:, 2] > 0.1)
@@ -251,7 +251,7 @@ def test_insulated_body_keeps_its_heat() -> None:
 
 
 def test_given_heat_is_kept() -> None:
-    """An insulated body holds all the heat that it was given."""
+    """An insulated body keeps all the heat of a prescribed flux."""
     body = shell(trimesh.creation.icosphere(3, 0.02))
     flux = np.random.default_rng(1).uniform(0.0, 1000.0, len(body.vertices))
     found = heat.simulate(body, [0.0, 5.0, 30.0], AMBIENT, [heat.Heating(flux)], step=1.0)
@@ -273,7 +273,7 @@ def test_no_overshoot() -> None:
 
 
 def test_unevenly_spaced_times() -> None:
-    """The times asked for choose the samples, not the result."""
+    """The output times select samples, and do not change the solution."""
     air = [heat.Convection(50.0, 350.0), heat.Radiation(0.9, AMBIENT)]
     even = heat.simulate(shell(SPOT), np.arange(0.0, 101.0), AMBIENT, air, step=0.5)
     uneven = heat.simulate(shell(SPOT), [0.0, 3.0, 10.0, 100.0], AMBIENT, air, step=0.5)

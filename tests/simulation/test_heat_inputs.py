@@ -1,4 +1,4 @@
-"""What heat refuses: shells, solids, exchanges and questions that are not physical."""
+"""Invalid shells, solids, exchanges and simulations of heat raise errors."""
 
 from collections.abc import Callable
 
@@ -35,7 +35,7 @@ FACE = np.array([[0, 1, 2]])
 def test_invalid_shell(
     vertices: Array, faces: npt.NDArray[np.int64], thickness: float, message: str
 ) -> None:
-    """What is no shell is refused with a reason."""
+    """An invalid mesh or thickness of a shell raises a ValueError with the reason."""
     with pytest.raises(ValueError, match=message):
         heat.Shell(vertices, faces, thickness, heat.GLASS)
 
@@ -75,13 +75,13 @@ def test_invalid_exchange(exchange: heat.Exchange, message: str) -> None:
     ],
 )
 def test_invalid_simulation(call: Callable[[heat.Shell], Array], message: str) -> None:
-    """A question that has no answer is refused."""
+    """Invalid times, steps and temperatures of a simulation raise a ValueError."""
     with pytest.raises(ValueError, match=message):
         call(BODY)
 
 
 def test_below_absolute_zero() -> None:
-    """Given cooling that nothing stops ends in an error, not in a negative temperature."""
+    """A constant cooling ends in an error, not in a negative temperature."""
     with pytest.raises(ArithmeticError, match=r"Invalid temperature -.* Must be above 0 K"):
         heat.simulate(BODY, [0.0, 1e5], AMBIENT, [heat.Heating(-100.0)], step=10.0)
 

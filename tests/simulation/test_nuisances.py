@@ -1,4 +1,4 @@
-"""Nuisances of one camera: each put into a capture of known truth, found, and undone."""
+"""Nuisances of one camera: each put into a capture of known truth, detected, and undone."""
 
 import re
 from collections.abc import Callable
@@ -190,7 +190,7 @@ def test_shutter_is_marked_once_and_says_so(clean: xr.Dataset) -> None:
 
 
 def test_shutter_refuses_nonsense() -> None:
-    """An image that never changes, whole numbers, and events elsewhere are refused."""
+    """A frozen capture, an integer capture and events outside it raise an error."""
     capture = still()
     with pytest.raises(ValueError, match=re.escape("Invalid counts of band '8-14': 0 of the 480")):
         find_shutter(capture.assign(counts=0 * capture["counts"]))
@@ -291,7 +291,7 @@ def test_drift_leaves_the_steps() -> None:
 
 
 def test_drift_refuses_nonsense() -> None:
-    """A patch of no good pixel, of another image, torn, or used twice is refused."""
+    """A patch without good pixels, of another size, incomplete or used twice raises an error."""
     capture = still()
     with pytest.raises(ValueError, match="it marks no good pixel"):
         undo_drift(capture, patch() & False)
@@ -335,7 +335,7 @@ def drifting() -> tuple[xr.Dataset, xr.Dataset, list[xr.Dataset]]:
 
 
 def pattern_error(corrected: xr.Dataset, seen: xr.Dataset) -> float:
-    """Spread between good pixels of the error at the last frames [count]."""
+    """Standard deviation over the good pixels of the error at the last frames [count]."""
     error = (corrected["counts"] - seen["counts"]).isel(time=slice(-10, None)).mean("time")
     return float(error.where(corrected["status"] & DEAD == 0).std(("y", "x")).max())
 
@@ -407,14 +407,14 @@ def test_bad_pixels_are_found(seed: int) -> None:
 
 
 def test_fast_frames_are_no_bad_pixels() -> None:
-    """At 60 Hz an edge of a silhouette creeps, and is still not taken for a blinking pixel."""
+    """At 60 Hz the slow edge of a silhouette is not marked as a blinking pixel."""
     false = [float((mark_bad(walkers(n, rate=60.0))["status"] != 0).mean()) for n in (2, 4)]
     print(f"false alarms at 60 Hz {false}")
     assert np.mean(false) < 1e-4
 
 
 def test_shutter_makes_no_bad_pixel(clean: xr.Dataset) -> None:
-    """New offsets are steps of every pixel for itself, and known: no pixel blinks."""
+    """New offsets after a known shutter event are not marked as blinking pixels."""
     capture = shutter(clean, np.random.default_rng(4))
     assert float((mark_bad(capture)["status"] != 0).mean()) > 0.01
     marked = mark_bad(mark_shutter(capture))
@@ -438,7 +438,7 @@ def test_bad_pixels_are_added_to_the_status() -> None:
 
 
 def test_bad_pixels_refuse_nonsense() -> None:
-    """Too few frames, or a limit that is none, is refused."""
+    """Too few frames and an invalid threshold raise a ValueError."""
     capture = still()
     with pytest.raises(ValueError, match=re.escape("Invalid band '8-14' of 15 frames")):
         mark_bad(capture.isel(time=slice(15)))
@@ -469,7 +469,7 @@ def test_lag_is_that_of_a_small_body() -> None:
     seed=st.integers(0, 1000),
 )
 def test_lag_round_trip(steps: list[float], constants: tuple[float, float], seed: int) -> None:
-    """What the pixels delayed comes back, for any spacing and a time constant for each band."""
+    """A simulated lag is undone, for any spacing of the frames and a time constant of each band."""
     time = np.concatenate([[0.0], np.cumsum(steps)])
     scene = movie(np.random.default_rng(seed).uniform(15000.0, 20000.0, time.size), time)
     # By name and not by place.
@@ -485,7 +485,7 @@ def test_lag_round_trip(steps: list[float], constants: tuple[float, float], seed
 
 
 def test_undoing_the_lag_raises_the_noise() -> None:
-    """By the factor that is stated, and successive frames are then correlated."""
+    """Undoing the lag raises the noise by the stated factor, and correlates successive frames."""
     rng, time = np.random.default_rng(0), np.arange(40000) / 60.0
     undone = undo_lag(movie(rng.standard_normal(time.size), time), 0.010)
     signal = undone["counts"].values[0, 1:, 0, 0]
@@ -501,7 +501,7 @@ def test_undoing_the_lag_raises_the_noise() -> None:
 
 
 def test_lag_of_marked_frames() -> None:
-    """A frame after one that was taken out is lost, too; at 10 Hz the rest hardly changes."""
+    """The frame after a missing one is lost, too; at 10 Hz the others hardly change."""
     capture = still()
     capture["counts"].values[0, 30] = np.nan
     undone = undo_lag(capture, 0.010)["counts"]
@@ -512,7 +512,7 @@ def test_lag_of_marked_frames() -> None:
 
 
 def test_lag_refuses_nonsense() -> None:
-    """No time constant, one frame, whole numbers, and a second time are refused."""
+    """A missing time constant, one frame, integer counts and a second correction raise an error."""
     capture = still()
     with pytest.raises(ValueError, match=re.escape("Invalid time_constant [s] 0.0")):
         undo_lag(capture, 0.0)
@@ -539,7 +539,7 @@ def test_steps_leave_their_input(clean: xr.Dataset) -> None:
 
 
 def test_simulated_nuisances_refuse_nonsense(clean: xr.Dataset) -> None:
-    """Shares, times and bands that are none are refused."""
+    """Shares, times and bands outside their range raise a ValueError."""
     rng = np.random.default_rng(0)
     for step in (nuisances.lose_frames, nuisances.spoil_pixels):
         with pytest.raises(ValueError, match=re.escape("Invalid share 1.0")):
@@ -552,7 +552,7 @@ def test_simulated_nuisances_refuse_nonsense(clean: xr.Dataset) -> None:
 
 @pytest.mark.parametrize("name", ["fire_shutter", "drift_pattern", "spoil_pixels", "lag"])
 def test_whole_numbers_are_refused(name: str) -> None:
-    """Raw counts would wrap around: a lagging pixel of 1000 counts would show 57,580."""
+    """Integer counts raise an error: a lagging pixel of 1000 counts would wrap to 57,580."""
     counts = np.full((2, 5, 2, 2), 1000, dtype=np.uint16)
     raw = xr.Dataset(
         {"counts": (("band", "time", "y", "x"), counts)},

@@ -69,7 +69,7 @@ def test_field_of_view_is_horizontal() -> None:
     ],
 )
 def test_no_camera(change: dict[str, object], message: str) -> None:
-    """What is no camera is refused, with the rule."""
+    """Invalid settings of a camera raise a ValueError with the rule."""
     arguments = {"position": CAMERA.position, "target": CAMERA.target, "shape": (3, 4)} | change
     with pytest.raises(ValueError, match=message):
         Camera(**arguments)  # type: ignore[arg-type]

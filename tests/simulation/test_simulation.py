@@ -1,4 +1,4 @@
-"""Simulation: scenes whose truth has a closed form, and a rig that adds no more than it says."""
+"""Simulation: scenes with closed-form truth, and a rig with its stated errors."""
 
 import re
 
@@ -53,7 +53,7 @@ def twin(rng: np.random.Generator) -> xr.Dataset:
     constant=st.floats(1.0, 100.0),
 )
 def test_heating_is_newton_s(start: float, stop: float, constant: float) -> None:
-    """It starts and stops where asked; between, the distance to its limit decays as exp(-t/tau)."""
+    """Heating meets its start and stop; the distance to its limit decays as exp(-t/tau)."""
     curve = heating(TIME, start, stop, constant)
     limit = start + (stop - start) / -np.expm1(-TIME[-1] / constant)
     decay = (limit - start) * np.exp(-TIME / constant)
@@ -100,7 +100,7 @@ def test_number_of_pulses(rng: np.random.Generator) -> None:
 
 
 def test_random_walk(rng: np.random.Generator) -> None:
-    """The walk's deviation is its amplitude at any time, its correlation exp(-lag / memory)."""
+    """The walk's deviation is its amplitude, and its correlation exp(-lag / memory)."""
     walk = Background("random walk", amplitude=2.0, memory=3.0).draw(TIME, 4000, rng) - 295.15
     np.testing.assert_allclose(walk.std(axis=1), 2.0, rtol=0, atol=0.1)  # K
     for lag in (1, 30):
@@ -110,7 +110,7 @@ def test_random_walk(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [0.0, np.nan, 2.0], [[0.0, 1.0]]])
 def test_times_that_are_no_capture(times: list[float], rng: np.random.Generator) -> None:
-    """A single time, one that stands still and a NaN are refused by backgrounds and heatings."""
+    """A single time, a repeated one and a NaN raise a ValueError in backgrounds and heatings."""
     rule = r"Must be (two or more|finite, and increase)"
     with pytest.raises(ValueError, match=rule):
         Background("still").draw(np.array(times), 3, rng)
@@ -120,13 +120,13 @@ def test_times_that_are_no_capture(times: list[float], rng: np.random.Generator)
 
 @pytest.mark.parametrize("constant", [0.0, -1.0, np.nan])
 def test_time_constants_are_positive(constant: float) -> None:
-    """Nothing heats with a time constant that is none."""
+    """A time constant that is not positive raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid time_constant \[s\]"):
         heating(TIME, 300.0, 320.0, constant)
 
 
 def test_unknown_background() -> None:
-    """A kind that does not exist is refused, with those that do."""
+    """An unknown kind of background raises an error that lists the known ones."""
     with pytest.raises(ValueError, match=r"Unknown background 'waves'. Must be one of .*'pulses'"):
         Background("waves")
 
@@ -189,7 +189,7 @@ def test_response_is_planck_s(rig: Rig, known: xr.Dataset) -> None:
     ],
 )
 def test_bad_rig(change: dict[str, object], error: type[Exception], message: str) -> None:
-    """Bands that do not exist and numbers that are no rig are refused."""
+    """Unknown bands and invalid numbers of a rig raise an error."""
     with pytest.raises(error, match=re.escape(message)):
         Rig(**change)  # type: ignore[arg-type]
 
@@ -210,7 +210,7 @@ def test_observed_counts(twin: xr.Dataset, known: xr.Dataset, rng: np.random.Gen
 def test_counts_say_of_what_they_are_a_twin(
     twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
 ) -> None:
-    """Observed and raw counts keep the name of the twin; those of another scene have none."""
+    """Observed and raw counts keep the name of their twin; other scenes have none."""
     seen = simulation.observe(twin.assign_attrs(twin="bulb"), known, rng)
     assert seen.attrs["twin"] == simulation.capture(seen, detector).attrs["twin"] == "bulb"
     assert "twin" not in simulation.observe(twin, known, rng).attrs
@@ -219,7 +219,7 @@ def test_counts_say_of_what_they_are_a_twin(
 def test_noise_of_observed_counts(
     twin: xr.Dataset, known: xr.Dataset, rng: np.random.Generator
 ) -> None:
-    """The noise has the response's deviation within 2 %, no mean, and no memory."""
+    """The noise has the response's deviation within 2 %, no mean, and no autocorrelation."""
     quiet = known.assign(noise=1e-9 * known["noise"])
     noise = (simulation.observe(twin, known, rng) - simulation.observe(twin, quiet, rng))["counts"]
     pixels = ("time", "y", "x")
@@ -231,7 +231,7 @@ def test_noise_of_observed_counts(
 
 
 def test_observe_refuses(twin: xr.Dataset, known: xr.Dataset, rng: np.random.Generator) -> None:
-    """A temperature that the rig cannot see, and a band without emissivity, are named."""
+    """A temperature outside the response, and a band without emissivity, raise an error."""
     with pytest.raises(ValueError, match=r"Invalid object_temperature .*the response's range"):
         simulation.observe(
             twin.assign(object_temperature=twin["object_temperature"] + 30), known, rng
@@ -269,7 +269,7 @@ def test_capture(
 def test_capture_that_does_not_fit(
     twin: xr.Dataset, known: xr.Dataset, detector: xr.Dataset, rng: np.random.Generator
 ) -> None:
-    """Counts over 16 bits, below 0 or NaN, and a missing band, are refused, not wrapped."""
+    """Counts outside 16 bits, NaN, and a missing band raise an error."""
     seen = simulation.observe(twin, known, rng)
     for wrong in (seen + 50000.0, seen - 40000.0, seen.where(seen["time"] > 1)):
         with pytest.raises(ValueError, match=r"band '8-14'. Must lie in \[0, 65535\]"):
@@ -315,7 +315,7 @@ def test_contact_measurements(known: xr.Dataset, rng: np.random.Generator) -> No
 
 
 def test_same_seed_same_data(rig: Rig, known: xr.Dataset) -> None:
-    """A seed decides everything, another seed changes it."""
+    """The same seed gives the same data, and another seed gives others."""
 
     def record(seed: int) -> xr.Dataset:
         rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""What is stored comes back unchanged, whole, and with the record of what made it."""
+"""Stored results are read back unchanged and complete, with their provenance."""
 
 import json
 import math
@@ -93,7 +93,7 @@ def test_opened_dataset_can_be_saved_again(capture: xr.Dataset, tmp_path: Path) 
 
 
 def test_failed_save_leaves_the_earlier_result(capture: xr.Dataset, tmp_path: Path) -> None:
-    """A write that fails on the way leaves what was there, and nothing beside it."""
+    """A failed write leaves the earlier result, and nothing beside it."""
     store.save(capture, tmp_path / "a.zarr", RECORD)
     first = contents(tmp_path)
     broken = capture.assign(material=("band", np.array([object(), object()])))
@@ -119,7 +119,7 @@ def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
 
 
 def test_missing_dataset_is_named(tmp_path: Path) -> None:
-    """Opening what is not there names the path."""
+    """Opening a missing dataset raises an error with its path."""
     with pytest.raises(FileNotFoundError, match=r"No dataset '.*a\.zarr'"):
         store.open_dataset(tmp_path / "a.zarr")
 
@@ -160,21 +160,21 @@ def test_numbers_come_back_sorted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, np.float32("nan")])
 def test_numbers_are_finite(value: float, tmp_path: Path) -> None:
-    """A number that is none is refused by name, and no file is written."""
+    """A number that is not finite raises a ValueError with its name, and no file is written."""
     with pytest.raises(ValueError, match=r"Invalid 'rmse_K' = .*\. Must be finite"):
         store.save_numbers({"rmse_K": value}, tmp_path / "a.json", RECORD)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_numbers_are_scalars(tmp_path: Path) -> None:
-    """A list among the numbers is refused by name."""
+    """A list among the numbers raises an error with its name."""
     with pytest.raises(TypeError, match=r"Invalid 'rmse_K' = \[1\]. Must be a number"):
         store.save_numbers({"rmse_K": [1]}, tmp_path / "a.json", RECORD)  # type: ignore[dict-item]
 
 
 @pytest.mark.parametrize("text", ['{"numbers": {"rmse_K": NaN}}', "{}", "[1]", "{"])
 def test_damaged_numbers_are_refused(text: str, tmp_path: Path) -> None:
-    """A file that is cut, loose or of another kind is not read."""
+    """A truncated, invalid or foreign file of numbers raises an error."""
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(ValueError, match=r"NaN|No 'numbers'|Expecting"):
         store.read_numbers(tmp_path / "a.json")
@@ -221,7 +221,7 @@ def test_parameter_must_be_plain(tmp_path: Path) -> None:
 
 
 def test_checksum_of_a_folder(tmp_path: Path) -> None:
-    """A folder's checksum hangs on names and contents alone."""
+    """A folder's checksum depends on its names and contents alone."""
     for name in ("a", "b"):
         (tmp_path / name / "sub").mkdir(parents=True)
         (tmp_path / name / "sub" / "file").write_text("abc")
@@ -261,7 +261,7 @@ def test_video_comes_back(tmp_path: Path) -> None:
     ],
 )
 def test_no_video_of_nonsense(tmp_path: Path, frames: list[np.ndarray], message: str) -> None:
-    """What cannot be a video is refused, and leaves nothing behind."""
+    """Frames that cannot be a video raise a ValueError, and no file is left behind."""
     with pytest.raises(ValueError, match=message):
         store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0)
     assert not any(tmp_path.iterdir())
