@@ -99,6 +99,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(session: Session, folder: Path, *, dry: bool) -> int:
     """Open the devices, print their identities, and record; returns the exit status."""
+    path = folder / f"{session.name}.zarr"
+    if session.blackbody is None and path.exists() and not dry:
+        raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
     if session.simulated:
         print(f"Session '{session.name}': every device is emulated, nothing is measured.")
     else:

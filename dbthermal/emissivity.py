@@ -2,7 +2,7 @@
 
 Spectra become a table of Planck-weighted band averages (`band_table`; `embedded_table` holds 25
 common materials). From a table follow the condition number of the mixing matrix for each pair of
-bands and the filter to set beside the camera's own band (`choose_filter`), by the criteria of the
+bands and the filter to set beside the camera's own band (`rank_filters`), by the criteria of the
 supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334, and by the noise.
 """
 
@@ -22,11 +22,11 @@ __all__ = [
     "CAMERA_BAND",
     "MINIMUM_COVERAGE",
     "band_table",
-    "choose_filter",
     "condition_numbers",
     "embedded_table",
     "filter_noise",
     "pair_summary",
+    "rank_filters",
 ]
 
 Array = npt.NDArray[np.float64]
@@ -251,7 +251,7 @@ def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.Da
     )
 
 
-def choose_filter(
+def rank_filters(
     table: xr.Dataset, noise: xr.DataArray, *, beside: str = CAMERA_BAND
 ) -> xr.Dataset:
     """

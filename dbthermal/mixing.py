@@ -67,7 +67,7 @@ def background(emissivity: Any, signal: Any, emitted: Any) -> Any:
 
 def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.ArrayLike) -> Array:
     """
-    Signal of a surface as `mixed`, with the emissivity checked.
+    Signal that leaves a surface: as `mixed`, but refuses emissivities outside [0, 1].
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from dbthermal import _smooth as smooth
 
-__all__ = ["MINIMUM_FRAMES", "estimate", "of_bands", "second_difference"]
+__all__ = ["MINIMUM_FRAMES", "estimate", "estimate_bands", "second_difference"]
 
 Array = npt.NDArray[np.float64]
 
@@ -41,9 +41,10 @@ def __dir__() -> list[str]:
 
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """
-    Samples (time, pixel) less the line through their neighbours, (time - 2, pixel).
+    Second difference in time of signals (time, pixel), in which white noise keeps its variance.
 
-    Scaled so that white noise keeps its variance; times [s] need not be even.
+    Each sample less the line through its two neighbours (time - 2, pixel), over the root of the sum
+    of the squared weights; times [s] need not be even.
     """
     time = np.asarray(time, dtype=np.float64)
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
@@ -118,7 +119,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     return float(np.sqrt(result[0])), float(np.sqrt(result[1]))
 
 
-def of_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
+def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
     """
     Noise (band) of two bands or more, each estimated beside the quietest; see `estimate`.
 

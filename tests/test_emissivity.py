@@ -239,7 +239,7 @@ def test_choice_weighs_condition_against_noise() -> None:
     """Filters are ordered by condition number; the lowest deviation may belong to another."""
     made = table(a=[0.90, 0.70, 0.75], b=[0.85, 0.60, 0.66])
     noise = xr.DataArray([0.03, 0.6, 0.1], coords={"band": made["band"]}, dims="band")
-    choice = emissivity.choose_filter(made, noise)
+    choice = emissivity.rank_filters(made, noise)
     assert choice["band"].values.tolist() == ["9.5", "8.5"]
     assert choice["condition_number"].values[0] < choice["condition_number"].values[1]
     assert choice.attrs["lowest_condition_number"] == "9.5"
@@ -259,7 +259,7 @@ def test_bad_noise(bands: list[str], values: list[float], units: str, message: s
     """Noise is a positive number of kelvin for every band."""
     noise = xr.DataArray(values, coords={"band": bands}, dims="band", attrs={"units": units})
     with pytest.raises(ValueError, match=re.escape(message)):
-        emissivity.choose_filter(table(glass=[0.86, 0.72]), noise)
+        emissivity.rank_filters(table(glass=[0.86, 0.72]), noise)
 
 
 def test_one_band_is_no_pair() -> None:
@@ -268,7 +268,7 @@ def test_one_band_is_no_pair() -> None:
     with pytest.raises(ValueError, match="Must be at least two"):
         emissivity.condition_numbers(alone)
     with pytest.raises(ValueError, match=re.escape("Must hold '10.6'")):
-        emissivity.choose_filter(
+        emissivity.rank_filters(
             table(m=[0.9, 0.8]), emissivity.filter_noise(0.03, FILTERS), beside="10.6"
         )
 
@@ -327,6 +327,6 @@ def test_filter_of_the_paper(spectra: dict[str, xr.Dataset]) -> None:
     """By the condition number the filter at 9.5 um is chosen, as published."""
     whole = {name: one for name, one in spectra.items() if one["wavelength"][-1] > 13e-6}
     made = emissivity.band_table(whole, FILTERS)
-    choice = emissivity.choose_filter(made, emissivity.filter_noise(0.03, FILTERS))
+    choice = emissivity.rank_filters(made, emissivity.filter_noise(0.03, FILTERS))
     assert choice.attrs["lowest_condition_number"] == "9.5"
     assert float(choice["condition_number"][0]) == pytest.approx(98.9, abs=0.5)

@@ -85,10 +85,10 @@ class _Covariances:
 
 def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int = 5) -> float:
     """
-    Estimate the time by which a band is exposed later than the first.
+    Delay of a band's exposures behind the first band's [s]; negative if it is ahead.
 
     Positive: frame n of this band was exposed that much **later** than frame n of the first. Where
-    the capture has the cameras' own stamps, it is the lag beyond them.
+    the capture has the cameras' own stamps, it is the delay beyond them.
 
     Parameters
     ----------

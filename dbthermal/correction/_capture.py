@@ -46,7 +46,8 @@ def correct_capture(
         Stage `capture` of `schema`, raw: `counts` (band, time, y, x) [count], uint16; optionally
         `frame_flags` and `exposure_time` (band, time), as recorded.
     correction : Dataset
-        From `fit_correction`; it may hold more bands.
+        From `fit_correction`, or `gain` [1], `offset` [count] and `bad` (bool) of your own, each
+        (band, y, x); it may hold more bands.
     flat, flat_after : DataArray, optional
         Mean raw frames (band, y, x) [count] of a uniform view, taken before and after the capture.
         The first renews the offsets; to the second they go in proportion to time.
@@ -66,14 +67,16 @@ def correct_capture(
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32, NaN where a frame is no
         measurement; `status` (y, x); `segment` (time); `drift` (band, time) [count]. The attributes
-        of the steps state what was done with which parameters; ``shutter_closed_frames`` is the
-        number of frames (by band) that were recorded as closed, -1 without `frame_flags`.
+        of the steps state what was done with which parameters: ``shutter_events`` is the number of
+        renewals of the offsets, ``frames_taken_out`` that of the frames set to NaN (by band), and
+        ``shutter_closed_frames`` that of the frames recorded as closed (by band), -1 without
+        `frame_flags`.
 
     Raises
     ------
     TypeError, ValueError
-        As the steps; and if offsets are to change in proportion to time across a shutter event,
-        where the camera renews them.
+        If capture or correction is not of its stage; as the steps; and if offsets are to change in
+        proportion to time across a shutter event, where the camera renews them.
 
     Examples
     --------
@@ -98,6 +101,8 @@ def correct_capture(
     >>> float(corrected.counts.std()) < 5
     True
     """
+    schema.check(capture, "capture")
+    schema.check(correction, "correction")
     closed = _closed(capture)
     events = find_shutter(capture, closed=closed) if shutter else None
     before = correction if flat is None else renew_offset(correction, flat)

@@ -75,14 +75,14 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
 
 def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.Dataset:
     """
-    Replace samples that a closed shutter or a lost frame repeats by NaN, and count the events.
+    Set frames of a closed shutter or a repeated image to NaN, and number the segments.
 
-    After an event every pixel of the band has an offset step of its own, of tens of counts, which
-    no camera reports. It is left in the counts: `separation.solve` keeps it out of the object, by a
-    free step of each pixel and band wherever `segment` changes; in the background it stays. Events
-    of two bands that overlap, or follow without a frame between, are counted as one, so that
-    cameras that fire together cost one step. An event before the first or after the last valid
-    frame makes none.
+    A `segment` is the stretch between two renewals of the offsets, at which every pixel of the band
+    makes an offset step of its own, of tens of counts, which no camera reports. It is left in the
+    counts: `separation.solve` keeps it out of the object, by a free step of each pixel and band
+    wherever `segment` changes; in the background it stays. Events of two bands that overlap, or
+    follow without a frame between, are counted as one, so that cameras that fire together cost one
+    step. An event before the first or after the last valid frame makes none.
 
     An event costs accuracy: only the object's smoothness ties the level after it to the one before.
     Beside five functions over 35 s, one step in the middle raises the standard deviation of the

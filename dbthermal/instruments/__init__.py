@@ -2,11 +2,11 @@
 
 Begin with a `session`, a YAML file of the recording and its devices' addresses; `devices` opens
 them, `protocols` records a scene or a blackbody sweep, `live` shows it meanwhile, and `recording`
-opens it again. `inventory` lists what is on the USB bus. Below are the drivers: `boson` over `fslp`
-and its `telemetry`, with frames by `v4l2` (`camera` is the interface of any camera), `filterwheel`
-over `apt`, and `tc08`; `transport` opens their lines. `thermocouple` converts type T.
-
-`emulated` devices stand behind ``sim://`` addresses, below the same drivers, and say what they are.
+opens it again. `inventory` lists what is on the USB bus. Below are the drivers: `boson` over
+`fslp`, `filterwheel` over `apt`, and `tc08`; `camera` is the interface of any camera, and
+`thermocouple` converts type T. Imported by name, as in ``import dbthermal.instruments.v4l2``, are
+``v4l2`` (frames), ``telemetry`` (what a Boson writes into them), ``transport`` (serial lines), and
+``emulated``: devices behind ``sim://`` addresses, below the same drivers, that say what they are.
 The drivers were written from public descriptions of the protocols and tested against public byte
 vectors and emulators, never against hardware. Those that talk to a device need the optional
 packages of ``dbthermal[instruments]``; a module is imported when it is first used.

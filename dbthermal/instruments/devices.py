@@ -224,8 +224,8 @@ def open_devices(
     Open the devices of a session: the real ones, or, by its one switch, the emulated ones.
 
     Addresses are ``v4l2:///dev/video0``, ``serial:///dev/ttyACM0`` and ``tc08:``; and in an
-    emulated session ``sim://camera/<name>`` and ``sim://boson/<name>``, with the name of a camera
-    of the world, ``sim://apt/<any>`` and ``sim://tc08``.
+    emulated session ``sim://<kind>/<name>``, with the kind of camera and its name in the world, for
+    frames and commands alike, ``sim://apt/<any>`` and ``sim://tc08``.
 
     Parameters
     ----------

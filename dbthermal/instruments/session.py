@@ -2,20 +2,20 @@
 
 One key, ``simulated``, switches the whole rig; every device has an address for either case::
 
-    name: coffee_pot
+    name: plate
     simulated: true
-    protocol: scene            # gain_offset, response, emissivity_bench or scene
-    duration: 60               # s
+    protocol: emissivity_bench # or gain_offset, response; or scene, without sweep and blackbody
+    duration: 2                # of each recording, s
     frame_rate: 60             # Hz
     shape: [512, 640]          # rows, columns
     telemetry_rows: 2
     cameras:
       "8-14":
-        video: {simulated: "sim://camera/wide", hardware: "v4l2:///dev/video0"}
+        video: {simulated: "sim://boson/wide", hardware: "v4l2:///dev/video0"}
         control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
       "9.5":
         kind: boson            # of dbthermal.instruments.camera.KINDS; boson by default
-        video: {simulated: "sim://camera/narrow", hardware: "v4l2:///dev/video2"}
+        video: {simulated: "sim://boson/narrow", hardware: "v4l2:///dev/video2"}
     devices:                   # whatever else is connected
       filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
       thermocouples: {simulated: "sim://tc08", hardware: "tc08:"}
@@ -26,9 +26,11 @@ One key, ``simulated``, switches the whole rig; every device has an address for 
     blackbody: {temperatures: [293.15, 303.15], stability: 0.02, window: 30, timeout: 1800}
 
 Temperatures are in kelvin, times in seconds. A key that is not known is an error. The camera whose
-band is one of the filters is the one behind the wheel.
+band is one of the filters is the one behind the wheel. The simulated address of its frames names
+the camera's kind.
 """
 
+import errno
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import field
@@ -90,13 +92,20 @@ class Camera:
 
     video: Device
     control: Device | None = None
-    kind: str = "boson"  # one of `dbthermal.instruments.camera.KINDS`
+    # One of `dbthermal.instruments.camera.KINDS`, and that of its simulated address.
+    kind: Annotated[str, Field(validate_default=True)] = "boson"
 
     @field_validator("kind")
     @classmethod
-    def _check_kind(cls, kind: str) -> str:
+    def _check_kind(cls, kind: str, info: ValidationInfo) -> str:
         if kind not in KINDS:
             raise ValueError(f"Must be one of {sorted(KINDS)}")
+        video: Device | None = info.data.get("video")
+        if video is not None and not video.simulated.startswith(f"sim://{kind}/"):
+            raise ValueError(
+                f"Must be the kind in its simulated address '{video.simulated}': that of a {kind} "
+                f"is sim://{kind}/<name>"
+            )
         return kind
 
 
@@ -123,7 +132,7 @@ class Session:
 
     Examples
     --------
-    >>> video = Device("sim://camera/wide", "v4l2:///dev/video0")
+    >>> video = Device("sim://boson/wide", "v4l2:///dev/video0")
     >>> Session("pot", True, "scene", 60.0, {"8-14": Camera(video)}).bands
     ('8-14',)
     """
@@ -229,6 +238,9 @@ class Session:
         files = {}
         if "rig" in content:
             rig = Path(path).parent / str(content.pop("rig"))
+            if not rig.exists():
+                message = f"Missing file of key 'rig' of session '{path}'. Must be copied with it"
+                raise FileNotFoundError(errno.ENOENT, message, str(rig))
             shared = _read_yaml(rig.read_text(encoding="utf-8"), str(rig))
             _check_unique("key of session and rig", [*map(str, content), *map(str, shared)])
             files = dict.fromkeys(shared, str(rig))

@@ -1,10 +1,11 @@
 """Statistical limits: the best accuracy that a capture allows, and how to plan one.
 
 `bounds` holds for the exact response, any number of bands and a known truth; `plan` applies it to
-materials, filters and seconds of video; `ratio_variance` is the closed form of two linear bands.
+materials, filters and seconds of video; `ratio_variance_bound` is the closed form of two linear
+bands.
 """
 
-from dbthermal.limits._bounds import bounds, ratio_variance, reflection_ratio
+from dbthermal.limits._bounds import bounds, ratio_variance_bound, reflection_ratio
 from dbthermal.limits._planner import CaptureDesign, plan, plan_durations
 
 __all__ = [
@@ -12,7 +13,7 @@ __all__ = [
     "bounds",
     "plan",
     "plan_durations",
-    "ratio_variance",
+    "ratio_variance_bound",
     "reflection_ratio",
 ]
 

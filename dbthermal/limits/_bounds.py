@@ -36,7 +36,7 @@ def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
     return np.asarray((1.0 - second) / (1.0 - first))
 
 
-def ratio_variance(
+def ratio_variance_bound(
     emissivity: tuple[float, float],
     noise: tuple[float, float],
     background: Array,
@@ -129,11 +129,11 @@ def bounds(
     Notes
     -----
     For the linear response and two bands, ``resting=False`` gives the reflection ratio the bound
-    of `ratio_variance`, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down alike
-    changes no sample. Frames at rest determine the emissivities, and sharpen the ratio. The exact
-    response determines them without, by its curvature, but hardly; as nothing then keeps y near the
-    truth, the bound of the ratio is loose. An `emissivity_std` of 0.29, that of a uniform number
-    in (0, 1), tightens it. Pixels that share a material do better than one.
+    of `ratio_variance_bound`, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
+    alike changes no sample. Frames at rest determine the emissivities, and sharpen the ratio. The
+    exact response determines them without, by its curvature, but hardly; as nothing then keeps y
+    near the truth, the bound of the ratio is loose. An `emissivity_std` of 0.29, that of a uniform
+    number in (0, 1), tightens it. Pixels that share a material do better than one.
 
     References
     ----------

@@ -196,7 +196,7 @@ def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Ar
         return np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
     counts, frames = quality.sample(capture, _NOISE_PIXELS)
     signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
-    return noises.of_bands(signals, capture["time"].values[frames])
+    return noises.estimate_bands(signals, capture["time"].values[frames])
 
 
 def _known_emissivity(

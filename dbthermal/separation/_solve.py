@@ -68,10 +68,11 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     Parameters
     ----------
     corrected : Dataset
-        `counts` (band, time, y, x) [count], `time` [s]; optionally `status` (y, x) from
-        `correction.correct` and `segment` (time) from `correction.mark_shutter`. Samples that are
-        NaN are left out. May be lazy, as from `store.open_dataset`: it is read a few rows at a
-        time, and never whole. "subspace" takes two bands or more, the other methods two.
+        `counts` (band, time, y, x) [count], `time` [s], and optionally `status` (y, x) and
+        `segment` (time), as `correction.correct_capture` gives them: a camera's raw counts must be
+        corrected first. Samples that are NaN are left out. May be lazy, as from
+        `store.open_dataset`: it is read a few rows at a time, and never whole. "subspace" takes two
+        bands or more, and at least 32 frames; the other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
         where present, otherwise the noise is estimated from the capture.
@@ -80,7 +81,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         least squares, dual-wavelength pyrometry, the blackbody channel prior, and the camera's
         own reading.
     settings : SubspaceSettings, DbvtSettings, NaiveSettings, RatioSettings or BcpSettings, optional
-        Options of the method; its defaults if not given.
+        Options of the method; its defaults if not given. "calibrated" and "apparent" have none.
     emissivity : DataArray, optional
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional

@@ -90,7 +90,7 @@ def expose(
 
 def drop_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
     """
-    Lost frames of a driver that stamps the others: they follow one another without a gap.
+    Remove lost frames, as a driver does that stamps the others: those that follow move up.
 
     Of a capture with `exposure_time` (band, time) [s], see `expose`, and a mask (band, time):
     counts and stamps with each band's remaining frames first, NaN behind them.
@@ -111,7 +111,7 @@ def drop_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
 
 def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
     """
-    Lost frames of a driver that returns the previous one again, and stamps none.
+    Replace lost frames by copies of the frame before, as a driver does that stamps none.
 
     Of a mask (band, time) that must spare the first frames (ValueError): counts in which a lost
     frame is a copy of the one before, without `exposure_time`.
@@ -129,7 +129,7 @@ def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
     """
-    Frames lost at random in each band, each replaced by the one before, as by `repeat_frames`.
+    Lose frames at random in each band: each is replaced by the one before (`repeat_frames`).
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ _SLOPE_TEMPERATURE: Final = 300.0
 @dataclass(frozen=True)
 class Rig:
     """
-    Two cameras, one of which looks through a filter, in counts.
+    Simulated cameras, one a band: response, noise and fixed pattern.
 
     The defaults are round figures for the camera of the paper: a 16-bit 640x512 microbolometer,
     about 115 counts/K near 300 K and NETD 20-40 mK without a filter; behind a filter the counts

@@ -38,7 +38,7 @@ def picture(time: float) -> Counts:
 
 def session(duration: float = 1.0) -> Session:
     """Two emulated cameras with small frames."""
-    camera = Camera(Device("sim://camera/any", "v4l2:///dev/video0"))
+    camera = Camera(Device("sim://boson/any", "v4l2:///dev/video0"))
     return Session("faults", True, "scene", duration, dict.fromkeys(BANDS, camera), RATE, SHAPE)
 
 

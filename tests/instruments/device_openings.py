@@ -14,7 +14,7 @@ from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
 from dbthermal.instruments import v4l2
 from dbthermal.instruments.boson import Boson
-from dbthermal.instruments.camera import Stream
+from dbthermal.instruments.camera import Stream, camera_kind
 from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated.apt import start as start_wheel
 from dbthermal.instruments.emulated.boson import start as start_camera
@@ -136,10 +136,14 @@ def y16_video(stack: ExitStack) -> Opened:
     return Opened(stack.enter_context(open_devices(session)).sources["8-14"], True)
 
 
-def real_video(_: ExitStack) -> Opened:
-    """A camera's node."""
-    path = address("DBTHERMAL_VIDEO")
-    return Opened(v4l2.Capture.open(path, Stream()), False)
+def real_video(stack: ExitStack) -> Opened:
+    """Frames of a camera, opened by its kind in the format that the environment says."""
+    url = address("DBTHERMAL_VIDEO")
+    kind = camera_kind(os.environ.get("DBTHERMAL_VIDEO_KIND", "boson"))
+    rows, columns = os.environ.get("DBTHERMAL_VIDEO_SHAPE", "512x640").split("x")
+    rate = float(os.environ.get("DBTHERMAL_VIDEO_RATE", "60"))
+    stream = Stream((int(rows), int(columns)), rate)
+    return Opened(stack.enter_context(kind.open_frames(url, stream)), False)
 
 
 Opening = Callable[[ExitStack], Opened]

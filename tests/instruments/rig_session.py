@@ -30,10 +30,10 @@ shape: [4, 80]
 telemetry_rows: 2
 cameras:
   "8-14":
-    video: {simulated: "sim://camera/wide", hardware: "v4l2:///dev/video0"}
+    video: {simulated: "sim://boson/wide", hardware: "v4l2:///dev/video0"}
     control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
   9.5:
-    video: {simulated: "sim://camera/narrow", hardware: "v4l2:///dev/video2"}
+    video: {simulated: "sim://boson/narrow", hardware: "v4l2:///dev/video2"}
     control: {simulated: "sim://boson/narrow", hardware: "serial:///dev/ttyACM1"}
 devices:
   filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}

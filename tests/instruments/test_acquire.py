@@ -73,7 +73,7 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
     arguments = [written(tmp_path / "a.yaml", TEXT), str(tmp_path / "b"), "--dry-run"]
     assert acquire.main(arguments) == 0
     said = capsys.readouterr().out
-    assert "9.5: device sim://camera/narrow" in said
+    assert "9.5: device sim://boson/narrow" in said
     assert "Preparing" not in said
     assert not (tmp_path / "b").exists()
 
@@ -92,6 +92,18 @@ def test_failures_have_a_status(
     file = written(tmp_path / "a.yaml", text)
     assert acquire.main([file, str(tmp_path)]) == status
     assert message in capsys.readouterr().err
+
+
+def test_recorded_scene_is_refused_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scene of this name is refused before a device is opened; a dry run looks at them."""
+    file = written(tmp_path / "a.yaml", scene_text())
+    (tmp_path / "plate.zarr").mkdir()
+    assert acquire.main([file, str(tmp_path), "--dry-run"]) == 0
+    monkeypatch.setattr(acquire, "open_devices", lambda _: pytest.fail("a device was opened"))
+    assert acquire.main([file, str(tmp_path)]) == 1
+    assert "plate.zarr'. Must be a new recording." in capsys.readouterr().err
 
 
 def test_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,8 +1,10 @@
 """Contracts that every device keeps on a stub, on its emulator and on hardware.
 
 To hold hardware against it, name the devices in DBTHERMAL_BOSON (serial:///dev/ttyACM0),
-DBTHERMAL_WHEEL (serial:///dev/ttyUSB0), DBTHERMAL_TC08 (tc08:) and DBTHERMAL_VIDEO (/dev/video0),
-and run with -m hardware: the wheel turns, a shutter closes, nothing is saved.
+DBTHERMAL_WHEEL (serial:///dev/ttyUSB0), DBTHERMAL_TC08 (tc08:) and DBTHERMAL_VIDEO
+(v4l2:///dev/video0), and run with -m hardware: the wheel turns, a shutter closes, nothing is saved.
+Frames are those of a Boson, 512x640 at 60 Hz, unless DBTHERMAL_VIDEO_KIND (boson),
+DBTHERMAL_VIDEO_SHAPE (rows x columns: 512x640) and DBTHERMAL_VIDEO_RATE (60) [Hz] say otherwise.
 """
 
 from collections.abc import Iterator, Mapping

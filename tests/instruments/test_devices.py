@@ -63,7 +63,7 @@ def test_every_device_says_what_it_is(devices: Devices) -> None:
     found = devices.identities()
     assert found["8-14"]["serial_number"] == "93588"
     assert found["9.5"]["serial_number"] == "93589"
-    assert found["9.5"]["device"] == "sim://camera/narrow"
+    assert found["9.5"]["device"] == "sim://boson/narrow"
     assert found["9.5"]["software_revision"] == "0.0.0"
     assert (found["filter_wheel"]["model"], found["thermocouples"]["serial_number"]) == (
         "BSC201",
@@ -211,22 +211,29 @@ def test_frames_are_counted_once(devices: Devices) -> None:
     assert devices.cameras["9.5"].run_ffc() == frame.sequence >= 4
 
 
+VIDEO, CONTROL = (f'{key}: {{simulated: "sim://boson/wide"' for key in ("video", "control"))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("sim://camera/wide", "sim://camera/tele"), "Unknown camera 'tele'"),
+        ((VIDEO, VIDEO.replace("wide", "tele")), "Unknown camera 'tele'"),
         (
-            ("sim://camera/wide", "sim://boson/wide"),
-            "Invalid address 'sim://boson/wide' of an emu",
+            (VIDEO, VIDEO.replace("boson", "y16")),
+            r"cameras\.8-14\.kind 'boson'\. Must be the kind in its simulated address 'sim://y16/wide'",
         ),
-        (("sim://boson/wide", "sim://apt/wide"), "Must be 'sim://boson/<name>'"),
-        (("sim://boson/wide", "sim://boson/tele"), "Unknown camera 'tele'"),
+        (
+            (VIDEO, VIDEO.replace("wide", "wide?ffc=120")),
+            r"Unknown option 'ffc' of an emulator\. It has no options\.",
+        ),
+        ((CONTROL, CONTROL.replace("boson", "apt")), "Must be 'sim://boson/<name>'"),
+        ((CONTROL, CONTROL.replace("wide", "tele")), "Unknown camera 'tele'"),
         (("sim://tc08", "sim://tc09"), "Invalid URL 'sim://tc09'"),
         (("{velocity", "{speed"), "Invalid setting of the wheel 'speed'"),
     ],
 )
 def test_other_addresses_are_refused(change: tuple[str, str], message: str) -> None:
-    """An invalid address raises an error that names it, and no device stays open."""
+    """An address invalid for the rig or the kind is named, and no device stays open."""
     world = bench(Session.from_yaml(TEXT))
     before = threading.active_count()
     with (

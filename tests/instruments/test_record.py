@@ -4,14 +4,17 @@ import errno
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 from faulty_camera import Faults, FaultyCamera
+from rig_devices import Clock
 
 from dbthermal import alignment, correction, store
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
+from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import (
     Limits,
@@ -28,7 +31,7 @@ from dbthermal.instruments.session import Camera, Device, Session
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
 BANDS = ("8-14", "9.5")
 SMALL = Limits(chunk=CHUNK, reserve=0, silence=0.1, reading_period=0.05, preview_period=0.0)
-VIDEO = Device("sim://camera/any", "v4l2:///dev/video0")
+VIDEO = Device("sim://boson/any", "v4l2:///dev/video0")
 PATTERN = np.random.default_rng(1).integers(5000, 6000, SHAPE).astype(np.uint16)
 
 
@@ -110,7 +113,7 @@ def test_identities_beside_those_of_the_sources(tmp_path: Path) -> None:
     record(session(), bench(), path, identities=known, limits=SMALL)
     found = open_capture(path).attrs["identities"]
     assert found["9.5"] == {
-        "device": "sim://camera/9.5",
+        "device": "sim://boson/9.5",
         "model": "emulated Boson",
         "serial_number": "101",
         **camera,
@@ -129,6 +132,34 @@ def test_frames_from_before_are_not_taken(tmp_path: Path) -> None:
     assert float(opened["exposure_time"].min()) >= 0
     assert int(opened["sequence"][:, 0].min()) > 4
     assert all(total["lost"] == 0 for total in summary.totals.values())
+
+
+def test_duration_begins_with_the_first_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long the file takes to be made: its frames are those of the duration, within one."""
+    clock, rate, made = Clock(), 60.0, _recorder._new_file
+    world = World(clock=clock)
+    world.add_camera("8-14", 1)
+    source = EmulatedCamera(
+        world, "8-14", {"8-14": picture}, "8-14", SHAPE, rate, sleep=clock.sleep
+    )
+    source.read()  # from now on it holds frames
+
+    def slowly(*parameters: Any) -> CaptureFile:
+        clock.sleep(0.44)
+        return made(*parameters)
+
+    monkeypatch.setattr(_recorder, "monotonic", clock)
+    monkeypatch.setattr(_recorder, "_new_file", slowly)
+    one = Session("test", True, "scene", 2.0, {"8-14": Camera(VIDEO)}, rate, SHAPE)
+    limits = Limits(chunk=200, reserve=0, queue=200)
+    summary = record(one, {"8-14": source}, tmp_path / "a.zarr", limits=limits)
+    times = open_capture(tmp_path / "a.zarr")["exposure_time"][0]
+    assert abs(summary.totals["8-14"]["frames"] - 2.0 * rate) <= 1
+    assert 0 <= times[0] < 1 / rate
+    assert abs(times[-1] - 2.0) <= 1 / rate
+    assert store.open_dataset(tmp_path / "a.zarr").attrs["clock_origin"] == 100.44
 
 
 @pytest.mark.parametrize("telemetry_rows", [0, 12])

@@ -63,7 +63,7 @@ def measure(rate: float, seconds: float, path: Path) -> Measured:
         world.add_camera(band, number)
         movie = Movie(noise, rate, endless=True)
         sources[band] = EmulatedCamera(world, band, {band: movie}, band, SHAPE, rate, 2)
-    cameras = dict.fromkeys(sources, Camera(Device("sim://camera/any", "v4l2:///dev/video0")))
+    cameras = dict.fromkeys(sources, Camera(Device("sim://boson/any", "v4l2:///dev/video0")))
     session = Session("rate", True, "scene", seconds, cameras, rate, SHAPE, 2)
     start = time.process_time()
     totals = record(session, dict(sources), path).totals

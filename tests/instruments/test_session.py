@@ -1,11 +1,14 @@
 """Sessions: their description in YAML, and the checks of its keys."""
 
 import re
+import textwrap
 from pathlib import Path
 
 import pytest
 from rig_session import TEXT, replaced
 
+from dbthermal.instruments import filterwheel
+from dbthermal.instruments import session as description
 from dbthermal.instruments.session import Session
 from reproduction import paths
 
@@ -18,7 +21,7 @@ def test_session_is_read(tmp_path: Path) -> None:
     session = Session.load(tmp_path / "a.yaml")
     wheel, video = session.devices["filter_wheel"], session.cameras["9.5"].video
     assert session.bands == ("8-14", "9.5")
-    assert (session.url(wheel), session.url(video)) == ("sim://apt/wheel", "sim://camera/narrow")
+    assert (session.url(wheel), session.url(video)) == ("sim://apt/wheel", "sim://boson/narrow")
     assert session.filters == {1: "9.5", 3: "11"}
     real = Session.from_yaml(replaced(("simulated: true", "simulated: false")))
     assert real.url(wheel) == "serial:///dev/ttyUSB0"
@@ -113,6 +116,31 @@ def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text("\n".join([*shared, "duration: 3"]), encoding="utf-8")
     with pytest.raises(ValueError, match="Repeated key of session and rig 'duration'"):
         Session.load(tmp_path / "a.yaml")
+    (tmp_path / "rig.yaml").unlink()
+    message = r"Missing file of key 'rig' of session '.*a\.yaml'.*: '.*rig\.yaml'$"
+    with pytest.raises(FileNotFoundError, match=message):
+        Session.load(tmp_path / "a.yaml")
+
+
+def test_described_session_is_valid() -> None:
+    """The YAML of the module's docstring is a session, with settings that a wheel has."""
+    assert description.__doc__ is not None
+    (text,) = re.findall(r"::\n\n(.*?)\n\n\S", description.__doc__, re.DOTALL)
+    session = Session.from_yaml(textwrap.dedent(text))
+    assert session.swept == ("9.5", "11")
+    assert filterwheel.Settings(filters=session.filters, **session.wheel).home_offset == 12.5
+
+
+@pytest.mark.parametrize("kind", ["boson", "y16"])
+def test_kind_of_a_camera_is_that_of_its_simulated_address(kind: str) -> None:
+    """A camera is never emulated by another kind; the error names both."""
+    other = {"boson": "y16", "y16": "boson"}[kind]
+    video = description.Device(f"sim://{other}/wide", "v4l2:///dev/video0")
+    assert description.Camera(video, kind=other).kind == other
+    with pytest.raises(
+        ValueError, match=f"'sim://{other}/wide': that of a {kind} is sim://{kind}/<n"
+    ):
+        description.Camera(video, kind=kind)
 
 
 def test_camera_behind_the_wheel() -> None:

@@ -23,7 +23,7 @@ def recorded(path: Path, telemetry_rows: int) -> xr.Dataset:
     """A scene during which the narrow camera corrects its offsets, once, by its command port."""
     cameras = {
         band: {
-            "video": {"simulated": f"sim://camera/{name}", "hardware": "v4l2:///dev/video0"},
+            "video": {"simulated": f"sim://boson/{name}", "hardware": "v4l2:///dev/video0"},
             "control": {"simulated": f"sim://boson/{name}", "hardware": "serial:///dev/ttyACM0"},
         }
         for band, name in (("8-14", "wide"), ("9.5", "narrow"))

@@ -49,11 +49,11 @@ def linear_noise(rig: Rig) -> tuple[float, float]:
 
 @pytest.mark.parametrize("background", [{}, {"kind": "random walk"}, {"drift": 5.0}], ids=str)
 def test_ratio_without_rest_is_the_closed_form(background: dict[str, Any]) -> None:
-    """Linear, with no frame at rest, the reflection ratio's bound is that of `ratio_variance`."""
+    """Linear, with no frame at rest, the ratio's bound is that of `ratio_variance_bound`."""
     scene = scene_of(0.86, 0.72, **background)
     found = limits.bounds(scene, RIG.response(), order=6, **NOTHING)["reflection_ratio_std"]
     cold = scene["background_temperature"].values[:, 0]
-    variance = limits.ratio_variance(
+    variance = limits.ratio_variance_bound(
         (0.86, 0.72), linear_noise(RIG), cold, smooth.polynomial_basis(TIME, 6)
     )
     np.testing.assert_allclose(found[1, 0], np.sqrt(variance), rtol=1e-7)
@@ -74,7 +74,7 @@ def test_bound_of_the_ratio_is_that_of_a_linear_model() -> None:
     jacobian = np.vstack([first, second])
     # One combination of smooth part and reflection is shared: the pseudoinverse leaves it out.
     expected = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10)[0, 0]
-    found = limits.ratio_variance(pair, noise, background, functions)
+    found = limits.ratio_variance_bound(pair, noise, background, functions)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

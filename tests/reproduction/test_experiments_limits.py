@@ -53,7 +53,7 @@ def test_ratio_is_at_the_bound() -> None:
 
 
 def test_slope_is_the_closed_form() -> None:
-    """The bound that knows the slopes is `ratio_variance` at the noise in kelvin."""
+    """The bound that knows the slopes is `ratio_variance_bound` at the noise in kelvin."""
     noise, size = (0.03, 0.35), 30
     found = limits.near_bound(GLASS, noise, bands=PAIR, pixels=size, seed=4, **COMMON)
     case = {"emissivity": GLASS, "start": 20.0, "stop": 45.0}
@@ -62,7 +62,9 @@ def test_slope_is_the_closed_form() -> None:
     cold = truth["background_temperature"].values[:, 0]
     orders = [
         np.sqrt(
-            bounds.ratio_variance((0.86, 0.72), noise, cold, smooth.polynomial_basis(time, order))
+            bounds.ratio_variance_bound(
+                (0.86, 0.72), noise, cold, smooth.polynomial_basis(time, order)
+            )
         )
         for order in range(3, 13)
     ]

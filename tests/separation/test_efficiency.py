@@ -120,7 +120,7 @@ def unknown_background(scene: xr.Dataset, noise: tuple[float, float], order: Arr
     result = np.empty(order.size)
     for one in np.unique(order):
         part, functions = order == one, smooth.polynomial_basis(TIME, int(one))
-        variance = limits.ratio_variance((0.86, 0.72), noise, cold[:, part], functions)
+        variance = limits.ratio_variance_bound((0.86, 0.72), noise, cold[:, part], functions)
         result[part] = np.sqrt(variance)
     return result
 

@@ -12,7 +12,7 @@ import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
@@ -31,7 +31,16 @@ from dbthermal.instruments.emulated.port import number, require_known
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import Closing
 
-__all__ = ["BUFFERS", "CLOSED", "FFC_PERIODS", "MODELS", "EmulatedCamera", "Picture", "open_frames"]
+__all__ = [
+    "BUFFERS",
+    "CLOSED",
+    "FFC_PERIODS",
+    "MODELS",
+    "EmulatedCamera",
+    "Model",
+    "Picture",
+    "open_frames",
+]
 
 Picture = Callable[[float], Counts]
 
@@ -41,13 +50,21 @@ BUFFERS: Final = 32
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
 
+
+class Model(NamedTuple):
+    """Name of an emulated model, and options that its address may have."""
+
+    name: str
+    options: tuple[str, ...] = ()
+
+
 MODELS: Final = MappingProxyType(
     {
-        "camera": "emulated Boson",
-        "y16": "emulated Y16 camera",
+        "boson": Model("emulated Boson"),
+        "y16": Model("emulated Y16 camera", ("ffc",)),
     }
 )
-"""Model of the emulated camera by the kind in its address, ``sim://camera/wide``."""
+"""Model of the emulated camera by its kind, as in its address ``sim://boson/wide``."""
 
 FFC_PERIODS: Final = (1.0, math.inf)
 """Shortest and longest time between corrections that a camera starts by itself [s]."""
@@ -70,7 +87,7 @@ class EmulatedCamera(Closing):
     frame_rate: float = 60.0  # [Hz]
     telemetry_rows: int = 0
     sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
-    kind: str = "camera"  # of `MODELS`
+    kind: str = "boson"  # of `MODELS`
     ffc_period: float = math.inf  # between corrections that the camera starts by itself [s]
 
     is_simulated: Final = True
@@ -88,7 +105,7 @@ class EmulatedCamera(Closing):
         """Device, model and number, labelled as emulated."""
         return {
             "device": f"sim://{self.kind}/{self.name}",
-            "model": MODELS[self.kind],
+            "model": MODELS[self.kind].name,
             "serial_number": str(self._state.serial_number),
         }
 
@@ -165,18 +182,18 @@ class EmulatedCamera(Closing):
 def open_frames(
     url: str, world: World, pictures: Mapping[str, Picture], band: str | None, stream: Stream
 ) -> EmulatedCamera:
-    """Open ``sim://camera/<name>``, a camera of the world; `band` None is behind the wheel.
+    """Open ``sim://<kind>/<name>``, a camera of the world; `band` None is behind the wheel.
 
-    Option of ``sim://y16/<name>?ffc=120``: `EmulatedCamera.ffc_period`.
+    The option ``ffc`` of ``sim://y16/<name>?ffc=120`` is `EmulatedCamera.ffc_period` [s].
     """
     parts = urlsplit(url)
     options = dict(parse_qsl(parts.query, keep_blank_values=True))
-    require_known(options, ("ffc",) if parts.netloc == "y16" else ())
     if parts.scheme != "sim" or parts.netloc not in MODELS:
         raise ValueError(
             f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
             f"one of {sorted(MODELS)}."
         )
+    require_known(options, MODELS[parts.netloc].options)
     return EmulatedCamera(
         world,
         parts.path.lstrip("/"),

@@ -94,7 +94,8 @@ class EmulatedPort(Closing):
 def require_known(options: Mapping[str, str], names: Sequence[str]) -> None:
     """Raise ValueError for an option of an emulator's address that it does not have."""
     for name in sorted(options.keys() - {*names}):
-        raise ValueError(f"Unknown option '{name}'. Must be one of {', '.join(names)}.")
+        rule = f"Must be one of {', '.join(names)}." if names else "It has no options."
+        raise ValueError(f"Unknown option '{name}' of an emulator. {rule}")
 
 
 def number(

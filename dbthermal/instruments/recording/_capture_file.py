@@ -216,6 +216,7 @@ class CaptureFile:
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
         self._origin, self._chunk = origin, chunk
+        self._start: dict[str, Any] = {}  # attributes of `begin`
         self._names = [*sources, *readings]
         self._notes: list[tuple[float, int, int, float]] = []
         self.broken = False
@@ -241,6 +242,10 @@ class CaptureFile:
     def totals(self) -> dict[str, dict[str, int]]:
         """Band to its ``frames``, ``lost``, ``refused`` and ``damaged``, numbers of frames."""
         return {band: dict(state.counts) for band, state in self._bands.items()}
+
+    def begin(self, origin: float, started: str) -> None:
+        """Let the recording begin at a time on the host's clock [s], `started` in UTC."""
+        self._origin, self._start = origin, {"clock_origin": origin, "started": started}
 
     def frame(self, band: str, frame: Frame, refused: int = 0) -> FrameFlag:
         """
@@ -375,7 +380,7 @@ class CaptureFile:
                 {name: np.array(values, self._variables[name].dtype) for name, values in columns}
             )
             self._notes = []
-        self.recording.commit(totals=self.totals)
+        self.recording.commit(totals=self.totals, **self._start)
         self.broken = False
 
     def _new_block(self) -> dict[str, npt.NDArray[Any]]:

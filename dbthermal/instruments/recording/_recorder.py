@@ -151,9 +151,10 @@ def record(
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
-    start = monotonic()  # clock of the sources' stamps
-    file = _new_file(session, sources, readings, identities or {}, Path(path), start, limits)
-    end, stop = monotonic() + session.duration, stop or threading.Event()
+    file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
+    start = monotonic()  # clock of the sources' stamps; to make the file may have taken a while
+    file.begin(start, _utc())
+    end, stop = start + session.duration, stop or threading.Event()
     run = _Run(file, sources, readings, limits, start, end, stop)
     # No daemon: it ends its work whatever becomes of this thread.
     writer = threading.Thread(target=run.write, name="writer")
@@ -195,7 +196,6 @@ def _new_file(
     readings: Mapping[str, Reading],
     identities: Identities,
     path: Path,
-    start: float,
     limits: Limits,
 ) -> CaptureFile:
     """Create the capture file, if the disk has room for all of it, uncompressed."""
@@ -213,11 +213,17 @@ def _new_file(
             for name in {**known, **identities}
         },
         "frame_rates": {band: source.frame_rate for band, source in sources.items()},
-        "started": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "started": _utc(),
         "provenance": store.provenance(asdict(session)),
     }
     units = {name: reading.units for name, reading in readings.items()}
-    return CaptureFile(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)
+    return CaptureFile(
+        path, sources, readings=units, origin=monotonic(), attrs=attrs, chunk=limits.chunk
+    )
+
+
+def _utc() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 class _Run:

@@ -60,7 +60,7 @@ def estimate(
 
     .. math:: \sigma^2 = \frac{1}{S} + \frac{n}{S^2 |v|^2}
 
-    The first term alone is the Cramer-Rao bound; see `limits.ratio_variance`.
+    The first term alone is the Cramer-Rao bound; see `limits.ratio_variance_bound`.
 
     References
     ----------

@@ -99,13 +99,14 @@ def efficiency(
     Scatter of the reflection ratio over its Cramer-Rao bound [1]; 1 is the best possible.
 
     Robust standard deviation over the pixels of a scene of one material. The noise is that of the
-    two bands' signals [K], the order the size of the smooth subspace of `limits.ratio_variance`.
+    two bands' signals [K], the order the size of the smooth subspace of
+    `limits.ratio_variance_bound`.
     """
     emissivity = truth["emissivity"].values[:, 0, 0]
     background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
     functions = smooth.polynomial_basis(truth["time"].values, order)
     pair = (float(emissivity[0]), float(emissivity[1]))
-    bound = np.sqrt(limits.ratio_variance(pair, noise, background, functions))
+    bound = np.sqrt(limits.ratio_variance_bound(pair, noise, background, functions))
     ratio = limits.reflection_ratio(result["emissivity"].values.reshape(2, -1))
     scaled = (ratio - limits.reflection_ratio(emissivity)) / bound
     scaled = scaled[np.isfinite(scaled)]

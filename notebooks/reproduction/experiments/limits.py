@@ -48,8 +48,9 @@ def near_bound(
     - "nothing": `limits.bounds` with one free number a frame and emissivities anywhere in (0, 1).
       At low noise it is loose, for the data tell the emissivities, and with them the level of
       the background and the ratio of the bands' slopes there, which this bound does not know;
-    - "slope": the closed form `limits.ratio_variance`, one free number a frame, but the slopes are
-      known: of the three the one that fits the reflection ratio. It says nothing of the object;
+    - "slope": the closed form `limits.ratio_variance_bound`, one free number a frame, but the
+      slopes are known: of the three the one that fits the reflection ratio. It says nothing of the
+      object;
     - "rest": `limits.bounds` that know in which frames the background rests, which the method does
       not.
 
