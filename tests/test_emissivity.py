@@ -102,7 +102,7 @@ def test_bands_by_name_or_as_such(bands: list[str]) -> None:
 
 
 def test_short_spectrum_is_refused() -> None:
-    """A spectrum up to 12.5 um covers 0.7808 of the band, and the error says so."""
+    """A spectrum up to 12.5 um raises an error with its coverage of 0.7808."""
     short = {"metal": spectrum([0.3, 12.5], [0.1, 0.1])}
     message = (
         "Invalid coverage 0.7808 of band '8-14' by the spectrum of 'metal', 3e-07 to 1.25e-05 m"
@@ -324,7 +324,7 @@ def test_every_spectrum_of_the_libraries(spectra: dict[str, xr.Dataset]) -> None
 
 @pytest.mark.data
 def test_filter_of_the_paper(spectra: dict[str, xr.Dataset]) -> None:
-    """By the condition number the filter at 9.5 um is chosen, as published."""
+    """The lowest condition number belongs to the filter at 9.5 um, as published."""
     whole = {name: one for name, one in spectra.items() if one["wavelength"][-1] > 13e-6}
     made = emissivity.band_table(whole, FILTERS)
     choice = emissivity.rank_filters(made, emissivity.filter_noise(0.03, FILTERS))

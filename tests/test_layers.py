@@ -74,7 +74,7 @@ def test_only_store_opens_zarr() -> None:
 
 
 def test_importing_the_package_is_light() -> None:
-    """`import dbthermal` loads nothing that a program may not need or have."""
+    """`import dbthermal` loads neither optional nor heavy packages."""
     code = "import sys, dbthermal; print({'torch', 'usb', 'serial', 'matplotlib'} & {*sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -67,7 +67,7 @@ def test_relative_error_is_of_degrees_celsius() -> None:
 def test_relative_error_needs_kelvin_above_zero(
     temperature: float, units: str, message: str
 ) -> None:
-    """Degrees Celsius passed as kelvin, or a truth of no positive reading, are refused."""
+    """Temperatures in degrees Celsius, or at or below 273.15 K, raise a ValueError."""
     truth = xr.DataArray([temperature], dims="time", attrs={"units": units})
     with pytest.raises(ValueError, match=re.escape(message)):
         metrics.relative_error_celsius(truth, truth)
@@ -110,7 +110,7 @@ def test_mask_is_bool_over_the_same_dims(
 
 
 def test_constant_map_has_no_correlation(truth: xr.DataArray) -> None:
-    """A map without variation is refused, not given a correlation of NaN."""
+    """A constant map raises an error instead of a NaN correlation."""
     flat = truth.where(truth["time"] != 2, 300.0)
     with pytest.raises(ValueError, match="Constant map in 1 of 4 frames"):
         metrics.correlation(truth, flat)

@@ -23,7 +23,7 @@ def test_background_is_the_inverse(emissivity: float, x: float, y: float) -> Non
 
 @given(FRACTIONS, FRACTIONS, SIGNALS, SIGNALS)
 def test_swap_gives_the_same_images(first: float, second: float, x: float, y: float) -> None:
-    """Object and background swapped, with emissivities 1 - e, cannot be told by the equation."""
+    """Object and background swapped, with emissivities 1 - e, give the same signals."""
     bands = np.array([first, second])
     swapped = mixing.leaving(1.0 - bands, y, x)
     np.testing.assert_allclose(mixing.leaving(bands, x, y), swapped, rtol=0, atol=1e-8)
@@ -54,7 +54,7 @@ def test_condition_number_of_glass() -> None:
 
 @given(FRACTIONS, FRACTIONS)
 def test_condition_number_against_numpy(first: float, second: float) -> None:
-    """It is that of `numpy.linalg.cond` wherever the matrix is not close to singular."""
+    """The closed form is `numpy.linalg.cond` unless the matrix is nearly singular."""
     assume(abs(first - second) > 1e-6)
     expected = float(np.linalg.cond(mixing.matrix([first, second])))
     assert float(mixing.condition_number([first, second])) == pytest.approx(expected, rel=1e-9)

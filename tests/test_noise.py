@@ -23,7 +23,7 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture
 def white(rng: np.random.Generator) -> Signals:
-    """Noise and nothing else, 0.03 and 0.35 K."""
+    """White noise of 0.03 and 0.35 K."""
     first, second = (std * rng.standard_normal((FRAMES, PIXELS)) for std in NOISE)
     return first, second
 
@@ -72,7 +72,7 @@ def test_second_difference_keeps_the_variance(rng: np.random.Generator) -> None:
 
 
 def test_white_noise(white: Signals) -> None:
-    """Noise alone comes back within three per cent."""
+    """White noise is estimated within three per cent."""
     assert noise.estimate(*white, TIME) == pytest.approx(NOISE, rel=TOLERANCE)
 
 
@@ -111,7 +111,7 @@ def test_bands_in_units_of_their_own(white: Signals) -> None:
 
 
 def test_offsets_do_not_matter(white: Signals) -> None:
-    """A constant in each pixel changes nothing."""
+    """A constant in each pixel does not change the estimate."""
     shifted = noise.estimate(white[0] + 300.0, white[1] - 50.0, TIME)
     assert shifted == pytest.approx(noise.estimate(*white, TIME), rel=1e-6)
 

@@ -174,7 +174,7 @@ def test_bad_response(
 
 
 def test_response_is_a_stage(two_bands: xr.Dataset) -> None:
-    """A response that lacks a coefficient is refused by its stage."""
+    """A response without one of its coefficients raises the error of its stage."""
     schema.check(two_bands, "response")
     with pytest.raises(ValueError, match="Missing variable 'offset' in the response"):
         response.curve(two_bands.drop_vars("offset"), "9.5")

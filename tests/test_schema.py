@@ -59,7 +59,7 @@ def test_every_variable_is_needed(stage: str) -> None:
 
 
 def test_absent_units_are_the_agreed_ones(capture: xr.Dataset) -> None:
-    """An array that says nothing of its unit passes; any real dtype does."""
+    """An array without a unit passes, and so does any real dtype."""
     counts = capture["counts"].drop_attrs(deep=False).astype(np.float32)
     schema.check(capture.assign(counts=counts), "capture")
 
@@ -183,7 +183,7 @@ def test_status_of_16_bits_still_opens(tmp_path: Path) -> None:
 
 
 def test_flags_are_read_by_name() -> None:
-    """Any of several flags counts; a name that the attributes do not hold is refused."""
+    """Any of several flags counts; an unknown name raises an error."""
     status = xr.DataArray(np.array([0, 1, 1024]), dims="x", attrs=schema.status_attrs())
     found = schema.has_flag(status, "dead_pixel", "no_background_motion")
     np.testing.assert_array_equal(found, [False, True, True])

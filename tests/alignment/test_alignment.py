@@ -1,4 +1,4 @@
-"""Two cameras onto one clock: offsets found, undone, and nothing made up where frames are lost."""
+"""Alignment of two cameras in time: offsets estimated and undone, lost frames left missing."""
 
 import numpy as np
 import pytest

@@ -169,7 +169,7 @@ def test_parallax_looks_like_a_time_offset() -> None:
 
 
 def test_the_offset_is_that_of_registered_views() -> None:
-    """Of views 3 pixels and 4/3 frames apart, the offset is found after they are registered."""
+    """The offset of views 3 pixels and 4/3 frames apart is found after their registration."""
     value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
     fine, rng, response = np.arange(1056) / 30.0, np.random.default_rng(3), RIG.response()
     wide = simulation.walkers(fine, (56, 72), value, rng)

@@ -213,7 +213,7 @@ def test_bad_counts(change: Change, message: str) -> None:
     ],
 )
 def test_bad_noise(noise: xr.DataArray, message: str) -> None:
-    """Noise of other bands, units or signs is refused."""
+    """Noise with missing bands, another unit or a negative value raises a ValueError."""
     with pytest.raises(ValueError, match=re.escape(message)):
         calibration.fit_response(blackbody(4), noise)
 

@@ -100,7 +100,7 @@ def test_each_step_matters(recorded: Recorded, off: dict[str, Any]) -> None:
 
 
 def test_provenance_of_every_step(recorded: Recorded) -> None:
-    """Attributes tell which steps ran, and with which parameters; the raw capture is left."""
+    """Attributes record the steps and their parameters; the raw capture is not changed."""
     before = recorded.raw.copy(deep=True)
     attrs = correct_capture(recorded.raw, recorded.correction, **recorded.options).attrs
     xr.testing.assert_identical(recorded.raw, before)

@@ -278,7 +278,7 @@ def test_band_must_be_corrected(capture: xr.Dataset, correction: xr.Dataset) -> 
 
 
 def test_pixels_must_be_the_same(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """A correction of another size, or of another window of the detector, is refused."""
+    """A correction of another size or window of the detector raises a ValueError."""
     with pytest.raises(ValueError, match="Invalid size 4 of 'x' of the capture"):
         correct(capture, correction.isel(x=slice(3)))
     with pytest.raises(ValueError, match="Invalid 'y' of the capture"):
@@ -306,7 +306,7 @@ def movies(rng: np.random.Generator) -> xr.Dataset:
 
 
 def test_noise_of_movies(movies: xr.Dataset) -> None:
-    """Mean frames and noise come back; the standard deviation of this median is 0.6 %."""
+    """Mean frames and noise are recovered; the standard deviation of this median is 0.6 %."""
     result = schema.check(blackbody_statistics(movies), "blackbody_frames")
     np.testing.assert_allclose(result["noise"], [20.0, 60.0], rtol=0.02)
     levels = result["counts"].mean(("y", "x"))

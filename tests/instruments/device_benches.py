@@ -29,7 +29,7 @@ QUICK = Settings(
 
 class Clock:
     """
-    Time that passes only when somebody waits.
+    A simulated clock, which advances only by waiting.
 
     Attributes
     ----------

@@ -28,7 +28,7 @@ class _Stub(Closing):
         self._said, self._closed = b"", False
 
     def read(self, size: int, timeout: float) -> bytes:  # noqa: ARG002 - no time goes by
-        """Give what was said."""
+        """Give the pending answer."""
         self._must_be_open()
         piece, self._said = self._said[:size], self._said[size:]
         return piece
@@ -135,7 +135,7 @@ class StubLibrary:
         return 1
 
     def usb_tc08_open_unit_progress(self, handle: Numbers, percent: Numbers) -> int:
-        """Give the unit, unless somebody has it."""
+        """Give the handle of the unit, or 0 if it is open already."""
         handle[0], percent[0] = 0 if self._is_open else HANDLE, 100
         self._is_open = True
         return 1

@@ -43,7 +43,7 @@ def written(path: Path, text: str) -> str:
 
 
 def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every device is named as emulated, the progress is told, and the movies are of the sweep."""
+    """A sweep prints its emulated devices and its progress, and its movies open."""
     file, folder = written(tmp_path / "a.yaml", ONE), tmp_path / "recorded"
     assert acquire.main([file, str(folder)]) == 0
     said = capsys.readouterr().out
@@ -97,7 +97,7 @@ def test_failures_have_a_status(
 def test_recorded_scene_is_refused_at_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A scene of this name is refused before a device is opened; a dry run looks at them."""
+    """An existing scene raises an error before a device is opened; a dry run opens them."""
     file = written(tmp_path / "a.yaml", scene_text())
     (tmp_path / "plate.zarr").mkdir()
     assert acquire.main([file, str(tmp_path), "--dry-run"]) == 0
@@ -176,7 +176,7 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_progress_is_a_line() -> None:
-    """One line tells the losses, the temperatures and the shutter of each band."""
+    """The progress is one line with the losses, temperatures and shutter of each band."""
     totals = {"9.5": {"frames": 10, "lost": 3, "refused": 0, "damaged": 0}}
     readings = {"fpa 9.5": 308.15, "ffc 9.5": float(FfcStatus.IN_PROGRESS)}
     line = acquire._progress(Watch(), Preview(1.0, {}, totals, readings))

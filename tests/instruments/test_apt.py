@@ -124,7 +124,7 @@ def test_status_of_either_length(text: str) -> None:
 
 
 def test_info_of_the_documentation() -> None:
-    """The documentation's example of who a controller is."""
+    """The documentation's example of a controller's identity is decoded."""
     info = apt.Info.parse(decode(INFO))
     assert (info.serial_number, info.model, info.type) == (94_000_009, "ION001", 44)
     assert (info.firmware, info.hardware, info.modification) == ("57.1.2", 1, 3)

@@ -64,7 +64,7 @@ def test_a_mute_camera_ends_a_wait_in_time() -> None:
 
 
 def test_each_program_begins_at_another_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first request's number comes from the time of day, so that old replies are told."""
+    """The first sequence number depends on the time of day, which identifies stale replies."""
     first = []
     for microseconds in (1_700_000_000_000_001, 1_700_000_000_100_001):
         monkeypatch.setattr(time, "time_ns", lambda now=microseconds: 1000 * now)
@@ -78,7 +78,7 @@ def test_each_program_begins_at_another_number(monkeypatch: pytest.MonkeyPatch) 
 
 class Slow(Closing):
     """
-    A camera that answers after a while, and notices who speaks before it did.
+    A camera that answers with a delay, and notes requests before its answer.
 
     Attributes
     ----------

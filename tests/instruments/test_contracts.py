@@ -78,7 +78,7 @@ def ask(device: Any) -> object:
 
 @opens(*CAMERAS, *WHEELS, *LOGGERS, *VIDEOS)
 def test_a_device_says_who_it_is(opened: Opened) -> None:
-    """Its identity is told twice alike, names it, and says whether hardware is behind it."""
+    """The identity is constant, names the device, and says if it is emulated."""
     told = identity(opened.device)
     assert dict(told) == dict(identity(opened.device))
     names = [value for name, value in told.items() if name in NAMES]
@@ -90,7 +90,7 @@ def test_a_device_says_who_it_is(opened: Opened) -> None:
 
 @opens(*CAMERAS, *WHEELS, *LOGGERS, *VIDEOS)
 def test_close_is_final(opened: Opened) -> None:
-    """Closed, and closed again, a device answers no more, and the error says what to do."""
+    """A closed device raises an error with a remedy; a second close does nothing."""
     ask(opened.device)
     opened.device.close()
     opened.device.close()
@@ -121,7 +121,7 @@ def test_a_device_has_one_client(opened: Opened) -> None:
 
 @opens(*CAMERAS)
 def test_a_camera_has_a_number_and_a_temperature(opened: Opened) -> None:
-    """It has a serial number that stays, and the temperature of a focal-plane array."""
+    """A camera has a constant serial number and a temperature of its focal-plane array."""
     camera: Boson = opened.device
     assert camera.identity()["serial_number"] == str(camera.serial_number())
     assert camera.serial_number() > 0
@@ -208,7 +208,7 @@ def test_silence_is_no_loss(opened: Opened) -> None:
 
 @pytest.mark.hardware
 def test_the_rig_is_found() -> None:
-    """With the rig plugged in all of it is found, and nothing stands in the way."""
+    """The inventory lists the whole rig without a warning."""
     found = inventory.find()
     assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
     assert [device.warnings for device in found] == [()] * 4

@@ -59,7 +59,7 @@ def test_opening_changes_nothing(devices: Devices) -> None:
 
 
 def test_every_device_says_what_it_is(devices: Devices) -> None:
-    """Numbers and versions are there, and that all are emulated."""
+    """Identities hold serial numbers and versions, and label all devices as emulated."""
     found = devices.identities()
     assert found["8-14"]["serial_number"] == "93588"
     assert found["9.5"]["serial_number"] == "93589"
@@ -110,7 +110,7 @@ class Kept(dict[int, int]):
     """Settings that stay as they are."""
 
     def __setitem__(self, key: int, value: int) -> None:
-        """Change nothing."""
+        """Ignore the new value."""
 
 
 def test_setting_that_is_not_taken_is_an_error() -> None:
@@ -168,7 +168,7 @@ class Logger:
 
 
 def test_one_scan_gives_all_channels_once() -> None:
-    """A round of readings is one scan; nobody gets a value twice, or an old one."""
+    """One scan of the logger serves all channels, and each value is read once."""
     logger, now = Logger(), [0.0]
     names = {1: "plate", 2: "room", 3: "wall"}
     thermocouples = Thermocouples(cast(TC08, logger), names, lambda: now[0])

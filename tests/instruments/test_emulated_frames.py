@@ -1,4 +1,4 @@
-"""The emulated camera shows the world it is in, and has the faults that it is told to have."""
+"""The emulated camera shows its world, and has the faults that are set."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ SHAPE, RATE = (8, 80), 10.0
 
 
 class Clock:
-    """A clock that goes on only while somebody sleeps."""
+    """A simulated clock, which advances only by waiting."""
 
     def __init__(self) -> None:
         self.time = 1000.0
@@ -40,7 +40,7 @@ def level(counts: int) -> Movie:
 
 
 def camera(faults: Faults | None = None, band: str | None = "8-14", rows: int = 0) -> FaultyCamera:
-    """A camera on a bench with a wheel of two filters, on a clock that nobody waits for."""
+    """A camera on a bench with a wheel of two filters, on a simulated clock."""
     clock = Clock()
     world = World(clock=clock, filters={1: "9.5", 2: "11"})
     world.add_camera("wide", 93588)
@@ -73,7 +73,7 @@ def test_it_says_that_it_is_emulated() -> None:
 
 
 def test_wheel_changes_what_is_seen() -> None:
-    """Behind the wheel the band is the filter's; between two filters nothing is seen."""
+    """Behind the wheel the band is the filter's; between two filters the beam is closed."""
     behind = camera(band=None)
     found = [shown(behind.read())]
     for position in (2, None, 3):
@@ -132,7 +132,7 @@ def test_nobody_reads() -> None:
 
 
 def test_damage() -> None:
-    """A corrupt frame says so, or does not; of a short one the rest is 0."""
+    """A corrupt frame is flagged unless its fault is hidden; missing bytes of a short one are 0."""
     faults = Faults(corrupt=frozenset({1}), unseen=frozenset({2}), short=frozenset({3}))
     found = list(frames(camera(faults), 5))
     expected = [0, FrameFlag.DRIVER_ERROR, 0, FrameFlag.WRONG_SIZE, 0]
@@ -143,14 +143,14 @@ def test_damage() -> None:
 
 
 def test_repeated_image_has_its_own_number() -> None:
-    """As a driver that lost a frame and hands out the last one again."""
+    """A repeated image has a new sequence number."""
     found = list(frames(camera(Faults(repeated=frozenset({2}))), 4))
     assert [shown(frame) for frame in found] == [1000, 1001, 1001, 1003]
     assert [frame.sequence for frame in found] == [0, 1, 2, 3]
 
 
 def test_clock_of_its_own() -> None:
-    """A drifting clock goes at its rate, and is not said to be the host's."""
+    """A drifting clock advances at its rate, and is labelled as the camera's own."""
     found = list(frames(camera(Faults(clock_rate=1.01)), 3))
     assert np.diff([frame.device_time for frame in found]) == pytest.approx(0.101)
     assert all(frame.flags == FrameFlag.FOREIGN_CLOCK for frame in found)

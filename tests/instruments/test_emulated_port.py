@@ -54,7 +54,7 @@ def held() -> tuple[int, int]:
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are counted on Linux")
 def test_nothing_is_left_open() -> None:
-    """After fifty cameras, half of them pulled out, no more files and threads are held."""
+    """Fifty cameras, half of them unplugged, leave no open files and threads."""
     threads, files = held()
     for number in range(50):
         world = World()
@@ -76,7 +76,7 @@ class Broken:
         raise ArithmeticError(f"an error in the emulator at {data!r}")
 
     def poll(self) -> list[bytes]:
-        """Say nothing."""
+        """No bytes."""
         return []
 
     def next_due(self) -> float:

@@ -64,7 +64,7 @@ def test_damaged_frames(name: str, tmp_path: Path) -> None:
 
 
 def test_a_repeated_image(tmp_path: Path) -> None:
-    """The recording keeps it as it came and says so, and afterwards it is found and taken out."""
+    """A repeated image is recorded with a flag, and found as a repeated frame afterwards."""
     recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(repeated=OFTEN)}).record(0.4)
     capture = open_capture(recorded.path).isel(time=slice(0, len(recorded.cameras["9.5"].frames)))
     found = find_shutter(capture).query(event="band == '9.5'")
@@ -85,7 +85,7 @@ def test_a_corrupt_frame_that_nobody_tells(tmp_path: Path) -> None:
 
 
 def test_an_unplugged_camera(tmp_path: Path) -> None:
-    """The other camera is recorded to the end, and the store says whose frames end where."""
+    """The other camera is recorded to the end, and the store marks the end of each band."""
     recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(unplugged=12)}).record(0.6)
     assert recorded.summary.ended == "source lost"
     assert recorded.kinds("9.5")[-1] == "source_lost"
@@ -296,7 +296,7 @@ def test_a_correction_that_stalls_replies_and_freezes_frames(tmp_path: Path) -> 
 
 
 def test_an_instrument_that_is_pulled_out(tmp_path: Path) -> None:
-    """Its readings are right until then and failed from then on, in the order of the log."""
+    """Readings are valid until the instrument is unplugged, and noted as failed afterwards."""
     bench = WheelBench()
     bench.homed().move_to(3)
     left = iter([True, True])

@@ -22,7 +22,7 @@ SETTINGS = Settings(filters=FILTERS)
 
 
 def test_places_are_sixths_of_a_turn() -> None:
-    """Each place is rounded by itself, for both families of controllers, and comes back."""
+    """Slots are at sixths of a turn, rounded one by one, for both families of controllers."""
     places = [BSC20X.target(position) for position in range(1, 7)]
     assert places == [0, 68_267, 136_533, 204_800, 273_067, 341_333]
     assert [BSC10X.target(k) for k in range(1, 7)] == [0, 4267, 8533, 12_800, 17_067, 21_333]
@@ -122,7 +122,7 @@ def test_a_controller_that_was_homed_before_is_taken_over() -> None:
 
 
 def test_stop() -> None:
-    """A wheel that was stopped between two slots says so, and goes on when it is told to."""
+    """A wheel stopped between two slots has no position, and can be moved again."""
     bench = WheelBench()
     wheel = bench.homed()
     bench.move(200_000)

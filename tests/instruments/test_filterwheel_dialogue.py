@@ -112,7 +112,7 @@ def test_neither_enabled_nor_not(bits: bytes) -> None:
 
 
 def test_another_language() -> None:
-    """A device that answers in text, such as an FW102C, is refused."""
+    """A device that answers in text, such as an FW102C, raises an error."""
     banner = b"Command error CMD_NOT_DEFINED\r\n> "
     chosen = Settings(addresses=((apt.UNIT, apt.UNIT),))
     with (

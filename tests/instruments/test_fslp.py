@@ -117,7 +117,7 @@ def test_a_number_must_be_whole(wrong: object) -> None:
 
 @given(st.lists(frames, max_size=4), st.lists(st.integers(0, 999), max_size=6), blobs)
 def test_frames_survive_any_cutting(sent: list[Frame], places: list[int], noise: bytes) -> None:
-    """Frames come back in their order however the stream is cut, past noise between them."""
+    """Frames are decoded in order however the stream is cut, with noise between them."""
     between = bytes(byte for byte in noise if byte != 0x8E)
     stream = b"".join(between + encoded(frame) for frame in sent)
     decoder = Decoder()
@@ -127,7 +127,7 @@ def test_frames_survive_any_cutting(sent: list[Frame], places: list[int], noise:
 
 @given(st.lists(blobs, max_size=8))
 def test_any_bytes_are_taken(pieces: list[bytes]) -> None:
-    """Of all start bytes, each began a frame that is returned, is counted as damaged or open."""
+    """Every start byte begins a frame that is decoded, counted as damaged, or open."""
     decoder = Decoder()
     found = [frame for piece in pieces for frame in decoder.feed(piece)]
     starts = b"".join(pieces).count(0x8E)
@@ -169,7 +169,7 @@ def test_a_damaged_frame_is_dropped_and_counted(sent: bytes) -> None:
 
 
 def test_the_longest_frame_is_read() -> None:
-    """As many bytes as the vendor's own receiver holds make a frame, one more do not."""
+    """A frame of the longest size is decoded, and one byte more is an error."""
     for size, found in ((MAXIMUM_FRAME, 1), (MAXIMUM_FRAME + 1, 0)):
         body = bytes(size - 2)
         sent = b"\x8e" + body + checksum(body).to_bytes(2) + b"\xae"

@@ -55,7 +55,7 @@ def denied_nodes(
 
 
 def test_whole_rig(tmp_path: Path) -> None:
-    """Two cameras, the wheel's controller and the logger are found, and nothing is to complain."""
+    """Two cameras, the wheel's controller and the logger are listed without a warning."""
     found = look(tmp_path, tc08(), apt(), boson(2, bus=2), boson(1))
     assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
     assert [device.path for device in found] == ["1-1", "2-2", "1-3", "1-4"]
@@ -178,7 +178,7 @@ def test_rates() -> None:
 
 
 def test_two_cameras_on_one_bus(tmp_path: Path) -> None:
-    """Two cameras at 60 Hz do not fit a bus, and each says so, with the numbers."""
+    """Two cameras at 60 Hz exceed the bus, and each has a warning with the rates."""
     found = look(tmp_path, boson(1, ports=(1, 1)), boson(2, ports=(1, 2)), frame_rate=60.0)
     assert " and ".join(found[0].warnings) == (
         "It shares bus 1 and the root port with EMULATED2: 629.1 Mbit/s at 60 frames/s, of 426.0 "
@@ -195,7 +195,7 @@ def test_two_cameras_that_fit(tmp_path: Path) -> None:
 
 
 def test_two_root_ports(tmp_path: Path) -> None:
-    """Two root ports of one bus may or may not share it: the warning says so."""
+    """Two root ports of one bus give a warning that they may share its rate."""
     found = look(tmp_path, boson(1), boson(2), frame_rate=60.0)
     assert "though not the root port (ask the controller)" in found[0].warnings[0]
 

@@ -36,7 +36,7 @@ def picture(time: float) -> Counts:
 
 
 def record_until_killed(path: Path, duration: float, pipe: Connection) -> None:
-    """Record, and tell after each frame how many of each band were taken."""
+    """Record, and print the number of frames of each band after every frame."""
     world, sources = World(), {}
     for number, band in enumerate(BANDS):
         world.add_camera(band, number)
@@ -108,7 +108,7 @@ def test_kill_costs_the_last_chunk(tmp_path: Path, kills: int) -> None:
 
 @pytest.mark.parametrize("kills", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_kill_while_it_is_closed(tmp_path: Path, kills: int) -> None:
-    """Killed about its end, a recording opens, too, and is complete only if it says so."""
+    """A recording killed near its end opens, and is marked complete only if it is."""
     for number, moment in enumerate(np.linspace(0.3, 0.15, kills)):
         path = tmp_path / f"{number}.zarr"
         killed(path, float(moment), duration=0.2)

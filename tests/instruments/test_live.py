@@ -1,4 +1,4 @@
-"""The live view tells how a recording goes, in one figure, and costs it no frame."""
+"""The live view shows the state of a recording in one figure, without losing frames."""
 
 import math
 import subprocess
@@ -109,7 +109,7 @@ def test_numbers_of_a_preview() -> None:
 
 
 def test_frame_rate_is_that_of_the_last_seconds() -> None:
-    """It is that at which frames came, whenever they were written, and 0 after a window of none."""
+    """The frame rate is over the last seconds of arrival times, and 0 without a frame in them."""
     running = [preview(at) for at in np.arange(0.0, 10.1, 0.5)]
     late = [replace(one, time=one.time + 0.4 * math.sin(one.time)) for one in running]
     stopped = [replace(running[-1], time=at) for at in (11.0, 12.0, 13.0)]
@@ -146,7 +146,7 @@ def test_another_recording_begins_anew() -> None:
     ],
 )
 def test_state_of_the_correction_as_the_camera_answers(number: float, name: str) -> None:
-    """Each state has its name, one that is not known its number, a failed reading says so."""
+    """Known states have a name, unknown ones a number, and failed readings "no answer"."""
     assert status(ffc(ffc=number)).ffc == name
 
 
@@ -160,7 +160,7 @@ def test_state_of_the_correction_by_the_frame() -> None:
 
 
 def test_time_since_the_last_correction() -> None:
-    """It is counted from when it was last seen, in the readings or as a leap of the telemetry."""
+    """The time counts from the last correction in the readings or in the telemetry."""
     asked = (ffc(1.0, ffc=3.0), ffc(2.0, ffc=2.0), ffc(5.5, ffc=3.0))
     assert math.isnan(status(asked[0]).ffc_age)
     assert status(*asked).ffc_age == 3.5
@@ -225,7 +225,7 @@ def test_title_says_that_it_is_emulated() -> None:
 
 
 def test_readings_are_written_below() -> None:
-    """Thermocouples in degrees Celsius, other units as told, no answer as such, cameras above."""
+    """Thermocouples are in degrees Celsius, other readings in their unit, failures as no answer."""
     view = live.View(is_simulated=True)
     named = {"plate": 303.15, "air": 40.0, "room": math.nan, "ffc 11": 3.0, "fpa 9.5": 308.15}
     view(replace(preview(), readings=named, units={"air": "%"}))
@@ -252,7 +252,7 @@ def test_one_figure_is_used_again() -> None:
 
 
 def test_no_picture_of_a_recording_before() -> None:
-    """A band without a frame is blank and says so, though it had one in the recording before."""
+    """A band without a frame is blank, also after an earlier recording."""
     view = live.View(is_simulated=True)
     totals = {band: preview().totals["9.5"] for band in BANDS}
     view(Preview(1.0, dict.fromkeys(BANDS, frame()), totals, {}))
@@ -265,7 +265,7 @@ def test_no_picture_of_a_recording_before() -> None:
 
 
 def test_updates_keep_the_period() -> None:
-    """It is drawn at most every period, and at once where another recording begins."""
+    """The view is drawn at most once a period, and at once for another recording."""
     display = Recorder()
     view = live.View(display, is_simulated=True, period=1.0)
     shown = []

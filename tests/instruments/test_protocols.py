@@ -25,7 +25,7 @@ TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), QUICKLY)
 
 
 class Clock:
-    """A clock that goes on only while somebody sleeps."""
+    """A simulated clock, which advances only by waiting."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -209,7 +209,7 @@ def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
 
 
 def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
-    """A camera that is pulled out leaves a recording that says so, and no further one."""
+    """An unplugged camera ends the sweep with an incomplete recording."""
     with rig(Session.from_yaml(ONE)) as devices:
         devices.prepare()
         assert devices.world is not None

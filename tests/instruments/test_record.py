@@ -265,7 +265,7 @@ def test_numbers_that_stand_are_flagged(tmp_path: Path) -> None:
 
 
 def test_readings_come_beside_the_frames(tmp_path: Path) -> None:
-    """Values are noted with their time; a failure is NaN, and stops nothing."""
+    """Readings are noted with their time; a failure is NaN, and the recording goes on."""
     answers = iter([300.0, 301.0])
 
     def read() -> float:
@@ -282,7 +282,7 @@ def test_readings_come_beside_the_frames(tmp_path: Path) -> None:
 
 
 def test_errors_end_it_and_keep_what_came(tmp_path: Path) -> None:
-    """A mistake in a reading or a preview is raised, and the frames before it are there."""
+    """An error in a reading or a preview is raised after the frames are stored."""
 
     def wrong() -> float:
         time.sleep(0.1)

@@ -55,7 +55,7 @@ def slow_down(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_slow_disk_refuses_frames_and_counts_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every frame of a queue that overflows is either there or counted as refused or lost."""
+    """Frames of an overflowing queue are stored, or counted as refused or lost."""
     limits, path = Limits(chunk=CHUNK, reserve=0, queue=2), tmp_path / "a.zarr"
     slow_down(monkeypatch)
     summary = record(session(0.5), bench(), path, limits=limits)
@@ -95,7 +95,7 @@ def test_writing_does_not_wait_for_the_preview(tmp_path: Path) -> None:
 def test_keyboard_interrupt_keeps_everything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, drawing: bool
 ) -> None:
-    """Interrupted, while it draws or waits, all frames that came are written, and it says so."""
+    """A keyboard interrupt keeps all frames, and the store is marked as interrupted."""
     slow_down(monkeypatch)
     came: list[int] = []
     read = FaultyCamera.read

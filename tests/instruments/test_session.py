@@ -16,7 +16,7 @@ SWEEP, FILTERS = "sweep: [9.5, 11]\n", 'filters: {1: 9.5, 3: "11"}\n'
 
 
 def test_session_is_read(tmp_path: Path) -> None:
-    """All that the file says is there, and one switch chooses all addresses."""
+    """All keys of the file are read, and one switch chooses all addresses."""
     (tmp_path / "a.yaml").write_text(TEXT, encoding="utf-8")
     session = Session.load(tmp_path / "a.yaml")
     wheel, video = session.devices["filter_wheel"], session.cameras["9.5"].video
@@ -144,7 +144,7 @@ def test_kind_of_a_camera_is_that_of_its_simulated_address(kind: str) -> None:
 
 
 def test_camera_behind_the_wheel() -> None:
-    """It is the one whose band is a filter; the wheel goes through the sweep, or stays there."""
+    """The camera behind the wheel is the one whose band is a filter of the wheel."""
     session = Session.from_yaml(TEXT)
     assert (session.filtered, session.swept) == ("9.5", ("9.5", "11"))
     alone = Session.from_yaml(replaced((SWEEP, "")))

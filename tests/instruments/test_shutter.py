@@ -54,7 +54,7 @@ class _Corrector:
 
 @pytest.mark.parametrize("telemetry_rows", [2, 0])
 def test_a_correction_is_taken_out_of_its_band(telemetry_rows: int, tmp_path: Path) -> None:
-    """Telemetry tells the first frozen frame, the serial line and the image a later one."""
+    """A correction is removed from its own band; telemetry marks its first frozen frame."""
     capture = recorded(tmp_path / "a.zarr", telemetry_rows)
     flags = capture["frame_flags"].values
     closed = (flags & int(FrameFlag.SHUTTER_CLOSED)) != 0

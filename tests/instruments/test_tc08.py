@@ -85,7 +85,7 @@ def test_identity(rig: LoggerBench) -> None:
 
 
 def test_nothing_happens_before_it_is_opened(rig: LoggerBench) -> None:
-    """The constructor opens nothing; a closed unit says what to do."""
+    """The constructor opens no unit, and a closed unit raises an error with a remedy."""
     rig.unit.faults.unplugged = True
     TC08(rig.unit)
     with pytest.raises(RuntimeError, match=r"closed\. Must be opened first"):
@@ -118,7 +118,7 @@ def test_opening_gives_up(rig: LoggerBench) -> None:
 
 
 def test_no_unit(rig: LoggerBench) -> None:
-    """A missing unit raises a ConnectionError that says so."""
+    """A missing unit raises a ConnectionError with the rule."""
     rig.unit.faults.no_unit = True
     with pytest.raises(ConnectionError, match=r"No TC-08\. Must be plugged in, and free"):
         rig.driver.open()
@@ -153,7 +153,7 @@ def test_each_failing_step_of_opening_is_seen(rig: LoggerBench, function: str) -
 
 
 def test_unplugging(rig: LoggerBench) -> None:
-    """A unit that is pulled out fails at the next reading; closing fails too, and both are told."""
+    """An unplugged unit raises an error at the next reading, noting that closing fails too."""
     rig.ready()
     rig.unit.faults.unplugged = True
     with (

@@ -112,7 +112,7 @@ def test_temperature_out_of_range_is_named(bad: float) -> None:
 
 @pytest.mark.parametrize("bad", [-5.7, 20.873, np.inf, np.nan])
 def test_voltage_out_of_range_is_named(bad: float) -> None:
-    """No voltage outside the range is clipped; that of an open thermocouple is refused too."""
+    """A voltage outside the range raises an error and is not clipped, also an open input's."""
     message = re.escape(f"Invalid voltage, referred to 0 °C, {bad} mV")
     with pytest.raises(ValueError, match=message):
         thermocouple.temperature([1.0, bad], ICE)

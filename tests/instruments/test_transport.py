@@ -59,7 +59,7 @@ def line(port: EmulatedPort) -> Iterator[SerialTransport]:
 
 
 def read_all(line: SerialTransport, size: int) -> bytes:
-    """Read until `size` bytes are there or one second brings none."""
+    """Read until `size` bytes have come, or no byte in one second."""
     received = b""
     while len(received) < size and (piece := line.read(4096, 1.0)):
         received += piece
@@ -98,7 +98,7 @@ def test_an_unplugged_device_is_an_error_with_its_name(port: EmulatedPort) -> No
 
 
 def test_closing_twice_is_the_same_as_once(port: EmulatedPort) -> None:
-    """A line and an emulator may be closed again; a closed line takes nothing."""
+    """A second close of line and emulator does nothing; a closed line raises an error."""
     line = open_serial(f"pty://{port.path}", baudrate=115200)
     for _ in range(2):
         line.close()
@@ -159,7 +159,7 @@ def test_a_name_says_nothing_in_vain(url: str, message: str) -> None:
 
 
 def test_the_path_of_an_emulator_is_its_name() -> None:
-    """Of two emulated cameras, the one that the address names is opened."""
+    """The address selects one of two emulated cameras by its name."""
     world = World()
     for name, number in (("boson", 1), ("wide", 2)):
         world.add_camera(name, number)
@@ -220,7 +220,7 @@ class Port:
 
 
 def test_only_a_missing_line_is_no_rts() -> None:
-    """A terminal without RTS says so; a port that was pulled out is an error."""
+    """A port without RTS returns False; an unplugged port raises an error."""
     lines = {
         number: SerialTransport(Port(number), "serial:///dev/ttyUSB0", is_simulated=False)
         for number in (errno.ENOTTY, errno.EIO)

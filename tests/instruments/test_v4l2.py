@@ -26,7 +26,7 @@ class Memory(bytearray):
     closed = False
 
     def close(self) -> None:
-        """As of `mmap.mmap`."""
+        """Close as of `mmap.mmap`."""
         self.closed = True
 
 
@@ -209,7 +209,7 @@ def test_a_frame_is_the_readers_own() -> None:
 
 @pytest.mark.parametrize("answers", [[], [(-1, 0, 0, 0)]])
 def test_no_frame_in_time(answers: list[tuple[int, int, int, int]]) -> None:
-    """Silence, and a frame that was announced and is not there, are told apart from a loss."""
+    """A wait without a frame, and an announced frame that is missing, are no lost frames."""
     with (
         opened(Driver(answers=answers)) as capture,
         pytest.raises(NoFrameError, match="No frame from '/dev/video0'"),
@@ -218,7 +218,7 @@ def test_no_frame_in_time(answers: list[tuple[int, int, int, int]]) -> None:
 
 
 def test_unplugging_is_told_and_close_still_works() -> None:
-    """A camera that is pulled out ends the stream; nothing stays open."""
+    """An unplugged camera ends the stream with an error, and the node is closed."""
     driver = Driver()
     capture = opened(driver)
     driver.lost = errno.ENODEV
@@ -233,7 +233,7 @@ def test_unplugging_is_told_and_close_still_works() -> None:
 
 
 def test_last_frame_before_unplugging_is_kept() -> None:
-    """A camera that is gone when its buffer goes back: the frame comes, the next read tells."""
+    """The last frame before unplugging is returned, and the next read raises an error."""
     driver = Driver(answers=[(BYTES, GOOD, 0, 5)])
     capture = opened(driver)
     driver.lost, driver.lost_at = errno.ENODEV, (v4l2.QBUF,)

@@ -1,4 +1,4 @@
-"""A generic 16-bit camera: its frames, and a session in which they alone tell its shutter."""
+"""A generic 16-bit camera: its frames, and its shutter from repeated images."""
 
 from contextlib import ExitStack
 from dataclasses import replace

@@ -216,7 +216,7 @@ def test_noise_scales_and_bands_help(
 
 
 def test_order_leaves_little() -> None:
-    """The order chosen leaves no more than the tenth of a variance, one fewer leaves more."""
+    """The chosen order leaves at most a tenth of a variance, and one order less leaves more."""
     scene = scene_of(0.86, 0.72)
     found = limits.bounds(scene, RIG.response(), **NOTHING)
     first, second = linear_noise(RIG)

@@ -184,7 +184,7 @@ def test_slum(tmp_path: Path) -> None:
     ],
 )
 def test_slum_refuses(tmp_path: Path, text: str, message: str) -> None:
-    """A table with other columns, gaps or units is refused."""
+    """A table with other columns, gaps or units raises a ValueError."""
     path = tmp_path / "slum.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
@@ -226,7 +226,7 @@ def test_missing_file(tmp_path: Path, read: Callable[[Path], object]) -> None:
 
 
 def test_palette_video_gives_positions_and_times(plasma: Path) -> None:
-    """The wave comes back within 1 % of the palette, at 10 frames per second."""
+    """The wave is recovered within 1 % of the palette, at 10 frames per second."""
     movie = readers.palette_video(plasma)
     assert movie.dims == ("time", "y", "x")
     assert movie.dtype == np.float32
@@ -270,7 +270,7 @@ def test_damaged_video(plasma: Path, tmp_path: Path) -> None:
 
 
 def test_truncated_video(plasma: Path, tmp_path: Path) -> None:
-    """A file that ends its play before its last frame is refused, with both numbers."""
+    """A file that ends before its last declared frame is refused, with both numbers."""
     path = tmp_path / "short.mp4"
     whole = plasma.read_bytes()
     play = whole.index(b"elst") + 12  # the length of the play [ms]
@@ -301,7 +301,7 @@ def test_masked_palette_video(masked: Path) -> None:
 
 @pytest.mark.parametrize("width", [0, 81])
 def test_masked_palette_video_width(masked: Path, width: int) -> None:
-    """A width that the video does not have is refused."""
+    """A width beyond the video's raises a ValueError."""
     with pytest.raises(ValueError, match=f"Invalid width {width} .* from 1 to 80 pixels"):
         readers.masked_palette_video(masked, width=width)
 

@@ -123,7 +123,7 @@ def draw_pooled(fill: float = 1.0, **attrs: object) -> Figure:
 
 
 def draw_validity(**attrs: object) -> Figure:
-    """Draw two cases, one of which has no flag and nothing wrong."""
+    """Draw two cases, one of them without flags and errors."""
     stress = xr.Dataset(
         {
             "status": (("case", "pixel"), [[0, 0, 4], [0, 0, 0]]),
@@ -161,7 +161,7 @@ def draw_disturbances(**attrs: object) -> Figure:
 
 
 def draw_parallax(**attrs: object) -> Figure:
-    """Draw two views, one of which has nothing to judge once."""
+    """Draw two views, one of them with a missing value."""
     measured = treated("parallax", "flagged", "covered", **attrs)
     measured["covered"][1, 0] = np.nan
     return figures.parallax(measured)

@@ -1,4 +1,4 @@
-"""Outside files are listed with checksums, fetched from their origin, refused if altered."""
+"""Outside files: a list with checksums, downloads from their origin, errors for altered files."""
 
 import hashlib
 import re
@@ -72,7 +72,7 @@ class Quiet(SimpleHTTPRequestHandler):
     """Serve files without a line for each."""
 
     def log_message(self, *_: object) -> None:
-        """Say nothing."""
+        """Print no line."""
 
 
 def list_files(root: Path, origin: str) -> None:
@@ -177,7 +177,7 @@ def test_download(served: Path, project: Path) -> None:
 
 
 def test_download_of_an_altered_file(served: Path, project: Path) -> None:
-    """A download with a wrong checksum is refused and thrown away."""
+    """A download with a wrong checksum raises an error and is removed."""
     (served / "two.txt").write_bytes(b"seconds")
     expected = hashlib.sha256(b"second").hexdigest()
     with pytest.raises(ValueError, match=rf"two\.txt.*{expected}"):

@@ -27,7 +27,7 @@ def test_writing_appears_and_fades() -> None:
 
 
 def test_the_index_writes_the_strokes() -> None:
-    """Its tip is a radius in front of each stroke, at its place, and no other finger is nearer."""
+    """The index's tip is a radius in front of each stroke, and nearer than other fingers."""
     writing, ends = Writing(start=3.0), np.array([(f.tip[0], 0.0, f.tip[1]) for f in FINGERS])
     for time, place in zip(*writing.path(), strict=True):
         tips = pointing(writing, float(time)).outwards(ends)

@@ -198,7 +198,7 @@ def test_prints_fade() -> None:
 
 
 def test_a_visitor_moves_behind_a_print() -> None:
-    """With somebody far away the plate's background moves, and the print is the same."""
+    """A person far away moves the plate's background and leaves the print as it is."""
     alone, visited = (
         twins.twin("fingerprint", SLOW, rng(), spacing=0.006, visitor=visitor)
         for visitor in (False, True)

@@ -94,7 +94,7 @@ def test_agreement() -> None:
 
 
 def test_agreement_of_other_frames() -> None:
-    """Maps of another number of frames are refused."""
+    """Maps of another number of frames raise a ValueError."""
     ours, theirs = pair()
     with pytest.raises(ValueError, match=r"Invalid shape \(10, 30, 60\) .* Must be \(9, 30, 60\)"):
         published.agreement(ours[1:], theirs, 3)

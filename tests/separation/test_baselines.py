@@ -135,7 +135,7 @@ def test_ratio_of_a_blackbody(kind: str) -> None:
 
 
 def gray_body(kind: str, share: float) -> Tile:
-    """A gray body in a room that emits nothing, as either kind of radiance has it."""
+    """A gray body in a room without emission, for either kind of radiance."""
     apparent = []
     for name in ("8-14", "9.5"):
         band = bands.get(name)

@@ -44,7 +44,7 @@ def errors(scene: xr.Dataset, result: xr.Dataset) -> tuple[float, float]:
 
 
 def linear(noise: tuple[float, float], pixels: int) -> tuple[Tile, Unknowns]:
-    """Glass as the paper's linear identities have it, and the true unknowns but for the noise."""
+    """Glass that satisfies the paper's linear identities, and its true unknowns without noise."""
     scene, _, response = glass(noise, pixels)
     curves = [responses.curve(response, band, "linear") for band in ("8-14", "9.5")]
     names = ("object_temperature", "background_temperature")
@@ -76,7 +76,7 @@ def anywhere(frames: int = 12, columns: int = 3) -> tuple[Unknowns, Images]:
 
 
 def test_reconstruction_is_exact_at_the_truth() -> None:
-    """Without noise the true smooth signals and k2 give back the second band to rounding."""
+    """At the truth without noise the second band is reconstructed to rounding."""
     tile, truth = linear((1e-9, 1e-9), 6)
     _, _, rest = objective.departures(truth, dbvt.tensors(tile, 6, DbvtSettings()))
     assert_allclose(rest, 0.0, rtol=0, atol=1e-7)  # K; a noise of 1e-9 K was needed
@@ -102,7 +102,7 @@ def test_reconstruction_starts_from_the_second_band() -> None:
 
 
 def test_mean_of_the_noise_is_squared() -> None:
-    """Slip 3: a negative mean costs what a positive one does, and not less than nothing."""
+    """Slip 3: a negative mean of the noise costs as much as a positive one."""
     unknowns, images = anywhere()
     noise = torch.full_like(unknowns.noise, 0.6)
     for sign in (1.0, -1.0):

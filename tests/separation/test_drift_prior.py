@@ -54,7 +54,7 @@ def test_clean_intervals_are_not_too_wide(stop: int) -> None:
 
 
 def test_prior_widens_emissivity_and_background_alone() -> None:
-    """A larger drift widens their bars; no value, and nothing of the object, changes."""
+    """A larger drift widens the emissivity's and background's deviations alone."""
     _, capture, response = experiments.simulate(GLASS, RIG, TIME, 100, seed=3)
     none, some, much = [
         separation.solve(capture, response, settings=separation.SubspaceSettings(drift))

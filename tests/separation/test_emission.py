@@ -74,7 +74,7 @@ def test_background_inverts_the_image_formation() -> None:
 
 
 def test_bend_is_the_difference_of_the_responses() -> None:
-    """It is nothing for linear responses, and makes exact reflections proportional."""
+    """The bend is zero for linear responses, and makes exact reflections proportional."""
     linear, exact = tile_of((0.86, 0.72), 1, 0.0), tile_of((0.86, 0.72), 1, 0.0, "exact")
     cold = 293.0 + 12.0 * np.sin(TIME)[:, np.newaxis]  # K
     found = replace(solved(linear)[1], emissivity=np.array([[0.86], [0.72]]))

@@ -58,7 +58,7 @@ def test_labels_are_numbered_without_gaps() -> None:
 
 
 def test_mask_is_kept_beside_the_counts() -> None:
-    """A mask of frames goes into the capture, which holds nothing that is not read."""
+    """A mask of frames is kept in the capture, and unused variables are dropped."""
     inputs = checked(mask=xr.DataArray(np.arange(40) > 3, dims="time"))
     assert set(map(str, inputs.capture)) == {"counts", "mask"}
     assert int(inputs.capture["mask"].sum()) == 36

@@ -186,7 +186,7 @@ def test_one_lost_sample_costs_its_frame_alone(pair: Pair, method: str) -> None:
 
 @every_method
 def test_pixel_that_lacks_frames(pair: Pair, method: str) -> None:
-    """It is solved with the frames that it has, or flagged where all need the same frames."""
+    """A pixel with missing frames is solved, or flagged by methods that need common frames."""
     record, spoilt = separation.get_method(method), pair[0].copy(deep=True)
     spoilt["counts"].values[1, 7:10, 0, 2] = np.nan  # longer than what is bridged
     result = solve(spoilt, pair[1], method)

@@ -54,7 +54,7 @@ def lost(fraction: float, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize("band", [[0], [1], [0, 1]])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_missing_frames_are_as_if_never_taken(case: Case, band: list[int], value: float) -> None:
-    """Frames that are not numbers, in one band or both, change nothing else."""
+    """Missing frames, in one band or both, leave all other frames' results as they are."""
     _, capture, response = case
     frames = lost(0.1)
     spoilt = capture.copy(deep=True)

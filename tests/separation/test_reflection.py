@@ -64,7 +64,7 @@ def found(signal: xr.DataArray) -> xr.Dataset:
 
 @pytest.mark.parametrize("scaling", [0.0, 0.002])
 def test_ratio_and_noise(scaling: float) -> None:
-    """The ratio comes back within 3 %, the ratio of the noises within 5 %, scaled or not."""
+    """The ratio is recovered within 3 %, the ratio of the noises within 5 %."""
     attrs = separation.uncalibrated_reflection(movie(scaling)).attrs
     assert attrs["pooled_ratio"] == pytest.approx(RATIO, rel=0.03)
     assert attrs["noise_ratio"] == pytest.approx((NOISE[1] / NOISE[0]) ** 2, rel=0.05)
@@ -91,7 +91,7 @@ def test_emission_and_reflection_are_the_first_band(
 
 
 def test_reflection_is_the_true_one(found: xr.Dataset) -> None:
-    """It is off by what the noise of the best linear estimate leaves, the scaling taken out."""
+    """The reflection's error is that of the best linear estimate, without the scaling."""
     functions = smooth.polynomial_basis(TIME, found.attrs["order"])
     true = pulses().reshape(FRAMES, -1)
     true -= functions @ (functions.T @ true)

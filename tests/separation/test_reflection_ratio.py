@@ -70,7 +70,7 @@ def test_reduced_chi2_is_one_on_the_model() -> None:
 
 
 def test_null_combination_of_two_bands() -> None:
-    """Its weights are (-k, 1) / (1 - k), its variance follows by propagation."""
+    """The null combination is (-k, 1) / (1 - k), and its variance follows by propagation."""
     ratio = np.array([[1.0, 1.0], [2.0, 0.4]])
     weights, variance = reflection_ratio.null_combination(ratio, NOISE)
     expected = np.stack([-ratio[1], np.ones(2)]) / (1.0 - ratio[1])
@@ -79,7 +79,7 @@ def test_null_combination_of_two_bands() -> None:
 
 
 def test_null_combination_of_three_bands_is_the_best() -> None:
-    """It cancels the background, keeps the object, and has the lowest variance of all such."""
+    """The null combination cancels the background and has the lowest variance."""
     ratio, noise = np.array([[1.0], [2.0], [1.4]]), np.array([0.03, 0.35, 0.2])
     weights, variance = reflection_ratio.null_combination(ratio, noise)
     assert weights.sum() == pytest.approx(1.0)

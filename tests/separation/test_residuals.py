@@ -30,7 +30,7 @@ def test_line_without_outliers_is_least_squares() -> None:
 
 
 def test_line_is_not_moved_by_outliers_on_one_side() -> None:
-    """With one point in four lifted, as by a person who walks by, it stays within the noise."""
+    """The slope stays within the noise with one point in four lifted."""
     rng = np.random.default_rng(3)
     abscissa = np.repeat((TIME - 15.0)[:, np.newaxis], 200, axis=1)
     lifted = 3.0 * (rng.random(abscissa.shape) < 0.25)

@@ -84,7 +84,7 @@ def test_known_emissivities_go_along(capture: xr.Dataset) -> None:
 
 
 def test_a_pixel_that_lacks_frames_has_a_tile_of_its_own(capture: xr.Dataset) -> None:
-    """It keeps its own frames; no other pixel loses any."""
+    """A pixel with missing frames gets its own tile; no other pixel loses frames."""
     there = np.ones((40, 7, 9), dtype=bool)
     there[10:16, 1, 2] = False
     mask = xr.DataArray(there, dims=("time", "y", "x"))

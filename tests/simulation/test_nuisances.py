@@ -71,7 +71,7 @@ def rows(events: xr.Dataset) -> list[tuple[str, int, int, bool]]:
 
 
 def test_shutter_events_are_found(clean: xr.Dataset) -> None:
-    """Each closing of each camera is found with all of its frames, and nothing else."""
+    """Each shutter event of each camera is found with all of its frames, without false ones."""
     rng = np.random.default_rng(2)
     capture = nuisances.fire_shutter(clean, [8.0, 20.04], rng, duration=0.55)
     capture = nuisances.fire_shutter(capture, 30.0, rng, bands=("9.5",))
@@ -159,7 +159,7 @@ def test_frames_known_to_be_closed() -> None:
     ids=["overlap", "touch", "apart", "two in one", "ends"],
 )
 def test_events_that_overlap_are_one(runs: list[tuple[str, int, int]], segments: list[int]) -> None:
-    """As few segments as leave each camera a change between its frames before and after."""
+    """Overlapping events share a segment, with a change between real frames of each camera."""
     names = ("band", "first_frame", "frames")
     parts = zip(*runs, strict=True)
     columns = {name: ("event", list(part)) for name, part in zip(names, parts, strict=True)}
@@ -172,7 +172,7 @@ def test_events_that_overlap_are_one(runs: list[tuple[str, int, int]], segments:
 
 
 def test_shutter_is_marked_once_and_says_so(clean: xr.Dataset) -> None:
-    """Provenance is written, the input is left, and a second marking is refused."""
+    """Provenance is written, the input is not changed, and a second marking raises an error."""
     capture = nuisances.fire_shutter(clean, 20.0, np.random.default_rng(2), bands=("8-14",))
     before = capture.copy(deep=True)
     marked = mark_shutter(capture)

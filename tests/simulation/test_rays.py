@@ -110,7 +110,7 @@ def test_sphere_mirrors_as_the_law_says() -> None:
 
 
 def test_mirror_law() -> None:
-    """The angle to the normal is kept, and mirroring twice is doing nothing."""
+    """The angle to the normal is kept, and mirroring twice is the identity."""
     rng = np.random.default_rng(2)
     directions, normals = unit(rng.normal(size=(2, 50, 3)))
     mirrored = mirror(directions, normals)
@@ -139,7 +139,7 @@ def test_values_are_interpolated_linearly() -> None:
 
 
 def test_hidden_points() -> None:
-    """Of a sphere's points those within the horizon's cone are seen, and no other."""
+    """The visible points of a sphere are those within the horizon's cone."""
     points = RADIUS * unit(np.random.default_rng(4).normal(size=(500, 3)))
     fine = sphere(subdivisions=5)
     height = points @ np.array([0.0, -1.0, 0.0])
@@ -206,7 +206,7 @@ def test_person_crosses_when_predicted() -> None:
 
 
 def test_the_nearest_actor_hides_the_others() -> None:
-    """Of two bodies along a ray the nearer one is seen, in whichever order they are given."""
+    """Of two bodies along a ray the nearer one is seen, in either order."""
     near = ball(0.2, 300.0, motion=lambda _: Pose(translation=(0.0, -2.0, 0.0)))
     far = ball(0.4, 310.0, motion=lambda _: Pose(translation=(0.0, -3.0, 0.0)))
     ray = np.zeros((1, 3)), np.array([[0.0, -1.0, 0.0]])

@@ -92,7 +92,7 @@ def test_one_pulse(rng: np.random.Generator) -> None:
 
 
 def test_number_of_pulses(rng: np.random.Generator) -> None:
-    """Six to nine pulses, each number as often: told by pulses that outlast the capture."""
+    """The number of pulses is uniform from six to nine."""
     drawn = Background(duration=(100.0, 101.0)).draw(TIME, 2000, rng)
     number, times = np.unique(np.rint((drawn[-1] - 295.15) / 3.0), return_counts=True)
     assert number.tolist() == [6, 7, 8, 9]
@@ -300,7 +300,7 @@ def test_calibration_undoes_the_detector(
 
 
 def test_contact_measurements(known: xr.Dataset, rng: np.random.Generator) -> None:
-    """The counts are of the true temperatures, the readings off by their deviations."""
+    """Counts follow the true temperatures; readings scatter by their deviations."""
     warm, cold = np.full(4000, 320.0), np.full(4000, 295.0)
     made = simulation.contact_measurements(known, GLASS, warm, cold, (0.1, 0.05), rng)
     for name, level, std in (("object", 320.0, 0.1), ("background", 295.0, 0.05)):

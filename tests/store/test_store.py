@@ -70,7 +70,7 @@ def test_dataset_comes_back_identical(capture: xr.Dataset, tmp_path: Path) -> No
 def test_any_array_comes_back(
     values: np.ndarray[Any, np.dtype[Any]], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """Any numbers of any shape come back bit by bit, infinities and gaps too."""
+    """Any array is read back bit by bit, infinities and NaN included."""
     path = tmp_path_factory.mktemp("any") / "a.zarr"
     dims = ("band", "time", "y", "x")[-values.ndim :]
     store.save(xr.Dataset({"value": (dims, values)}), path, RECORD)
@@ -181,7 +181,7 @@ def test_damaged_numbers_are_refused(text: str, tmp_path: Path) -> None:
 
 
 def test_figure_is_the_same_twice(tmp_path: Path) -> None:
-    """The same figure gives the same bytes, and tells what made it."""
+    """The same figure gives the same bytes, with its provenance."""
     for name in ("a.png", "b.png"):
         figure = Figure(figsize=(2, 1))
         figure.subplots().plot([293.15, 294.15])
@@ -213,7 +213,7 @@ def test_record_holds_what_made_a_result(tmp_path: Path) -> None:
 
 
 def test_parameter_must_be_plain(tmp_path: Path) -> None:
-    """A parameter that JSON cannot hold is refused by name."""
+    """A parameter that JSON cannot hold raises an error with its name."""
     with pytest.raises(ValueError, match="Invalid parameter 'noise' = nan"):
         store.provenance({"noise": math.nan})
     with pytest.raises(TypeError, match="Invalid parameter 'folder' = "):
@@ -243,7 +243,7 @@ def film(*shapes: tuple[int, int]) -> list[np.ndarray]:
 
 
 def test_video_comes_back(tmp_path: Path) -> None:
-    """As many frames, at their rate, of nearly their colours, with the record as a comment."""
+    """A video has its frames, rate and nearly its colours, and the provenance as a comment."""
     store.save_video(film((32, 48), (32, 48), (32, 48)), tmp_path / "a.mp4", RECORD, rate=10.0)
     with av.open(tmp_path / "a.mp4") as video:
         assert video.streams.video[0].average_rate == 10
