@@ -35,7 +35,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> ModuleType:
-    """Import the module `name` of this package when it is first asked for (PEP 562)."""
+    """Import the module `name` of this package when it is first used (PEP 562)."""
     if name in __all__:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"Unknown module {name!r} in {__name__}. Must be one of {__all__}.")

@@ -36,7 +36,7 @@ Mask = npt.NDArray[np.bool_]
 _PIXELS: Final = 16384
 # Fewest frames from which an offset is estimated.
 _MINIMUM_FRAMES: Final = 32
-# Groups of pixels whose agreement tells the offset's standard deviation.
+# Groups of pixels of the jackknife, which gives the offset's standard deviation.
 _GROUPS: Final = 16
 _SIGNIFICANCE: Final = 6.0
 # Largest standard deviation of an offset [frame].

@@ -101,7 +101,7 @@ def align(
     names = [str(name) for name in schema.check(corrected, "corrected")["band"].values]
     matrices = None if transform is None else _matrices(transform, names)
     if matrices is not None:
-        # First of all: what moves passes an unregistered view earlier or later.
+        # Registered first: a moving reflection passes an unregistered view earlier or later.
         corrected = _registered(corrected, matrices)
     counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]

@@ -1,4 +1,4 @@
-"""Correction of a camera's raw counts: what the detector adds to the signal is undone or marked.
+"""Correction of a camera's raw counts: errors of the detector are undone or marked.
 
 Begin with `fit_correction` (gain, offset and bad pixels from a blackbody, whose movies
 `blackbody_statistics` reduces); then `correct_capture` does all of it in one documented order. Its

@@ -35,7 +35,7 @@ def __dir__() -> list[str]:
 def canvas(
     rows: int, columns: int, size: tuple[float, float]
 ) -> tuple[Figure, npt.NDArray[np.object_]]:
-    """Figure and axes (rows, columns), owned by nobody but the caller."""
+    """Figure and axes (rows, columns), which are not registered with pyplot."""
     figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     plt.close(figure)
     return figure, axes

@@ -299,7 +299,7 @@ def camera_kind(name: str) -> CameraKind:
 class Shutter:
     """State of one camera's shutter after a frame; see `next_shutter`."""
 
-    closed: bool = False  # whether the frame is flagged `FrameFlag.SHUTTER_CLOSED`
+    closed: bool = False  # True if the frame is flagged `FrameFlag.SHUTTER_CLOSED`
     copies: int = 0  # frames in a row, up to this one, that repeat the image before
     last_ffc_frame: int | None = None  # frame of the last correction, from telemetry
 

@@ -1,4 +1,4 @@
-"""Devices of the rig on the USB bus: their nodes, and what keeps them from being used.
+"""Devices of the rig on the USB bus: their nodes, and warnings about drivers and permissions.
 
 The bus is only listed, through pyusb, and the serial ports by pyserial: no configuration is set,
 nothing is reset, claimed or detached from its kernel driver, for the devices may be recording. A
@@ -184,7 +184,7 @@ def _enumerate(backend: Any, kind: Kind) -> Iterator[Any]:
 
 
 def _device(kind: Kind, raw: Any, terminals: list[Any], sysfs: Path, dev: Path) -> Device:
-    """Device of the bus with its nodes and with what stands in the way of their use."""
+    """Device of the bus with its nodes and the warnings about their use."""
     ports = tuple(raw.port_numbers or ())
     device = Device(kind, raw.bus, ports, SPEEDS.get(raw.speed, "unknown"))
     serial, problem = _serial_number(kind, raw)

@@ -268,7 +268,7 @@ class TC08(Closing):
         unit = (UnitInfo * 1)()
         unit[0].size = ctypes.sizeof(UnitInfo)
         if not self._library.usb_tc08_get_unit_info(self._open_handle(), unit):
-            raise self._error("tell what it is")
+            raise self._error("read its identity")
         texts = (unit[0].serial, unit[0].calibration_date, unit[0].driver)
         serial, date, driver = (text.decode("ascii", "backslashreplace") for text in texts)
         versions = unit[0].hardware, unit[0].variant
@@ -319,7 +319,7 @@ class TC08(Closing):
         """
         handle = self._open_handle()
         if not self._has_channels:
-            raise RuntimeError("The TC-08 has no channels yet. Must be told them first.")
+            raise RuntimeError("The TC-08 has no channels yet. Must be set by set_channels first.")
         values, overflow = (c_float * CHANNELS)(), (c_int16 * 1)()
         start = self._clock()
         done = self._library.usb_tc08_get_single(handle, values, overflow, KELVIN)

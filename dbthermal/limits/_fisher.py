@@ -35,7 +35,7 @@ QUANTITIES: Final = (
 _NEGLIGIBLE: Final = 0.1
 _HIGHEST_ORDER: Final = 30
 # Information in a direction, relative to that on its parameters were each the only unknown, below
-# which it is rounding: a deviation a million times larger tells nothing of any quantity here.
+# which it is rounding: a deviation a million times larger is no information on any quantity here.
 _ROUNDING: Final = 1e-12
 # Squared share of a quantity's gradient along such directions, above which it depends on them.
 _DEPENDENT: Final = 1e-8

@@ -12,7 +12,7 @@ from dbthermal import mixing, planck, schema
 from dbthermal.bands import FILTERS, Band
 from dbthermal.limits._fisher import Array, TopHat, Truth, deviations, smallest_order
 
-# Best filter of a material whose temperature no filter determines.
+# Entry of a material without a best filter: none of them determines its temperature.
 _NO_FILTER: Final = "none"
 # Time constant of the object's warming, as a share of the capture.
 _TIME_CONSTANT: Final = 1.0 / 3.0

@@ -32,7 +32,7 @@ __all__ = [
     "uncalibrated_reflection",
 ]
 
-# The settings are imported with their method when they are first asked for: one needs torch.
+# The settings are imported with their method when they are first used: one needs torch.
 _SETTINGS: Final = {
     "BcpSettings": "_baselines.bcp",
     "DbvtSettings": "_dbvt",

@@ -31,7 +31,7 @@ class Method:
     separate: Callable[..., Any]  # `Estimate` of a `Tile`, and of the settings where there are any
     settings: type[Any] | None = None  # frozen dataclass; a field `batch` is a tile's pixels
     minimum_frames: int = 1
-    knows_emissivity: bool = False  # is given the emissivities, and does not estimate them
+    knows_emissivity: bool = False  # needs known emissivities, and does not estimate them
     whole_image: bool = False  # looks at a pixel's neighbours: a tile is the whole image
     every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
     even_times: bool = False  # refuses frames at uneven times, by name

@@ -34,7 +34,7 @@ def status_bits(conditions: Mapping[Status, Mask]) -> Bits:
 
 
 def unusable(status: Bits) -> Mask:
-    """Return the pixels of which nothing can be computed."""
+    """Return the pixels that cannot be separated."""
     return np.asarray((status & _UNUSABLE) != 0)
 
 

@@ -1,4 +1,4 @@
-r"""Ray casting: what a pinhole camera sees of a mesh, and where its mirror-like surface reflects.
+r"""Ray casting: intersections of camera rays with a mesh, and rays mirrored at its surface.
 
 Meshes are `trimesh.Trimesh`, directions unit vectors in a world whose z points up, lengths in
 metres. The mirror law is :math:`r = d - 2 (d \cdot n) n` for a ray along d and a unit normal n,

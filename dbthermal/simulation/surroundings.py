@@ -1,4 +1,4 @@
-"""Surroundings of an object: a room, and bodies that move in it; what reflected rays meet.
+"""Surroundings of an object: a room, and bodies that move in it, as seen by reflected rays.
 
 A ray carries the temperature of the first body that it meets, or that of the room. All are taken
 as blackbodies: skin, clothes, walls and hot drinks have emissivities of 0.95 and more.

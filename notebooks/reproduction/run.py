@@ -65,7 +65,7 @@ class Run:
         return store.open_dataset(self.input(f"{stem}{ending}", path)).load()
 
     def data(self, collection: str) -> dict[str, Path]:
-        """Verified outside files of a collection, name to path; empty if it is not at hand."""
+        """Verified outside files of a collection, name to path; empty if it is not available."""
         if not manifest.available(collection):
             return {}
         sums = manifest.provenance(collection)

@@ -75,7 +75,7 @@ def agreement(reflection: xr.DataArray, theirs: xr.Dataset, strongest: int) -> x
             f"Must be {reflection.shape}."
         )
     theirs = theirs.assign_coords({dim: reflection[dim] for dim in ("time", "y", "x")})
-    # Smoothed within the object alone: what lies beside it neither enters nor dims its edge.
+    # Smoothed within the object alone: its surroundings neither enter nor dim its edge.
     inside, width = theirs["valid"].values.astype(np.float64), (0.0, SMOOTHING, SMOOTHING)
     smoothed = gaussian_filter(reflection.values * inside, width)
     weight = gaussian_filter(inside, width)

@@ -4,11 +4,11 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
+from device_benches import Clock
 from dialogue import Dialogue
 from faulty_boson import DEBUG_CHANNEL
 from hypothesis import given
 from hypothesis import strategies as st
-from rig_devices import Clock
 from test_fslp import ESCAPED_REPLY, SERIAL_REPLY, SERIAL_REQUEST
 
 from dbthermal.instruments import fslp

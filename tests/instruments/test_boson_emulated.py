@@ -4,11 +4,11 @@ from collections import deque
 from typing import Any
 
 import pytest
+from device_benches import BosonBench, Clock
 from faulty_boson import Fault, FaultyBoson
 from hypothesis import given
 from hypothesis import strategies as st
-from loop import Loop
-from rig_devices import BosonBench, Clock
+from loopback import Loop
 from test_boson import SERIAL, SET_GAIN
 from test_fslp import SERIAL_REQUEST
 

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 
 import pytest
+from device_benches import BosonBench, Clock
 from dialogue import Dialogue, Pair
 from faulty_boson import Fault
-from rig_devices import BosonBench, Clock
 from test_boson import reply
 
 from dbthermal.instruments import fslp

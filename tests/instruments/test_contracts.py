@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from device_benches import FILTERS
+from device_openings import CAMERAS, LOGGERS, VIDEOS, WHEELS, Opened, Opening
 from faulty_camera import frames
-from rig_devices import FILTERS
-from rig_openings import CAMERAS, LOGGERS, VIDEOS, WHEELS, Opened, Opening
 
 from dbthermal.instruments import inventory
 from dbthermal.instruments.boson import Boson, commands

@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from rig_devices import BosonBench
+from device_benches import BosonBench
 from rig_session import TEXT, bench, pictures, replaced, rig
 
 from dbthermal.instruments.boson import Boson, BosonTimeoutError, commands

@@ -5,7 +5,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from loop import Loop
+from loopback import Loop
 from test_transport import Echo
 
 from dbthermal.instruments import transport

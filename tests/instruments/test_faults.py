@@ -1,8 +1,8 @@
 """Every fault of the rig: its error or its mark in a recording, and no frame lost for it.
 
-What is asked of an instrument goes through its driver to its emulator, on a clock of its own; the
-frames come from two emulated cameras in real time, and each picture tells when it was seen. Frames
-that a busy machine loses are losses like others, so all is held against what came (`rig_take`).
+Instruments are read by their drivers on emulators with a simulated clock; frames come from two
+emulated cameras in real time, with counts that tell their time. Frames that a busy machine loses
+are counted as losses, and every recording is checked against its frames (`checked_recording`).
 """
 
 import math
@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked_recording import CheckedRecording, Read, session
+from device_benches import BosonBench, LoggerBench, WheelBench
 from faulty_boson import Fault, FaultyBoson
 from faulty_camera import Faults
-from rig_devices import BosonBench, LoggerBench, WheelBench
-from rig_take import Read, Take, session
 
 from dbthermal import store
 from dbthermal.correction import find_shutter
@@ -35,7 +35,7 @@ from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.tc08 import TC08, TC08Error
 from dbthermal.instruments.transport import TransportError
 
-# Cameras: what goes wrong with their frames.
+# Cameras: faults of their frames.
 
 OFTEN = frozenset(range(6, 60, 5))
 AFTER = frozenset(number + 1 for number in OFTEN)
@@ -48,25 +48,25 @@ DAMAGES = {
     "dropped and corrupt": (Faults(dropped=OFTEN, corrupt=AFTER), ERROR | LOST, "damaged"),
     "shutter": (Faults(ffc=frozenset(range(6, 15))), FrameFlag.SHUTTER_CLOSED, "shutter_closed"),
 }
-"""What happens to which frames, the flag that tells it, and the note in the log."""
+"""Faults of frames, the flag and the note in the log of each."""
 
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_frames(name: str, tmp_path: Path) -> None:
     """Damage is flagged and noted for its own camera, and for no other."""
     faults, flag, kind = DAMAGES[name]
-    take = Take(tmp_path / "a.zarr", {"9.5": faults}).record(0.5)
-    flags = [FrameFlag(int(value)) for value in take.stored("9.5")["frame_flags"]]
+    recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": faults}).record(0.5)
+    flags = [FrameFlag(int(value)) for value in recorded.stored("9.5")["frame_flags"]]
     assert any(flag in found for found in flags)
-    assert kind in take.kinds("9.5")
-    assert {*take.kinds("8-14")} <= {"frames_lost"}
-    assert take.summary.ended == "duration"
+    assert kind in recorded.kinds("9.5")
+    assert {*recorded.kinds("8-14")} <= {"frames_lost"}
+    assert recorded.summary.ended == "duration"
 
 
 def test_a_repeated_image(tmp_path: Path) -> None:
     """The recording keeps it as it came and says so, and afterwards it is found and taken out."""
-    take = Take(tmp_path / "a.zarr", {"9.5": Faults(repeated=OFTEN)}).record(0.4)
-    capture = open_capture(take.path).isel(time=slice(0, len(take.cameras["9.5"].given)))
+    recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(repeated=OFTEN)}).record(0.4)
+    capture = open_capture(recorded.path).isel(time=slice(0, len(recorded.cameras["9.5"].frames)))
     found = find_shutter(capture).query(event="band == '9.5'")
     repeated = np.isin(capture["sequence"].sel(band="9.5"), [*OFTEN])
     flagged = capture["frame_flags"].sel(band="9.5").values & int(FrameFlag.IMAGE_REPEATED)
@@ -77,8 +77,8 @@ def test_a_repeated_image(tmp_path: Path) -> None:
 
 def test_a_corrupt_frame_that_nobody_tells(tmp_path: Path) -> None:
     """A corrupt frame that the driver does not report is not detected."""
-    take = Take(tmp_path / "a.zarr", {"9.5": Faults(unseen=OFTEN)}).record(0.4)
-    kept = take.stored("9.5")
+    recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(unseen=OFTEN)}).record(0.4)
+    kept = recorded.stored("9.5")
     corrupt = np.isin(kept["sequence"], [*OFTEN])
     assert corrupt.any()
     assert {*kept["frame_flags"].values[corrupt]} <= {0, int(LOST)}
@@ -86,30 +86,34 @@ def test_a_corrupt_frame_that_nobody_tells(tmp_path: Path) -> None:
 
 def test_an_unplugged_camera(tmp_path: Path) -> None:
     """The other camera is recorded to the end, and the store says whose frames end where."""
-    take = Take(tmp_path / "a.zarr", {"9.5": Faults(unplugged=12)}).record(0.6)
-    assert take.summary.ended == "source lost"
-    assert take.kinds("9.5")[-1] == "source_lost"
-    assert take.cameras["9.5"].given[-1].sequence < 12 < take.cameras["8-14"].given[-1].sequence
-    opened = open_capture(take.path)
-    after = opened.sel(band="9.5").isel(time=slice(len(take.cameras["9.5"].given), None))
+    recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(unplugged=12)}).record(0.6)
+    assert recorded.summary.ended == "source lost"
+    assert recorded.kinds("9.5")[-1] == "source_lost"
+    assert (
+        recorded.cameras["9.5"].frames[-1].sequence
+        < 12
+        < recorded.cameras["8-14"].frames[-1].sequence
+    )
+    opened = open_capture(recorded.path)
+    after = opened.sel(band="9.5").isel(time=slice(len(recorded.cameras["9.5"].frames), None))
     assert opened.attrs["complete"] is False
     assert np.isnan(after["exposure_time"]).all()
 
 
 def test_a_clock_that_drifts(tmp_path: Path) -> None:
     """Stamps of a camera's own clock are kept, are no times, and are fitted on demand only."""
-    take = Take(tmp_path / "a.zarr", {"9.5": Faults(clock_rate=1.01)}).record(0.4)
+    recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(clock_rate=1.01)}).record(0.4)
     with pytest.raises(ValueError, match=r"Invalid exposure times of band '9\.5': 0 stamps"):
-        open_capture(take.path)
-    fitted = open_capture(take.path, fitted=True)["exposure_time"].sel(band="9.5")
-    given = take.cameras["9.5"].given
-    device, host = ([getattr(f, name) for f in given] for name in ("device_time", "host_time"))
+        open_capture(recorded.path)
+    fitted = open_capture(recorded.path, fitted=True)["exposure_time"].sel(band="9.5")
+    frames = recorded.cameras["9.5"].frames
+    device, host = ([getattr(f, name) for f in frames] for name in ("device_time", "host_time"))
     line = np.polynomial.Polynomial.fit(device, host, 1)
-    expected = line(np.array(device)) - store.open_dataset(take.path).attrs["clock_origin"]
-    np.testing.assert_allclose(fitted[: len(given)], expected, rtol=0, atol=1e-6)
+    expected = line(np.array(device)) - store.open_dataset(recorded.path).attrs["clock_origin"]
+    np.testing.assert_allclose(fitted[: len(frames)], expected, rtol=0, atol=1e-6)
 
 
-# Instruments: what goes wrong with what is asked beside the frames.
+# Instruments: faults of the devices that are read beside the frames.
 
 FPA, SLOT, TIP, ROOM = 308.15, 3.0, 350.0, 296.15
 
@@ -204,8 +208,8 @@ TROUBLES: dict[str, tuple[Callable[[], Instrument], float | Error]] = {
     "wheel: stale answers": (lambda: wheel(late=1.2), SLOT),
     "wheel: one answer in many reads": (lambda: wheel(single_bytes=True), SLOT),
     "wheel: noise": (lambda: wheel(noise=b"\xff\x12\x04"), SLOT),
-    "wheel: reports that nobody asked for": (lambda: wheel(stray_completed=True), SLOT),
-    "wheel: an error that nobody asked for": (lambda: wheel(notice="motor hot"), SLOT),
+    "wheel: unsolicited reports": (lambda: wheel(stray_completed=True), SLOT),
+    "wheel: an unsolicited error": (lambda: wheel(notice="motor hot"), SLOT),
     "wheel: silent": (lambda: wheel(silent=True), (NoReplyError, "must be on and in no other")),
     "wheel: stalled": (stalled_wheel, (NotHomedError, "has lost steps since. Must be homed")),
     "wheel: between two slots": (stopped_wheel, (WheelError, "between two slots, at .* deg")),
@@ -222,7 +226,7 @@ TROUBLES: dict[str, tuple[Callable[[], Instrument], float | Error]] = {
 """What is done to which instrument, and what its user gets: a number, or an error."""
 
 
-def asked(device: Instrument) -> Read:
+def read_by_user(device: Instrument) -> Read:
     """Function with which a user reads an instrument."""
     if isinstance(device, TC08):
         return lambda: float(device.single().temperature[1])
@@ -243,7 +247,7 @@ def read_beside_frames(device: Instrument) -> Read:
 def test_what_the_user_sees(name: str) -> None:
     """A fault is overcome repeatedly, or raises an error that names it."""
     make, sees = TROUBLES[name]
-    ask = asked(make())
+    ask = read_by_user(make())
     for _ in range(3):
         if isinstance(sees, float):
             assert ask() == pytest.approx(sees, abs=0.05, nan_ok=True)
@@ -253,7 +257,7 @@ def test_what_the_user_sees(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def troubled(tmp_path_factory: pytest.TempPathFactory) -> Take:
+def troubled(tmp_path_factory: pytest.TempPathFactory) -> CheckedRecording:
     """One recording during which every instrument has faults and is slow."""
 
     def slowly(read: Read) -> Read:
@@ -264,11 +268,11 @@ def troubled(tmp_path_factory: pytest.TempPathFactory) -> Take:
         return wait_and_read
 
     readings = {name: slowly(read_beside_frames(make())) for name, (make, _) in TROUBLES.items()}
-    return Take(tmp_path_factory.mktemp("troubled") / "a.zarr").record(0.8, readings)
+    return CheckedRecording(tmp_path_factory.mktemp("troubled") / "a.zarr").record(0.8, readings)
 
 
 @pytest.mark.parametrize("name", TROUBLES)
-def test_what_is_recorded(name: str, troubled: Take) -> None:
+def test_what_is_recorded(name: str, troubled: CheckedRecording) -> None:
     """Valid readings are in the log, all others are noted as failed, and no frame is lost."""
     sees, found = TROUBLES[name][1], troubled.noted(name)
     if isinstance(sees, float) and not math.isnan(sees):
@@ -281,14 +285,14 @@ def test_what_is_recorded(name: str, troubled: Take) -> None:
 
 def test_a_correction_that_stalls_replies_and_freezes_frames(tmp_path: Path) -> None:
     """The camera answers after its shutter opened; its frames say that it was closed."""
-    take = Take(tmp_path / "a.zarr", {"9.5": Faults(ffc=frozenset(range(8, 20)))})
-    device = FaultyBoson(take.world, "9.5")
+    recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(ffc=frozenset(range(8, 20)))})
+    device = FaultyBoson(recorded.world, "9.5")
     device.faults.ffc_stalls = True
     with EmulatedPort(device) as port, Boson.from_url(f"pty://{port.path}", timeout=20) as boson:
-        take.record(1.0, {"fpa": read_beside_frames(boson)})
+        recorded.record(1.0, {"fpa": read_beside_frames(boson)})
         assert boson.statistics.timeouts == 0
-    assert "shutter_closed" in take.kinds("9.5")
-    assert {*take.kinds("fpa")} == {"reading"}
+    assert "shutter_closed" in recorded.kinds("9.5")
+    assert {*recorded.kinds("fpa")} == {"reading"}
 
 
 def test_an_instrument_that_is_pulled_out(tmp_path: Path) -> None:
@@ -301,6 +305,6 @@ def test_an_instrument_that_is_pulled_out(tmp_path: Path) -> None:
         bench.device.plugged = next(left, False)
         return bench.wheel.position()
 
-    take = Take(tmp_path / "a.zarr").record(0.5, {"slot": read})
-    assert take.noted("slot")[:2] == [("reading", SLOT)] * 2
-    assert {*take.kinds("slot")[2:]} == {"reading_failed"}
+    recorded = CheckedRecording(tmp_path / "a.zarr").record(0.5, {"slot": read})
+    assert recorded.noted("slot")[:2] == [("reading", SLOT)] * 2
+    assert {*recorded.kinds("slot")[2:]} == {"reading_failed"}

@@ -1,8 +1,8 @@
 """The filter wheel: its places, its settings, and the emulated wheel in memory and on a line."""
 
 import pytest
-from loop import Loop
-from rig_devices import FILTERS, QUICK, WheelBench
+from device_benches import FILTERS, QUICK, WheelBench
+from loopback import Loop
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.emulated.apt import EmulatedApt, start

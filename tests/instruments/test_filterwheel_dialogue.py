@@ -1,10 +1,10 @@
 """The filter wheel's driver byte for byte, and among foreign and invalid answers."""
 
 import pytest
+from device_benches import FILTERS, Clock
 from dialogue import Dialogue, Pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rig_devices import FILTERS, Clock
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.apt import Id, command

@@ -3,9 +3,9 @@
 import logging
 
 import pytest
+from device_benches import Clock, WheelBench
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rig_devices import Clock, WheelBench
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.filterwheel import (

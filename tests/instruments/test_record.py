@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from device_benches import Clock
 from faulty_camera import Faults, FaultyCamera
-from rig_devices import Clock
 
 from dbthermal import alignment, correction, store
 from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from device_benches import LoggerBench
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from rig_devices import LoggerBench
 
 from dbthermal.instruments import tc08
 from dbthermal.instruments.emulated.world import World
@@ -99,7 +99,7 @@ def test_close_is_idempotent(rig: LoggerBench) -> None:
     assert rig.driver.open().identity().serial_number == "EMULATED"
     with pytest.raises(RuntimeError, match="open already"):
         rig.driver.open()
-    with pytest.raises(RuntimeError, match="Must be told them first"):
+    with pytest.raises(RuntimeError, match="Must be set by set_channels first"):
         rig.driver.single()
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_openings import real_video
+from device_openings import real_video
 from test_v4l2 import BYTES, GOOD, Driver
 
 from dbthermal import correction

@@ -1,4 +1,4 @@
-"""Contract of all methods: what `solve` promises holds for every one that is registered."""
+"""Contract of all methods: properties of `solve` that hold for every registered method."""
 
 from collections.abc import Callable
 from typing import Any
@@ -87,7 +87,7 @@ def test_record(method: str) -> None:
 
 @every_method
 def test_result_is_as_the_schema_has_it(pair: Pair, method: str) -> None:
-    """Dims, dtypes and units are the glossary's; the capture is unchanged; the origin is said."""
+    """The result satisfies the glossary, names its method, and leaves the capture unchanged."""
     before = pair[0].copy(deep=True)
     result = solve(*pair, method)
     schema.check(result, "separated")
@@ -144,7 +144,7 @@ def test_number_of_threads_changes_nothing(method: str) -> None:
 
 @every_method
 def test_slightly_uneven_times(method: str) -> None:
-    """An interval that varies by a fifth is taken by every method."""
+    """Intervals that vary by a fifth are accepted by every method."""
     time = TIME + np.random.default_rng(2).uniform(-0.01, 0.01, TIME.size)
     result = solve(capture_of((2, 6), time), RIG.response(), method)
     assert bool(result["object_temperature"].notnull().any())
@@ -153,7 +153,7 @@ def test_slightly_uneven_times(method: str) -> None:
 @every_method
 @pytest.mark.parametrize("gap", ["times", "nan"])
 def test_lost_frames(pair: Pair, method: str, gap: str) -> None:
-    """Lost frames are NaN and the others solved; who needs even times has `even_times`."""
+    """Lost frames are NaN and the others solved; methods that need even times say so."""
     capture, response = pair
     kept = np.ones(TIME.size, dtype=bool)
     kept[[7, *range(30, 36)]] = False
@@ -198,7 +198,7 @@ def test_pixel_that_lacks_frames(pair: Pair, method: str) -> None:
 
 
 def mark_dead(capture: xr.Dataset) -> xr.Dataset:
-    """One pixel is dead, as the correction says, and hot."""
+    """Mark a hot pixel as dead in the status."""
     capture["counts"].values[:, :, 1, 2] = 60000.0
     status = np.zeros((4, 6), dtype=np.uint32)
     status[1, 2] = Status.DEAD_PIXEL
@@ -206,13 +206,13 @@ def mark_dead(capture: xr.Dataset) -> xr.Dataset:
 
 
 def lose_samples(capture: xr.Dataset) -> xr.Dataset:
-    """Three frames in five of a pixel are not a number, in one band."""
+    """Set three frames in five of a pixel to NaN, in one band."""
     capture["counts"].values[0, :72, 1, 2] = np.nan
     return capture
 
 
 def stop_changing(capture: xr.Dataset) -> xr.Dataset:
-    """One pixel of one band never changes."""
+    """Set one pixel of one band to a constant."""
     capture["counts"].values[1, :, 1, 2] = 16000.0
     return capture
 
@@ -229,7 +229,7 @@ def stop_changing(capture: xr.Dataset) -> xr.Dataset:
 def test_bad_pixel_is_flagged_and_alone(
     pair: Pair, method: str, spoil: Callable[[xr.Dataset], xr.Dataset], bit: Status
 ) -> None:
-    """A pixel that nothing can be computed of is NaN with its flag, and no other has the flag.
+    """An unusable pixel is NaN with its flag, and no other pixel has the flag.
 
     The others keep their values, unless the method looks at neighbours or draws random starts.
     """
@@ -260,7 +260,7 @@ def test_status_of_the_correction_is_kept(pair: Pair, method: str) -> None:
 @every_method
 @pytest.mark.parametrize("value", [0.0, -1e6, 1e9, np.inf, np.nan])
 def test_hostile_counts_are_no_error(pair: Pair, method: str, value: float) -> None:
-    """Counts that no scene has, in one pixel or in all, leave a flag and no exception."""
+    """Impossible counts, in one pixel or in all, give a flag and no exception."""
     capture, response = pair
     one, whole = capture.copy(deep=True), capture.copy(deep=True)
     one["counts"].values[:, :80, 1, 2] = value
@@ -288,7 +288,7 @@ def test_temperature_outside_the_response_is_flagged(
 
 @every_method
 def test_third_band_is_taken_or_refused(method: str) -> None:
-    """Two equations, two bands: a third one is refused before anything else."""
+    """A third band is solved, or raises a ValueError in a method for two bands."""
     rig = Rig(bands=("8-14", "9.5", "10.6"), noise=(0.03, 0.35, 0.15))
     emissivity = emissivity_of(0.86, 0.72, 0.88, bands=rig.bands)
     capture, response = capture_of((4, 6), TIME, emissivity, rig), rig.response()
@@ -302,7 +302,7 @@ def test_third_band_is_taken_or_refused(method: str) -> None:
 
 @every_method
 def test_demands_are_said(pair: Pair, method: str) -> None:
-    """Short captures, needless or missing emissivities, pools and settings: errors that name it."""
+    """Unmet demands of a method raise an error that names them."""
     record = separation.get_method(method)
     if record.minimum_frames > 1:
         frames = record.minimum_frames - 1

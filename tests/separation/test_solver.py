@@ -37,7 +37,7 @@ def test_tiles_draw_for_themselves() -> None:
 
 @pytest.mark.parametrize("method", ["naive", "dbvt"])
 def test_random_starts_hang_on_the_seed_alone(capture: xr.Dataset, method: str) -> None:
-    """Random starts depend on the seed alone, not on the number of threads."""
+    """Random starts depend on the seed: the same one repeats the result, another changes it."""
     response = Rig().response()
     few = separation.DbvtSettings(steps=3, stages=1) if method == "dbvt" else None
     first, again, other = (
@@ -121,7 +121,7 @@ def test_progress_is_shown(capture: xr.Dataset, capsys: pytest.CaptureFixture[st
 
 
 def test_options_are_recorded(capture: xr.Dataset) -> None:
-    """The result records its settings, and the quantities that are not estimated."""
+    """The result records the settings of its method."""
     result = separation.solve(
         capture, Rig().response(), "ratio", settings=separation.RatioSettings("narrow")
     )

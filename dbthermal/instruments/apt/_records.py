@@ -175,7 +175,7 @@ class Notice:
 
     @classmethod
     def parse(cls, message: Message) -> Self:
-        """Error of HW_RICHRESPONSE, or of HW_RESPONSE, which says nothing more."""
+        """Error of HW_RICHRESPONSE, or of HW_RESPONSE, which has no further data."""
         if message.id == Id.HW_RESPONSE:
             return cls(0, 0, "an error without a text")
         data = _data(message, (Id.HW_RICHRESPONSE,), cls._FORMAT.size)

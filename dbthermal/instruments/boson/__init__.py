@@ -229,7 +229,7 @@ class Boson(Closing):
                 elif (last := self.read(commands.LAST_FFC_FRAME, repeats=0)) != before or changed:
                     return last
             except BosonTimeoutError:
-                pass  # mute while the shutter is closed: asked again until time is up
+                pass  # no reply while the shutter is closed: requested again until the time limit
             if self._clock() >= deadline:
                 raise BosonTimeoutError(f"No flat-field correction within {timeout:g} s.")
             self._sleep(POLL)

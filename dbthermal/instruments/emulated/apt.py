@@ -73,7 +73,7 @@ class Drive:
         return self.origin + math.copysign(way, self.distance)
 
     def _rise(self, time: float) -> float:
-        """Way from rest in a time, with one ramp [count]."""
+        """Distance from rest in a time, with one ramp [count]."""
         ramp = min(time, self.velocity / self.acceleration)
         return self.acceleration * ramp**2 / 2 + self.velocity * (time - ramp)
 

@@ -43,7 +43,7 @@ class CameraState:
     serial_number: int
     fpa_temperature: float = FPA  # of its focal-plane array [K]
     plugged: bool = True  # False once it was pulled out
-    has_frames: bool = False  # whether an emulated frame source counts its frames
+    has_frames: bool = False  # True if an emulated frame source counts its frames
     frame_count: int = 0  # frames since its sensor started
     ffc_count: int = 0  # flat-field corrections started
     ffc_until: float = -math.inf  # end of the last one [s]

@@ -227,7 +227,7 @@ def _utc() -> str:
 
 
 class _Run:
-    """One recording: the threads that fetch, read and write, and what they share."""
+    """One recording: the threads that fetch, read and write, and their shared state."""
 
     def __init__(
         self,
@@ -309,7 +309,7 @@ class _Run:
             self.over.set()
 
     def show(self, preview: Callable[[Preview], None] | None) -> None:
-        """Call the preview now and then, until nothing more is written."""
+        """Call the preview at its period, until the last frame is written."""
         units = {name: reading.units for name, reading in self.readings.items()}
         period = _SHOW_POLL  # until there is something to show
         # Not `Thread.join`: interrupted, Python 3.11's takes a running thread for an ended one.

@@ -34,9 +34,9 @@ from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
 # Largest departure of an interval from the median one, relative to it.
 _UNEVEN: Final = 0.5
-# Finished columns are left out of the steps every so many steps.
+# Interval at which finished columns are removed from the search [step].
 _SWEEP: Final = 10
-# torch's number of threads is the process's: what it was before the first of several tiles.
+# Number of torch's threads, which is the process's, before the first of several tiles.
 _THREADS: Final = threading.Lock()
 _BEFORE: Final[list[int]] = []
 
@@ -97,7 +97,7 @@ def _weighted(
 
 
 def _last_stage(unknowns: Unknowns, images: Images, settings: DbvtSettings) -> Minimum:
-    """Steps until no column improves; finished columns are left out of them now and then."""
+    """Steps until no column improves; finished columns are removed at intervals."""
     search = newton.begin(unknowns, images, settings)
     columns = torch.arange(search.loss.numel(), device=search.loss.device)
     state, progress, part = unknowns, search, images

@@ -191,7 +191,11 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Esti
 
 
 def _survey(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Survey:
-    """Only broken models are left out: a choice by the estimate itself would bias the sum."""
+    """
+    Survey of a solution, without the pixels whose model is broken.
+
+    A selection by the estimate itself would bias the sum over a material.
+    """
     status = _report(tile, functions, solution).status
     ratios, emission = solution.ratios, solution.emission
     sound = (status & _BROKEN) == 0

@@ -215,7 +215,7 @@ def candidates(time: Array) -> Whole:
 
 
 def ramp_frames(time: Array) -> Whole:
-    """Frames, relative to its middle, of a jump that takes as long as is left out on one side."""
+    """Frames, relative to its middle, of a jump as long as the margin excluded on one side."""
     half = int(0.5 * AROUND / np.median(np.diff(time)))
     return np.arange(-half, half + 1)
 

@@ -185,7 +185,7 @@ def cost(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
 
 
 def _with(value: xr.DataArray, attrs: Mapping[str, str]) -> xr.DataArray:
-    """Number with nothing but its unit."""
+    """Number as a DataArray with its unit."""
     return value.reset_coords(drop=True).drop_attrs().assign_attrs(attrs)
 
 

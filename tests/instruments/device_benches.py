@@ -1,4 +1,4 @@
-"""Emulated devices of the rig below their drivers, on a clock of their own, for several tests."""
+"""Emulated devices and their drivers on a simulated clock, for several tests."""
 
 from collections import deque
 from collections.abc import Callable
@@ -7,7 +7,7 @@ import numpy as np
 from faulty_apt import FaultyApt
 from faulty_boson import Fault, FaultyBoson
 from faulty_tc08 import FaultyTC08
-from loop import Loop
+from loopback import Loop
 
 from dbthermal.instruments import apt, fslp
 from dbthermal.instruments.boson import Boson
@@ -68,17 +68,17 @@ class BosonBench:
         self.camera = Boson(self.loop, first_sequence=1, clock=self.clock, sleep=self.clock.sleep)
 
     def spoil(self, *faults: Fault | None) -> None:
-        """Give the next requests these faults."""
+        """Set faults of the next requests."""
         self.device.faults.once = deque(faults)
 
     def exchange(self, request: bytes) -> list[fslp.Frame]:
-        """Send bytes past the driver and decode what comes back."""
+        """Send bytes without the driver, and decode the answer."""
         self.loop.write(request)
         return fslp.Decoder().feed(self.loop.read(4096, 0.1))
 
 
 class WheelBench:
-    """An emulated wheel, and the driver that turns it, on one clock that takes no time."""
+    """An emulated wheel and its driver, on one simulated clock."""
 
     def __init__(self, model: str = "BSC201", slot_offset: float = 0.0, **options: object) -> None:
         self.clock = Clock(0.0)
@@ -95,7 +95,7 @@ class WheelBench:
         return self.wheel
 
     def move(self, position: int) -> None:
-        """Move the motor past the driver."""
+        """Move the motor without the driver."""
         data = apt.Position(1, position).pack()
         self.device.receive(apt.command(apt.Id.MOT_MOVE_ABSOLUTE, data=data, destination=apt.BAY_1))
 

@@ -1,4 +1,4 @@
-"""A recording on two emulated cameras whose pictures tell the time, held against what came."""
+"""A recording on two emulated cameras whose counts tell the time, checked against their frames."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -26,7 +26,7 @@ from dbthermal.instruments.session import Camera, Device, Session
 BANDS, SHAPE, RATE, MILLI = ("8-14", "9.5"), (16, 24), 100.0, 1e-3
 LIMITS = Limits(chunk=5, queue=10_000, reserve=0, reading_period=0.02)
 PATTERN = np.random.default_rng(1).integers(5000, 6000, SHAPE).astype(np.uint16)
-SOURCES_OWN = 0x07  # flags that are the source's to set
+SOURCE_FLAGS = 0x07  # flags that are the source's to set
 
 Read = Callable[[], float]
 
@@ -43,22 +43,22 @@ def session(duration: float = 1.0) -> Session:
 
 
 class Witness(FaultyCamera):
-    """An emulated camera that keeps what it gave."""
+    """An emulated camera that keeps a copy of every frame that it gave."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.given: list[Frame] = []
+        self.frames: list[Frame] = []
 
     def read(self, timeout: float = 1.0) -> Frame:
         """Give a frame, and keep a copy."""
         frame = super().read(timeout)
-        self.given.append(replace(frame, counts=frame.counts.copy()))
+        self.frames.append(replace(frame, counts=frame.counts.copy()))
         return frame
 
 
 @dataclass
-class Take:
-    """One recording on two emulated cameras, with their faults, and what came meanwhile."""
+class CheckedRecording:
+    """One recording on two emulated cameras, with their faults and the frames that they gave."""
 
     path: Path
     faults: Mapping[str, Faults] = field(default_factory=dict)
@@ -74,11 +74,15 @@ class Take:
                 self.world, band, pictures, band, SHAPE, RATE, faults=faults
             )
 
-    def record(self, duration: float, readings: Mapping[str, Read] | None = None) -> "Take":
-        """Record so long [s], and hold it against what came."""
-        asked = {name: Reading(read) for name, read in (readings or {}).items()}
+    def record(
+        self, duration: float, readings: Mapping[str, Read] | None = None
+    ) -> "CheckedRecording":
+        """Record for a duration [s], and check the recording."""
+        instruments = {name: Reading(read) for name, read in (readings or {}).items()}
         sources: dict[str, FrameSource] = dict(self.cameras)
-        self.summary = record(session(duration), sources, self.path, readings=asked, limits=LIMITS)
+        self.summary = record(
+            session(duration), sources, self.path, readings=instruments, limits=LIMITS
+        )
         self.log = [note[1:] for note in notes(self.path)]
         for band in BANDS:
             self.check(band)
@@ -90,7 +94,7 @@ class Take:
         return store.open_dataset(self.path).sel(band=band).isel(time=frames)
 
     def noted(self, source: str) -> list[tuple[str, float]]:
-        """Notes of one source."""
+        """Kinds and values of the notes of one source."""
         return [(kind, value) for kind, name, value in self.log if name == source]
 
     def kinds(self, source: str) -> list[str]:
@@ -98,21 +102,21 @@ class Take:
         return [kind for kind, _ in self.noted(source)]
 
     def check(self, band: str) -> None:
-        """Every frame that came is there as it came, has its own time, and losses are counted."""
-        given, kept = self.cameras[band].given, self.stored(band)
-        assert len(given) == kept.sizes["time"] > 0
-        np.testing.assert_array_equal(kept["counts"], [frame.counts for frame in given])
-        np.testing.assert_array_equal(kept["sequence"], [frame.sequence for frame in given])
-        np.testing.assert_array_equal(kept["device_time"], [frame.device_time for frame in given])
+        """Check that all frames are stored unchanged, each with its time, and losses counted."""
+        frames, kept = self.cameras[band].frames, self.stored(band)
+        assert len(frames) == kept.sizes["time"] > 0
+        np.testing.assert_array_equal(kept["counts"], [frame.counts for frame in frames])
+        np.testing.assert_array_equal(kept["sequence"], [frame.sequence for frame in frames])
+        np.testing.assert_array_equal(kept["device_time"], [frame.device_time for frame in frames])
         flags = kept["frame_flags"].values
-        np.testing.assert_array_equal(flags & SOURCES_OWN, [int(frame.flags) for frame in given])
-        same = [np.array_equal(a.counts, b.counts) for a, b in pairwise(given)]
+        np.testing.assert_array_equal(flags & SOURCE_FLAGS, [int(frame.flags) for frame in frames])
+        same = [np.array_equal(a.counts, b.counts) for a, b in pairwise(frames)]
         np.testing.assert_array_equal(flags[1:] & int(FrameFlag.IMAGE_REPEATED) > 0, same)
         self.check_times(kept, flags, self.cameras[band].faults)
-        self.check_losses(band, given, flags)
+        self.check_losses(band, frames, flags)
 
     def check_times(self, kept: xr.Dataset, flags: Any, faults: Faults) -> None:
-        """A frame has the time that its picture tells, or says that it has none, and why."""
+        """Check that a frame has the time of its counts, or a flag that explains a missing time."""
         stamps = kept["exposure_time"].values
         timed = (flags & int(UNTIMED | FrameFlag.FOREIGN_CLOCK)) == 0
         np.testing.assert_array_equal(np.isfinite(stamps), timed)
@@ -125,15 +129,15 @@ class Take:
         expected = np.broadcast_to(since[:, None, None], told.shape)
         np.testing.assert_allclose(told, expected, rtol=0, atol=0.51 * MILLI)
 
-    def check_losses(self, band: str, given: list[Frame], flags: Any) -> None:
-        """Leaps of the numbers, damage and the shutter are in the log and the totals, no more."""
-        leaps = np.diff([frame.sequence for frame in given]) - 1
+    def check_losses(self, band: str, frames: list[Frame], flags: Any) -> None:
+        """Check that lost and damaged frames and the shutter are in the log and in the totals."""
+        leaps = np.diff([frame.sequence for frame in frames]) - 1
         found, totals = self.noted(band), self.summary.totals[band]
         assert [value for kind, value in found if kind == "frames_lost"] == list(leaps[leaps > 0])
         assert (totals["lost"], totals["refused"]) == (leaps.sum(), 0)
         told = flags[1:] & int(FrameFlag.FRAMES_LOST_BEFORE) > 0
         np.testing.assert_array_equal(told, leaps > 0)
-        damaged = sum(bool(frame.flags & DAMAGED) for frame in given)
+        damaged = sum(bool(frame.flags & DAMAGED) for frame in frames)
         assert self.kinds(band).count("damaged") == totals["damaged"] == damaged
         closed = [bool(flag & int(FrameFlag.SHUTTER_CLOSED)) for flag in flags]
         changes = sum(before != after for before, after in pairwise([False, *closed]))

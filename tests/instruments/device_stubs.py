@@ -1,4 +1,4 @@
-"""The least that passes for each device, written without the codecs and the emulators."""
+"""Minimal stand-ins for each device, independent of the codecs and the emulators."""
 
 import re
 import struct
@@ -7,7 +7,7 @@ from collections.abc import MutableSequence
 from typing import Any
 
 import numpy as np
-from rig_devices import Clock
+from device_benches import Clock
 
 from dbthermal.instruments.transport import Closing, TransportError
 
@@ -20,7 +20,7 @@ HANDLE, JUNCTION, TIP = 7, 293.15, 298.15  # the last two in kelvin
 
 
 class _Stub(Closing):
-    """A line to a stub: what it says is read at once."""
+    """A line to a stub, whose answers are available at once."""
 
     is_simulated = True
 

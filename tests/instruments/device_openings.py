@@ -1,4 +1,4 @@
-"""How each device of the rig is opened for its tests: on a stub, on its emulator, on hardware."""
+"""Ways to open each device of the rig for tests: on a stub, on its emulator, on hardware."""
 
 import os
 from collections.abc import Callable
@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from rig_devices import FILTERS, QUICK, BosonBench, Clock, LoggerBench, WheelBench
-from rig_stubs import StubCamera, StubController, StubLibrary
+from device_benches import FILTERS, QUICK, BosonBench, Clock, LoggerBench, WheelBench
+from device_stubs import StubCamera, StubController, StubLibrary
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
 from dbthermal.instruments import v4l2
@@ -33,7 +33,7 @@ def address(name: str) -> str:
 
 
 class Opened(NamedTuple):
-    """A device, whether hardware is behind it, and how a second client would open it."""
+    """An open device, emulated or hardware, and a function that opens a second client."""
 
     device: Any
     is_simulated: bool
@@ -104,20 +104,20 @@ def emulated_logger(_: ExitStack) -> Opened:
 
 
 def real_logger(_: ExitStack) -> Opened:
-    """A TC-08 with a type T in socket 1, in a room."""
+    """A TC-08 with a type-T thermocouple in socket 1, at room temperature."""
     url = address("DBTHERMAL_TC08")
     return Opened(TC08.from_url(url), False, lambda: TC08.from_url(url))
 
 
 def stub_video(_: ExitStack) -> Opened:
-    """The V4L2 driver on a stand-in for the kernel's calls, which it takes for the kernel."""
+    """The V4L2 driver on a stand-in for the kernel's calls."""
     answers = [(BYTES, GOOD, 1000 * number, number) for number in range(10)]
     kernel = Driver(answers=answers).kernel()
     return Opened(v4l2.Capture.open("/dev/video0", STREAM, kernel), False)
 
 
 def emulated_video(_: ExitStack) -> Opened:
-    """An emulated camera on a clock that nobody waits for."""
+    """An emulated camera on a clock without real waiting."""
     clock = Clock()
     world = World(clock=clock)
     world.add_camera("wide", 1)

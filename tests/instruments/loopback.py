@@ -1,4 +1,4 @@
-"""A line straight to an emulated device, in memory and on an injected clock: waiting takes none."""
+"""A line to an emulated device in memory, on an injected clock without real waiting."""
 
 import time as system_time
 from collections import deque
@@ -47,7 +47,7 @@ class Loop(Closing):
         self._device.receive(data)
 
     def read(self, size: int, timeout: float) -> bytes:
-        """Give one piece of what the device says; see `Transport.read`."""
+        """Give one piece of the device's output; see `Transport.read`."""
         deadline = self._clock() + timeout
         while True:
             self._check()
