@@ -40,9 +40,9 @@ def pulses(rng: np.random.Generator, share: float) -> noise.Array:
     return np.apply_along_axis(lambda s: 3.0 * (np.convolve(s, kernel)[:FRAMES] > 0), 0, starts)
 
 
-def walk(rng: np.random.Generator, memory: float) -> noise.Array:
-    """Background (time, pixel) [K] of 3 K that forgets within `memory` seconds."""
-    keep = np.exp(-0.1 / memory)
+def walk(rng: np.random.Generator, correlation_time: float) -> noise.Array:
+    """Background (time, pixel) [K] of 3 K, a random walk of a `correlation_time` [s]."""
+    keep = np.exp(-0.1 / correlation_time)
     steps = 3.0 * rng.standard_normal((FRAMES, PIXELS))
     values = np.empty_like(steps)
     values[0] = steps[0]
@@ -89,16 +89,18 @@ def test_pulses_do_not_enter(white: Signals, rng: np.random.Generator, share: fl
     assert noise.estimate(*moved, TIME) == pytest.approx(NOISE, rel=0.05)
 
 
-@pytest.mark.parametrize(("memory", "tolerance"), [(0.3, 0.06), (3.0, 0.06), (30.0, 0.22)])
+@pytest.mark.parametrize(
+    ("correlation_time", "tolerance"), [(0.3, 0.06), (3.0, 0.06), (30.0, 0.22)]
+)
 def test_restless_background(
-    white: Signals, rng: np.random.Generator, memory: float, tolerance: float
+    white: Signals, rng: np.random.Generator, correlation_time: float, tolerance: float
 ) -> None:
     """A background that never rests is separated from the noise by its covariance in the bands.
 
     At 0.3 s it makes the quiet band's differences 6.6 times too large; 4 % are left. At 30 s a
     fifth is: one pixel does not show what the bands share.
     """
-    first, second = noise.estimate(*reflect(white, walk(rng, memory)), TIME)
+    first, second = noise.estimate(*reflect(white, walk(rng, correlation_time)), TIME)
     assert first == pytest.approx(NOISE[0], rel=tolerance)
     assert second == pytest.approx(NOISE[1], rel=TOLERANCE)
 

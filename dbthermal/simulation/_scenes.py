@@ -33,7 +33,7 @@ class Background:
         Fewest and most pulses in the capture.
     duration : tuple of float
         Shortest and longest pulse [s].
-    memory : float
+    correlation_time : float
         Correlation time of the walk [s].
     drift : float
         Change of the resting temperature over the capture, linear in time [K].
@@ -44,7 +44,7 @@ class Background:
     amplitude: float = 3.0
     count: tuple[int, int] = (6, 9)
     duration: tuple[float, float] = (1.0, 3.0)
-    memory: float = 3.0
+    correlation_time: float = 3.0
     drift: float = 0.0
 
     def __post_init__(self) -> None:
@@ -55,8 +55,10 @@ class Background:
             raise ValueError(f"Invalid count {self.count} of pulses. Must be two, not falling.")
         if not 0 < self.duration[0] <= self.duration[1]:
             raise ValueError(f"Invalid duration {self.duration} s. Must be positive, not falling.")
-        if not self.memory > 0:
-            raise ValueError(f"Invalid memory {self.memory} s. Must be positive.")
+        if not self.correlation_time > 0:
+            raise ValueError(
+                f"Invalid correlation_time {self.correlation_time} s. Must be positive."
+            )
 
     def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
         """Background temperature (time, pixel) [K], one realisation a pixel, at times [s]."""
@@ -83,8 +85,8 @@ class Background:
         change = np.empty((time.size, pixels))
         change[0] = rng.standard_normal(pixels)
         for frame in range(1, time.size):
-            # AR(1) of unit variance: correlation exp(-dt / memory) from frame to frame.
-            kept = np.exp(-(time[frame] - time[frame - 1]) / self.memory)
+            # AR(1) of unit variance: correlation exp(-dt / correlation_time) from frame to frame.
+            kept = np.exp(-(time[frame] - time[frame - 1]) / self.correlation_time)
             fresh = np.sqrt(1.0 - kept**2) * rng.standard_normal(pixels)
             change[frame] = kept * change[frame - 1] + fresh
         return self.amplitude * change

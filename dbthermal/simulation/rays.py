@@ -134,7 +134,7 @@ class Hits:
         """Rays that meet the mesh, shape (ray,)."""
         return np.asarray(self.face != MISSED)
 
-    def of(self, rays: Mask) -> "Hits":
+    def select(self, rays: Mask) -> "Hits":
         """Intersections of the selected rays, in their order."""
         return Hits(self.face[rays], self.distance[rays], self.weights[rays])
 

@@ -156,7 +156,7 @@ class _Target:
         origins, directions = self.rays
         near = np.flatnonzero(self._near(pose.outwards(self.middle)))
         hits = self.caster.cast(*pose.inwards(origins[near], directions[near]))
-        return near[hits.met], hits.of(hits.met)
+        return near[hits.met], hits.select(hits.met)
 
     def _near(self, middle: Array) -> npt.NDArray[np.bool_]:
         """Rays that pass through the sphere about the actor."""
@@ -194,5 +194,5 @@ def incident(
             first = hits.distance < nearest[rays]
             selected, warmth = rays[first], target.actor.warmth(float(now))
             nearest[selected] = hits.distance[first]
-            frame[selected] = target.caster.interpolate(hits.of(first), warmth)
+            frame[selected] = target.caster.interpolate(hits.select(first), warmth)
     return result

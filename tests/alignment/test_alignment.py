@@ -71,13 +71,13 @@ def test_time_offset_is_found(scene: xr.Dataset, delay: float) -> None:
     assert abs(error) < 0.04  # four times what 400 pixels scatter by
 
 
-@pytest.mark.parametrize("memory", [0.3, 3.0, 30.0])
+@pytest.mark.parametrize("correlation_time", [0.3, 3.0, 30.0])
 @pytest.mark.parametrize("delay", [0.3, 1.5])
-def test_time_offset_of_a_restless_background(memory: float, delay: float) -> None:
+def test_time_offset_of_a_restless_background(correlation_time: float, delay: float) -> None:
     """A background that walks at random shows the offset as one that steps does."""
-    capture = recorded(glass(kind="random walk", memory=memory), delay)
+    capture = recorded(glass(kind="random walk", correlation_time=correlation_time), delay)
     error = alignment.time_offset(capture) / PERIOD - delay
-    print(f"memory {memory} s, {delay} frames late: error {error:.4f} frames")
+    print(f"correlation time {correlation_time} s, {delay} frames late: error {error:.4f} frames")
     assert abs(error) < 0.1
 
 

@@ -72,7 +72,7 @@ def test_intervals_hold_beside_a_jump() -> None:
 @pytest.mark.parametrize(
     "background",
     [{}, {"amplitude": 12.0}, {"drift": 5.0}]
-    + [{"kind": "random walk", "memory": memory} for memory in (0.3, 3.0, 30.0)],
+    + [{"kind": "random walk", "correlation_time": time} for time in (0.3, 3.0, 30.0)],
     ids=str,
 )
 def test_nothing_jumps_where_nothing_jumps(background: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
 SLOW: tuple[dict[str, Any], ...] = (
     {},
     {"drift": 5.0},
-    *({"kind": "random walk", "memory": memory} for memory in (0.3, 3.0, 30.0)),
+    *({"kind": "random walk", "correlation_time": time} for time in (0.3, 3.0, 30.0)),
 )
 
 

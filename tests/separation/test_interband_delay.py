@@ -39,7 +39,7 @@ def test_the_flag_grows_with_the_offset() -> None:
 @pytest.mark.parametrize(
     "background",
     [{}, {"drift": 5.0}, {"amplitude": 12.0}]
-    + [{"kind": "random walk", "memory": memory} for memory in (0.3, 3.0, 30.0)],
+    + [{"kind": "random walk", "correlation_time": time} for time in (0.3, 3.0, 30.0)],
     ids=str,
 )
 def test_simultaneous_bands_are_not_suspected(

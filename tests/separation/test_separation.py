@@ -93,9 +93,9 @@ def test_intervals_of_the_object_hold(noise_known: bool) -> None:
 @pytest.mark.parametrize(
     ("background", "limit"),
     [
-        ({"kind": "random walk", "memory": 0.3}, 0.11),
-        ({"kind": "random walk", "memory": 3.0}, 0.15),
-        ({"kind": "random walk", "memory": 30.0}, 0.42),
+        ({"kind": "random walk", "correlation_time": 0.3}, 0.11),
+        ({"kind": "random walk", "correlation_time": 3.0}, 0.15),
+        ({"kind": "random walk", "correlation_time": 30.0}, 0.42),
         ({"drift": 5.0}, 0.19),
     ],
 )

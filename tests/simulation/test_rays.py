@@ -104,7 +104,7 @@ def test_sphere_mirrors_as_the_law_says() -> None:
     root = np.sqrt(along**2 - np.sum(origins**2, axis=1) + RADIUS**2)
     normals = unit(origins + (-along - root)[:, np.newaxis] * directions)
     inner = np.sum(normals * directions, axis=1) < -0.5  # not at the rim, where facets show
-    _, mirrored = caster.mirrored(hits.of(met), directions)
+    _, mirrored = caster.mirrored(hits.select(met), directions)
     cosines = np.sum(mirrored * mirror(directions, normals), axis=1)[inner]
     assert np.degrees(np.arccos(cosines.min())) < 0.2
 
@@ -164,7 +164,7 @@ def test_convex_surface_does_not() -> None:
     coarse = sphere(subdivisions=2)
     origins, directions = rays_of(FRONT)
     hits = coarse.cast(origins, directions)
-    again = coarse.cast(*coarse.mirrored(hits.of(hits.met), directions[hits.met]))
+    again = coarse.cast(*coarse.mirrored(hits.select(hits.met), directions[hits.met]))
     assert not again.met.any()
 
 

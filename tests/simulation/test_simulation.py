@@ -100,8 +100,9 @@ def test_number_of_pulses(rng: np.random.Generator) -> None:
 
 
 def test_random_walk(rng: np.random.Generator) -> None:
-    """The walk's deviation is its amplitude, and its correlation exp(-lag / memory)."""
-    walk = Background("random walk", amplitude=2.0, memory=3.0).draw(TIME, 4000, rng) - 295.15
+    """The walk's deviation is its amplitude, and its correlation exp(-lag / correlation_time)."""
+    background = Background("random walk", amplitude=2.0, correlation_time=3.0)
+    walk = background.draw(TIME, 4000, rng) - 295.15
     np.testing.assert_allclose(walk.std(axis=1), 2.0, rtol=0, atol=0.1)  # K
     for lag in (1, 30):
         found = np.mean(walk[lag:] * walk[:-lag]) / np.mean(walk**2)
@@ -225,8 +226,9 @@ def test_noise_of_observed_counts(
     pixels = ("time", "y", "x")
     np.testing.assert_allclose(noise.std(pixels) / known["noise"], 1.0, rtol=0, atol=0.02)
     np.testing.assert_allclose(noise.mean(pixels), 0.0, rtol=0, atol=0.1)  # count
-    memory = (noise.values[:, 1:] * noise.values[:, :-1]).mean(axis=(1, 2, 3)) / known["noise"] ** 2
-    np.testing.assert_allclose(memory, 0.0, rtol=0, atol=0.03)
+    covariance = (noise.values[:, 1:] * noise.values[:, :-1]).mean(axis=(1, 2, 3))
+    autocorrelation = covariance / known["noise"] ** 2
+    np.testing.assert_allclose(autocorrelation, 0.0, rtol=0, atol=0.03)
     assert abs(float(xr.corr(*noise))) < 0.03
 
 

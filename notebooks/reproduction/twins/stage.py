@@ -91,7 +91,7 @@ class _View:
 
     @property
     def seen(self) -> Hits:
-        return self.hits.of(self.hits.met)
+        return self.hits.select(self.hits.met)
 
 
 def take(stage: Stage, capture: Capture) -> xr.Dataset:
@@ -130,7 +130,7 @@ def _with_itself(
 ) -> Array:
     """Reflection (time, ray) [K] with the object's own where a reflected ray meets it."""
     again = view.caster.cast(origins, directions)
-    reflected[:, again.met] = view.caster.interpolate(again.of(again.met), stage.temperature)
+    reflected[:, again.met] = view.caster.interpolate(again.select(again.met), stage.temperature)
     return reflected
 
 
