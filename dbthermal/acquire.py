@@ -2,7 +2,7 @@
 
 The devices are opened, named and prepared, and the session's protocol is run: a scene becomes
 ``<name>.zarr`` in the folder, a sweep of the blackbody a recording for each temperature and filter.
-An interrupted sweep goes on where it was. The user sets the blackbody when asked. With
+An interrupted sweep goes on where it was. The user sets the blackbody on request. With
 ``--simulate`` the same drivers talk to emulated devices, whose cameras see a blackbody.
 
 Exit status: 0 if all was recorded, 1 if a device or a recording failed, 2 if the session is

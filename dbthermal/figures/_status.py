@@ -57,7 +57,7 @@ def status(result: xr.Dataset) -> Figure:
     Raises
     ------
     ValueError
-        If a bit is none of `schema.Status`.
+        If a bit is not one of `schema.Status`.
     """
     first = first_reason(result["status"])
     shares = {name: float(np.mean(first == name)) for name in ("", *REASONS)}

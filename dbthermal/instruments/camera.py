@@ -338,9 +338,9 @@ def next_shutter(
     repeated : bool
         No pixel differs from the frame before.
     last_ffc_frame : int, optional
-        From the frame's telemetry (`Metadata`); None if there is none, or the frame is damaged.
+        From the frame's telemetry (`Metadata`); None without any, or if the frame is damaged.
     ffc_status : FfcStatus, optional
-        Latest reading of the serial line; None if there is none, or it is too old.
+        Latest reading of the serial line; None without any, or if it is too old.
 
     Returns
     -------

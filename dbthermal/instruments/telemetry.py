@@ -5,7 +5,7 @@ certain**: it is where public decoders that do not depend on one another agree (
 ``Boson640Telemetry.java``, the Python class ``BosonWithTelemetry``, belivan/flir_stereo
 ``flir_ros_sync.cpp``), and none of them is the vendor's. So are the orders: each 16-bit word is
 little-endian, and of a longer number the high word comes first; the latter is an option of
-`decode`. That is why a recording keeps the rows as they came. The meaning of the status bits is not
+`decode`. Therefore a recording keeps the rows as they came. The meaning of the status bits is not
 public: the state of the shutter follows from `last_ffc_frame` and from the serial line, see
 `camera.next_shutter`.
 

@@ -186,7 +186,7 @@ def open_serial(
     Raises
     ------
     ValueError
-        If the name is none of these, has options that are not understood, or gives a
+        If the name is not one of these, has options that are not understood, or gives a
         pseudo-terminal as a serial port, which would let an emulator pass for hardware.
     TransportError
         If the port cannot be opened.

@@ -107,7 +107,7 @@ def test_arbitrary_answers(answers: list[bytes]) -> None:
 def test_neither_enabled_nor_not(bits: bytes) -> None:
     """An invalid state of the channel raises an error of the wheel."""
     dialogue = Dialogue([*_connection()[:-1], (_connection()[-1][0], bits)])
-    with dialogue, pytest.raises(WheelError, match="does not say what the motor does"):
+    with dialogue, pytest.raises(WheelError, match="Unknown state of the motor"):
         FilterWheel(dialogue, SETTINGS).connect()
 
 

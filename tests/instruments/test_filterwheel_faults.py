@@ -280,7 +280,7 @@ def test_a_device_that_never_ends_is_another_one() -> None:
     clock = Clock()
     line = Endless(2 * MAXIMUM_UNSOLICITED)
     wheel = FilterWheel(line, Settings(), clock=clock, sleep=clock.sleep)
-    with pytest.raises(WrongDeviceError, match="More than 65536 bytes came unasked"):
+    with pytest.raises(WrongDeviceError, match="More than 65536 unsolicited bytes came"):
         wheel.connect()
 
 

@@ -19,9 +19,9 @@ from dbthermal.instruments.apt import Id
 from dbthermal.instruments.filterwheel._settings import CHANNEL, MODELS, Scale, Settings
 from dbthermal.instruments.transport import Transport
 
-ATTEMPTS: Final = 2  # number of times that a request is sent before its reply is given up
+ATTEMPTS: Final = 2  # number of times that a request is sent before its reply counts as missing
 READ_SIZE: Final = 256  # largest number of bytes that are read at once
-MAXIMUM_UNSOLICITED: Final = 65536  # [byte] a line that talks without end is another device's
+MAXIMUM_UNSOLICITED: Final = 65536  # [byte] an endless stream comes from another device
 ACCURACY: Final = 0.01  # largest relative difference of a speed that is read back
 
 _EVENTS = (Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED)
@@ -126,7 +126,7 @@ class Controller:
         try:
             enabled = apt.is_enabled(reply)
         except ValueError as error:
-            raise WheelError(f"The controller does not say what the motor does: {error}") from error
+            raise WheelError(f"Unknown state of the motor: {error}") from error
         if not enabled:
             raise WheelError("The controller did not enable the motor. It must be connected.")
         self.raise_notice()
@@ -289,7 +289,7 @@ class Controller:
             count += len(received)
             if count > MAXIMUM_UNSOLICITED:
                 raise WrongDeviceError(
-                    f"More than {MAXIMUM_UNSOLICITED} bytes came unasked. Must be an APT "
+                    f"More than {MAXIMUM_UNSOLICITED} unsolicited bytes came. Must be an APT "
                     "controller."
                 )
 

@@ -87,7 +87,7 @@ def overview(folder: str | Path) -> xr.Dataset:
     Parameters
     ----------
     folder : str or Path
-        With recordings (ValueError if there is none); other files in it are passed over.
+        With recordings (ValueError without any); other files in it are passed over.
 
     Returns
     -------

@@ -239,7 +239,7 @@ def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
     """
     Residual from the best of three starts: all points, those above, those below the plain line.
 
-    What disturbs a resting background lies mostly on one side of it, and one of the halves is
+    Disturbances of a resting background lie mostly on one side of it, and one of the halves is
     then nearly free of it. Each start closes in on the densest half of the points by a scale that
     is a fraction of the deviation; the one with the smallest deviation wins, pixel by pixel. A
     hundred points in single precision are enough to start from.
