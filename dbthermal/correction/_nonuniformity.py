@@ -3,7 +3,7 @@
 The correction follows the supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334: a
 blackbody fills the view at several temperatures, and each pixel is brought to the frame's mean by
 least squares. A bad pixel is marked, never filled from its neighbours: a filled pixel looks like a
-measurement and is none.
+measurement but is not one.
 """
 
 from typing import Final

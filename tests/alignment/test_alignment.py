@@ -106,7 +106,7 @@ def test_shutter_steps_are_no_motion(scene: xr.Dataset) -> None:
 
 
 def test_a_still_background_gives_no_offset_by_chance() -> None:
-    """None of 20 captures with a still background gives an offset."""
+    """Not one of 20 captures with a still background gives an offset."""
     found = []
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -137,7 +137,7 @@ def test_frames_from_before_are_not_taken(tmp_path: Path) -> None:
 def test_duration_begins_with_the_first_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However long the file takes to be made: its frames are those of the duration, within one."""
+    """The duration counts from the first frame, however long the file takes to create."""
     clock, rate, made = Clock(), 60.0, _recorder._new_file
     world = World(clock=clock)
     world.add_camera("8-14", 1)

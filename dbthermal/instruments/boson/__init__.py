@@ -105,9 +105,9 @@ class Boson(Closing):
     One camera's command port, a `camera.CameraControl`; for any number of threads.
 
     Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
-    `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is asked
-    for again if no reply comes; a command that changes the camera never is. Open it by `from_url`;
-    tests hand in a line, the number of the first request, clock and sleep [s].
+    `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is
+    requested again if no reply comes; a command that changes the camera never is. Open it by
+    `from_url`; tests hand in a line, the number of the first request, clock and sleep [s].
     """
 
     def __init__(
