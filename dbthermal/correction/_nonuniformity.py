@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.special import ndtri
 from scipy.stats import chi2
 
 from dbthermal import planck, schema
+from dbthermal.noise import MAD
 from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
@@ -28,8 +28,6 @@ OUTLIER: Final = 6.0
 
 _PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "offset_renewed"}
 _PASSES = 2
-# Median absolute deviation -> standard deviation of a normal distribution.
-_MAD = 1.0 / float(ndtri(0.75))
 # Below this a difference between pixels is rounding, and no pixel is an outlier [count].
 _ROUNDING = 0.01
 
@@ -386,7 +384,7 @@ def _least_squares(frames: Array, level: Array) -> tuple[Array, Array, Mask]:
 def _inliers(values: Array, good: Mask, threshold: float) -> Mask:
     """Values [count] within `threshold` robust standard deviations of the good ones' median."""
     centre = np.median(values[good])
-    scale = _MAD * np.median(np.abs(values[good] - centre))
+    scale = MAD * np.median(np.abs(values[good] - centre))
     return np.asarray(np.abs(values - centre) <= threshold * max(scale, _ROUNDING))
 
 
