@@ -175,8 +175,8 @@ def ucsb(path: str | Path) -> xr.Dataset:
     FileNotFoundError
         If the file does not exist.
     ValueError
-        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or a value
-        is refused as by `ecostress`.
+        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or a
+        value is refused as by `ecostress`.
 
     Examples
     --------
