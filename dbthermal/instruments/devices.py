@@ -198,14 +198,15 @@ class Devices:
             cameras=renamed(self.cameras),
         )
 
-    def flush(self, clock: Callable[[], float] = system_time.monotonic) -> None:
-        """Discard the frames that the drivers hold, which show the scene as it was before.
-
-        `clock` is the host's, that of the frames [s]; `SourceLostError` if a camera is gone.
+    def flush(self) -> None:
         """
-        start = clock()
+        Discard the frames that the drivers hold, which show the scene as it was before.
+
+        `SourceLostError` if a camera is gone.
+        """
+        start = system_time.monotonic()
         for source in self.sources.values():
-            while clock() - start < FLUSH_TIMEOUT:
+            while system_time.monotonic() - start < FLUSH_TIMEOUT:
                 try:
                     frame = source.read(0.0)
                 except NoFrameError:
