@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import simulation, store
+from dbthermal.response import counts
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -21,8 +22,6 @@ def test_the_ten_lines_run(
         np.linspace(273.15, 343.15, 8), dims="temperature", attrs={"units": "K"}
     )
     temperature = temperature.assign_coords(temperature=temperature)
-    from dbthermal.response import counts
-
     store.save(counts(response, temperature).to_dataset(), tmp_path / "blackbody.zarr", {})
     store.save(corrected, tmp_path / "scene.zarr", {})
     monkeypatch.chdir(tmp_path)

@@ -7,12 +7,12 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import map_coordinates
-from scipy.special import ndtri
 
 from dbthermal import noise as noises
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, sample, time_offset
+from dbthermal.noise import MAD
 
 Array = npt.NDArray[np.float64]
 Movie = npt.NDArray[np.float32]
@@ -24,8 +24,6 @@ TRANSFORM: Final = schema.Variable(
 
 # Standard deviations of noise beyond which a step lies between two frames.
 _STEP: Final = 5.0
-# Median absolute deviation -> standard deviation of a normal distribution.
-_MAD: Final = 1.0 / float(ndtri(0.75))
 # A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
 _DIGITS: Final = 9
 
@@ -208,7 +206,7 @@ def _noise(corrected: xr.Dataset, stamps: Array) -> Array:
         here = present(frames) & np.isfinite(times)
         signal = frames[here]
         rough = noises.second_difference(signal, times[here])
-        scatter = _MAD * np.median(np.abs(rough), axis=0)
+        scatter = MAD * np.median(np.abs(rough), axis=0)
         levels.append((np.median(scatter), np.median(scatter / signal.std(axis=0))))
     return np.array(levels).T
 

@@ -14,6 +14,7 @@ from scipy.special import ndtri
 
 from dbthermal import schema
 from dbthermal.correction._nonuniformity import OUTLIER
+from dbthermal.noise import MAD
 from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
@@ -24,9 +25,8 @@ Mask = npt.NDArray[np.bool_]
 _MINIMUM_FRAMES: Final = 16
 # Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
 _QUIET = 0.8
-# Mean magnitude of that share of a standard normal distribution, and the median's scale.
+# Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
-_MAD = 1.0 / float(ndtri(0.75))
 # A pixel is held against those around it: the median of a window this wide, and the eight nearest.
 _WINDOW = 5
 _NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
@@ -77,8 +77,23 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     Raises
     ------
     TypeError, ValueError
-        If the threshold is not positive, or a band has fewer than 16 frames that are not NaN, or
-        than 0.5 s have.
+        If the threshold is not positive, or a band has fewer frames that are not NaN than 16, or
+        than 0.4 s and three frames more.
+
+    Examples
+    --------
+    One pixel blinks: it is 80 counts too high for a second.
+
+    >>> import numpy as np, xarray as xr
+    >>> counts = np.random.default_rng(1).normal(20000, 4, (1, 60, 12, 12))  # [count]
+    >>> counts[0, 30:40, 5, 7] += 80
+    >>> corrected = xr.Dataset(
+    ...     {"counts": (("band", "time", "y", "x"), counts)},
+    ...     {"band": ["8-14"], "time": np.arange(60) / 10.0},
+    ... )
+    >>> marked = mark_bad(corrected)
+    >>> np.argwhere(marked.status.values).tolist(), marked.jumping_pixels
+    ([[5, 7]], 1)
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not threshold > 0:
@@ -152,7 +167,7 @@ def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
     if not finite.any():
         return np.asarray(level == 0)
     centre = np.median(apart[finite])
-    scale = max(_MAD * float(np.median(np.abs(apart[finite] - centre))), _ROUNDING)
+    scale = max(MAD * float(np.median(np.abs(apart[finite] - centre))), _ROUNDING)
     return np.asarray((np.abs(apart - centre) > threshold * scale) | (level == 0))
 
 

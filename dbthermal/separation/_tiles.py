@@ -18,11 +18,10 @@ from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._quality import status_bits
+from dbthermal.separation._quality import Bits, status_bits
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.intp]
-Bits = npt.NDArray[np.uint32]
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""

@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from sketches import BANDS, DEGREE, array, check_measured, titles
 
-from dbthermal import figures
+from dbthermal import emissivity, figures, limits
 
 
 def correction(fill: float = 1.0, **attrs: object) -> xr.Dataset:
@@ -191,3 +191,16 @@ def test_bad_pixels_are_marked() -> None:
     assert np.argwhere(np.ma.getmaskarray(image)).tolist() == [[1, 2]]
     np.testing.assert_array_equal(axis.lines[0].get_xydata(), [[2, 1]])
     assert "1 bad pixel" in axis.get_title()
+
+
+def test_plan_frames_the_best_filter() -> None:
+    """The best filter of each material is framed; a material without one has no line."""
+    table = emissivity.embedded_table()
+    noise = emissivity.filter_noise(0.03, table["band"].values.tolist())
+    table = table.sel(material=["plate window glass", "brass plate", "water"])
+    expected = limits.plan(table, noise)
+    durations = limits.plan_durations(table, noise, [20.0, 40.0])
+    axes = figures.plan(expected, durations, ["plate window glass", "brass plate"]).axes
+    framed = [text.get_text() for text in axes[0].texts if text.get_bbox_patch()]
+    assert framed == [f"{v:.2g}" for v in expected["object_temperature_std"].min("filter")[::2]]
+    assert len(axes[1].lines) == 1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import emissivity, figures, limits, simulation
+from dbthermal import emissivity, limits, simulation
 from dbthermal.limits._planner import _truth
 from dbthermal.simulation import Rig
 
@@ -116,27 +116,3 @@ def test_bad_design_is_a_clear_error(change: dict[str, float]) -> None:
     """Invalid capture conditions raise a ValueError with the rule."""
     with pytest.raises(ValueError, match="Must"):
         replace(limits.CaptureDesign(), **change)
-
-
-def texts(figure: Any) -> set[str]:
-    """Labels of all axes."""
-    return {text for axis in figure.axes for text in (axis.get_xlabel(), axis.get_ylabel()) if text}
-
-
-def test_figure_of_the_plan(materials: Materials) -> None:
-    """A map with the best filter of each material framed, and the lines of those that have one."""
-    table, noise = materials
-    table = table.sel(material=["plate window glass", "brass plate", "water"])
-    expected = limits.plan(table, noise)
-    durations = limits.plan_durations(table, noise, [20.0, 40.0])
-    figure = figures.plan(expected, durations, ["plate window glass", "brass plate"])
-    figure.draw_without_rendering()
-    framed = [text.get_text() for text in figure.axes[0].texts if text.get_bbox_patch()]
-    assert framed == [f"{v:.2g}" for v in expected["object_temperature_std"].min("filter")[::2]]
-    assert len(figure.axes[1].lines) == 1
-    assert texts(figure) == {
-        "filter beside 8-14 [\N{MICRO SIGN}m]",
-        "length of the film [s]",
-        "expected std [K]",
-    }
-    assert "(simulated)" in figure.get_suptitle()

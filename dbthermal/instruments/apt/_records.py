@@ -99,10 +99,11 @@ class HomeParameters(Record):
 
 
 @dataclass(frozen=True)
-class Status:
+class Status(Record):
     """Position counter, encoder counter (a filter wheel has none) [count] and state of a motor."""
 
-    _FORMAT: ClassVar[struct.Struct] = struct.Struct("<HiiI")
+    _FORMAT = struct.Struct("<HiiI")
+    _IDS = (Id.MOT_GET_STATUSUPDATE,)
 
     channel: int
     position: int
@@ -112,14 +113,9 @@ class Status:
     @classmethod
     def parse(cls, message: Message) -> Self:
         """Status of MOT_GET_STATUSUPDATE, of whose longer form the end is not read."""
-        ids = (Id.MOT_GET_STATUSUPDATE,)
-        data = _data(message, ids, cls._FORMAT.size, longer=True)
+        data = _data(message, cls._IDS, cls._FORMAT.size, longer=True)
         channel, position, encoder, bits = cls._FORMAT.unpack_from(data)
         return cls(channel, position, encoder, StatusBits(bits))
-
-    def pack(self) -> bytes:
-        """Data of the shorter form; ValueError if a number does not fit its field."""
-        return _packed(self._FORMAT, self, *astuple(self))
 
 
 @dataclass(frozen=True)

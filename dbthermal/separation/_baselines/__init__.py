@@ -4,7 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from dbthermal.separation._tiles import Array, Bits, Estimate, Tile
+from dbthermal.separation._quality import Bits
+from dbthermal.separation._tiles import Array, Estimate, Tile
 
 WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")
 """Variables that a method without standard deviations never estimates."""

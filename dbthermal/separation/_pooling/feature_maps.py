@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy import ndimage
-from scipy.special import ndtri
 
 from dbthermal import response as responses
+from dbthermal.noise import MAD
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -23,8 +23,6 @@ Labels = npt.NDArray[np.intp]
 
 # Rows of a capture that are read at a time.
 _ROWS: Final = 64
-# Normal standard deviation over the median absolute deviation.
-_MAD: Final = 1.0 / float(ndtri(0.75))
 # Standard deviation of the Gaussian window of the edge statistic, and distance of the windows'
 # centres from the pixel, to both sides [pixel].
 _BLUR: Final = 1.0
@@ -106,7 +104,7 @@ def _pixel_scatter(image: Array) -> float:
     # var(a - 2 b + c) = 6 s^2
     bend = (image[2:] - 2.0 * image[1:-1] + image[:-2]) / np.sqrt(6.0)
     known = np.abs(bend[np.isfinite(bend)])
-    return _MAD * float(np.median(known)) if known.size else 0.0
+    return MAD * float(np.median(known)) if known.size else 0.0
 
 
 def edges(maps: Array, variances: Array) -> Array:

@@ -9,7 +9,6 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import _smooth as smooth
 from dbthermal import limits, separation, simulation
 from dbthermal.simulation import Background, Rig
 
@@ -104,7 +103,7 @@ def efficiency(
     """
     emissivity = truth["emissivity"].values[:, 0, 0]
     background = truth["background_temperature"].values.reshape(truth.sizes["time"], -1)
-    functions = smooth.polynomial_basis(truth["time"].values, order)
+    functions = limits.polynomial_basis(truth["time"].values, order)
     pair = (float(emissivity[0]), float(emissivity[1]))
     bound = np.sqrt(limits.ratio_variance_bound(pair, noise, background, functions))
     ratio = limits.reflection_ratio(result["emissivity"].values.reshape(2, -1))

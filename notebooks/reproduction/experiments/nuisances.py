@@ -137,7 +137,7 @@ def parallax(
     second camera looks to the right, a multiple of 1 / `COLUMNS`, and down, a whole number [pixel];
     together they stay within the margin of the scene, 12 pixels (ValueError).
 
-    `misregistered` [pixel], distance of the transform by `registration.register` from the true one;
+    `misregistered` [pixel], distance of the transform by `alignment.register` from the true one;
     and over `treatment`, one of `VIEWS`, the variables of `cost`.
     """
     places = np.array([COLUMNS * shift[0], COLUMNS * distance, shift[1]])

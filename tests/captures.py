@@ -1,0 +1,44 @@
+"""Simulated captures of reflected people, of a uniform view, and of one signal in time."""
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import simulation
+from dbthermal.simulation import Rig
+
+RIG = Rig()
+SHAPE = (64, 80)
+
+
+def panels(*, size: int = 16) -> xr.DataArray:
+    """A checkerboard of two materials: edges and corners everywhere."""
+    rows, columns = np.indices(SHAPE)
+    other = (rows // size + columns // size) % 2 == 1
+    values = [np.where(other, *pair) for pair in ((0.3, 0.95), (0.5, 0.85))]
+    return xr.DataArray(values, dims=("band", "y", "x"), coords={"band": list(RIG.bands)})
+
+
+def walkers(seed: int, *, rate: float = 10.0, frames: int = 350) -> xr.Dataset:
+    """A clean capture of people reflected in panels of two materials."""
+    rng = np.random.default_rng(seed)
+    scene = simulation.walkers(np.arange(frames) / rate, SHAPE, panels(), rng)
+    return simulation.observe(scene, RIG.response(), rng)
+
+
+def still(level: float = 16000.0, count: int = 60, noise: float = 4.0) -> xr.Dataset:
+    """A uniform view with noise, 20 by 24 pixels."""
+    rng = np.random.default_rng(5)
+    counts = level + noise * rng.standard_normal((2, count, 20, 24))
+    return xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts.astype(np.float32), {"units": "count"})},
+        coords={"band": list(RIG.bands), "time": ("time", np.arange(count) / 10, {"units": "s"})},
+    )
+
+
+def movie(signal: np.ndarray, time: object) -> xr.Dataset:
+    """Counts (band, time, y, x), double precision, of one signal (time) in two bands."""
+    counts = np.broadcast_to(np.asarray(signal)[:, np.newaxis, np.newaxis], (2, len(signal), 1, 1))
+    return xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts.copy(), {"units": "count"})},
+        coords={"band": list(RIG.bands), "time": np.asarray(time)},
+    )

@@ -1,0 +1,210 @@
+"""Shutter events and lost frames: each simulated with known frames, found, and marked."""
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import xarray as xr
+from captures import RIG, still, walkers
+
+from dbthermal import _smooth as smooth
+from dbthermal import separation, simulation
+from dbthermal.correction import find_shutter, mark_shutter
+from dbthermal.simulation import Background
+from reproduction import experiments
+
+TIME = np.arange(350) / 10.0
+
+
+@pytest.fixture(scope="module")
+def clean() -> xr.Dataset:
+    """350 frames at 10 Hz without a nuisance."""
+    return walkers(1)
+
+
+def rows(events: xr.Dataset) -> list[tuple[str, int, int, bool]]:
+    """Events as tuples."""
+    names = ("band", "first_frame", "frames", "renewed")
+    return list(zip(*(events[name].values.tolist() for name in names), strict=True))
+
+
+def test_shutter_events_are_found(clean: xr.Dataset) -> None:
+    """Each shutter event of each camera is found with all of its frames, without false ones."""
+    rng = np.random.default_rng(2)
+    capture = simulation.fire_shutter(clean, [8.0, 20.04], rng, duration=0.55)
+    capture = simulation.fire_shutter(capture, 30.0, rng, bands=("9.5",))
+    both = [(band, first, 5, True) for first in (81, 201) for band in RIG.bands]
+    assert rows(find_shutter(capture)) == [*both, ("9.5", 301, 5, True)]
+    events = find_shutter(capture)
+    np.testing.assert_allclose(events["start"], [8.1, 8.1, 20.1, 20.1, 30.1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(events["stop"] - events["start"], 0.4, rtol=0, atol=1e-9)  # [s]
+    marked = mark_shutter(capture)
+    gone = marked["counts"].isnull().any(("y", "x"))
+    np.testing.assert_array_equal(gone.sum("time"), [10, 15])
+    np.testing.assert_array_equal(np.flatnonzero(np.diff(marked["segment"])), [85, 205, 305])
+    assert marked["segment"].dtype.kind == "i"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_clean_capture_has_no_event(seed: int) -> None:
+    """Neither floating nor whole-number counts of a clean capture repeat a frame."""
+    capture = walkers(seed, frames=120)
+    whole = capture.assign(counts=np.rint(capture["counts"]).astype(np.uint16))
+    for made in (capture, whole):
+        assert find_shutter(made).sizes["event"] == 0
+    marked = mark_shutter(capture)
+    xr.testing.assert_identical(marked["counts"], capture["counts"])
+    assert not marked["segment"].any()
+
+
+def test_repeated_frames_are_found(clean: xr.Dataset) -> None:
+    """All of the frames that a driver repeats are found; a lost one starts no segment."""
+    capture = simulation.lose_frames(clean, 0.05, np.random.default_rng(3))
+    marked = mark_shutter(capture)
+    found = np.isnan(marked["counts"].values).all(axis=(2, 3))
+    print(f"repeated {int(capture['repeated'].sum())}, found {int(found.sum())}")
+    np.testing.assert_array_equal(found, capture["repeated"])
+    events = find_shutter(capture)
+    np.testing.assert_array_equal(events["renewed"], events["frames"] > 1)
+    lost = events.isel(event=~events["renewed"].values)
+    assert not mark_shutter(capture, lost)["segment"].any()
+    assert marked.attrs["repeated_frames"] == lost.sizes["event"]
+
+
+def test_a_copy_is_a_copy_in_every_pixel() -> None:
+    """One pixel that differs, off the pixels looked at first, makes a frame a real one."""
+    rng = np.random.default_rng(0)
+    counts = rng.normal(16000.0, 4.0, (1, 20, 200, 220)).astype(np.float32)
+    counts[0, [7, 12]] = counts[0, [6, 11]]
+    counts[0, 12, 101, 33] += 1.0
+    capture = xr.Dataset(
+        {"counts": (("band", "time", "y", "x"), counts)},
+        coords={"band": ["9.5"], "time": np.arange(20.0)},
+    )
+    assert rows(find_shutter(capture)) == [("9.5", 7, 1, False)]
+
+
+def test_frames_known_to_be_closed() -> None:
+    """Telemetry marks the first frame, too, and joins the copies that touch it."""
+    capture = still()
+    capture["counts"].values[0, 31:34] = capture["counts"].values[0, [30]]
+    closed = xr.DataArray(np.isin(np.arange(60), [29, 30, 50]), dims="time")
+    found = rows(find_shutter(capture, closed=closed))
+    assert sorted(found) == [
+        ("8-14", 29, 5, True),
+        ("8-14", 50, 1, True),
+        ("9.5", 29, 2, True),
+        ("9.5", 50, 1, True),
+    ]
+    one = closed.expand_dims(band=list(RIG.bands)) & xr.DataArray([False, True], dims="band")
+    by_band = find_shutter(capture, closed=one.transpose("band", "time"))
+    assert rows(by_band)[-1] == ("9.5", 50, 1, True)
+    with pytest.raises(ValueError, match="Invalid closed frames of sizes"):
+        find_shutter(capture, closed=closed[:50])
+    with pytest.raises(TypeError, match="Invalid dtype int64 of the closed frames"):
+        find_shutter(capture, closed=closed.astype(int))
+
+
+@pytest.mark.parametrize(
+    ("runs", "segments"),
+    [
+        ([("8-14", 10, 5), ("9.5", 12, 6)], [15]),
+        ([("8-14", 10, 5), ("9.5", 15, 3)], [15]),
+        ([("8-14", 10, 5), ("9.5", 17, 3)], [15, 20]),
+        ([("8-14", 10, 20), ("9.5", 12, 3), ("9.5", 20, 3)], [15, 23]),
+        ([("8-14", 0, 5), ("9.5", 55, 5)], []),
+    ],
+    ids=["overlap", "touch", "apart", "two in one", "ends"],
+)
+def test_events_that_overlap_are_one(runs: list[tuple[str, int, int]], segments: list[int]) -> None:
+    """Overlapping events share a segment, with a change between real frames of each camera."""
+    names = ("band", "first_frame", "frames")
+    parts = zip(*runs, strict=True)
+    columns = {name: ("event", list(part)) for name, part in zip(names, parts, strict=True)}
+    events = xr.Dataset(columns).assign(renewed=("event", [True] * len(runs)))
+    segment = mark_shutter(still(), events)["segment"].values
+    np.testing.assert_array_equal(1 + np.flatnonzero(np.diff(segment)), segments)
+    for _, first, number in runs:
+        if first > 0 and first + number < 60:
+            assert segment[first - 1] < segment[first + number]
+
+
+def test_shutter_is_marked_once_and_says_so(clean: xr.Dataset) -> None:
+    """Provenance is written, the input is not changed, and a second marking raises an error."""
+    capture = simulation.fire_shutter(clean, 20.0, np.random.default_rng(2), bands=("8-14",))
+    before = capture.copy(deep=True)
+    marked = mark_shutter(capture)
+    xr.testing.assert_identical(capture, before)
+    assert marked.attrs == {
+        **capture.attrs,
+        "shutter_events": 1,
+        "repeated_frames": 0,
+        "frames_taken_out": [5, 0],
+    }
+    assert marked["counts"].attrs == capture["counts"].attrs
+    assert marked["counts"].dtype == np.float32
+    with pytest.raises(ValueError, match="marked before"):
+        mark_shutter(marked)
+
+
+def test_shutter_refuses_nonsense() -> None:
+    """A frozen capture, an integer capture and events outside it raise an error."""
+    capture = still()
+    with pytest.raises(ValueError, match=re.escape("Invalid counts of band '8-14': 0 of the 480")):
+        find_shutter(capture.assign(counts=0 * capture["counts"]))
+    with pytest.raises(TypeError, match="Must be floating"):
+        mark_shutter(capture.astype(int))
+    events = find_shutter(capture, closed=xr.DataArray(np.arange(60) == 59, dims="time"))
+    with pytest.raises(ValueError, match=r"Invalid event of frames 59 to 59. Must lie in \[0, 49"):
+        mark_shutter(capture.isel(time=slice(50)), events)
+    with pytest.raises(ValueError, match="Missing 'renewed' of the events"):
+        mark_shutter(capture, events.drop_vars("renewed"))
+
+
+def glass(pixels: int = 400) -> tuple[xr.Dataset, xr.Dataset, np.random.Generator]:
+    """Scene and capture of plate glass that warms from 20 to 45 C."""
+    rng = np.random.default_rng(11)
+    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    scene = simulation.independent_pixels(
+        TIME, emissivity, Background(), pixels, rng, start=293.15, stop=318.15
+    )
+    return scene, simulation.observe(scene, RIG.response(), rng), rng
+
+
+def rmse(scene: xr.Dataset, capture: xr.Dataset) -> float:
+    """Error of the object temperature of glass [K]."""
+    result = separation.solve(capture, RIG.response())
+    return float(experiments.score(scene, result)["object_temperature_rmse"])
+
+
+def shutter(capture: xr.Dataset, rng: np.random.Generator) -> xr.Dataset:
+    """One event, of half a second and tens of counts."""
+    return simulation.fire_shutter(capture, 17.0, rng, offset_std=40.0)
+
+
+def lost(capture: xr.Dataset, rng: np.random.Generator) -> xr.Dataset:
+    """One frame of twenty is lost."""
+    return simulation.lose_frames(capture, 0.05, rng)
+
+
+@pytest.mark.parametrize("nuisance", [shutter, lost])
+def test_separation_stands_a_shutter_and_lost_frames(
+    nuisance: Callable[[xr.Dataset, np.random.Generator], xr.Dataset],
+) -> None:
+    """The object temperature is within 20 % of that of the undisturbed capture."""
+    scene, capture, rng = glass()
+    undisturbed = rmse(scene, capture)
+    marked = rmse(scene, mark_shutter(nuisance(capture, rng)))
+    print(f"{nuisance.__name__}: {marked:.4f} K, undisturbed {undisturbed:.4f} K")
+    assert marked <= 1.2 * undisturbed
+
+
+@pytest.mark.parametrize(("times", "factor"), [((17.5,), 1.90), ((11.0, 24.0), 2.71)])
+def test_a_step_costs_accuracy(times: tuple[float, ...], factor: float) -> None:
+    """The smooth part's deviation rises as stated, steps being fitted beside five functions."""
+    functions = smooth.polynomial_basis(TIME, 5)
+    steps = (TIME[:, np.newaxis] > np.array(times)).astype(float)
+    both = np.hstack([functions, steps])
+    covariance = np.linalg.inv(both.T @ both)[:5, :5]
+    np.testing.assert_allclose(np.sqrt(np.trace(covariance) / 5), factor, rtol=0, atol=0.01)

@@ -1,0 +1,147 @@
+"""Drift in time and lag of the detector: each simulated with a known truth, and undone."""
+
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+from captures import RIG, movie, still
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dbthermal import schema, simulation
+from dbthermal.correction import mark_shutter, undo_drift, undo_lag
+
+
+def patch() -> xr.DataArray:
+    """The upper left ten by ten pixels."""
+    return xr.DataArray(np.indices((20, 24)).max(axis=0) < 10, dims=("y", "x"))
+
+
+def test_common_drift_is_undone() -> None:
+    """A bend of 60 counts goes, to 0.4 of a count: 0.1 of noise over the patch's 100 pixels."""
+    capture = still(count=350)
+    curve = 60.0 * (1.0 - np.exp(-np.arange(350) / 150.0))
+    drifting = capture.assign(counts=capture["counts"] + xr.DataArray(curve, dims="time"))
+    drifting = drifting.astype(np.float32)
+    undone = undo_drift(drifting, patch())
+    error = (undone["counts"] - capture["counts"]).values
+    print(f"largest error of the drift {np.abs(error).max():.2f} count of 60")
+    assert np.abs(error).max() < 0.4
+    np.testing.assert_allclose(undone["drift"] - curve, 0.0, rtol=0, atol=0.4)
+    assert undone["counts"].dims == capture["counts"].dims
+    assert undone.attrs["drift_order"] == 5
+    assert undone.attrs["drift_pixels"] == 100
+
+
+def test_drift_leaves_the_steps() -> None:
+    """Each segment is undone by itself; frames taken out stay out, and steps stay in."""
+    capture = still(count=300)
+    drifting = simulation.drift_pattern(capture, np.random.default_rng(0), common=50.0)
+    stepped = simulation.fire_shutter(drifting, 15.0, np.random.default_rng(1))
+    marked = mark_shutter(stepped)
+    undone = undo_drift(marked, patch(), order=2)
+    gone = np.isnan(undone["drift"])
+    np.testing.assert_array_equal(gone, marked["counts"].isnull().any(("y", "x")))
+    level = undone["counts"].where(undone["segment"] == 1).mean("time")
+    step = level - undone["counts"].where(undone["segment"] == 0).mean("time")
+    shift = (stepped["counts"] - drifting["counts"]).isel(time=-1)
+    difference = step - shift
+    assert float(shift.std()) == pytest.approx(40.0, rel=0.1)  # count
+    # Of the drift the second segment keeps what it had at its first frame.
+    np.testing.assert_allclose(difference, 50.0 * 156 / 299, rtol=0, atol=2.5)
+
+
+def test_drift_refuses_nonsense() -> None:
+    """A patch without good pixels, of another size, incomplete or used twice raises an error."""
+    capture = still()
+    with pytest.raises(ValueError, match="it marks no good pixel"):
+        undo_drift(capture, patch() & False)
+    with pytest.raises(ValueError, match=re.escape("Invalid reference of sizes {'y': 20, 'x': 5}")):
+        undo_drift(capture, patch()[:, :5])
+    with pytest.raises(TypeError, match="Invalid dtype int64 of the reference"):
+        undo_drift(capture, patch().astype(int))
+    with pytest.raises(ValueError, match="Invalid order 1 of the drift"):
+        undo_drift(capture, patch(), order=1)
+    with pytest.raises(ValueError, match="the drift was undone before"):
+        undo_drift(undo_drift(capture, patch()), patch())
+    capture["counts"].values[1, 7, 2, 3] = np.nan
+    with pytest.raises(ValueError, match=re.escape("NaN in frame 7 of band '9.5'")):
+        undo_drift(capture, patch())
+    status = xr.zeros_like(patch(), dtype=np.uint16)
+    status[2, 3] = schema.Status.INVALID_SAMPLES
+    assert undo_drift(capture.assign(status=status), patch()).attrs["drift_pixels"] == 99
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    steps=st.lists(st.floats(0.002, 0.2), min_size=1, max_size=20),
+    constants=st.tuples(st.floats(0.001, 0.03), st.floats(0.001, 0.03)),
+    seed=st.integers(0, 1000),
+)
+def test_lag_round_trip(steps: list[float], constants: tuple[float, float], seed: int) -> None:
+    """A simulated lag is undone, for any spacing of the frames and a time constant of each band."""
+    time = np.concatenate([[0.0], np.cumsum(steps)])
+    scene = movie(np.random.default_rng(seed).uniform(15000.0, 20000.0, time.size), time)
+    # By name and not by place.
+    constant = xr.DataArray(
+        list(constants[::-1]), dims="band", coords={"band": list(RIG.bands[::-1])}
+    )
+    undone = undo_lag(simulation.lag(scene, constant), constant)
+    np.testing.assert_allclose(
+        undone["counts"][:, 1:], scene["counts"][:, 1:], rtol=0, atol=1e-5
+    )  # [count]
+    assert np.isnan(undone["counts"][:, 0]).all()
+    assert undone.attrs["lag_time_constant"] == list(constants)
+
+
+def test_undoing_the_lag_raises_the_noise() -> None:
+    """Undoing the lag raises the noise by the stated factor, and correlates successive frames."""
+    rng, time = np.random.default_rng(0), np.arange(40000) / 60.0
+    undone = undo_lag(movie(rng.standard_normal(time.size), time), 0.010)
+    signal = undone["counts"].values[0, 1:, 0, 0]
+    kept = np.exp(-1.0 / 0.6)
+    factor, correlation = signal.std(), np.corrcoef(signal[1:], signal[:-1])[0, 1]
+    print(f"noise times {factor:.3f}, correlation {correlation:.3f}")
+    assert factor == pytest.approx(np.sqrt(1 + kept**2) / (1 - kept), rel=0.02)
+    assert correlation == pytest.approx(-kept / (1 + kept**2), abs=0.02)
+    np.testing.assert_allclose(undone.attrs["lag_noise_amplification"], factor, rtol=0.02)
+    movies = [movie(signal[:9], np.arange(9) / rate) for rate in (10.0, 60.0, 100.0)]
+    factors = [undo_lag(one, 0.010).attrs["lag_noise_amplification"][0] for one in movies]
+    np.testing.assert_allclose(factors, [1.0, 1.255, 1.686], rtol=0, atol=0.001)
+
+
+def test_lag_of_marked_frames() -> None:
+    """The frame after a missing one is lost, too; at 10 Hz the others hardly change."""
+    capture = still()
+    capture["counts"].values[0, 30] = np.nan
+    undone = undo_lag(capture, 0.010)["counts"]
+    gone = [np.flatnonzero(np.isnan(part).all(("y", "x"))).tolist() for part in undone]
+    assert gone == [[0, 30, 31], [0]]
+    assert float(abs(undone - capture["counts"]).max()) < 0.01  # count
+    assert undone.dtype == np.float32
+
+
+def test_lag_refuses_nonsense() -> None:
+    """A missing time constant, one frame, integer counts and a second correction raise an error."""
+    capture = still()
+    with pytest.raises(ValueError, match=re.escape("Invalid time_constant [s] 0.0")):
+        undo_lag(capture, 0.0)
+    named = xr.DataArray([0.01], dims="band", coords={"band": ["9.5"]})
+    with pytest.raises(ValueError, match="Missing band '8-14' in the time constants"):
+        undo_lag(capture, named)
+    with pytest.raises(ValueError, match="Invalid capture of 1 frame"):
+        undo_lag(capture.isel(time=[0]), 0.01)
+    with pytest.raises(TypeError, match="Must be floating"):
+        undo_lag(capture.astype(int), 0.01)
+    with pytest.raises(ValueError, match="the lag was undone before"):
+        undo_lag(undo_lag(capture, 0.01), 0.01)
+
+
+def test_undoing_leaves_its_input() -> None:
+    """A new dataset comes out of each correction, and the old one is as it was."""
+    capture = still()
+    before = capture.copy(deep=True)
+    assert undo_lag(capture, 0.01) is not capture
+    assert undo_drift(capture, patch()) is not capture
+    xr.testing.assert_identical(capture, before)
