@@ -89,6 +89,8 @@ def band_table(
     ------
     KeyError
         If a band's name is unknown.
+    TypeError
+        If the spectra are no mapping, or a band is neither a Band nor a name.
     ValueError
         If there is no spectrum or no band, a band repeats, a spectrum is not as `schema` has it or
         holds NaN, the temperature is outside `bands.TEMPERATURE_RANGE`, or a spectrum covers less
@@ -145,6 +147,11 @@ def embedded_table() -> xr.Dataset:
     .. [1] Baldridge et al. (2009), doi:10.1016/j.rse.2008.11.007
     .. [2] Meerdink et al. (2019), doi:10.1016/j.rse.2019.05.015
     .. [3] Kotthaus et al. (2014), doi:10.1016/j.isprsjprs.2014.05.005
+
+    Examples
+    --------
+    >>> embedded_table().emissivity.sel(material="plate window glass", band="9.5").item()
+    0.718
     """
     text = resources.files("dbthermal").joinpath(_TABLE).read_text(encoding="utf-8")
     rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
@@ -171,6 +178,17 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
     DataArray
         Condition numbers (material, first, second) [1], symmetric; infinite on the diagonal and
         where the two emissivities are equal. See `mixing.condition_number`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the table is not as `schema` has it, or has one band only.
+
+    Examples
+    --------
+    >>> numbers = condition_numbers(embedded_table()).sel(first="8-14", second="9.5")
+    >>> numbers.sel(material=["plate window glass", "water"]).values.round(1).tolist()
+    [9.4, 649.2]
     """
     values = schema.check(table, "emissivity_table")["emissivity"]
     names = values["band"].values
@@ -202,6 +220,12 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
         materials in the mean. A gray material counts in the median as infinite and not in the mean,
         which a few nearly gray ones govern: choose by the median. Both are infinite where every
         material is gray, as on the diagonal.
+
+    Examples
+    --------
+    >>> summary = pair_summary(condition_numbers(embedded_table()))
+    >>> summary["median"].sel(first="8-14", second=["9.5", "10.6"]).values.round(1).tolist()
+    [110.7, 342.3]
     """
     finite = numbers.copy(data=np.isfinite(numbers.values))
     count = finite.sum("material")
@@ -238,6 +262,16 @@ def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.Da
     -------
     DataArray
         Noise (band) [K].
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If a band is unknown or repeats, or `netd` or the temperature is out of range.
+
+    Examples
+    --------
+    >>> filter_noise(0.04, ["8-14", "9.5", "10.6"]).values.round(3).tolist()  # [K]
+    [0.04, 0.398, 0.15]
     """
     chosen = _require_bands(bands)
     netd = float(planck.require_positive("netd [K]", netd))
@@ -274,8 +308,8 @@ def rank_filters(
     Returns
     -------
     Dataset
-        Over band, sorted by the first: `condition_number` [1]; `condition_number_mean` [1], over
-        the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
+        Each (band), in the order of the first: `condition_number` [1]; `condition_number_mean` [1],
+        over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
         `lowest_condition_number` and `lowest_std` name the filter of each criterion.
 
     Raises
@@ -283,6 +317,14 @@ def rank_filters(
     TypeError, ValueError
         If the table is not as `schema` has it or has no band `beside` and another, or the noise
         lacks a band, is in another unit, or is not finite and positive.
+
+    Examples
+    --------
+    >>> ranked = rank_filters(embedded_table(), filter_noise(0.04, FILTERS))
+    >>> ranked.band.values.tolist()
+    ['9.5', '12.1', '8.5', '10.6']
+    >>> ranked.object_temperature_std.values.round(2).tolist()  # [K]
+    [1.26, 2.34, 1.85, 2.25]
     """
     std = _single_frame_std(table, noise, beside).median("material", skipna=False)
     pairs = pair_summary(condition_numbers(table)).sel(first=beside, drop=True)

@@ -35,12 +35,21 @@ def correlation(
     Returns
     -------
     DataArray
-        Correlation without y and x [1], in [-1, 1].
+        Correlation [1], in [-1, 1], over the dims other than y and x.
 
     Raises
     ------
     ValueError
         If coordinates differ, fewer than two pixels count, one is not finite, or a map is constant.
+
+    Examples
+    --------
+    An emissivity [1] and an apparent temperature [K] that is linear in it.
+
+    >>> import xarray as xr
+    >>> emissivity = xr.DataArray([[0.2, 0.4], [0.6, 0.9]], dims=("y", "x"))
+    >>> round(float(correlation(emissivity, 290.0 + 10.0 * emissivity)), 6)
+    1.0
     """
     first, second = xr.broadcast(*xr.align(first, second, join="exact"))
     left, right = (_centred(values, mask) for values in (first, second))
@@ -74,6 +83,15 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     ------
     ValueError
         If coordinates differ, a unit is not K, or a true temperature is not above 273.15 K.
+
+    Examples
+    --------
+    Half a kelvin at 25 degrees Celsius:
+
+    >>> import xarray as xr
+    >>> truth = xr.DataArray(298.15)
+    >>> round(float(relative_error_celsius(truth + 0.5, truth)), 6)  # [percent]
+    2.0
     """
     for values in (estimate, truth):
         if values.attrs.get("units", "K") != "K":

@@ -86,6 +86,19 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     ------
     ValueError
         If there are fewer than `MINIMUM_FRAMES` frames, no pixel, or a noise comes out as zero.
+
+    Examples
+    --------
+    Reflections that step at random, weaker in the first band; noise of 50 and 150 mK.
+
+    >>> import numpy as np
+    >>> rng, time = np.random.default_rng(1), np.arange(300) / 10.0  # [s]
+    >>> steps = rng.normal(0, 5, (300, 64)) * (rng.random((300, 64)) < 0.05)
+    >>> reflected = np.cumsum(steps, axis=0)  # [K]
+    >>> first = 0.2 * reflected + rng.normal(0, 0.05, reflected.shape)
+    >>> second = 0.4 * reflected + rng.normal(0, 0.15, reflected.shape)
+    >>> np.allclose(estimate(first, second, time), [0.05, 0.15], rtol=0.1)  # [K]
+    True
     """
     frames, pixels = first.shape
     if frames < MINIMUM_FRAMES or pixels == 0:

@@ -165,26 +165,9 @@ class LinearCurve(Curve):
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
     """
-    Temperatures as float64, all of which must lie in the calibrated range of a curve.
+    Temperatures [K] as float64, all of which must lie in the calibrated range of a curve.
 
-    Parameters
-    ----------
-    temperature : array_like
-        Temperatures [K].
-    curve : Curve
-        The curve.
-    name : str
-        Name of the quantity, for the error.
-
-    Returns
-    -------
-    ndarray
-        The temperatures [K].
-
-    Raises
-    ------
-    ValueError
-        If one lies outside the range or is NaN; the error names the first.
+    Raises ValueError with the name and the first temperature that lies outside or is NaN.
     """
     values = np.asarray(temperature, dtype=np.float64)
     bad = ~((values >= curve.lowest) & (values <= curve.highest))
@@ -198,7 +181,7 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
 
 def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     """
-    Return the curve of one band.
+    Curve of one band.
 
     Parameters
     ----------
@@ -212,7 +195,7 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     Returns
     -------
     Curve
-        The curve.
+        Of the kind wanted; a `LinearCurve` if linear.
 
     Raises
     ------
@@ -247,25 +230,10 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
 
 def noise(response: xr.Dataset, bands: list[str]) -> Array:
     """
-    Noise of some bands of a response.
+    Noise (band) [count] of some bands of a response, the standard deviation of one pixel's counts.
 
-    Parameters
-    ----------
-    response : Dataset
-        Stage `response` of `schema`, with `noise` (band) [count].
-    bands : list of str
-        Names.
-
-    Returns
-    -------
-    ndarray, shape (band,)
-        Standard deviation of one pixel's counts [count].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there is no noise, its dims or unit are others, a band is missing, or a value is not
-        finite and positive.
+    Raises TypeError or ValueError if there is no noise, its dims or unit are others, a band is
+    missing, or a value is not finite and positive.
     """
     if "noise" not in response:
         raise ValueError("Missing noise of the response. Must be given to fit_response.")

@@ -283,8 +283,8 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     """
     Check a dataset against its stage, and return it unchanged.
 
-    A missing `units` attribute is taken as the agreed unit; a different one is an error. Values are
-    not read, except those of coordinates and of variables without pixels.
+    A missing `units` attribute is taken as the agreed unit; a different one is an error. Of the
+    values only those of the coordinates are read.
 
     Parameters
     ----------
@@ -300,6 +300,15 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     ValueError
         If a variable, dimension or coordinate is missing, misnamed or out of order, a unit is
         another one, a coordinate does not increase strictly, or bands repeat.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> wavelength = ("wavelength", [8.0, 14.0], {"units": "um"})
+    >>> glass = xr.Dataset({"emissivity": ("wavelength", [0.9, 0.8])}, {"wavelength": wavelength})
+    >>> check(glass, "spectrum")
+    Traceback (most recent call last):
+    ValueError: Invalid units 'um' of 'wavelength' of 'emissivity' of the spectrum. Must be 'm'.
     """
     if stage not in STAGES:
         raise ValueError(f"Unknown stage '{stage}'. Must be one of {sorted(STAGES)}.")

@@ -68,6 +68,22 @@ def register(
     ----------
     .. [1] Evangelidis, Psarakis (2008), IEEE Transactions on Pattern Analysis and Machine
        Intelligence 30, 1858, doi:10.1109/TPAMI.2008.113
+
+    Examples
+    --------
+    The second view shows the scene three pixels further right and two further down.
+
+    >>> import numpy as np, xarray as xr
+    >>> from scipy.ndimage import gaussian_filter
+    >>> scene = gaussian_filter(np.random.default_rng(1).normal(20000, 3000, (70, 70)), 4)
+    >>> views = np.stack([[scene[3:67, 3:67]] * 2, [scene[1:65, :64]] * 2])  # [count]
+    >>> corrected = xr.Dataset(
+    ...     {"counts": (("band", "time", "y", "x"), views)},
+    ...     {"band": ["8-14", "9.5"], "time": [0.0, 0.1]},
+    ... )
+    >>> transform = register(corrected, model="translation")
+    >>> transform.sel(band="9.5").values[:2, 2].round(1).tolist()  # [pixel]
+    [3.0, 2.0]
     """
     if model not in _MODELS:
         raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")

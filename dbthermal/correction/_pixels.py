@@ -77,8 +77,23 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     Raises
     ------
     TypeError, ValueError
-        If the threshold is not positive, or a band has fewer than 16 frames that are not NaN, or
-        than 0.5 s have.
+        If the threshold is not positive, or a band has fewer frames that are not NaN than 16, or
+        than 0.4 s and three frames more.
+
+    Examples
+    --------
+    One pixel blinks: it is 80 counts too high for a second.
+
+    >>> import numpy as np, xarray as xr
+    >>> counts = np.random.default_rng(1).normal(20000, 4, (1, 60, 12, 12))  # [count]
+    >>> counts[0, 30:40, 5, 7] += 80
+    >>> corrected = xr.Dataset(
+    ...     {"counts": (("band", "time", "y", "x"), counts)},
+    ...     {"band": ["8-14"], "time": np.arange(60) / 10.0},
+    ... )
+    >>> marked = mark_bad(corrected)
+    >>> np.argwhere(marked.status.values).tolist(), marked.jumping_pixels
+    ([[5, 7]], 1)
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not threshold > 0:

@@ -61,6 +61,21 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     TypeError, ValueError
         If `closed` is no boolean of the frames, or in a band fewer than 16 of the pixels compared
         ever change.
+
+    Examples
+    --------
+    The camera repeats an image five times while its shutter is closed.
+
+    >>> import numpy as np, xarray as xr
+    >>> counts = np.random.default_rng(1).normal(20000, 4, (1, 40, 8, 8)).round()  # [count]
+    >>> counts[0, 21:26] = counts[0, 20]
+    >>> capture = xr.Dataset(
+    ...     {"counts": (("band", "time", "y", "x"), counts)},
+    ...     {"band": ["8-14"], "time": np.arange(40) / 10.0},
+    ... )
+    >>> events = find_shutter(capture)
+    >>> [events[name].item() for name in ("first_frame", "frames", "start", "stop", "renewed")]
+    [21, 5, 2.1, 2.5, True]
     """
     counts = schema.check(corrected, "corrected")["counts"]
     known = _closed_frames(counts, closed)

@@ -46,7 +46,7 @@ _HEADER_RULES: Final = {
 
 
 def ecostress(path: str | Path) -> xr.Dataset:
-    """
+    r"""
     Spectrum of an ECOSTRESS (or ASTER) library file, ``*.spectrum.txt``.
 
     The file gives the hemispherical reflectance R [%] of an opaque sample, so that by Kirchhoff's
@@ -70,12 +70,27 @@ def ecostress(path: str | Path) -> xr.Dataset:
         If the file does not exist.
     ValueError
         If it is truncated or longer than declared, is no hemispherical reflectance in percent over
-        micrometres, or holds a value that is no spectrum's.
+        micrometres, an emissivity is outside `schema.EMISSIVITY_LIMITS`, or a wavelength is outside
+        0.001 to 1000 um or out of order.
 
     References
     ----------
     Meerdink et al. (2019), The ECOSTRESS spectral library version 1.0, Remote Sensing of
     Environment 230, 111196, doi:10.1016/j.rse.2019.05.015
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> lines = ["Name: Window glass", "Measurement: Hemispherical reflectance"]
+    >>> lines += ["X Units: Wavelength (micrometers)", "Y Units: Reflectance (percent)"]
+    >>> lines += ["First X Value: 8.0", "Last X Value: 14.0", "Number of X Values: 3", ""]
+    >>> lines += ["8.0 4.0", "9.5 25.0", "14.0 10.0"]  # wavelength [um], reflectance [%]
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "glass.spectrum.txt")
+    ...     size = path.write_text("\n".join(lines))
+    ...     ecostress(path).emissivity.values.tolist()
+    [0.96, 0.75, 0.9]
     """
     path = Path(path)
     lines = path.read_text(encoding="latin-1").split("\n")
@@ -89,7 +104,7 @@ def ecostress(path: str | Path) -> xr.Dataset:
 
 
 def slum(path: str | Path) -> dict[str, xr.Dataset]:
-    """
+    r"""
     Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
 
     Parameters
@@ -107,13 +122,23 @@ def slum(path: str | Path) -> dict[str, xr.Dataset]:
     FileNotFoundError
         If the file does not exist.
     ValueError
-        If the columns are others, a row is short, or a value is no spectrum's.
+        If the columns are not these, a row is short, or a value is refused as by `ecostress`.
 
     References
     ----------
     Kotthaus et al. (2014), Derivation of an urban materials spectral library through emittance and
     reflectance spectroscopy, ISPRS Journal of Photogrammetry and Remote Sensing 94, 194-212,
     doi:10.1016/j.isprsjprs.2014.05.005
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "LUMA_SLUM_IR.csv")
+    ...     size = path.write_text("wavelength,A001,A002\n8.0,0.93,0.89\n14.0,0.95,0.97\n")
+    ...     slum(path)["A002"].emissivity.values.tolist()
+    [0.89, 0.97]
     """
     path = Path(path)
     titles, rows = _table(path)
@@ -131,7 +156,7 @@ def slum(path: str | Path) -> dict[str, xr.Dataset]:
 
 
 def ucsb(path: str | Path) -> xr.Dataset:
-    """
+    r"""
     Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
 
     Parameters
@@ -150,8 +175,18 @@ def ucsb(path: str | Path) -> xr.Dataset:
     FileNotFoundError
         If the file does not exist.
     ValueError
-        If the columns are others, wavelength and wavenumber disagree by more than 0.1 %, or a value
-        is no spectrum's.
+        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or a
+        value is refused as by `ecostress`.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "water.csv")
+    ...     size = path.write_text("x1,x2,y_water\n8.0,1250.0,0.985\n12.5,800.0,0.981\n")
+    ...     ucsb(path).emissivity.values.tolist()
+    [0.985, 0.981]
     """
     path = Path(path)
     titles, rows = _table(path)

@@ -65,8 +65,24 @@ def palette_video(path: str | Path, palette: str = "plasma") -> xr.DataArray:
     FileNotFoundError
         If the file does not exist.
     ValueError
-        If the palette is unknown or does not fit, the file cannot be decoded to its end, or the
-        number of frames is not the declared one.
+        If the palette is unknown or does not fit, the file cannot be decoded to its end, its
+        timestamps do not increase, or the number of frames is not the declared one.
+
+    Examples
+    --------
+    A wedge drawn in plasma and encoded at 10 Hz comes back within 0.05.
+
+    >>> import numpy as np
+    >>> from tempfile import TemporaryDirectory
+    >>> from matplotlib import colormaps
+    >>> from dbthermal import store
+    >>> wedge = np.broadcast_to(np.linspace(0.1, 0.9, 64), (3, 48, 64))
+    >>> with TemporaryDirectory() as folder:
+    ...     frames = colormaps["plasma"](wedge, bytes=True)[..., :3]
+    ...     store.save_video(frames, f"{folder}/wedge.mp4", {}, rate=10.0)
+    ...     movie = palette_video(f"{folder}/wedge.mp4")
+    >>> bool(abs(movie - wedge).max() < 0.05), movie.time.values.tolist()  # [1], [s]
+    (True, [0.0, 0.1, 0.2])
     """
     path = Path(path)
     colours = _palette(palette)
@@ -108,6 +124,21 @@ def masked_palette_video(
     ------
     FileNotFoundError, ValueError
         As `palette_video`; also if the video is narrower than `width`, or has no coloured pixel.
+
+    Examples
+    --------
+    The left half of the video is drawn in turbo, the right half is gray.
+
+    >>> import numpy as np
+    >>> from tempfile import TemporaryDirectory
+    >>> from matplotlib import colormaps
+    >>> from dbthermal import store
+    >>> frames = np.full((3, 48, 64, 3), 90, dtype=np.uint8)
+    >>> frames[:, :, :32] = colormaps["turbo"](np.linspace(0.2, 0.8, 32), bytes=True)[:, :3]
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save_video(frames, f"{folder}/half.mp4", {}, rate=10.0)
+    ...     masked_palette_video(f"{folder}/half.mp4").valid[0, 24, [10, 50]].values.tolist()
+    [True, False]
     """
     path = Path(path)
     colours = _palette(palette)

@@ -63,11 +63,14 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
 
     Examples
     --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
     >>> from dbthermal import store
-    >>> folder = getfixture("tmp_path")
-    >>> store.save(xr.Dataset({"counts": ("band", [3, 4])}), folder / "a.zarr", {})
-    >>> store.open_dataset(folder / "a.zarr").counts.values.tolist()
-    [3, 4]
+    >>> counts = xr.Dataset({"counts": ("band", [20310, 20750])})  # [count]
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save(counts, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
+    ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
+    [20310, 20750]
     """
     # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
     plain = _with_text_as(dataset.drop_encoding(), "U", np.dtypes.StringDType())
@@ -94,6 +97,18 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     Dataset
         Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
         fixed-length kind.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> wall = xr.Dataset({"object_temperature": ("time", [295.2, 295.3], {"units": "K"})})
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save(wall, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
+    ...     saved = store.open_dataset(f"{folder}/wall.zarr").load()
+    >>> saved.equals(wall), saved.attrs["provenance"]["parameters"]
+    (True, {'frames': 2})
     """
     if not Path(path).is_dir():
         raise FileNotFoundError(
@@ -139,6 +154,16 @@ def save_numbers(
         File ``*.json``. Its parents are made.
     provenance : mapping
         From `dbthermal.store.provenance`.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> with TemporaryDirectory() as folder:
+    ...     path = f"{folder}/wall.json"
+    ...     store.save_numbers({"object_rmse_K": 0.21}, path, store.provenance({"frames": 2}))
+    ...     store.read_numbers(path)
+    {'object_rmse_K': 0.21}
     """
     content = {
         "numbers": {name: _number(name, value) for name, value in numbers.items()},
@@ -183,6 +208,17 @@ def save_figure(
         From `dbthermal.store.provenance`; becomes the text chunk ``Comment``, as JSON.
     dpi : int
         Resolution [pixel/inch].
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from matplotlib.figure import Figure
+    >>> from PIL import Image
+    >>> from dbthermal import store
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save_figure(Figure(figsize=(2, 1)), f"{folder}/wall.png", {"commit": "unknown"})
+    ...     Image.open(f"{folder}/wall.png").text["Comment"]
+    '{"commit": "unknown"}'
     """
     metadata = {"Software": "dbthermal", "Comment": _json(provenance)}
     with _whole(path, ".png") as part:
