@@ -13,7 +13,6 @@ from dbthermal.separation._baselines.calibrated import temperature_variance
 from dbthermal.simulation import Rig
 
 RIG = Rig()
-TIME = np.arange(350) / 10.0
 
 
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
