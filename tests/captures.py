@@ -1,4 +1,4 @@
-"""Simulated captures of reflected people, of a uniform view, and of one signal in time."""
+"""Emissivities, and captures of reflected people, of a uniform view, of one signal in time."""
 
 import numpy as np
 import xarray as xr
@@ -8,6 +8,11 @@ from dbthermal.simulation import Rig
 
 RIG = Rig()
 SHAPE = (64, 80)
+
+
+def emissivity_of(*values: float, bands: tuple[str, ...] = RIG.bands) -> xr.DataArray:
+    """Emissivity (band)."""
+    return xr.DataArray(list(values), dims="band", coords={"band": list(bands)})
 
 
 def panels(*, size: int = 16) -> xr.DataArray:

@@ -116,7 +116,7 @@ def test_own_part_keeps_a_jump() -> None:
     np.testing.assert_allclose(own, 0.1 * time + jump, rtol=0, atol=1e-9)
 
 
-def test_leverage_with_steps_is_the_variance_of_the_own_part() -> None:
+def test_leverage_with_steps_is_the_variance_of_the_object_part() -> None:
     """White noise through the fit scatters as the leverage says, at every order."""
     rng = np.random.default_rng(5)
     time, noise = np.arange(80.0), rng.standard_normal((80, 4000))

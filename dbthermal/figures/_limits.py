@@ -12,13 +12,12 @@ from matplotlib.image import AxesImage
 
 from dbthermal.figures.drawing import (
     COLORS,
+    MARKERS,
     canvas,
     plain_decades,
     plain_ticks,
     provenance_note,
 )
-
-_MARKERS: Final = "osD^v"
 
 # Deviations [K] at the ends of the colour map; beyond, a filter is as good or as bad as can be.
 _SCALE: Final = (0.1, 10.0)
@@ -63,7 +62,7 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
             durations["seconds"],
             durations["object_temperature_std"].sel(material=name, filter=chosen),
             color=COLORS[index % len(COLORS)],
-            marker=_MARKERS[index % len(_MARKERS)],
+            marker=MARKERS[index % len(MARKERS)],
             markersize=4,
             linewidth=1,
             label=f"{name}, {chosen} {_MICRO}",

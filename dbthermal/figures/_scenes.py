@@ -140,6 +140,15 @@ def separated_temperatures(
     -------
     Figure
         As many rows as there are times.
+
+    Examples
+    --------
+    >>> from dbthermal import figures
+    >>> movie = xr.DataArray(np.full((1, 4, 6), 300.0), {"time": [0.0]}, ("time", "y", "x"))
+    >>> apparent = movie.expand_dims(band=["8-14", "9.5"])  # K
+    >>> figure = figures.separated_temperatures(apparent, movie, movie - 300.0, title="plate")
+    >>> [axis.get_title() for axis in figure.axes[2:4]]
+    ['emission, 0.0 s', 'reflection less its mean, 0.0 s']
     """
     labels = ("apparent [\N{DEGREE SIGN}C]", "object [\N{DEGREE SIGN}C]", label)
     inputs = (apparent - zero_Celsius).assign_attrs(apparent.attrs)

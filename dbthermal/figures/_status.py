@@ -58,6 +58,14 @@ def status(result: xr.Dataset) -> Figure:
     ------
     ValueError
         If a bit is not one of `schema.Status`.
+
+    Examples
+    --------
+    >>> from dbthermal import figures, schema
+    >>> bits = np.array([[0, 0, 0, int(schema.Status.DEAD_PIXEL)]], dtype=np.uint32)
+    >>> figure = figures.status(xr.Dataset({"status": (("y", "x"), bits)}))
+    >>> [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+    ['75.0 %  good', '25.0 %  dead pixel']
     """
     first = first_reason(result["status"])
     shares = {name: float(np.mean(first == name)) for name in ("", *REASONS)}

@@ -12,6 +12,7 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
 __all__ = [
     "COLORS",
+    "MARKERS",
     "band_label",
     "canvas",
     "draw_image",
@@ -25,7 +26,8 @@ __all__ = [
 COLORS: Final = ("#1b6ca8", "#d1495b", "#66a182", "#edae49", "#6c4f77")
 """Colours of the bands, in their order."""
 
-_LABELS: Final = {"8-14": "8-14 \N{MICRO SIGN}m"}
+MARKERS: Final = "osD^vPX*"
+"""Markers of lines, in their order."""
 
 
 def __dir__() -> list[str]:
@@ -55,7 +57,7 @@ def band_label(name: object) -> str:
     str
         E.g. "9.5 um", with a micro sign.
     """
-    return _LABELS.get(str(name), f"{name} \N{MICRO SIGN}m")
+    return f"{name} \N{MICRO SIGN}m"
 
 
 def provenance_note(data: xr.Dataset | xr.DataArray) -> str:

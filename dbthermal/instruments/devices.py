@@ -198,14 +198,15 @@ class Devices:
             cameras=renamed(self.cameras),
         )
 
-    def flush(self, clock: Callable[[], float] = system_time.monotonic) -> None:
-        """Discard the frames that the drivers hold, which show the scene as it was before.
-
-        `clock` is the host's, that of the frames [s]; `SourceLostError` if a camera is gone.
+    def flush(self) -> None:
         """
-        start = clock()
+        Discard the frames that the drivers hold, which show the scene as it was before.
+
+        `SourceLostError` if a camera is gone.
+        """
+        start = system_time.monotonic()
         for source in self.sources.values():
-            while clock() - start < FLUSH_TIMEOUT:
+            while system_time.monotonic() - start < FLUSH_TIMEOUT:
                 try:
                     frame = source.read(0.0)
                 except NoFrameError:
@@ -251,6 +252,16 @@ def open_devices(
         If the world has no such camera.
     OSError, WheelError, TC08Error
         If a device cannot be opened, or is another one.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments.session import Camera, Device, Session
+    >>> port = Device("sim://boson/wide", "serial:///dev/ttyACM0")
+    >>> video = Device("sim://boson/wide", "v4l2:///dev/video0")
+    >>> session = Session("pot", True, "scene", 60.0, {"8-14": Camera(video, port)})
+    >>> with open_devices(session) as devices:
+    ...     devices.identities()["8-14"]["model"], devices.readings()["fpa 8-14"].read()  # K
+    ('emulated Boson', 308.15)
     """
     if session.simulated:
         if world is None:

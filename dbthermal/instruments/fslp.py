@@ -148,6 +148,15 @@ class Decoder:
     Bytes between frames are ignored. A start byte always begins anew. A frame that is cut short,
     too long or too short, holds an illegal escape or has the wrong checksum is dropped and counted
     in `damaged`: each start byte began a frame that was returned, is counted, or is still open.
+
+    Examples
+    --------
+    >>> line, decoder = encode(1, 0x00050002), Decoder()
+    >>> decoder.feed(b"noise" + line[:9])
+    []
+    >>> [frame] = decoder.feed(line[9:])
+    >>> frame.sequence, hex(frame.command), decoder.damaged
+    (1, '0x50002', 0)
     """
 
     def __init__(self) -> None:

@@ -152,7 +152,15 @@ def find(
 
 
 def describe(devices: Iterable[Device]) -> str:
-    """Text with a line for each device, its warnings below it, and one for each missing kind."""
+    """
+    Text with a line for each device, its warnings below it, and one for each missing kind.
+
+    Examples
+    --------
+    >>> camera = Device(KINDS[0], bus=1, ports=(2, 4), speed="high", video_nodes=("/dev/video0",))
+    >>> print(describe([camera]).splitlines()[0])
+    FLIR Boson without serial number: 1-2.4, high speed, /dev/video0
+    """
     listed = list(devices)
     lines = []
     for kind in KINDS:

@@ -79,6 +79,11 @@ def emf(temperature: npt.ArrayLike) -> Array:
     .. [1] NIST ITS-90 Thermocouple Database, SRD 60, doi:10.18434/T4S888
     .. [2] Burns, Scroger, Strouse, Croarkin, Guthrie (1993), NIST Monograph 175,
        doi:10.6028/NIST.MONO.175
+
+    Examples
+    --------
+    >>> emf([273.15, 373.15]).round(3).tolist()  # mV
+    [0.0, 4.279]
     """
     return _emf(_inside("temperature", temperature, TEMPERATURE, "K") - zero_Celsius)
 

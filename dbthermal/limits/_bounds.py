@@ -31,6 +31,11 @@ def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
     -------
     ndarray
         Ratio [1].
+
+    Examples
+    --------
+    >>> reflection_ratio([0.86, 0.72]).round(3).item()  # plate glass in 8-14 um and 9.5 um
+    2.0
     """
     first, second = np.asarray(emissivity, dtype=np.float64)
     return np.asarray((1.0 - second) / (1.0 - first))
@@ -65,6 +70,16 @@ def ratio_variance_bound(
     -------
     ndarray
         Smallest variance [1] of an unbiased estimate.
+
+    Examples
+    --------
+    Plate glass before a background that changes by 3 K every five seconds:
+
+    >>> background = 295.0 + 3.0 * (np.arange(200) // 50 % 2)  # K, 10 frames/s
+    >>> functions, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, 200), 5))
+    >>> variance = ratio_variance_bound((0.86, 0.72), (0.03, 0.35), background, functions)
+    >>> np.sqrt(variance).round(2).item()
+    0.15
     """
     ratio = float(reflection_ratio(emissivity))
     rapid = background - np.tensordot(functions, functions.T @ background, axes=1)
@@ -113,7 +128,7 @@ def bounds(
     Dataset
         `object_temperature_std`, `background_temperature_std` (time, y, x) [K], `emissivity_std`
         and `reflection_ratio_std` (band, y, x) [1], of :math:`(1 - e_m) / (1 - e_r)` with r the
-        quieter band (attribute `reference_band`); infinite without information. `identifiable`
+        quietest band (attribute `reference_band`); infinite without information. `identifiable`
         (quantity, y, x): True if the deviation, root mean square over time and largest of the
         bands, is below that of a uniform number in (0, 1) or in the calibrated range, and for a
         ratio below the ratio itself. `condition_number`, `order` (y, x) [1]; `resting`
@@ -139,6 +154,19 @@ def bounds(
     ----------
     .. [1] Kay (1993), Fundamentals of Statistical Signal Processing: Estimation Theory, chapter 3
     .. [2] Golub, Pereyra (2003), Inverse Problems 19, R1, doi:10.1088/0266-5611/19/2/201
+
+    Examples
+    --------
+    Plate glass, and a gray body, of which two bands tell nothing:
+
+    >>> from dbthermal import simulation
+    >>> rig, rng, bands = simulation.Rig(), np.random.default_rng(1), ["8-14", "9.5"]
+    >>> emissivity = xr.DataArray([[0.86, 0.90], [0.72, 0.90]], {"band": bands}, ("band", "x"))
+    >>> panels = emissivity.expand_dims(y=3, axis=1)
+    >>> scene = simulation.walkers(np.arange(200) / 10, (3, 2), panels, rng).isel(y=[1])
+    >>> std = bounds(scene, rig.response())["object_temperature_std"]
+    >>> std.mean("time").values.round(2).tolist()  # K
+    [[0.04, inf]]
     """
     if not emissivity_std >= 0:
         raise ValueError(f"Invalid emissivity_std {emissivity_std}. Must not be negative.")

@@ -192,6 +192,18 @@ def plan_durations(
     ------
     ValueError
         As `plan`, or if the lengths do not increase.
+
+    Examples
+    --------
+    Plate glass, recorded for 10 s and for 40 s:
+
+    >>> from dbthermal import emissivity, limits
+    >>> table = emissivity.embedded_table()
+    >>> glass = table.sel(material=["plate window glass"], band=["8-14", "9.5"])
+    >>> noise = emissivity.filter_noise(0.03, ["8-14", "9.5"])
+    >>> expected = limits.plan_durations(glass, noise, [10.0, 40.0])
+    >>> expected["object_temperature_std"].squeeze().values.round(1).tolist()  # K
+    [0.4, 0.2]
     """
     design = CaptureDesign() if design is None else design
     lengths = np.asarray(seconds, dtype=np.float64)

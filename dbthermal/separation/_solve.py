@@ -222,6 +222,13 @@ def get_method(name: str) -> Method:
     ------
     ValueError
         If there is no such method.
+
+    Examples
+    --------
+    >>> get_method("calibrated").knows_emissivity
+    True
+    >>> get_method("subspace").settings(background_drift=1.0)  # K
+    SubspaceSettings(background_drift=1.0)
     """
     if name not in METHODS:
         raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}.")

@@ -92,8 +92,8 @@ def drop_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
     """
     Remove lost frames, as a driver does that stamps the others: those that follow move up.
 
-    Of a capture with `exposure_time` (band, time) [s], see `expose`, and a mask (band, time):
-    counts and stamps with each band's remaining frames first, NaN behind them.
+    The capture has `exposure_time` (band, time) [s], see `expose`; `lost` is a mask (band, time).
+    In the result each band's remaining counts and stamps come first, and NaN behind them.
     """
     _check_lost(corrected, lost)
     counts, stamps = (
@@ -113,8 +113,8 @@ def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
     """
     Replace lost frames by copies of the frame before, as a driver does that stamps none.
 
-    Of a mask (band, time) that must spare the first frames (ValueError): counts in which a lost
-    frame is a copy of the one before, without `exposure_time`.
+    `lost` is a mask (band, time); ValueError if a band's first frame is lost. The result has no
+    `exposure_time`.
     """
     _check_lost(corrected, lost)
     if lost[:, 0].any():
@@ -186,6 +186,18 @@ def fire_shutter(
     TypeError, ValueError
         If the capture is not as `schema` has it, a time does not lie in it, the duration is not
         positive, or a band is missing.
+
+    Examples
+    --------
+    Closed for 0.25 s after 0.2 s: two frames repeat the one before.
+
+    >>> rng, time = np.random.default_rng(1), ("time", np.arange(6) / 10, {"units": "s"})
+    >>> ramp = np.arange(6.0).reshape(1, 6, 1, 1)
+    >>> counts = (("band", "time", "y", "x"), ramp, {"units": "count"})
+    >>> capture = xr.Dataset({"counts": counts}, {"band": ["8-14"], "time": time})
+    >>> closed = fire_shutter(capture, [0.2], rng, duration=0.25, offset_std=0.0)
+    >>> closed["counts"].values.ravel().tolist()
+    [0.0, 1.0, 2.0, 2.0, 2.0, 5.0]
     """
     counts = _floating(corrected).copy(deep=True)
     planck.require_positive("duration [s]", duration)
@@ -315,6 +327,17 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
         the pixel.
     time_constant : float or DataArray
         Time constant [s], of all bands or (band), by name.
+
+    Examples
+    --------
+    A step of 100 counts through a pixel of 0.1 s, frame by frame every 0.1 s:
+
+    >>> step = np.array([0.0, 0.0, 100.0, 100.0, 100.0]).reshape(1, 5, 1, 1)
+    >>> counts = (("band", "time", "y", "x"), step, {"units": "count"})
+    >>> time = ("time", np.arange(5) / 10, {"units": "s"})
+    >>> capture = xr.Dataset({"counts": counts}, {"band": ["8-14"], "time": time})
+    >>> lag(capture, 0.1)["counts"].values.round().ravel().tolist()
+    [0.0, 0.0, 63.0, 86.0, 95.0]
     """
     counts = _floating(corrected).copy(deep=True)
     _, new = lag_coefficients(time_constant, counts)

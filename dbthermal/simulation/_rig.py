@@ -171,7 +171,7 @@ def observe(
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
     """
-    Fixed pattern of the rig's detectors of a shape (rows, columns).
+    Random fixed pattern of the rig's detectors, of a shape (rows, columns).
 
     `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies, relative to
     the mean of the live pixels, a smooth vignette (narcissus) included; `dead` (band, y, x).
@@ -217,6 +217,17 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     ------
     ValueError
         If the detector lacks a band, or a count does not fit into 16 bits (no silent saturation).
+
+    Examples
+    --------
+    >>> from dbthermal import simulation
+    >>> rig, rng = simulation.Rig(bad_fraction=0.1), np.random.default_rng(1)
+    >>> glass = xr.DataArray([0.86, 0.72], coords={"band": list(rig.bands)}, dims="band")
+    >>> scene = simulation.walkers(np.arange(3) / 10, (24, 32), glass, rng)
+    >>> corrected = simulation.observe(scene, rig.response(), rng)
+    >>> raw = simulation.capture(corrected, simulation.pattern(rig, (24, 32), rng))
+    >>> raw["counts"].dtype.name, round(float((raw["counts"] == 0).mean()), 1)  # dead pixels
+    ('uint16', 0.1)
     """
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
@@ -251,6 +262,17 @@ def blackbody_movies(
     -------
     Dataset
         `counts` uint16 (band, temperature, frame, y, x) [count].
+
+    Examples
+    --------
+    >>> from dbthermal import simulation
+    >>> rig, rng = simulation.Rig(bad_fraction=0.0), np.random.default_rng(1)
+    >>> detector = simulation.pattern(rig, (24, 32), rng)
+    >>> steps = np.array([283.15, 303.15])  # K
+    >>> movies = simulation.blackbody_movies(rig, steps, 4, detector, rng)
+    >>> rise = movies["counts"].mean(("frame", "y", "x")).diff("temperature").squeeze()
+    >>> (rise / 20.0).values.round().tolist()  # count/K in each band
+    [108.0, 11.0]
     """
     response = rig.response()
     shape = (frames, *detector["gain"].shape[1:])
@@ -274,8 +296,8 @@ def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
     """
     Raw counts of one band, uint16 (..., y, x): fixed pattern, rounding, dead pixels at 0.
 
-    Of corrected counts (..., y, x) [count] and a `pattern` of this band (y, x). Raises a ValueError
-    if a count does not fit into 16 bits.
+    Takes corrected counts (..., y, x) [count] and the `pattern` (y, x) of this band. Raises a
+    ValueError if a count does not fit into 16 bits.
     """
     raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
     if not (raw.min() >= 0 and raw.max() <= correction.DETECTOR_MAXIMUM):  # a NaN fails it, too

@@ -114,6 +114,11 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     -------
     ndarray, shape (time, ...)
         Temperature [K].
+
+    Examples
+    --------
+    >>> heating(np.array([0.0, 10.0, 20.0]), 293.15, 313.15, 10.0).round(2).tolist()
+    [293.15, 307.77, 313.15]
     """
     increasing(time, "a heating")
     constant = planck.require_positive("time_constant [s]", time_constant)

@@ -184,6 +184,17 @@ def incident(
         Temperature of the walls behind all actors [K].
     actors : sequence of Actor
         Bodies; the nearest hides the others.
+
+    Examples
+    --------
+    A ray along x meets a person of 306 K who walks through it, else a wall of 295 K:
+
+    >>> path = gliding([0.0, 2.0], [(2.0, -2.0, 0.0), (2.0, 2.0, 0.0)])  # s, m
+    >>> person = painted([(trimesh.creation.box((0.3, 0.5, 1.8)), 306.0)], path)
+    >>> origin, forward = np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]])
+    >>> met = incident(origin, forward, np.array([0.0, 1.0, 2.0]), 295.0, [person])
+    >>> met.ravel().round(1).tolist()  # K
+    [295.0, 306.0, 295.0]
     """
     targets = [_Target(actor, origins, directions) for actor in actors]
     result = np.full((time.size, len(directions)), room)

@@ -24,7 +24,7 @@ from dbthermal.instruments.boson import (
 from dbthermal.instruments.boson.commands import Setting
 from dbthermal.instruments.camera import GainMode
 
-SERIAL, FPA, GAIN, SET_GAIN = 0x00050002, 0x00050030, 0x00050015, 0x00050014
+SERIAL, FPA, SET_GAIN = 0x00050002, 0x00050030, 0x00050014
 
 
 def reply(sequence: int, command: int, data: bytes = b"", status: int = 0) -> bytes:

@@ -1,7 +1,7 @@
 """Frame rate, processor load and memory of recordings on the emulated rig.
 
-``pytest -m bench tests/test_record_rate.py --capture=no`` prints it. The cameras are emulated: what
-is measured is the way from a frame that is there to the disk, not USB.
+``pytest -m bench tests/instruments/test_record_rate.py --capture=no`` prints it. The cameras
+are emulated: what is measured is the way from a frame that is there to the disk, not USB.
 """
 
 import os

@@ -22,7 +22,6 @@ from reproduction.figures import validity
 
 TIME = np.arange(350) / 10.0  # s
 GLASS: dict[str, Any] = {"case": "glass", "emissivity": [0.86, 0.72], "start": 20, "stop": 45}
-STILL: dict[str, Any] = GLASS | {"case": "still", "background": {"kind": "still"}}
 PIXELS = 2000
 
 

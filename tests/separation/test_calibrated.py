@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from captures import emissivity_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,12 +13,6 @@ from dbthermal.separation._baselines.calibrated import temperature_variance
 from dbthermal.simulation import Rig
 
 RIG = Rig()
-TIME = np.arange(350) / 10.0
-
-
-def emissivity_of(*values: float) -> xr.DataArray:
-    """Emissivity (band) of the rig's two bands."""
-    return xr.DataArray(list(values), dims="band", coords={"band": list(RIG.bands)})
 
 
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from dbthermal import _smooth as smooth
@@ -11,8 +10,6 @@ from dbthermal import mixing, response
 from dbthermal.separation._subspace import emission, reflection_ratio
 from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Rig
-
-Floats = npt.NDArray[np.float64]
 
 TIME = np.arange(350) / 10.0  # s
 FUNCTIONS = smooth.subspace(TIME, 6)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import emissivity_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,11 +26,6 @@ QUICK: dict[str, Any] = {
 
 Pair = tuple[xr.Dataset, xr.Dataset]
 every_method = pytest.mark.parametrize("method", separation.METHODS)
-
-
-def emissivity_of(*values: float, bands: tuple[str, ...] = RIG.bands) -> xr.DataArray:
-    """Emissivity (band)."""
-    return xr.DataArray(list(values), dims="band", coords={"band": list(bands)})
 
 
 GLASS = emissivity_of(0.86, 0.72)

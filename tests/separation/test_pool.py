@@ -15,7 +15,6 @@ from reproduction import experiments
 RIG = Rig()
 TIME = np.arange(350) / 10.0
 GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
-TEMPERATURES = ("object_temperature", "background_temperature")
 Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 

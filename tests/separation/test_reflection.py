@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import xarray as xr
+from captures import emissivity_of
 from numpy.typing import NDArray
 
 from dbthermal import _smooth as smooth
@@ -164,11 +165,6 @@ def test_refused(
     """Other dimensions, NaN, and movies with too few pixels raise an error."""
     with pytest.raises(ValueError, match=re.escape(message)):
         separation.uncalibrated_reflection(change(signal), **options)  # type: ignore[arg-type]
-
-
-def emissivity_of(*values: float) -> xr.DataArray:
-    """Emissivity (band) of the rig's two bands."""
-    return xr.DataArray(list(values), dims="band", coords={"band": ["8-14", "9.5"]})
 
 
 def test_reflected_change() -> None:

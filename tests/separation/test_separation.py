@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from captures import emissivity_of
 
 from dbthermal import schema, separation, simulation
 from dbthermal.simulation import Background, Rig
@@ -18,11 +19,6 @@ PROTOTYPE = {
     (0.60, 0.45): (0.33, 0.78, 0.027, 0.025),
     (0.30, 0.50): (0.42, 0.93, 0.019, 0.026),
 }
-
-
-def emissivity_of(*values: float) -> xr.DataArray:
-    """Emissivity (band) of the rig's two bands."""
-    return xr.DataArray(list(values), dims="band", coords={"band": list(RIG.bands)})
 
 
 def glass_case(**changes: object) -> dict[str, object]:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import xarray as xr
+from captures import emissivity_of
 
 from dbthermal import response as responses
 from dbthermal import schema, separation
@@ -13,11 +14,6 @@ from dbthermal.simulation import Rig
 
 RIG = Rig()
 TIME = np.arange(350) / 10.0
-
-
-def emissivity_of(*values: float) -> xr.DataArray:
-    """Emissivity (band) of the rig's two bands."""
-    return xr.DataArray(list(values), dims="band", coords={"band": list(RIG.bands)})
 
 
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]

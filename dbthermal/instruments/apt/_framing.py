@@ -187,6 +187,15 @@ class Decoder:
     ----------
     dropped : int
         Number of bytes that belonged to no message so far.
+
+    Examples
+    --------
+    A message that a wheel has come home, after one byte of noise:
+
+    >>> decoder = Decoder()
+    >>> [message] = decoder.feed(bytes.fromhex("ff 44 04 01 00 01 21"))
+    >>> Id(message.id).name, decoder.dropped
+    ('MOT_MOVE_HOMED', 1)
     """
 
     def __init__(

@@ -108,6 +108,12 @@ class Boson(Closing):
     `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is
     requested again if no reply comes; a command that changes the camera never is. Open it by
     `from_url`; tests hand in a line, the number of the first request, clock and sleep [s].
+
+    Examples
+    --------
+    >>> with Boson.from_url("sim://boson/wide") as camera:
+    ...     camera.fpa_temperature(), camera.identity()["is_simulated"]  # K
+    (308.15, True)
     """
 
     def __init__(

@@ -135,9 +135,9 @@ class World:
         position = self._wheel
         return None if position is None else self.filters.get(position)
 
-    def scene_temperatures(self, time: float | None = None) -> dict[str, float]:
+    def scene_temperatures(self) -> dict[str, float]:
         """Temperatures [K] in the scene by name, with ``"blackbody"`` and ``"room"``."""
-        scene = {} if self._scene is None else self._scene(self.scene_time(time))
+        scene = {} if self._scene is None else self._scene(self.scene_time())
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:

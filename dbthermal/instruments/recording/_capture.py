@@ -39,6 +39,18 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         If the folder does not exist.
     ValueError
         If a band has fewer than two frames with a time.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments import devices, protocols, recording, session
+    >>> camera = session.Camera(session.Device("sim://boson/wide", "v4l2:///dev/video0"))
+    >>> plan = session.Session("pot", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
+    >>> path, limits = getfixture("tmp_path") / "pot.zarr", recording.Limits(reserve=0)
+    >>> with devices.open_devices(plan) as rig:
+    ...     summary = protocols.record_scene(rig, path, limits=limits)
+    >>> capture = recording.open_capture(path)
+    >>> capture["counts"].dims, round(float(capture["time"].diff("time").median()), 3)  # s
+    (('band', 'time', 'y', 'x'), 0.017)
     """
     recording = store.open_dataset(path)
     opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")

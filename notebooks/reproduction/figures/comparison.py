@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 
 from dbthermal.figures.drawing import (
     COLORS,
+    MARKERS,
     band_label,
     canvas,
     draw_image,
     limits_of,
     provenance_note,
 )
-
-_MARKERS = "osD^vPX*"
 
 
 def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
@@ -64,7 +63,7 @@ def _lines(axis: Axes, errors: xr.DataArray) -> None:
             errors["noise"],
             errors.sel(variant=name),
             color=COLORS[index % len(COLORS)],
-            marker=_MARKERS[index % len(_MARKERS)],
+            marker=MARKERS[index % len(MARKERS)],
             markersize=4,
             linewidth=1,
             linestyle="-" if index < len(COLORS) else "--",

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 from dbthermal.figures.drawing import (
     COLORS,
+    MARKERS,
     canvas,
     draw_image,
     limits_of,
@@ -15,8 +16,6 @@ from dbthermal.figures.drawing import (
     plain_ticks,
     provenance_note,
 )
-
-_MARKERS: Final = "osD^v"
 
 _MICRO: Final = "\N{MICRO SIGN}m"
 
@@ -40,7 +39,7 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
         for index, case in enumerate(cases["case"].values):
             here, color = cases.sel(case=case), COLORS[index % len(COLORS)]
             error, bound = here[f"{name}_error"], here[f"{name}_bound"]
-            mark = {"color": color, "marker": _MARKERS[index % len(_MARKERS)], "markersize": 5}
+            mark = {"color": color, "marker": MARKERS[index % len(MARKERS)], "markersize": 5}
             label = f"{case}, " if str(case) else ""
             above.plot(here["noise"], bound, color=color, linewidth=1, label=f"{label}bound")
             below.plot(here["noise"], error / bound, linewidth=1, **mark)
@@ -94,7 +93,7 @@ def error_over_bands(measured: xr.Dataset) -> Figure:
     error, place = measured["object_temperature_error"], np.arange(measured.sizes["bands"])
     for index, case in enumerate(measured["case"].values):
         bound = measured["object_temperature_bound"].sel(case=case)
-        mark = {"color": COLORS[index], "marker": _MARKERS[index], "markersize": 5, "linewidth": 1}
+        mark = {"color": COLORS[index], "marker": MARKERS[index], "markersize": 5, "linewidth": 1}
         left.plot(place, bound, color=COLORS[index], linewidth=1, label=f"{case}, bound")
         right.plot(place, error / bound, **mark)
     left.plot(place, error, "ko", markersize=5, label="measured")

@@ -8,9 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from dbthermal.figures.drawing import COLORS, canvas, provenance_note
+from dbthermal.figures.drawing import COLORS, MARKERS, canvas, provenance_note
 
-_MARKERS: Final = "osD^v"
 _RMSE: Final = "object_temperature_rmse"
 _RMSE_LABEL: Final = "RMSE of the object temperature [K]"
 
@@ -92,7 +91,7 @@ def _lines(axis: Axes, values: xr.DataArray, over: str) -> None:
             values[over],
             values.sel(treatment=treatment),
             color=COLORS[index % len(COLORS)],
-            marker=_MARKERS[index % len(_MARKERS)],
+            marker=MARKERS[index % len(MARKERS)],
             markersize=4,
             linewidth=1,
             label=treatment,
