@@ -80,8 +80,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         This project's separator; known emissivities; the paper's optimiser; and to compare with,
         least squares, dual-wavelength pyrometry, the blackbody channel prior, and the camera's
         own reading.
-    settings : SubspaceSettings, DbvtSettings, NaiveSettings, RatioSettings or BcpSettings, optional
-        Options of the method; its defaults if not given. "calibrated" and "apparent" have none.
+    settings : Settings, optional
+        Record of the method's options, such as `SubspaceSettings`; its defaults if not given.
+        "calibrated" and "apparent" have none.
     emissivity : DataArray, optional
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional
