@@ -79,7 +79,8 @@ def test_beside_the_object_the_background_is_seen(scene: xr.Dataset) -> None:
 
 def test_observed_with_noise_only(scene: xr.Dataset, rig: xr.Dataset) -> None:
     """A rig can observe it: the stage `corrected`."""
-    schema.check(simulation.observe(scene, rig, rng()), "corrected")
+    corrected = schema.check(simulation.observe(scene, rig, rng()), "corrected")
+    assert corrected["counts"].shape[1:] == scene["object_temperature"].shape
 
 
 @pytest.mark.parametrize(

@@ -114,7 +114,7 @@ def reductions(reduction: xr.DataArray, published: Sequence[float]) -> Figure:
     axis.set_xticks(place, [str(name) for name in reduction["term"].values])
     axis.set_ylabel("reduction of the error by the term [%]")
     axis.legend(frameon=False, fontsize=8)
-    axis.set_title("What each loss term is worth" + provenance_note(reduction))
+    axis.set_title("Error saved by each loss term" + provenance_note(reduction))
     return figure
 
 

@@ -57,7 +57,7 @@ def disturbances(measured: xr.Dataset) -> Figure:
     _kelvin(axis)
     axis.margins(y=0.2)
     axis.legend(frameon=False, fontsize=8)
-    axis.set_title("Frames that are none" + provenance_note(measured))
+    axis.set_title("Lost frames and a closed shutter" + provenance_note(measured))
     return figure
 
 
