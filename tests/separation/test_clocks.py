@@ -14,7 +14,7 @@ from dbthermal.simulation import Background, Rig
 
 RIG = Rig()
 GLASS = emissivity_of(0.86, 0.72)
-FRAME = np.arange(350)
+FRAME = np.arange(350.0)
 EVEN = FRAME / 10.0  # s
 
 CLOCKS: dict[str, npt.NDArray[np.float64]] = {
@@ -85,13 +85,15 @@ def test_every_method_takes_any_clock_or_names_it(clock: str, method: str) -> No
     """No clock is an error but for a method of even times, which names it."""
     _, capture = seen_at(CLOCKS[clock], 12, seed=1)
     known = separation.get_method(method)
-    options = {"emissivity": GLASS} if known.knows_emissivity else {}
+    emissivity = GLASS if known.knows_emissivity else None
     if known.even_times and clock != "nanoseconds":
         with pytest.raises(ValueError, match=r"Invalid interval .* of 'time' after .* s for"):
             separation.solve(capture, RIG.response(), method)
         return
     quick = separation.DbvtSettings(stages=1, steps=2) if method == "dbvt" else None
-    result = separation.solve(capture, RIG.response(), method, settings=quick, **options)
+    result = separation.solve(
+        capture, RIG.response(), method, settings=quick, emissivity=emissivity
+    )
     assert bool(result["object_temperature"].notnull().any())
 
 

@@ -242,7 +242,7 @@ def ramp(time: Array) -> Array:
     """Times [s], from its middle, of the steps of a jump that takes as long as `AROUND`."""
     step = max(float(np.median(np.diff(time))), 0.5 * AROUND / _RAMP)
     half = int(0.5 * AROUND / step)
-    return step * np.arange(-half, half + 1)
+    return np.asarray(step * np.arange(-half, half + 1.0))
 
 
 def beside_jump(time: Array, jump: int, segment: Whole | None = None) -> Mask:
