@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from attack.runner import CLASSES, Tally, attack_all, only, table
+from attack.runner import CLASSES, attack_all, only, table
 
 _MARKS = ("<!-- attack: begin -->", "<!-- attack: end -->")
 
@@ -47,8 +47,6 @@ def write(page: Path, lines: list[str], command: str) -> None:
     marked = re.compile(f"{begin}.*{end}", re.DOTALL)
     page.write_text(marked.sub(lambda _: text, content), encoding="utf-8")
 
-
-_ = Tally
 
 if __name__ == "__main__":
     sys.exit(main())

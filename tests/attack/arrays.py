@@ -5,9 +5,9 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+
 from attack.oracle import Attack, Verdict
 from attack.scenes import CALIBRATED, SLOPE, Array, Scene, blackbody, clock, scene
-
 from dbthermal import calibration, separation
 
 Rng = np.random.Generator
@@ -125,18 +125,21 @@ def gray(rng: Rng) -> Attack:
     return solving(what, made, response_of(made, noise=bool(rng.random() < 0.8)), good=True)
 
 
+_NUMBERS: Final = ("u2", "i4", "i8", "f4", "f8", ">f4", ">f8", ">u2")
+
+
 def dtypes(rng: Rng) -> Attack:
     """Counts of every number type, of either byte order, as objects, complex, text or times."""
     made = scene(rng, shape=(6, 8))
-    kinds = "u1 i2 u2 i4 i8 f2 f4 f8 >f4 >f8 >u2 O c8 U8 M8[s] m8[s] b1 S8".split()
-    kind = str(rng.choice(kinds))
+    kind = str(rng.choice([*_NUMBERS, "u1", "i2", "f2", "O", "c8", "U8", "M8[s]", "m8[s]", "b1"]))
     with np.errstate(all="ignore"):
         counts = made.counts()
         whole = counts.round().astype(int)
         counts = (whole if kind.strip(">")[0] in "uiMm" else counts).astype(kind)
     method = any_method(rng)
-    good = kind.endswith(("u2", "i4", "i8", "f4", "f8"))
-    return solving(f"counts of {kind}", made.with_counts(counts), None, method, "counts", good=good)
+    return solving(
+        f"counts of {kind}", made.with_counts(counts), None, method, "counts", good=kind in _NUMBERS
+    )
 
 
 def samples(rng: Rng) -> Attack:
@@ -231,7 +234,7 @@ _SPOILS: Final[Mapping[str, Callable[[Rng, Any], None]]] = {
 
 
 def clocks(rng: Rng) -> Attack:
-    """Clocks with jitter, bursts, gaps, an hour's pause, repeated, backward and impossible times."""
+    """Clocks with jitter, bursts, gaps, pauses, repeated, backward and impossible times."""
     what = str(rng.choice(list(_CLOCKS)))
     frames = int(rng.choice([64, 160, 300]))
     stamps = np.asarray(_CLOCKS[what](rng, clock(frames)))
@@ -297,7 +300,7 @@ _CLOCKS: Final[Mapping[str, Callable[[Rng, Array], Any]]] = {
 
 
 def shapes(rng: Rng) -> Attack:
-    """Images of one pixel or one line, too few frames, other orders of dims, missing coordinates."""
+    """Images of one pixel or line, too few frames, other dims, missing coordinates."""
     made = scene(rng, shape=(6, 8), bands=int(rng.integers(2, 4)), time=clock(64))
     what = str(rng.choice(list(_SHAPES)))
     made.capture = _SHAPES[what](rng, made.capture)
@@ -327,7 +330,9 @@ def _same_bands(_: Rng, capture: xr.Dataset) -> xr.Dataset:
 _SHAPES: Final[Mapping[str, Callable[[Rng, xr.Dataset], Any]]] = {
     "tiny": _tiny,
     "dims in another order": lambda rng, one: one.transpose(
-        *rng.choice([["time", "band", "y", "x"], ["y", "x", "band", "time"], ["band", "time", "x", "y"]])
+        *rng.choice(
+            [["time", "band", "y", "x"], ["y", "x", "band", "time"], ["band", "time", "x", "y"]]
+        )
     ),
     "no coordinate time": lambda _, one: one.drop_vars("time"),
     "no coordinate band": lambda _, one: one.drop_vars("band"),
@@ -368,7 +373,9 @@ def _spoilt_coefficient(rng: Rng, response: xr.Dataset) -> xr.Dataset:
 
 
 def _spoilt_noise(rng: Rng, response: xr.Dataset) -> xr.Dataset:
-    values = response["noise"].values * rng.choice([np.nan, np.inf, 0.0, -1.0], response.sizes["band"])
+    values = response["noise"].values * rng.choice(
+        [np.nan, np.inf, 0.0, -1.0], response.sizes["band"]
+    )
     return response.assign(noise=("band", values, {"units": "count"}))
 
 

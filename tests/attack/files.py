@@ -13,14 +13,14 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 import yaml
-from attack.oracle import Attack, Verdict
-from attack.scenes import scene
-from attack.stages import wrong
-from reproduction import manifest, paths
 
+from attack.oracle import Attack, Verdict
+from attack.scenes import pick, scene
+from attack.stages import wrong
 from dbthermal import acquire, schema, store
 from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.session import Session
+from reproduction import manifest, paths
 
 Rng = np.random.Generator
 REPOSITORY: Final = Path(__file__).parents[2]
@@ -46,12 +46,17 @@ def originals() -> Path:
     counts = schema.STAGES["capture"]["counts"]
     variables = {"counts": counts, "frame_flags": flags, "exposure_time": stamps, **log}
     recording = store.Recording(
-        folder / "recording.zarr", variables, {"y": 16, "x": 20}, ["8-14", "9.5"], chunk=10, attrs={}
+        folder / "recording.zarr",
+        variables,
+        {"y": 16, "x": 20},
+        ["8-14", "9.5"],
+        chunk=10,
+        attrs={},
     )
     for _ in range(4):
         for place, band in enumerate(("8-14", "9.5")):
             first = recording.frames[band]
-            block = {
+            block: dict[str, Any] = {
                 "counts": made.counts()[place, first : first + 10].astype(np.uint16),
                 "frame_flags": np.zeros(10, np.uint16),
                 "exposure_time": made.time[first : first + 10],
@@ -108,20 +113,25 @@ def _same(path: Path, *, attributes: bool) -> Callable[[xr.Dataset], Verdict]:
             for name in {*whole.variables} | {*opened.variables}
             if name not in opened.variables
             or name not in whole.variables
-            or not whole[name].variable.equals(opened[name].variable)
+            or not _alike(whole[name], opened[name])
         )
-        told = not opened.attrs.get("complete", True) and path.name.startswith("recording")
-        if told and all(
-            whole[n].isel({d: slice(0, s) for d, s in opened[n].sizes.items()}).equals(opened[n])
-            for n in opened.data_vars
-            if n in whole
-        ):
+        part = {str(dim): slice(0, size) for dim, size in opened.sizes.items()}
+        kept = [n for n in opened.data_vars if n in whole]
+        same = all(_alike(whole[n].isel(part, missing_dims="ignore"), opened[n]) for n in kept)
+        if same and opened.attrs.get("complete") is False:
             return Verdict("flagged")
         if not changed and attributes and whole.attrs != opened.attrs:
             changed = ["attributes"]
         return wrong(f"other {changed}", where=bool(changed))
 
     return judge
+
+
+def _alike(first: xr.DataArray, second: xr.DataArray) -> bool:
+    """Of the same dims, type and values, bit by bit."""
+    kinds = (first.dtype.kind, first.dims, first.shape)
+    same = kinds == (second.dtype.kind, second.dims, second.shape)
+    return same and first.values.tobytes() == second.values.astype(first.dtype).tobytes()
 
 
 def bits(rng: Rng) -> Attack:
@@ -156,7 +166,11 @@ def chunks(rng: Rng) -> Attack:
     if what == "of noise":
         file.write_bytes(rng.bytes(file.stat().st_size))
     if what == "exchanged":
-        same = [f for f in files if f != file and f.relative_to(path).parts[0] == file.relative_to(path).parts[0]]
+        same = [
+            f
+            for f in files
+            if f != file and f.relative_to(path).parts[0] == file.relative_to(path).parts[0]
+        ]
         other = same[int(rng.integers(len(same)))] if same else file
         kept = file.read_bytes()
         file.write_bytes(other.read_bytes())
@@ -174,7 +188,7 @@ def stores(rng: Rng) -> Attack:
     array = str(rng.choice(arrays))
     what = str(rng.choice(list(_METADATA)))
     _METADATA[what](rng, path, array)
-    attributes = what not in ("a foreign file",)
+    attributes = what != "a foreign file"
     judge = _same(path, attributes=attributes)
     return Attack(f"{path.name}/{array}: {what}", lambda: _open(path), judge, (path.name,))
 
@@ -182,7 +196,9 @@ def stores(rng: Rng) -> Attack:
 def _edit(rng: Rng, path: Path, array: str) -> None:
     file = path / array / "zarr.json"
     content = json.loads(file.read_text(encoding="utf-8"))
-    key = str(rng.choice(["shape", "data_type", "fill_value", "dimension_names", "codecs", "node_type"]))
+    key = str(
+        rng.choice(["shape", "data_type", "fill_value", "dimension_names", "codecs", "node_type"])
+    )
     worse = {
         "shape": [10**9 for _ in content["shape"]],
         "data_type": "int8",
@@ -199,8 +215,17 @@ def _attributes(rng: Rng, path: Path, _: str) -> None:
     file = path / "zarr.json"
     content = json.loads(file.read_text(encoding="utf-8"))
     keys = sorted(content["attributes"])
-    content["attributes"][str(rng.choice(keys))] = rng.choice([None, -1, 1e9, "text"])
+    content["attributes"][str(rng.choice(keys))] = pick(rng, [None, -1, 1e9, "text"])
     file.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _replaced(path: Path, content: bytes | None) -> None:
+    """An empty folder, or a file, in place of the store."""
+    shutil.rmtree(path)
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
 
 
 _METADATA: Final[Mapping[str, Callable[[Rng, Path, str], Any]]] = {
@@ -211,14 +236,16 @@ _METADATA: Final[Mapping[str, Callable[[Rng, Path, str], Any]]] = {
     "metadata cut": lambda _, path, a: (path / a / "zarr.json").write_bytes(
         (path / a / "zarr.json").read_bytes()[:-20]
     ),
-    "metadata of another text": lambda _, path, a: (path / a / "zarr.json").write_bytes(b"[1, 2]\xff"),
+    "metadata of another text": lambda _, path, a: (path / a / "zarr.json").write_bytes(
+        b"[1, 2]\xff"
+    ),
     "an array lost": lambda _, path, array: shutil.rmtree(path / array),
     "an array renamed": lambda _, path, array: (path / array).rename(path / f"{array}2"),
     "metadata edited": _edit,
     "attributes edited": _attributes,
     "a foreign file": lambda _, path, __: (path / "notes.txt").write_text("x", encoding="ascii"),
-    "emptied": lambda _, path, __: [shutil.rmtree(path), path.mkdir()],
-    "a file": lambda _, path, __: [shutil.rmtree(path), path.write_bytes(b"PK")],
+    "emptied": lambda _, path, __: _replaced(path, None),
+    "a file": lambda _, path, __: _replaced(path, b"PK"),
     "gone": lambda _, path, __: shutil.rmtree(path),
 }
 
@@ -240,11 +267,13 @@ def numbers(rng: Rng) -> Attack:
         text.replace("rmse", "rm\udcffse"),
         "[" * 100_000,
     ]
-    content = str(rng.choice(worse))
+    content = str(pick(rng, worse))
     path.write_bytes(content.encode("utf-8", "surrogateescape"))
     # A cut may fall behind the last bracket: nothing is lost then.
     judge = lambda got: wrong(f"{got}", where=got != {"rmse_K": 0.21, "name": "a"})  # noqa: E731
-    return Attack(f"numbers {content[:60]!r}", lambda: store.read_numbers(path), judge, ("numbers.json",))
+    return Attack(
+        f"numbers {content[:60]!r}", lambda: store.read_numbers(path), judge, ("numbers.json",)
+    )
 
 
 SESSION: Final = """
@@ -272,7 +301,7 @@ thermocouples: {1: blackbody, 4: plate}
 blackbody: {temperatures: [300.0, 290.0], stability: 0.1, window: 3, timeout: 20}
 """
 
-_VALUES: Final = (
+_VALUES: Final[tuple[Any, ...]] = (
     *(None, True, -1, 0, 1e400, float("nan"), 10**30, "text", "", [], {}, [0, 0], [4], [-4, 80]),
     *([4.5, 80], [10**9, 10**9], {"a": 1}, "v4l2:///etc/passwd", "sim://", "sim://boson/"),
     *("serial://", "tc08:/tmp/x.so", "file:///etc/passwd", "\x00", "a/b", "../../x", "sim://y16/w"),
@@ -331,9 +360,12 @@ def _broken(rng: Rng, text: str) -> str:
         return text[:place]
     if kind == 1:
         bomb = "a: &a [x,x,x,x,x,x,x,x,x]\n"
-        levels = [f"{c}: &{c} [{','.join(['*' + b] * 9)}]" for b, c in zip("abcdefgh", "bcdefghi", strict=True)]
+        levels = [
+            f"{c}: &{c} [{','.join(['*' + b] * 9)}]"
+            for b, c in zip("abcdefgh", "bcdefghi", strict=True)
+        ]
         return bomb + "\n".join(levels) + text
-    return text[:place] + str(rng.choice(worse)) + text[place:]
+    return text[:place] + str(pick(rng, worse)) + text[place:]
 
 
 def _dry_run(path: Path) -> tuple[int, str, str]:
@@ -349,7 +381,7 @@ def _session_verdict(found: tuple[int, str, str], what: str, path: Path, key: st
     """Status 2 and an error that names the key, or a session that is really as described."""
     status, _, err = found
     if status == 0:
-        if what == "twice" or what == "unknown":
+        if what in ("twice", "unknown"):
             return wrong(f"{what} key '{key}' is accepted")
         session = Session.load(path)
         sane = 0 < session.shape[0] * session.shape[1] < 1e8 and 0 < session.duration < 1e7
@@ -383,7 +415,7 @@ def parameters(rng: Rng) -> Attack:
 
     def act() -> Any:
         kept = paths.params
-        paths.params = lambda _: file
+        paths.params = lambda stem: folder / f"{stem}.yaml"
         try:
             return run.Run(stem, good).provenance["parameters"]
         finally:
@@ -392,29 +424,33 @@ def parameters(rng: Rng) -> Attack:
     return Attack(
         f"parameters of {stem}: {what}",
         act,
-        lambda got: wrong(f"accepted {got}"[:200], where=what == "twice" or not set(got) <= set(good)),
+        lambda got: wrong(
+            f"accepted {got}"[:200], where=what == "twice" or not set(got) <= set(good)
+        ),
         (f"{stem}|no_such_parameter",),
     )
 
 
 def manifests(rng: Rng) -> Attack:
-    """``data_manifest.yaml`` with names that leave the folder, other sizes and sums, broken text."""
+    """``data_manifest.yaml`` with names that leave the folder, other sizes, broken text."""
     entry = {"name": "a.txt", "sha256": "0" * 64, "bytes": 3}
-    collection = {
+    collection: dict[str, Any] = {
         "title": "t", "origin": "https://localhost/", "citation": ["c"], "terms": "t",
         "used_by": ["u"], "note": "n", "files": [entry],
     }  # fmt: skip
     content: dict[str, Any] = {"collections": {"spectra": collection}}
-    what = str(rng.choice(["file", "collection", "origin", "sha256", "bytes", "twice", "broken", "key"]))
-    name = str(rng.choice(["../a", "/etc/passwd", "..", ".", "", "a/b", "a\x00"]))
+    what = str(
+        rng.choice(["file", "collection", "origin", "sha256", "bytes", "twice", "broken", "key"])
+    )
+    name = str(pick(rng, ["../a", "/etc/passwd", "..", ".", "", "a/b", "a\x00"]))
     if what == "file":
         entry["name"] = name
     elif what == "collection":
         content["collections"] = {name: collection}
     elif what == "origin":
-        collection["origin"] = str(rng.choice(["file:///etc/", "", "/etc/"]))
+        collection["origin"] = pick(rng, ["file:///etc/", "", "/etc/"])
     elif what in ("sha256", "bytes"):
-        entry[what] = rng.choice([-1, 0, 10**15, 1.5]) if what == "bytes" else "z" * 64
+        entry[what] = pick(rng, [-1, 0, 10**15, 1.5]) if what == "bytes" else "z" * 64
     elif what == "key":
         collection["keyx"] = 1
     text = yaml.safe_dump(content)

@@ -1,4 +1,4 @@
-"""Hostile spectra and videos: look-alikes of the public files, and the files themselves, damaged."""
+"""Hostile spectra and videos: look-alikes of the public files, or these themselves, damaged."""
 
 import os
 import struct
@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import av
 import numpy as np
+from matplotlib import colormaps
+
 from attack.files import flip, workplace
 from attack.oracle import Attack, Verdict
 from attack.stages import RIGHT, wrong
-from matplotlib import colormaps
-
 from dbthermal import readers
 
 Rng = np.random.Generator
@@ -45,8 +45,7 @@ def _whole(kind: str) -> tuple[bytes, ...]:
         text = "wavelength,A001,A002\n" + "".join(f"{w:.4f},{v:.4f},{v:.5f}\n" for w, v in rows)
         pattern = "slum/LUMA*.csv"
     else:
-        title = "Wavenumber (cm-1),Wavelength (micrometer),Emissivity (1)\n"
-        text = title + "".join(f"{1e4 / w:.4f},{w:.4f},{v:.4f}\n" for w, v in rows[::-1])
+        text = "x1,x2,y_glass\n" + "".join(f"{w:.4f},{1e4 / w:.4f},{v:.4f}\n" for w, v in rows)
         pattern = "ucsb/*[!T].csv"
     folder = os.environ.get("DBTHERMAL_DATA")
     public = sorted(Path(folder).glob(pattern))[::40] if folder else []
@@ -72,9 +71,15 @@ def spectra(rng: Rng) -> Attack:
             a.shape == b.shape and np.allclose(a, b, rtol=0, atol=1e-12)
             for a, b in zip(values, truth, strict=True)
         )
-        return wrong(f"{what} accepted: {len(values)} arrays, sizes {[v.size for v in values][:4]}", where=not same)
+        return wrong(
+            f"{what} accepted: {len(values)} arrays, sizes {[v.size for v in values][:4]}",
+            where=not same,
+        )
 
-    return Attack(f"{kind}: {what}", lambda: read(path), judge, (path.name,))
+    # Neither library says how many rows there are.
+    endless = "cut" in what and kind != "ecostress"
+    limit = "no number of rows in the file" if endless else ""
+    return Attack(f"{kind}: {what}", lambda: read(path), judge, (path.name,), limit=limit)
 
 
 def _values(found: Any) -> list[np.ndarray]:
@@ -96,7 +101,7 @@ def _put(value: bytes) -> Callable[[list[bytes], int], None]:
     def change(lines: list[bytes], place: int) -> None:
         mark = b"," if b"," in lines[place] else None
         parts = lines[place].split(mark)
-        parts[0 if value in (b"-1",) else -1] = value
+        parts[0 if value == b"-1" else -1] = value
         lines[place] = (mark or b" ").join(parts)
 
     return change
@@ -124,7 +129,9 @@ _TABLES: Final[Mapping[str, Callable[[Rng, bytes], bytes]]] = {
     "bad UTF-8": lambda rng, whole: _line(rng, whole, _put(b"\xff\xfe")),
     "a value of 10^9": lambda rng, whole: _line(rng, whole, _put(b"1e9")),
     "rows swapped": lambda rng, whole: _line(rng, whole, _swap),
-    "a row short": lambda rng, whole: _line(rng, whole, lambda lines, n: lines.__setitem__(n, b"8.1")),
+    "a row short": lambda rng, whole: _line(
+        rng, whole, lambda lines, n: lines.__setitem__(n, b"8.1")
+    ),
     "a row twice": lambda rng, whole: _line(rng, whole, lambda lines, n: lines.insert(n, lines[n])),
     "no header": lambda _, whole: whole.split(b"\n\n" if b"\n\n" in whole else b"\n", 1)[1],
     "another library": lambda _, whole: _whole("slum" if b"Name" in whole else "ecostress")[0],
@@ -135,17 +142,47 @@ _TABLES: Final[Mapping[str, Callable[[Rng, bytes], bytes]]] = {
 @cache
 def _film() -> bytes:
     """A small video of a wave drawn in plasma."""
-    path = workplace() / "whole.mp4"
     time, y, x = np.ogrid[:24, :48, :64]
     wave = 0.5 + 0.35 * np.sin(y / 9 + time / 4) * np.cos(x / 11)
-    frames = colormaps["plasma"](np.rint(wave * 255).astype(int), bytes=True)[..., :3]
+    return _encoded(colormaps["plasma"](np.rint(wave * 255).astype(int), bytes=True)[..., :3])
+
+
+@cache
+def _large() -> bytes:
+    """A video of a few kB, whose pictures take a gigabyte."""
+    return _encoded(np.broadcast_to(np.array([204, 71, 120], np.uint8), (72, 1080, 1920, 3)))
+
+
+def _encoded(frames: Any) -> bytes:
+    path = workplace() / "whole.mp4"
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "18"})
-        stream.height, stream.width, stream.pix_fmt = 48, 64, "yuv420p"
+        stream = container.add_stream("libx264", rate=10, options={"crf": "18", "preset": "fast"})
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "yuv420p"
         for frame in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
     return path.read_bytes()
+
+
+def _spoil(rng: Rng, content: bytearray, what: str) -> None:
+    """Damage the bytes of a video."""
+    if what == "noise":
+        first = content.index(b"mdat") + 4 + int(rng.integers(50, 1500))
+        content[first : first + 20] = rng.bytes(20)
+    elif what == "cut":
+        del content[int(rng.integers(len(content))) :]
+    elif what == "size":
+        # The width and height that the container states; the stream has its own.
+        place = content.index(b"avc1", content.index(b"stsd") + 12) + 28
+        content[place : place + 4] = struct.pack(">HH", 32000, 32000)
+    elif what == "text":
+        content = bytearray(
+            b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nwhole.mp4\n#EXT-X-ENDLIST\n"
+        )
+    elif what == "zeros":
+        place = int(rng.integers(len(content) - 100))
+        content[place : place + 100] = bytes(100)
 
 
 def videos(rng: Rng) -> Attack:
@@ -155,22 +192,11 @@ def videos(rng: Rng) -> Attack:
     path = folder / "film.mp4"
     path.write_bytes(whole)
     truth = readers.palette_video(path).values
-    what = str(rng.choice(["flipped", "flipped", "noise", "cut", "size", "address", "text", "zeros"]))
-    content, given = bytearray(whole), str(path)
-    if what == "noise":
-        first = whole.index(b"mdat") + 4 + int(rng.integers(50, 1500))
-        content[first : first + 20] = rng.bytes(20)
-    elif what == "cut":
-        del content[int(rng.integers(len(content))) :]
-    elif what == "size":
-        # The width and height that the container states; the stream has its own.
-        place = whole.index(b"avc1", whole.index(b"stsd") + 12) + 28
-        content[place : place + 4] = struct.pack(">HH", 32000, 32000)
-    elif what == "text":
-        content = bytearray(b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nwhole.mp4\n#EXT-X-ENDLIST\n")
-    elif what == "zeros":
-        place = int(rng.integers(len(content) - 100))
-        content[place : place + 100] = bytes(100)
+    what = str(rng.choice(["flipped"] * 4 + ["noise", "cut", "size", "address", "text", "zeros"]))
+    large = rng.random() < 0.05
+    content, given = bytearray(_large() if large else whole), str(path)
+    what = "large" if large else what
+    _spoil(rng, content, what)
     path.write_bytes(bytes(content))
     if what == "flipped":
         flip(rng, path)
@@ -186,8 +212,10 @@ def videos(rng: Rng) -> Attack:
         # A bit that the codec cannot tell from another picture changes little of it.
         return wrong(f"{what}: positions off by {off:.2f}", where=off > 0.25) if off else RIGHT
 
-    named = Path(given).name or given
-    return Attack(f"video {what} {given if what == 'address' else ''}", lambda: readers.palette_video(given), judge, (f"film|{named}",))
+    limit = "H.264 has no checksum" if what in ("flipped", "noise", "zeros") else ""
+    told = given if what == "address" else ""
+    act = lambda: readers.palette_video(given)  # noqa: E731
+    return Attack(f"video {what} {told}", act, judge, (f"film|{Path(given).name}",), limit=limit)
 
 
 _ADDRESSES: Final = (

@@ -18,6 +18,9 @@ BAD: Final = ("silent", "traceback", "warning", "memory", "hang", "crash", "reje
 """Wrong without a word; another error, or one that names nothing; a library's warning that leaks;
 too much memory or time; the end of the process; good input refused."""
 
+LIMIT: Final = "limit"
+"""Wrong without a word, where docs/trust.md says that nothing in the input shows it."""
+
 SECONDS: Final = 60
 MEGABYTES: Final = 500
 """Bounds of one input, in time and beyond the memory held before it; inputs are a few MB."""
@@ -44,7 +47,7 @@ class Attack:
     One hostile input: what is wrong with it, the call, and the judge of what the call returns.
 
     A refusal must contain one of the texts of each entry in `names`, parted by ``|``. `good` input
-    must be accepted.
+    must be accepted. `limit` is why nothing in the input shows that it is wrong, if so.
     """
 
     what: str
@@ -52,6 +55,7 @@ class Attack:
     judge: Callable[[Any], Verdict]
     names: tuple[str, ...] = ()
     good: bool = False
+    limit: str = ""
 
 
 @dataclass(frozen=True)
@@ -81,13 +85,13 @@ def carry_out(attack: Attack) -> Outcome:
         warnings.simplefilter("error", RuntimeWarning)
         verdict = _verdict(attack)
     used = _memory("VmHWM") - before
+    if verdict.kind == "silent" and attack.limit:
+        verdict = Verdict(LIMIT, attack.limit)
     if verdict.kind in _WORK and used > MEGABYTES:
         verdict = Verdict("memory", f"{used:.0f} MB")
     if verdict.kind in GOOD and leaked:
         verdict = Verdict("warning", f"{leaked[0].category.__name__}: {leaked[0].message}")
-    return Outcome(
-        verdict.kind, attack.what, verdict.note, used, verdict.unflagged, verdict.wrong
-    )
+    return Outcome(verdict.kind, attack.what, verdict.note, used, verdict.unflagged, verdict.wrong)
 
 
 def _verdict(attack: Attack) -> Verdict:

@@ -4,7 +4,7 @@ import multiprocessing
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Final
@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from attack import arrays, files, kills, media, stages
-from attack.oracle import BAD, GOOD, SECONDS, Attack, Outcome, carry_out
+from attack.oracle import BAD, GOOD, LIMIT, SECONDS, Attack, Outcome, carry_out
 
 Make = Callable[[np.random.Generator], Attack]
 
@@ -68,7 +68,9 @@ class Tally:
 
     def bad_lines(self) -> list[str]:
         """A line on each bad one."""
-        return [f"{self.name}:{seed} {kind} | {one.what} | {one.note}" for seed, kind, one in self.bad]
+        return [
+            f"{self.name}:{seed} {kind} | {one.what} | {one.note}" for seed, kind, one in self.bad
+        ]
 
 
 def make(name: str, seed: int) -> Attack:
@@ -103,8 +105,8 @@ class Worker:
 
     def _start(self) -> None:
         self._pipe, theirs = self._context.Pipe()
-        self._process = self._context.Process(target=_serve, args=(theirs,))
-        self._process.start()
+        self.process = self._context.Process(target=_serve, args=(theirs,))
+        self.process.start()
         theirs.close()
 
     def run(self, name: str, seed: int) -> Outcome:
@@ -115,10 +117,10 @@ class Worker:
             if self._pipe.poll(3 * SECONDS):
                 outcome = self._pipe.recv()
         except (EOFError, ConnectionError):
-            self._process.join()
+            self.process.join()
         if isinstance(outcome, Outcome):
             return outcome
-        code = self._process.exitcode
+        code = self.process.exitcode
         kind = "hang" if code is None else "crash"
         self.close()
         self._start()
@@ -127,10 +129,10 @@ class Worker:
     def close(self) -> None:
         """End the process."""
         self._pipe.close()
-        self._process.join(5)
-        if self._process.is_alive():
-            self._process.kill()
-            self._process.join()
+        self.process.join(5)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
 
 
 def _serve(pipe: Connection) -> None:
@@ -146,7 +148,7 @@ def _serve(pipe: Connection) -> None:
 
 def table(tallies: Mapping[str, Tally]) -> list[str]:
     """Table in Markdown: class by outcome, with the sums and the pixels without a flag."""
-    head = ["class", "inputs", *GOOD, *BAD, "wrong pixels without a flag"]
+    head = ["class", "inputs", *GOOD, LIMIT, *BAD, "wrong pixels without a flag"]
     rows = [_row(f"`{name}`", tally.outcomes.values()) for name, tally in tallies.items()]
     every = [one for tally in tallies.values() for one in tally.outcomes.values()]
     rows.append(_row("**all**", every))
@@ -156,10 +158,10 @@ def table(tallies: Mapping[str, Tally]) -> list[str]:
     return [share, "", *(f"| {line} |" for line in lines)]
 
 
-def _row(name: str, outcomes: "Sequence[Outcome] | object") -> list[str]:
-    found = list(outcomes)  # type: ignore[call-overload]
+def _row(name: str, outcomes: Iterable[Outcome]) -> list[str]:
+    found = list(outcomes)
     counts = Counter(one.kind for one in found)
     unflagged, wrong = sum(o.unflagged for o in found), sum(o.wrong for o in found)
     pixels = f"{wrong} of {unflagged}" if unflagged > len(found) else ""
-    numbers = [str(counts[kind] or "") for kind in (*GOOD, *BAD)]
+    numbers = [str(counts[kind] or "") for kind in (*GOOD, LIMIT, *BAD)]
     return [name, str(len(found)), *numbers, pixels]

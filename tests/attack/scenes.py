@@ -4,6 +4,7 @@ Nothing here imports the package: counts of two to five bands, of a body that wa
 pass before it, in the image formation e U(x) + (1 - e) U(y).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Final
@@ -92,6 +93,11 @@ class Scene:
         """The scene with spoilt counts."""
         array = self.capture["counts"]
         return self.changed(counts=(array.dims, counts, array.attrs))
+
+
+def pick(rng: np.random.Generator, options: Sequence[Any]) -> Any:
+    """One of some options, of any types."""
+    return options[int(rng.integers(len(options)))]
 
 
 def clock(frames: int, rate: float = 10.0) -> Array:

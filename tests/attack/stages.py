@@ -1,13 +1,14 @@
 """Hostile arrays into the steps beside the separation: clocks, corrections, calibration, tables."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from attack.oracle import Attack, Verdict
-from attack.scenes import CALIBRATED, SLOPE, Array, Scene, blackbody, clock, counts_of, scene
 
+from attack.oracle import Attack, Verdict
+from attack.scenes import SLOPE, Array, Scene, blackbody, clock, counts_of, scene
 from dbthermal import alignment, calibration, correction, emissivity, limits, metrics
 
 Rng = np.random.Generator
@@ -51,7 +52,7 @@ def aligned(rng: Rng) -> Attack:
         return _compare(result, made)
 
     names = ("offset|time|frame|pixel|gap|clock|band",)
-    more = {"offset": expected, "clock": "9.5"} if given else {}
+    more: dict[str, Any] = {"offset": expected, "clock": "9.5"} if given else {}
     what = f"align {delay:.1f} frames, {sorted(more)}: {what}"
     return Attack(what, lambda: alignment.align(spoilt, **more), judge, names)
 
@@ -125,7 +126,10 @@ def _jump(rng: Rng, made: Scene) -> tuple[xr.Dataset, float]:
 
 def _pause(rng: Rng, made: Scene) -> tuple[xr.Dataset, float]:
     """Both pause for an hour or a day; the scene waits."""
-    place, length = int(rng.integers(30, made.time.size - 30)), float(rng.choice([600, 3600, 86400]))
+    place, length = (
+        int(rng.integers(30, made.time.size - 30)),
+        float(rng.choice([600, 3600, 86400])),
+    )
     later = made.time + length * (np.arange(made.time.size) >= place)
     made.time = later
     return made.capture.assign_coords(time=("time", later, {"units": "s"})), 0.0
@@ -173,7 +177,9 @@ def registered(rng: Rng) -> Attack:
     for _ in range(12):
         texture += rng.normal() * np.sin(x * rng.uniform(0.05, 0.5) + y * rng.uniform(0.05, 0.5))
     shift = rng.integers(0, 3, 2)
-    views = np.stack([texture[4:-4, 4:-4], texture[4 - shift[0] :, 4 - shift[1] :][:rows, :columns]])
+    views = np.stack(
+        [texture[4:-4, 4:-4], texture[4 - shift[0] :, 4 - shift[1] :][:rows, :columns]]
+    )
     what = str(rng.choice(["good", "NaN", "infinite", "flat", "unlike", "huge"]))
     if what in ("NaN", "infinite"):
         views[1, rng.integers(rows), rng.integers(columns)] = np.nan if what == "NaN" else np.inf
@@ -346,7 +352,9 @@ def _bent(rng: Rng, counts: xr.DataArray, spoil: str) -> xr.DataArray:
     span = np.ptp(values[band])
     if spoil == "saturates":
         knee = np.quantile(values[band], 0.7)
-        values[band] = np.where(values[band] > knee, knee + (values[band] - knee) * 0.05, values[band])
+        values[band] = np.where(
+            values[band] > knee, knee + (values[band] - knee) * 0.05, values[band]
+        )
     elif spoil == "outlier":
         values[band, place] += rng.choice([-1, 1]) * rng.uniform(0.02, 0.05) * span
     elif spoil == "swapped":
@@ -363,7 +371,7 @@ def _bent(rng: Rng, counts: xr.DataArray, spoil: str) -> xr.DataArray:
 _FITS: Final[Mapping[str, Callable[[Rng, xr.DataArray], Any]]] = {
     "good": lambda _, one: one,
     **{
-        name: lambda rng, one, name=name: _bent(rng, one, name)
+        name: partial(_bent, spoil=name)
         for name in ("saturates", "outlier", "swapped", "no curve", "wave")
     },
     "in degrees Celsius": lambda _, one: one.assign_coords(
@@ -396,7 +404,10 @@ def tables(rng: Rng) -> Attack:
     def judge(table: xr.Dataset) -> Verdict:
         found = table["emissivity"].values[0]
         low, high = float(np.nanmin(y)), float(np.nanmax(y))
-        inside = np.all((found >= low - 1e-9) & (found <= high + 1e-9)) and what in ("good", "coarse")
+        inside = np.all((found >= low - 1e-9) & (found <= high + 1e-9)) and what in (
+            "good",
+            "coarse",
+        )
         return wrong(f"accepted: {found}", where=not inside)
 
     names = ("glass|emissivity|wavelength|coverage|covers",)
@@ -425,9 +436,14 @@ def plans(rng: Rng) -> Attack:
     table = emissivity.embedded_table().isel(material=slice(0, 4))
     bands = [str(band) for band in table["band"].values]
     noise = xr.DataArray(
-        rng.uniform(0.03, 0.4, len(bands)), dims="band", coords={"band": bands}, attrs={"units": "K"}
+        rng.uniform(0.03, 0.4, len(bands)),
+        dims="band",
+        coords={"band": bands},
+        attrs={"units": "K"},
     )
-    kind = str(rng.choice(["NaN", "infinite", "zero", "negative", "unit", "bands", "order", "text"]))
+    kind = str(
+        rng.choice(["NaN", "infinite", "zero", "negative", "unit", "bands", "order", "text"])
+    )
     if kind in ("NaN", "infinite", "zero", "negative"):
         value = {"NaN": np.nan, "infinite": np.inf, "zero": 0.0, "negative": -0.1}[kind]
         if rng.random() < 0.5:
@@ -460,7 +476,7 @@ def measures(rng: Rng) -> Attack:
     other = truth + rng.normal(0, 0.1, shape)
     other.attrs["units"] = "K"
     kind = str(rng.choice(["good", "window", "size", "dims", "text", "unit", "type", "constant"]))
-    changed: Any = {
+    changes: dict[str, Callable[[], Any]] = {
         "window": lambda: other.assign_coords(x=other["x"] + 3),
         "size": lambda: other.isel(x=slice(0, 5)),
         "dims": lambda: other.rename(x="column"),
@@ -468,7 +484,8 @@ def measures(rng: Rng) -> Attack:
         "unit": lambda: other.assign_attrs(units="degC"),
         "type": lambda: other.values,
         "constant": lambda: 0 * other + 300,
-    }.get(kind, lambda: other)()
+    }
+    changed = changes.get(kind, lambda: other)()
     first = rng.random() < 0.5
     function = metrics.correlation if first else metrics.relative_error_celsius
     fine = kind in ("good", "constant") or (first and kind == "unit")
