@@ -12,6 +12,7 @@ writer ends.
 
 import errno
 import math
+import os
 import queue
 import shutil
 import threading
@@ -88,7 +89,7 @@ class Summary:
     Result of a recording, with `totals` as in `Preview`.
 
     `ended` is ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is
-    lost), or ``"no frames"`` if a band had none.
+    lost), or ``"no frames"`` if a band had none. `path` is where the recording lies now.
     """
 
     path: Path
@@ -112,6 +113,9 @@ def record(
 
     Frames that a driver buffered before the start, by their stamps, are not recorded: they show
     another filter, or another scene. Two seconds after the start such a stamp counts as wrong.
+
+    The recorder holds its folder: renamed or moved on its disk, it or one above it, the recording
+    goes on in it without losing a frame, with a note in the log, and the result has its new path.
 
     Parameters
     ----------
@@ -142,7 +146,8 @@ def record(
     FileExistsError
         If `path` exists.
     OSError
-        If there is too little space, before or on the way.
+        If there is too little space, before or on the way; or the folder, or one of an array in
+        it, was deleted, replaced or taken to another disk, or that of an array moved.
     ValueError
         If the sources are not those of the session, or are emulated and the session is not.
     Exception
@@ -170,7 +175,7 @@ def record(
             run.done.wait()
     if run.errors:
         raise run.errors[0]
-    return Summary(Path(path), run.ended, file.totals)
+    return Summary(file.recording.place(), run.ended, file.totals)
 
 
 def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
@@ -359,7 +364,7 @@ class _Run:
             self._room[band].release()
             number += 1
             if number % self.limits.chunk == 0:
-                _check_space(self.file.recording.path, self.limits.reserve)
+                _check_space(self.file.recording.root, self.limits.reserve)
 
     def _write_rest(self) -> None:
         """Write the rest of the queues, when the threads have ended."""
@@ -416,7 +421,7 @@ def _check_space(path: Path, least: int) -> None:
     available = _free(path)
     if available < least:
         message = f"Too little space: {available} bytes are free. Must be {least}"
-        raise OSError(errno.ENOSPC, message, str(path))
+        raise OSError(errno.ENOSPC, message, os.path.realpath(path))
 
 
 def _free(path: Path) -> int:
