@@ -7,9 +7,10 @@ then the folder that holds the name is synced.
 
 import asyncio
 import os
+import weakref
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -18,6 +19,49 @@ from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
 _THREADS: Final = 8
+
+
+class HeldFolder:
+    """
+    A folder held by its descriptor, wherever it is renamed or moved on its disk.
+
+    Parameters
+    ----------
+    folder : Path
+        That exists (OSError otherwise).
+    path : Path, optional
+        Where it will be moved next, if that is another place.
+
+    Attributes
+    ----------
+    root : Path
+        Leads into it, wherever it is; without a /proc, as on macOS, its path.
+    close : callable
+        Lets it go.
+    """
+
+    def __init__(self, folder: Path, path: Path | None = None) -> None:
+        self._path, self._descriptor = path or folder, os.open(folder, os.O_RDONLY)
+        self.close = weakref.finalize(self, os.close, self._descriptor)
+        self._link = Path(f"/proc/self/fd/{self._descriptor}")
+        self.root = self._link if self._link.exists() else self._path.absolute()
+
+    def place(self) -> Path:
+        """Path at which the folder lies now: FileNotFoundError if it was deleted."""
+        paths = (self._path, Path(os.path.realpath(self._link)))
+        for path in paths:
+            if self.has(path):
+                return path
+        raise FileNotFoundError(
+            f"No folder '{paths[0]}' any more: it was deleted, replaced or taken to another disk. "
+            "Must stay while it is written to."
+        )
+
+    def has(self, path: Path) -> bool:
+        """True if a path leads to the held folder."""
+        with suppress(OSError):
+            return os.path.samestat(os.fstat(self._descriptor), path.stat())
+        return False
 
 
 class DurableStore(LocalStore):
