@@ -1,12 +1,14 @@
-"""Readers of outside formats: thermal spectra, videos drawn in a palette.
+"""Readers of outside formats: thermal spectra, videos drawn in a palette, settings in YAML.
 
-A reader takes a path and returns labelled data in SI units, or raises; it mends nothing.
+A reader takes a path and returns labelled data in SI units, or raises; it mends nothing. What it
+opens was written by others: it must be a regular file of a limited size.
 """
 
+from dbthermal._text import read_yaml
 from dbthermal.readers._spectra import ecostress, slum, ucsb
 from dbthermal.readers._videos import masked_palette_video, palette_video
 
-__all__ = ["ecostress", "masked_palette_video", "palette_video", "slum", "ucsb"]
+__all__ = ["ecostress", "masked_palette_video", "palette_video", "read_yaml", "slum", "ucsb"]
 
 
 def __dir__() -> list[str]:

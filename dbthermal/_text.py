@@ -1,0 +1,252 @@
+"""Text from elsewhere: files, numbers and YAML, read strictly, or refused with line and rule.
+
+Whatever a reader opens was written by others. `read_text` opens regular files of a limited size,
+`number` takes decimal numbers alone, `parse_yaml` takes mappings that mean the same in YAML 1.1 and
+1.2. Nothing is guessed, and of two equal keys neither wins.
+"""
+
+import math
+import os
+import re
+import stat
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+TEXT_LIMIT: Final = 2**26
+"""Largest table that is read [byte]; the largest of the public libraries has 0.7 MB."""
+
+YAML_LIMIT: Final = 2**22
+"""Largest YAML file that is read [byte]."""
+
+_DEPTH: Final = 50  # of nested lists and mappings in YAML
+_SHOWN: Final = 60  # characters of a value in a message
+_LARGEST: Final = 2**53  # up to here whole numbers are exact also as float
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
+_DECIMAL: Final = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
+_CONSTANTS: Final = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
+# Numbers that YAML 1.1 and 1.2 read alike: 012, 1e3 and 1_000 are not among them.
+_WHOLE: Final = re.compile(r"[-+]?(0|[1-9][0-9]*)")
+_REAL: Final = re.compile(r"([-+]?(0|[1-9][0-9]*)\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?")
+
+
+def regular_file(path: str | Path, limit: int) -> Path:
+    """Return the path of a regular file of at most `limit` bytes; ValueError if it is another.
+
+    A folder, a pipe or a device is refused without being opened. OSError if there is none.
+    """
+    path = Path(path)
+    state = path.stat()
+    if not stat.S_ISREG(state.st_mode):
+        kind = "folder" if stat.S_ISDIR(state.st_mode) else "pipe, socket or device"
+        raise ValueError(f"Invalid file '{path}', a {kind}. Must be a regular file.")
+    if state.st_size > limit:
+        raise ValueError(
+            f"Invalid size {state.st_size} bytes of '{path}'. Must be at most {limit}."
+        )
+    return path
+
+
+def read_text(path: str | Path, *, encoding: str = "utf-8", limit: int = TEXT_LIMIT) -> str:
+    """
+    Text of a regular file, with line ends as newlines and without a byte-order mark.
+
+    ValueError names the file, the line and the rule if the file is a folder, a pipe or a device,
+    larger than `limit` [byte], not of the encoding, or holds a control character such as NUL.
+    OSError if it cannot be opened.
+    """
+    with regular_file(path, limit).open("rb") as file:
+        content = file.read(limit)
+    try:
+        text = content.decode(encoding).removeprefix("\ufeff")
+    except UnicodeDecodeError as error:
+        place = _place(os.fspath(path), content[: error.start].decode("latin-1"))
+        byte = f"0x{content[error.start]:02x}"
+        raise ValueError(f"{place}: Invalid byte {byte}. Must be text in {encoding}.") from error
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if found := _CONTROL.search(text):
+        place = _place(os.fspath(path), text[: found.start()])
+        raise ValueError(f"{place}: Invalid control character {found.group()!r}. Must be text.")
+    return text
+
+
+def _place(source: str, before: str) -> str:
+    """Place of the character that follows a piece of text."""
+    return at(source, before.count("\n") + 1, len(before) - before.rfind("\n"))
+
+
+def at(source: str, line: int, column: int | None = None) -> str:
+    """Place in a text, for the beginning of a message; lines and columns count from 1."""
+    return f"{source}, line {line}" + ("" if column is None else f", column {column}")
+
+
+def shown(value: object) -> str:
+    """Value as a message shows it: in one line, and cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}... ({len(text)} characters)"
+
+
+def number(text: str, place: str) -> float:
+    """Finite number written in decimal digits; ValueError with its `place` if it is not one."""
+    text = text.strip(" \t")
+    value = float(text) if _DECIMAL.fullmatch(text) else math.nan
+    if not math.isfinite(value):
+        raise ValueError(
+            f"{place}: Invalid number {shown(text)}. Must be finite, and written in digits with a "
+            "decimal point."
+        )
+    return value
+
+
+def read_yaml(path: str | Path) -> dict[Any, Any]:
+    """
+    Mapping in a YAML file, whose values mean the same in YAML 1.1 and 1.2.
+
+    Parameters
+    ----------
+    path : str or Path
+        Regular file in UTF-8 of at most `YAML_LIMIT` bytes.
+
+    Returns
+    -------
+    dict
+        Keys are text or numbers; values are mappings, lists, text, finite numbers, bool or None.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened.
+    ValueError
+        One line with file, line, column and rule, for: text that is no YAML, or no mapping;
+        repeated keys (also ``1`` beside ``"1"``); anchors, aliases, tags, several documents, deep
+        nesting; numbers that are not finite; and plain values that the versions of YAML read
+        differently, such as ``on``, ``012``, ``12:30``, ``1e3`` or a date. In quotes they are text.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "a.yaml")
+    ...     size = path.write_text("{name: plate, shape: [4, 6], 9.5: true}")
+    ...     read_yaml(path)
+    {'name': 'plate', 'shape': [4, 6], 9.5: True}
+    """
+    return parse_yaml(read_text(path, limit=YAML_LIMIT), os.fspath(path))
+
+
+def parse_yaml(text: str, source: str) -> dict[Any, Any]:
+    """
+    Mapping in a text, as `read_yaml` has it of a file; `source` is its name in messages.
+
+    Examples
+    --------
+    >>> parse_yaml("{duration: 1, duration: 2}", "session")
+    Traceback (most recent call last):
+    ValueError: session, line 1, column 15: Repeated key 'duration'. Must be listed once.
+    """
+    import yaml  # noqa: PLC0415 - of the extra `instruments`; most of the package does without
+
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C ten times as fast
+    builder = _Builder(source, yaml.resolver.Resolver())
+    try:
+        for event in yaml.parse(text, loader):
+            builder.take(event)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = at(source, mark.line + 1, mark.column + 1) if mark else source
+        raise ValueError(f"{place}: Must be YAML: {error.problem}.") from error
+    except (yaml.YAMLError, UnicodeError) as error:
+        raise ValueError(f"{source}: Must be YAML: {' '.join(str(error).split())}.") from error
+    if not isinstance(builder.content, dict):
+        raise ValueError(f"{source}: Invalid content {shown(builder.content)}. Must be a mapping.")
+    return builder.content
+
+
+class _Builder:
+    """Content of a YAML document, built event by event, so that depth and aliases cost nothing."""
+
+    def __init__(self, source: str, resolver: Any) -> None:
+        self.source, self.resolver = source, resolver
+        self.content: Any = None
+        self._documents = 0
+        self._open: list[_Open] = []  # outermost first
+
+    def take(self, event: Any) -> None:
+        """Take in one event of the parser."""
+        kind = type(event).__name__.removesuffix("Event")
+        if getattr(event, "anchor", None) is not None:
+            self._refuse(event, f"anchor or alias '{event.anchor}'", "Must be written out")
+        if getattr(event, "tag", None) not in {None, "!"}:
+            self._refuse(event, f"tag '{event.tag}'", "Must be left out")
+        if kind == "DocumentStart":
+            self._documents += 1
+            if self._documents > 1:
+                self._refuse(event, "second document", "Must be one")
+        elif kind == "Scalar":
+            self._put(self._scalar(event) if event.implicit[0] else event.value, event)
+        elif kind in {"MappingStart", "SequenceStart"}:
+            if len(self._open) >= _DEPTH:
+                self._refuse(event, f"nesting deeper than {_DEPTH}", "Must be less deep")
+            value: Any = {} if kind == "MappingStart" else []
+            self._put(value, event)
+            self._open.append(_Open(value))
+        elif kind in {"MappingEnd", "SequenceEnd"}:
+            self._open.pop()
+
+    def _put(self, value: Any, event: Any) -> None:
+        """Put a value where the document stands: key, value of a key, entry of a list."""
+        if not self._open:
+            self.content = value
+            return
+        open_ = self._open[-1]
+        if isinstance(open_.value, list):
+            open_.value.append(value)
+        elif open_.key is None:
+            open_.key = self._key(value, open_.names, event)
+        else:
+            open_.value[open_.key], open_.key = value, None
+
+    def _key(self, key: Any, names: set[str], event: Any) -> Any:
+        if isinstance(key, bool) or not isinstance(key, str | int | float):
+            self._refuse(event, f"key {shown(key)}", "Must be text or a number")
+        if str(key) in names:
+            raise ValueError(f"{self._at(event)}: Repeated key {shown(key)}. Must be listed once.")
+        names.add(str(key))
+        return key
+
+    def _scalar(self, event: Any) -> Any:
+        """Value of a plain scalar, if all versions of YAML read it alike."""
+        from yaml import ScalarNode  # noqa: PLC0415
+
+        text = event.value
+        if text in _CONSTANTS:
+            return _CONSTANTS[text]
+        if _WHOLE.fullmatch(text) and len(text) < 18 and abs(int(text)) <= _LARGEST:
+            return int(text)
+        if _REAL.fullmatch(text) and math.isfinite(float(text)):
+            return float(text)
+        is_text = self.resolver.resolve(ScalarNode, text, (True, False)).endswith(":str")
+        if not is_text or _DECIMAL.fullmatch(text) or re.fullmatch("0o[0-7]+", text):
+            rule = "Must be a finite decimal number, true, false, or in quotes if it is text"
+            self._refuse(event, f"value {text[:_SHOWN]}", rule)
+        return text
+
+    def _at(self, event: Any) -> str:
+        return at(self.source, event.start_mark.line + 1, event.start_mark.column + 1)
+
+    def _refuse(self, event: Any, what: str, rule: str) -> NoReturn:
+        raise ValueError(f"{self._at(event)}: Invalid {what}. {rule}.")
+
+
+@dataclass
+class _Open:
+    """List or mapping that is not complete, and of a mapping its keys, and the key in hand."""
+
+    value: Any
+    names: set[str] = field(default_factory=set)
+    key: Any = None
