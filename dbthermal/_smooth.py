@@ -5,11 +5,15 @@ the fit of every order follows from one set of coefficients.
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+# Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
+_ROUNDED: Final = 1e-6
 
 
 @dataclass(frozen=True)
@@ -122,5 +126,23 @@ def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
         )
     span = time[-1] - time[0] if time.size > 1 else 1.0
     position = 2.0 * (time - time[0]) / span - 1.0
-    columns, _ = np.linalg.qr(np.polynomial.legendre.legvander(position, order - 1))
-    return np.asarray(columns)
+    columns, triangle = np.linalg.qr(np.polynomial.legendre.legvander(position, order - 1))
+    size = np.abs(np.diag(triangle))
+    return np.asarray(columns) if size.min() > _ROUNDED * size.max() else _arnoldi(position, order)
+
+
+def _arnoldi(position: Array, order: int) -> Array:
+    """
+    As `polynomial_basis`, where frames in few places make polynomials nearly dependent.
+
+    Each function is the one before times the position, made orthogonal (Brubeck, Nakatsukasa,
+    Trefethen 2021, doi:10.1137/19M130839X).
+    """
+    columns = np.full((position.size, order), 1.0 / np.sqrt(position.size))
+    for degree in range(1, order):
+        following = position * columns[:, degree - 1]
+        for _ in range(2):  # once more, against rounding
+            known = columns[:, :degree]
+            following = following - known @ (known.T @ following)
+        columns[:, degree] = following / np.linalg.norm(following)
+    return columns

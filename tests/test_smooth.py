@@ -153,3 +153,15 @@ def test_jump_in_slope_over_uneven_times() -> None:
     functions = smooth.subspace(time, 4, jump=80)
     own = functions.object_part @ (functions.functions.T @ bent)
     np.testing.assert_allclose(own, bent, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("pause", [3.6e3, 1e9])
+def test_recordings_far_apart_have_each_their_curve(pause: float) -> None:
+    """Across a pause of an hour or of 30 years the functions hold a curve of each recording."""
+    since = np.arange(100) / 10.0
+    time = np.concatenate([since, pause + since])
+    functions = smooth.polynomial_basis(time, 14)
+    np.testing.assert_allclose(functions.T @ functions, np.eye(14), rtol=0, atol=1e-10)
+    curve = np.concatenate([np.exp(-since / 5.0), 2.0 - (since / 10.0) ** 3])
+    fitted = functions @ (functions.T @ curve)
+    np.testing.assert_allclose(fitted, curve, rtol=0, atol=1e-4)

@@ -105,8 +105,8 @@ def record_sweep(
 
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep,
     and a scene too is recorded after a correction. Recordings of this sweep that are in the folder
-    and complete are kept, so that a sweep that was interrupted goes on where it was. Call
-    `Devices.prepare` before.
+    and complete are kept, so that a sweep that was interrupted goes on where it was. If the folder
+    is renamed or moved meanwhile the sweep goes on in it. Call `Devices.prepare` before.
 
     Parameters
     ----------
@@ -134,23 +134,29 @@ def record_sweep(
         As `wait_stable`; the recordings before are kept.
     SourceLostError
         If a camera is lost on the way.
+    FileNotFoundError
+        If the folder was deleted meanwhile.
     """
     session = devices.session
     readings = devices.readings()
     if session.blackbody is None or BLACKBODY not in readings:
         raise ValueError(f"Invalid session '{session.name}'. Must have and read a blackbody.")
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    held = store.HeldFolder(Path(folder))
     plan = _plan(session, folder)
     kept = [_kept(number, temperature, band, path) for number, temperature, band, path in plan]
     steps: list[Step] = []
     resting: int | None = None
-    for (number, temperature, band, path), was in zip(plan, kept, strict=True):
+    for (number, temperature, band, planned), was in zip(plan, kept, strict=True):
         if was is None and resting != number:
             set_temperature(temperature)
             wait_stable(session, temperature, readings[BLACKBODY].read)
             devices.correct_offsets()
             resting = number
+        path = held.place() / planned.name
         summary = was or _record_step(devices, band, path, limits, preview)
-        steps.append(Step(number, temperature, mean_reading(path, BLACKBODY), band, summary))
+        blackbody = mean_reading(path if was else summary.path, BLACKBODY)
+        steps.append(Step(number, temperature, blackbody, band, summary))
     return steps
 
 
@@ -259,5 +265,5 @@ def _record_step(
     )
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
-    require_filter(path, band)
+    require_filter(summary.path, band)
     return summary

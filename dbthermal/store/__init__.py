@@ -2,9 +2,11 @@
 
 `save` and `open_dataset` keep datasets as zarr; `save_numbers`, `save_figure`, `save_text` and
 `save_video` keep the rest of a result, each with the record from `provenance`. `Recording` grows in
-chunks and survives a kill or a power loss. No other package opens or writes zarr.
+chunks and survives a kill or a power loss; a `HeldFolder` is found wherever it is moved. No other
+package opens or writes zarr.
 """
 
+from dbthermal.store._durable import HeldFolder
 from dbthermal.store._provenance import checksum, provenance
 from dbthermal.store._recording import Recording
 from dbthermal.store._results import (
@@ -19,6 +21,7 @@ from dbthermal.store._results import (
 )
 
 __all__ = [
+    "HeldFolder",
     "Number",
     "Recording",
     "checksum",

@@ -5,26 +5,70 @@ its new name and no content. So the new content is synced to the disk first, the
 then the folder that holds the name is synced.
 """
 
-import asyncio
 import os
+import weakref
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
 from zarr.core.buffer import Buffer
-from zarr.storage import LocalStore
+
+from dbthermal.store._integrity import SummedStore, add_sums
 
 _THREADS: Final = 8
 
 
-class DurableStore(LocalStore):
+class HeldFolder:
+    """
+    A folder held by its descriptor, wherever it is renamed or moved on its disk.
+
+    Parameters
+    ----------
+    folder : Path
+        That exists (OSError otherwise).
+    path : Path, optional
+        Where it will be moved next, if that is another place.
+
+    Attributes
+    ----------
+    root : Path
+        Leads into it, wherever it is; without a /proc, as on macOS, its path.
+    close : callable
+        Lets it go.
+    """
+
+    def __init__(self, folder: Path, path: Path | None = None) -> None:
+        self._path, self._descriptor = path or folder, os.open(folder, os.O_RDONLY)
+        self.close = weakref.finalize(self, os.close, self._descriptor)
+        self._link = Path(f"/proc/self/fd/{self._descriptor}")
+        self.root = self._link if self._link.exists() else self._path.absolute()
+
+    def place(self) -> Path:
+        """Path at which the folder lies now: FileNotFoundError if it was deleted."""
+        paths = (self._path, Path(os.path.realpath(self._link)))
+        for path in paths:
+            if self.has(path):
+                return path
+        raise FileNotFoundError(
+            f"No folder '{paths[0]}' any more: it was deleted, replaced or taken to another disk. "
+            "Must stay while it is written to."
+        )
+
+    def has(self, path: Path) -> bool:
+        """True if a path leads to the held folder."""
+        with suppress(OSError):
+            return os.path.samestat(os.fstat(self._descriptor), path.stat())
+        return False
+
+
+class DurableStore(SummedStore):
     """
     Zarr store in a folder in which an existing file is replaced in one step.
 
-    New files are written as `LocalStore` does, and are brought to the disk by `tree_to_disk`, for
+    New files are written as `SummedStore` does, and are brought to the disk by `tree_to_disk`, for
     many at once take the time of one.
     """
 
@@ -32,25 +76,25 @@ class DurableStore(LocalStore):
         """Write a file by its relative name; if that fails, the old one stays."""
         path = self.root / key
         if path.exists():
-            replace(path, value.to_bytes(), path.with_name(f".{path.name}.part"))
+            self.replace(key, value.to_bytes(), path.with_name(f".{path.name}.part"))
         else:
             super().set_sync(key, value)
 
-    async def set(self, key: str, value: Buffer) -> None:
-        """Write a file; see `set_sync`."""
-        await asyncio.to_thread(self.set_sync, key, value)
+    def replace(self, key: str, content: bytes, part: Path) -> None:
+        """Replace a file by its relative name, when its checksum is on the disk; see `replace`."""
+        replace(self.root / key, content, part, before=[add_sums(self.root, {key: content})])
 
 
-def replace(path: Path, content: bytes, part: Path) -> None:
+def replace(path: Path, content: bytes, part: Path, before: Iterable[Path] = ()) -> None:
     """
     Replace a file in one step: a power loss leaves the old content or the new one.
 
     The new content is written to `part`, on the same file system. If that fails, the old file
-    stays, and nothing beside it.
+    stays, and nothing beside it. The files `before` are brought to the disk with it.
     """
     try:
         part.write_bytes(content)
-        to_disk([part])
+        to_disk([part, *before])
         part.replace(path)
     except OSError:
         part.unlink(missing_ok=True)

@@ -4,28 +4,56 @@ The folder is a zarr store (format 3) from the first moment on. Chunks are writt
 disk first; then ``zarr.json``, which says how many frames are valid, is replaced in one step. Valid
 chunks are never written over in place. A kill or a power loss thus leaves a store without the chunk
 that was being written: ``complete`` is False and ``frames_written`` is where each band ends.
-`dbthermal.store.open_dataset` opens that much of it.
+`dbthermal.store.open_dataset` opens that much of it. The folder is held by its descriptor: renamed
+or moved, the recording goes on in it, and nothing is written to what now has its path.
 """
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 import zarr
-from zarr.codecs import BloscCodec
+from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal.schema import COORDINATES, Variable
-from dbthermal.store._durable import DurableStore, made_beside, replace, tree_to_disk
+from dbthermal.store._durable import (
+    DurableStore,
+    HeldFolder,
+    made_beside,
+    replace,
+    tree_to_disk,
+)
+from dbthermal.store._integrity import GROUP, MARK, SUMS, SummedStore, add_sums, last_sums
 
 Values = npt.NDArray[Any]
+Method = TypeVar("Method", bound=Callable[..., Any])
 
-_GROUP: Final = "zarr.json"  # file of a zarr group's attributes
+_NO_NODES: Final = "band"  # folder of an array, in which zarr seeks no nodes: for unfinished files
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
-_COMPRESSOR: Final = BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle")
+_COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec())
+
+
+def _in_held_folder(method: Method) -> Method:
+    """Let a method raise what is missing of the folder, and errors with paths in it."""
+
+    @wraps(method)
+    def held(recording: "Recording", *inputs: Any, **more: Any) -> Any:
+        recording.place()
+        try:
+            return method(recording, *inputs, **more)
+        except OSError as error:
+            recording.place()
+            if isinstance(error.filename, str):
+                error.filename = os.path.realpath(error.filename)
+            raise
+
+    return cast("Method", held)
 
 
 class Recording:
@@ -37,7 +65,8 @@ class Recording:
     JSON, and `fills` are values behind a band's last frame, instead of NaN or 0.
 
     `frames` is the number of frames of each band and `rows` that of the log, as far as they are
-    written; `commit` declares them valid.
+    written; `commit` declares them valid. `root` leads into the folder wherever it is moved. After
+    the folder was deleted, or one of an array moved, FileNotFoundError: nothing more is written.
     """
 
     def __init__(
@@ -58,23 +87,49 @@ class Recording:
             raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
         self.frames, self.rows = dict.fromkeys(bands, 0), 0
         self._attrs = json.loads(
-            json.dumps({**attrs, "complete": False, "closed": False}, allow_nan=False)
+            json.dumps({**MARK, **attrs, "complete": False, "closed": False}, allow_nan=False)
         )
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
         whole = {**sizes, "band": len(bands), "time": chunk}
         with made_beside(self.path, self.path.absolute().parent) as part:
-            group = zarr.open_group(part, mode="w-", zarr_format=3, attributes=self._attrs)
+            part.mkdir()
+            group = zarr.open_group(
+                SummedStore(part), mode="w-", zarr_format=3, attributes=self._attrs
+            )
             for name, variable in variables.items():
                 _create(group, name, variable, whole, (fills or {}).get(name))
             names = group.create_array(
-                "band", shape=(len(bands),), dtype=str, dimension_names=("band",)
+                "band",
+                shape=(len(bands),),
+                dtype=str,
+                compressors=_COMPRESSORS,
+                dimension_names=("band",),
             )
             names[:] = np.array(bands, dtype=np.dtypes.StringDType())
-        group = zarr.open_group(DurableStore(self.path), mode="r+", use_consolidated=False)
+            self._folder = HeldFolder(part, self.path)
+        self.root = self._folder.root
+        self._store = DurableStore(self.root)
+        group = zarr.open_group(self._store, mode="r+", use_consolidated=False)
         # A chunk of zeros is written too: a missing one was never recorded.
         config: Any = {"write_empty_chunks": True}
         self._arrays = {name: array.with_config(config) for name, array in group.arrays()}
+        self._inside = {name: (self.root / name).stat() for name in self._arrays}
 
+    def place(self) -> Path:
+        """Path at which the recording lies now; FileNotFoundError if a part of it is missing."""
+        if self._closed:
+            return self.path
+        place = self._folder.place()
+        for name, held in self._inside.items():
+            folder = self.root / name
+            if not (folder.exists() and os.path.samestat(folder.stat(), held)):
+                raise FileNotFoundError(
+                    f"No array '{name}' in the recording '{place}' any more: its folder was moved, "
+                    "replaced or deleted. Must stay while it is written to."
+                )
+        return place
+
+    @_in_held_folder
     def append(self, band: str, block: Mapping[str, Values]) -> None:
         """
         Write a chunk of frames of one band behind its others; valid with the next `commit`.
@@ -89,6 +144,7 @@ class Recording:
         self._to_disk(block, [Path("c", str(place), str(start // self.chunk))])
         self.frames[band] = stop
 
+    @_in_held_folder
     def append_log(self, columns: Mapping[str, Values]) -> None:
         """Write rows of the log, every variable (row,); valid with the next `commit`."""
         start, end = self.rows, self.rows + len(next(iter(columns.values())))
@@ -99,16 +155,21 @@ class Recording:
         self._to_disk(columns, [Path("c", str(number)) for number in chunks])
         self.rows = end
 
+    @_in_held_folder
     def read(self, name: str, band: str) -> Values:
         """Values (frame, ...) of a band, as many as the longest band has frames."""
         place, frames = list(self.frames).index(band), max(self.frames.values())
         return np.asarray(self._arrays[name][place, :frames])
 
+    @_in_held_folder
     def commit(self, **attrs: Any) -> None:
         """Declare valid, in one step, all that was appended, and set attributes (JSON)."""
         self._attrs.update(attrs, frames_written=dict(self.frames), log_written=self.rows)
-        _write_attributes(self.path, self._attrs)
+        content = {"zarr_format": 3, "node_type": "group", "attributes": self._attrs}
+        text = json.dumps(content, allow_nan=False)
+        self._store.replace(GROUP, text.encode(), self._part(GROUP))
 
+    @_in_held_folder
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
         """
         Bring all bands to one number of frames, with `time` [s] as coordinate; set attributes.
@@ -130,7 +191,9 @@ class Recording:
         if time is not None:
             self._create_time(time)
         self.commit(complete=complete, closed=True, **attrs)
-        self._closed = True
+        replace(self.root / SUMS, last_sums(self.root), self._part(SUMS))
+        self.path, self._closed = self.place(), True
+        self._folder.close()
 
     def _repeat_last(self, place: int, recorded: int, frames: int) -> None:
         """Fill a band up to a number of frames with copies of its last one, chunk by chunk."""
@@ -146,37 +209,27 @@ class Recording:
             start = stop
 
     def _create_time(self, time: Values) -> None:
-        with made_beside(self.path / "time", self.path.absolute().parent) as part:
+        with made_beside(self.root / "time", self.root / _NO_NODES) as part:
             zarr.create_array(
                 part,
                 data=time.astype(np.float64),
+                compressors=_COMPRESSORS,
                 dimension_names=("time",),
                 attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
+                config={"write_empty_chunks": True},
             )
+        # Its metadata last: lines that are cut short are then not those of an array.
+        files = sorted(path for path in (self.root / "time").rglob("*") if path.is_file())
+        names = [path.relative_to(self.root).as_posix() for path in files]
+        add_sums(self.root, {name: (self.root / name).read_bytes() for name in names})
+
+    def _part(self, name: str) -> Path:
+        return self.root / _NO_NODES / f".{name}.part"
 
     def _to_disk(self, names: Iterable[str], chunks: Sequence[Path]) -> None:
-        """Bring chunks of some arrays to the disk, and the folders that they are in."""
-        tree_to_disk([self.path / name / chunk for name in names for chunk in chunks], self.path)
-
-
-def attributes(path: str | Path) -> dict[str, Any]:
-    """Attributes of a store as they are on the disk, without a look at its arrays."""
-    content = json.loads((Path(path) / _GROUP).read_text(encoding="utf-8"))
-    return dict(content.get("attributes", {}))
-
-
-def valid_part(attrs: Mapping[str, Any]) -> dict[str, slice]:
-    """Valid part of a recording that is not closed: frames that all bands have, rows of the log."""
-    frames = min(attrs["frames_written"].values())
-    return {"time": slice(0, frames), "log": slice(0, attrs["log_written"])}
-
-
-def _write_attributes(path: Path, attrs: Mapping[str, Any]) -> None:
-    """Replace the attributes of a store in one step; if that fails, the old ones stay."""
-    content = {"zarr_format": 3, "node_type": "group", "attributes": dict(attrs)}
-    text = json.dumps(content, allow_nan=False)
-    # Written beside the store: a file cut short by a kill is no part of the store.
-    replace(path / _GROUP, text.encode(), path.parent / f".{path.name}.part")
+        """Bring chunks of some arrays to the disk, their checksums, and the folders around them."""
+        places = [self.root / name / chunk for name in names for chunk in chunks]
+        tree_to_disk([*places, self.root / SUMS], self.root)
 
 
 def _create(
@@ -190,7 +243,7 @@ def _create(
         shape=tuple(whole[dim] for dim in variable.dims),
         chunks=tuple(chunks[dim] for dim in variable.dims),
         dtype=variable.dtype,
-        compressors=_COMPRESSOR,
+        compressors=_COMPRESSORS,
         fill_value=nothing if fill is None else fill,
         dimension_names=variable.dims,
         attributes=dict(variable.attrs),

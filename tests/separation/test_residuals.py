@@ -116,12 +116,12 @@ def test_change_point_is_at_the_step() -> None:
     step = np.where(np.arange(TIME.size) >= 140, 1.0, 0.0)[:, np.newaxis]
     rng = np.random.default_rng(7)
     moved = np.stack([0.86 * step, 0.72 * step]) * np.ones(20)
-    inside, ramp = residuals.candidates(TIME), residuals.ramp_frames(TIME)
+    inside = residuals.candidates(TIME)
     for height, sign in ((6.0, 1.0), (0.0, -1.0)):
         signals = height * moved + 0.03 * rng.standard_normal((2, TIME.size, 20))
         # A background beside it, along another direction, is not taken for the step.
         signals += np.array([0.14, 0.28])[:, None, None] * rng.standard_normal((TIME.size, 20))
-        frame, gain = residuals.find_jump(signals, FUNCTIONS, np.array([0.03, 0.03]), inside, ramp)
+        frame, gain = residuals.find_jump(signals, TIME, FUNCTIONS, np.array([0.03, 0.03]), inside)
         assert np.all(sign * gain > 0)
         if height:
             np.testing.assert_array_equal(frame, 140)
@@ -132,14 +132,16 @@ def test_isolated_change() -> None:
     step = 6.0 * (np.arange(TIME.size) >= 140)
     pulses = 6.0 * ((np.arange(TIME.size) // 40) % 2)
     signal = np.stack([step, pulses], axis=1) + 0.03 * noise(2)
-    found = residuals.isolated_change(signal, FUNCTIONS, residuals.ramp_frames(TIME))
+    found = residuals.isolated_change(signal, TIME, FUNCTIONS)
     np.testing.assert_array_equal(found, [True, False])
 
 
 def test_ramp_takes_a_second() -> None:
-    """Frames of a jump that takes as long as the time that is left out on one side."""
-    ramp = residuals.ramp_frames(TIME)
-    assert (ramp[-1] - ramp[0]) / 10.0 == pytest.approx(residuals.AROUND)
+    """A jump takes as long as the time that is left out on one side, at any frame rate."""
+    for time in (TIME, TIME / 1e3, TIME / 1e10):
+        ramp = residuals.ramp(time)
+        assert ramp[-1] - ramp[0] == pytest.approx(residuals.AROUND)
+        assert ramp.size <= 501  # bounded, however fast the clock
 
 
 def test_shutter_event_beside_a_jump_leaves_one_side() -> None:

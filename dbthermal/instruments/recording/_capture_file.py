@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from pathlib import Path
+from time import monotonic
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -45,6 +46,7 @@ CHUNK: Final = 30
 _AHEAD: Final = 1e-3  # by how much a stamp may be later than the frame's arrival [s]
 _STALE: Final = 3.0  # age at which a reading of the serial line says no more of the shutter [s]
 _HELD: Final = 1.0  # how long a note may wait for a chunk before it is written without one [s]
+_RECORDER: Final = "recorder"  # source of notes on the recording itself
 _FILLS: Final = MappingProxyType(
     {"frame_flags": int(FrameFlag.PADDED), "sequence": -1, "frame_counter": -1}
 )
@@ -64,6 +66,7 @@ class Note(IntEnum):
     CORRECTION = 8
     NO_FRAME = 9
     SOURCE_LOST = 10
+    FOLDER_MOVED = 11
 
 
 NOTES: Final = MappingProxyType(
@@ -79,6 +82,7 @@ NOTES: Final = MappingProxyType(
         Note.CORRECTION: "frame_counter at which the camera renewed its offsets, from telemetry",
         Note.NO_FRAME: "time without a frame [s]",
         Note.SOURCE_LOST: "NaN, the source gives no more frames",
+        Note.FOLDER_MOVED: "NaN, the recording's folder was moved or renamed; it went on in it",
     }
 )
 """Kind of a note to the meaning of its value."""
@@ -199,7 +203,7 @@ class CaptureFile:
     `attrs` are attributes of the recording (JSON), and `chunk` is the number of frames that are
     written together. FileExistsError if `path` exists; ValueError if the sources differ in shape or
     telemetry. After a failed write `broken` is True: what was written before is valid, and nothing
-    more may be handed over.
+    more may be handed over. Renamed or moved, the recording goes on in its folder, with a note.
     """
 
     def __init__(
@@ -217,8 +221,8 @@ class CaptureFile:
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
         self._origin, self._chunk = origin, chunk
         self._start: dict[str, Any] = {}  # attributes of `begin`
-        self._names = [*sources, *readings]
-        self._notes: list[tuple[float, int, int, float]] = []
+        self._names = [*sources, *readings, _RECORDER]
+        self._notes: list[tuple[float, ...]] = []
         self.broken = False
         self.recording = store.Recording(
             path,
@@ -236,6 +240,7 @@ class CaptureFile:
             },
             fills=_FILLS,
         )
+        self._place = self.recording.place()
         self._bands = {band: _Band(self._new_block()) for band in sources}
 
     @property
@@ -283,10 +288,12 @@ class CaptureFile:
         if kind is Note.READING and source != band and band in self._bands:
             status = FfcStatus(int(value)) if value in set(FfcStatus) else None
             self._bands[band].ffc_status = time, status
-        row = time - self._origin, int(kind), self._names.index(source), value
-        self._notes.append(row)
-        if row[0] - self._notes[0][0] > _HELD:
+        self._notes.append(self._row(kind, source, time, value))
+        if self._notes[-1][0] - self._notes[0][0] > _HELD:
             self._write_notes()
+
+    def _row(self, kind: Note, source: str, time: float, value: float) -> tuple[float, ...]:
+        return time - self._origin, int(kind), self._names.index(source), value
 
     def refused(self, band: str, number: int, time: float) -> None:
         """Count frames of a band that came and were not taken, and note it."""
@@ -373,6 +380,9 @@ class CaptureFile:
 
     def _write_notes(self) -> None:
         self.broken = True
+        if (place := self.recording.place()) != self._place:
+            self._place = place
+            self._notes.append(self._row(Note.FOLDER_MOVED, _RECORDER, monotonic(), math.nan))
         if self._notes:
             names = ("log_time", "log_kind", "log_source", "log_value")
             columns = zip(names, zip(*self._notes, strict=True), strict=True)

@@ -5,13 +5,14 @@ waits for another: a command that a camera answers late, because it corrects its
 costs no frame. A queue of bounded length leads to the thread that writes. If the disk is too slow
 the queue fills, frames are refused, and the log has their number and time.
 
-The caller's thread shows the preview. A preview that is slow or raises, or an interrupt by the
-keyboard, twice maybe, stops no chunk half-way: the frames that came before are written before the
-writer ends.
+The caller's thread shows the preview. A preview that is slow or raises, an interrupt by the
+keyboard, twice maybe, or a signal stops no chunk half-way: the frames that came before are written
+before the writer ends.
 """
 
 import errno
 import math
+import os
 import queue
 import shutil
 import threading
@@ -32,6 +33,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.signals import SignalExit, raised_signals
 
 Identities = Mapping[str, Mapping[str, str | bool]]
 
@@ -88,7 +90,7 @@ class Summary:
     Result of a recording, with `totals` as in `Preview`.
 
     `ended` is ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is
-    lost), or ``"no frames"`` if a band had none.
+    lost), or ``"no frames"`` if a band had none. `path` is where the recording lies now.
     """
 
     path: Path
@@ -112,6 +114,9 @@ def record(
 
     Frames that a driver buffered before the start, by their stamps, are not recorded: they show
     another filter, or another scene. Two seconds after the start such a stamp counts as wrong.
+
+    The recorder holds its folder: renamed or moved on its disk, it or one above it, the recording
+    goes on in it without losing a frame, with a note in the log, and the result has its new path.
 
     Parameters
     ----------
@@ -142,35 +147,40 @@ def record(
     FileExistsError
         If `path` exists.
     OSError
-        If there is too little space, before or on the way.
+        If there is too little space, before or on the way; or the folder, or one of an array in
+        it, was deleted, replaced or taken to another disk, or that of an array moved.
     ValueError
         If the sources are not those of the session, or are emulated and the session is not.
     Exception
         Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
         what was recorded is kept. A second interrupt ends the wait, not the writing.
+    SignalExit
+        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell; also kept. A
+        signal that the program handles or ignores is left alone.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
-    file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
-    start = monotonic()  # clock of the sources' stamps; to make the file may have taken a while
-    file.begin(start, _utc())
-    end, stop = start + session.duration, stop or threading.Event()
-    run = _Run(file, sources, readings, limits, start, end, stop)
-    # No daemon: it ends its work whatever becomes of this thread.
-    writer = threading.Thread(target=run.write, name="writer")
-    try:
-        writer.start()
-        run.show(preview)
-    except BaseException:
-        run.interrupted = True
-        raise
-    finally:
-        run.over.set()
-        if writer.ident is not None:  # None only where an interrupt came before its start
-            run.done.wait()
+    with raised_signals():
+        file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
+        start = monotonic()  # clock of the sources' stamps; to make the file may have taken a while
+        file.begin(start, _utc())
+        end, stop = start + session.duration, stop or threading.Event()
+        run = _Run(file, sources, readings, limits, start, end, stop)
+        # No daemon: it ends its work whatever becomes of this thread.
+        writer = threading.Thread(target=run.write, name="writer")
+        try:
+            writer.start()
+            run.show(preview)
+        except BaseException as error:
+            run.interrupted = error.name if isinstance(error, SignalExit) else "interrupted"
+            raise
+        finally:
+            run.over.set()
+            if writer.ident is not None:  # None only where an interrupt came before its start
+                run.done.wait()
     if run.errors:
         raise run.errors[0]
-    return Summary(Path(path), run.ended, file.totals)
+    return Summary(file.recording.place(), run.ended, file.totals)
 
 
 def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
@@ -243,7 +253,7 @@ class _Run:
         self.start, self.end, self.stop = start, end, stop
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
-        self.interrupted, self.ended = False, ""
+        self.interrupted, self.ended = "", ""
         # For the preview, after each frame is written: totals, last frames, last readings.
         self.totals: dict[str, dict[str, int]] = {}
         self.last_frames: dict[str, Frame] = {}
@@ -359,7 +369,7 @@ class _Run:
             self._room[band].release()
             number += 1
             if number % self.limits.chunk == 0:
-                _check_space(self.file.recording.path, self.limits.reserve)
+                _check_space(self.file.recording.root, self.limits.reserve)
 
     def _write_rest(self) -> None:
         """Write the rest of the queues, when the threads have ended."""
@@ -391,7 +401,7 @@ class _Run:
         if self.errors:
             return "no space" if getattr(self.errors[0], "errno", 0) == errno.ENOSPC else "error"
         if self.interrupted:
-            return "interrupted"
+            return self.interrupted
         if self._lost_sources:
             return "source lost"
         if len(self.last_frames) < len(self._room):
@@ -416,7 +426,7 @@ def _check_space(path: Path, least: int) -> None:
     available = _free(path)
     if available < least:
         message = f"Too little space: {available} bytes are free. Must be {least}"
-        raise OSError(errno.ENOSPC, message, str(path))
+        raise OSError(errno.ENOSPC, message, os.path.realpath(path))
 
 
 def _free(path: Path) -> int:

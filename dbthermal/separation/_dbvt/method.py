@@ -124,8 +124,8 @@ def _even(time: Array) -> float:
     worst = int(np.argmax(np.abs(steps - interval)))
     if abs(steps[worst] - interval) > _UNEVEN * interval:
         raise ValueError(
-            f"Invalid interval {steps[worst]:.3g} s after {time[worst]:.3g} s for method 'dbvt'. "
-            f"Must be {interval:.3g} s throughout: its smoothness loss is of even frames."
+            f"Invalid interval {steps[worst]:.3g} s of 'time' after {time[worst]:.6g} s for method "
+            f"'dbvt'. Must be {interval:.3g} s throughout: its smoothness loss is of even frames."
         )
     return interval
 

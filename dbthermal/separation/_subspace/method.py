@@ -245,15 +245,15 @@ def _with_jumps(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """All steps: pixels that do not fit are solved anew with a jump in the subspace."""
     functions = _functions(tile)
     result = _exact(tile, functions, settings, _report)
-    inside, ramp = residuals.candidates(tile.time), residuals.ramp_frames(tile.time)
+    inside = residuals.candidates(tile.time)
     if inside.size == 0:
         return result
-    isolated = residuals.isolated_change(tile.signals[0], functions, ramp)
+    isolated = residuals.isolated_change(tile.signals[0], tile.time, functions)
     suspect = ((result.status & _SUSPECT) != 0) | isolated
     if not np.any(suspect):
         return result
-    noise = np.array(tile.noise)
-    frame, gain = residuals.find_jump(tile.signals[..., suspect], functions, noise, inside, ramp)
+    noise, signals = np.array(tile.noise), tile.signals[..., suspect]
+    frame, gain = residuals.find_jump(signals, tile.time, functions, noise, inside)
     first = np.full(suspect.shape, -1)
     first[suspect] = np.where(gain > 0, frame, -1)
     for jump in np.unique(first[first >= 0]):

@@ -43,6 +43,12 @@ _ORDER: Final = 7
 _ISOLATED: Final = 3.0
 # Fewest frames before and after a jump.
 _MARGIN: Final = 24
+# Steps, at most, on one side of the middle of a ramp.
+_RAMP: Final = 250
+# Share of a step's energy outside the smooth functions, below which it is rounding [1].
+_HELD: Final = 1e-6
+# Decimals to which a time is rounded before it is counted in whole lengths.
+_DIGITS: Final = 9
 
 
 @dataclass(frozen=True)
@@ -150,13 +156,13 @@ def interband_delay(
 
 
 def find_jump(
-    signals: Array, functions: smooth.Subspace, noise: Array, inside: Whole, ramp: Whole
+    signals: Array, time: Array, functions: smooth.Subspace, noise: Array, inside: Whole
 ) -> tuple[Whole, Array]:
     r"""
     Change point (pixel): first frame after the step that lowers the energy across the axis most.
 
     Sought in signals (band, time, pixel) [K] of `noise` (band) [K], among the frames `inside` from
-    `candidates`, for a sudden step and one spread evenly over the frames of `ramp` beside it.
+    `candidates`, for a sudden step and one spread evenly over the `ramp` beside it.
     With the smooth functions projected out, a step at frame t takes from the whitened scatter
     :math:`S` the part :math:`g g^T / n`, with g the sum of the residuals from t on, and n the
     energy of the step orthogonal to the functions. The second value is by how much the information
@@ -173,16 +179,25 @@ def find_jump(
     scatter = np.einsum("btp,ctp->pbc", residual, residual)
     before = np.linalg.eigvalsh(scatter)[..., :-1].sum(axis=-1)
     first, lowest = np.zeros(before.size, dtype=np.intp), np.full(before.size, np.inf)
-    for offsets in (np.zeros(1, dtype=np.intp), ramp):
-        places = inside[:, np.newaxis] + offsets
-        energy = norm[places].mean(axis=1) - np.abs(offsets[:, np.newaxis] - offsets).mean() / 2.0
-        energy -= np.sum(held[places].mean(axis=1) ** 2, axis=1)
-        # A running sum: side by side, the offsets of a fast film would need a gigabyte.
+    between = 0.5 * (time[inside] + time[inside - 1])
+    for shifts in (np.zeros(1), ramp(time)):
+        # A running mean: side by side, the steps of a fast film would need a gigabyte.
         mean = np.zeros((len(after), inside.size, after.shape[2]))
-        for offset in offsets:
-            mean += after[:, inside + offset] / offsets.size
-        part = np.einsum("btp,ctp->tpbc", mean, mean) / energy[:, None, None, None]
-        null_energy = np.linalg.eigvalsh(scatter - part)[..., :-1].sum(axis=-1)
+        of_functions = np.zeros((inside.size, basis.shape[1]))
+        energy = np.zeros(inside.size)
+        for number, shift in enumerate(shifts):
+            places = np.searchsorted(time, between + shift)
+            mean += after[:, places] / shifts.size
+            of_functions += held[places] / shifts.size
+            # Of the steps i and j the later counts: the mean of N - max(p_i, p_j).
+            energy += norm[places] / shifts.size
+            energy -= places * ((2 * number + 1 - shifts.size) / shifts.size**2)
+        energy -= np.sum(of_functions**2, axis=1)
+        # In a gap of the clock the smooth functions hold a step already: it explains nothing.
+        free = energy > _HELD * np.minimum(inside, norm[inside])
+        part = np.einsum("btp,ctp->tpbc", mean, mean)[free] / energy[free, None, None, None]
+        null_energy = np.broadcast_to(before, (inside.size, before.size)).copy()
+        null_energy[free] = np.linalg.eigvalsh(scatter - part)[..., :-1].sum(axis=-1)
         best = np.argmin(null_energy, axis=0)
         least = null_energy[best, np.arange(best.size)]
         first = np.where(least < lowest, inside[best], first)
@@ -191,17 +206,26 @@ def find_jump(
     return first, gain - 4.0 * np.log(frames)
 
 
-def isolated_change(signal: Array, functions: smooth.Subspace, ramp: Whole) -> Mask:
+def isolated_change(signal: Array, time: Array, functions: smooth.Subspace) -> Mask:
     """
     Pixels of a signal (time, pixel) with one change far larger than all others.
 
-    From frame to frame, or over the frames of `ramp`. A background comes and goes: its largest
-    changes come in pairs at least.
+    From frame to frame, or from one mean over the length of a `ramp` to the next. A background
+    comes and goes: its largest changes come in pairs at least.
     """
     basis = functions.functions[:, : functions.steps + _ORDER]
     residual = signal - basis @ (basis.T @ signal)
-    blocks = residual.shape[0] // ramp.size
-    slow = residual[: blocks * ramp.size].reshape(blocks, ramp.size, -1).mean(axis=1)
+    shifts = ramp(time)
+    if shifts.size == 1:
+        return _outstanding(residual)
+    # Lengths of a ramp before each frame; rounded, so that an even clock gives even blocks.
+    step = shifts[1] - shifts[0]
+    since = np.round((time - time[0]) / (shifts.size * step), _DIGITS)
+    whole = np.floor(np.round((time[-1] - time[0] + step) / (shifts.size * step), _DIGITS))
+    block = np.floor(since[since < whole])
+    starts = np.flatnonzero(np.diff(block, prepend=-1.0))
+    number = np.diff(starts, append=block.size)[:, np.newaxis]
+    slow = np.add.reduceat(residual[: block.size], starts, axis=0) / number
     return _outstanding(residual) | _outstanding(slow)
 
 
@@ -214,10 +238,11 @@ def candidates(time: Array) -> Whole:
     return np.asarray(1 + np.flatnonzero(good))
 
 
-def ramp_frames(time: Array) -> Whole:
-    """Frames, relative to its middle, of a jump as long as the margin excluded on one side."""
-    half = int(0.5 * AROUND / np.median(np.diff(time)))
-    return np.arange(-half, half + 1)
+def ramp(time: Array) -> Array:
+    """Times [s], from its middle, of the steps of a jump that takes as long as `AROUND`."""
+    step = max(float(np.median(np.diff(time))), 0.5 * AROUND / _RAMP)
+    half = int(0.5 * AROUND / step)
+    return np.asarray(step * np.arange(-half, half + 1.0))
 
 
 def beside_jump(time: Array, jump: int, segment: Whole | None = None) -> Mask:

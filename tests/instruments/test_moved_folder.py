@@ -1,0 +1,203 @@
+"""A recording whose folder is moved goes on in it whole; one that loses a part ends and says so."""
+
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from file_operations import before_operation, operations_of
+from rig_session import rig
+from test_killed import BANDS, RATE, check, frame, two_bands
+from test_protocols import TWO, swept
+from test_record import SMALL, bench, session
+
+from dbthermal import store
+from dbthermal.instruments.recording import Preview, notes, open_sweep, record
+from dbthermal.instruments.recording._capture_file import Note
+from dbthermal.instruments.session import Session
+
+FRAMES = 15
+
+
+def itself(path: Path) -> Path:
+    """Rename the recording."""
+    return path.rename(path.with_name("renamed.zarr"))
+
+
+def parent(path: Path) -> Path:
+    """Rename the folder that it is in."""
+    return path.parent.rename(path.parent.with_name("renamed")) / path.name
+
+
+def elsewhere(path: Path) -> Path:
+    """Move it to another folder, and delete the one that it was in."""
+    (folder := path.parent.with_name("other")).mkdir()
+    place = path.rename(folder / path.name)
+    path.parent.rmdir()
+    return place
+
+
+def replaced_by_another(path: Path) -> Path:
+    """Rename it, and put another folder there that looks like it."""
+    place = itself(path)
+    shutil.copytree(place, path)
+    return place
+
+
+def twice(path: Path) -> Path:
+    """Rename it and what it is in."""
+    return parent(itself(path))
+
+
+MOVES = (itself, parent, elsewhere, replaced_by_another, twice)
+
+
+def write(path: Path) -> Path:
+    """Write a whole recording frame by frame, and return where it lies."""
+    file = two_bands(path)
+    for number in range(FRAMES):
+        file.note(Note.READING, "plate", number / RATE, number)
+        for band in BANDS:
+            file.frame(band, frame(number))
+    file.close(complete=True, ended="stopped")
+    return file.recording.place()
+
+
+def check_whole(place: Path) -> None:
+    """Check that a recording has every frame and note, and no part of another's name."""
+    opened = store.open_dataset(place)
+    assert opened.attrs["frames_written"] == dict.fromkeys(BANDS, FRAMES)
+    assert (opened.attrs["closed"], opened.attrs["complete"]) == (True, True)
+    check(opened, 2 * [FRAMES])
+    readings = [value for _, kind, _, value in notes(place) if kind == "reading"]
+    np.testing.assert_array_equal(readings, np.arange(FRAMES))
+
+
+def moments(tmp_path: Path, every: int) -> range:
+    """Every so many-th file operation of a recording, from when it is begun to its end."""
+    begun = operations_of(lambda: two_bands(tmp_path / "a.zarr"))
+    return range(begun + 1, operations_of(lambda: write(tmp_path / "b.zarr")), every)
+
+
+@pytest.mark.parametrize("every", [500, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("move", MOVES)
+def test_moved_at_any_operation_it_goes_on(
+    tmp_path: Path, move: Callable[[Path], Path], every: int
+) -> None:
+    """Moved before any file operation, the recording is whole at its new place, and says so."""
+    noted = 0
+    for moment in (chosen := moments(tmp_path, every)):
+        folder = tmp_path / f"{moment}" / "deep"
+        folder.mkdir(parents=True)
+        path = folder / "a.zarr"
+        places: list[Path] = []
+
+        def act(to: list[Path] = places, at: Path = path) -> None:
+            to.append(move(at))
+
+        with before_operation(moment, act):
+            place = write(path)
+        assert [place] == places
+        check_whole(place)
+        assert path.exists() == (move is replaced_by_another)
+        noted += "folder_moved" in [note[1] for note in notes(place)]
+        shutil.rmtree(tmp_path / f"{moment}")
+    assert noted >= len(chosen) - 1 - 60 // every  # the last operations are after the last note
+
+
+def deleted(path: Path) -> None:
+    """Delete the recording."""
+    shutil.rmtree(path)
+
+
+def carried_off(path: Path) -> None:
+    """Take it to another disk: copy it, and delete it."""
+    shutil.copytree(path, path.with_name("copy.zarr"))
+    shutil.rmtree(path)
+
+
+def array_moved(path: Path) -> None:
+    """Rename the folder of an array."""
+    (path / "counts").rename(path / "old")
+
+
+def array_replaced(path: Path) -> None:
+    """Put a copy in place of the folder of an array."""
+    shutil.copytree(path / "counts", path.parent / "copy")
+    shutil.rmtree(path / "counts")
+    (path.parent / "copy").rename(path / "counts")
+
+
+LOSSES = (deleted, carried_off, array_moved, array_replaced)
+
+
+@pytest.mark.parametrize("every", [500, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("lose", LOSSES)
+def test_without_a_part_it_ends(tmp_path: Path, lose: Callable[[Path], None], every: int) -> None:
+    """Without its folder, or an array's, a recording ends with its name, and makes no other."""
+    for moment in moments(tmp_path, every):
+        path = tmp_path / f"{moment}" / "a.zarr"
+        path.parent.mkdir()
+        said = "No array 'counts'" if "array" in lose.__name__ else r"a\.zarr"
+        with pytest.raises(OSError, match=said), before_operation(moment, partial(lose, path)):
+            write(path)
+        if lose is array_moved:
+            shutil.rmtree(path / "counts", ignore_errors=True)  # of a chunk that is not valid
+            (path / "old").rename(path / "counts")
+        left = path.with_name("copy.zarr") if lose is carried_off else path
+        if lose is deleted:
+            assert not path.exists()
+        else:
+            opened = store.open_dataset(left)
+            assert opened.attrs["complete"] is False
+            check(opened, 2 * [opened.sizes["time"]])
+
+
+def test_a_recorder_follows_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Moved while it records, by a relative path that leads elsewhere since, it goes on."""
+    (tmp_path / "a").mkdir()
+    monkeypatch.chdir(tmp_path / "a")
+
+    def move(shown: Preview) -> None:
+        if shown.totals[BANDS[0]]["frames"] > 10 and Path("b.zarr").exists():
+            Path("b.zarr").rename(tmp_path / "c.zarr")
+            monkeypatch.chdir(tmp_path)
+
+    summary = record(session(0.4), bench(), "b.zarr", limits=SMALL, preview=move)
+    assert (summary.path, summary.ended) == (tmp_path / "c.zarr", "duration")
+    opened = store.open_dataset(summary.path)
+    for band, place in zip(BANDS, opened["sequence"].values, strict=True):
+        found = place[: summary.totals[band]["frames"]]
+        np.testing.assert_array_equal(np.diff(found), 1)
+        assert found.size > 30
+    assert list(tmp_path.glob("**/*.zarr")) == [summary.path]
+
+
+def test_a_deleted_recording_ends_at_once(tmp_path: Path) -> None:
+    """Deleted while it records, it ends with an error that names it, and is not made anew."""
+    path = tmp_path / "a.zarr"
+
+    def delete(_: Preview) -> None:
+        shutil.rmtree(path, ignore_errors=True)
+
+    with pytest.raises(FileNotFoundError, match=r"a\.zarr' any more"):
+        record(session(60.0), bench(), path, limits=SMALL, preview=delete)
+    assert not path.exists()
+
+
+def test_a_sweep_follows_its_folder(tmp_path: Path) -> None:
+    """The folder of a sweep, renamed on the way, has all its recordings; the old one is gone."""
+    before, after = tmp_path / "before", tmp_path / "after"
+
+    def move(_: Preview) -> None:
+        if (before / "plate_00_11.zarr").exists():
+            before.rename(after)
+
+    with rig(Session.from_yaml(TWO)) as devices:
+        devices.prepare()
+        steps = swept(devices, before, preview=move)
+    assert [step.summary.path.parent for step in steps] == [before, after, after, after]
+    assert open_sweep(after, "plate", frames=5).sizes["temperature"] == 2
+    assert not before.exists()

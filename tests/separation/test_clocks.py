@@ -1,0 +1,134 @@
+"""Clocks that are not even: solved from the real times as well as at even ones, or refused."""
+
+import tracemalloc
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import xarray as xr
+from captures import emissivity_of
+
+from dbthermal import separation, simulation
+from dbthermal.schema import Status
+from dbthermal.simulation import Background, Rig
+
+RIG = Rig()
+GLASS = emissivity_of(0.86, 0.72)
+FRAME = np.arange(350.0)
+EVEN = FRAME / 10.0  # s
+
+CLOCKS: dict[str, npt.NDArray[np.float64]] = {
+    "nanoseconds": FRAME * 1e-9,
+    "microseconds": FRAME * 1e-6,
+    "a frame every 10 minutes": FRAME * 600.0,
+    "since 1970": EVEN + 1.7e9,
+    "jitter": EVEN + np.random.default_rng(1).uniform(-0.04, 0.04, FRAME.size),
+    "at random": np.cumsum(np.random.default_rng(2).exponential(0.1, FRAME.size)),
+    "bursts of 8 in 0.7 ms": FRAME // 8 * 0.8 + FRAME % 8 * 1e-4,
+    "bursts of 32 in 31 us": FRAME // 32 * 3.2 + FRAME % 32 * 1e-6,
+    "5 frames a minute": FRAME // 5 * 60.0 + FRAME % 5 * 0.1,
+    "two bursts an hour apart": EVEN + 3600.0 * (FRAME >= 175),
+    "two rapid bursts an hour apart": FRAME * 1e-4 + 3600.0 * (FRAME >= 175),
+    "two pauses": EVEN + 3600.0 * (FRAME >= 117) + 1800.0 * (FRAME >= 233),
+    "a pause of 30 years": EVEN + 1e9 * (FRAME >= 175),
+    "slower by five": np.where(FRAME < 175, EVEN, EVEN[175] + (FRAME - 175) * 0.5),
+    "slower and slower": np.expm1(FRAME / 44.0),
+}
+"""Times [s] of 350 frames."""
+
+
+def seen_at(
+    time: npt.NDArray[np.float64], pixels: int, seed: int, *, slow: bool = False
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """Scene and capture of glass that warms in the real time, people passing frame by frame."""
+    rng = np.random.default_rng(seed)
+    since = time - time[0]
+    quick = (
+        not slow and since[-1] > 5.0 and np.sum(since < 20.0) > 150
+    )  # enough frames for rapid warming
+    constants = (8.0, 20.0) if quick else (0.25 * since[-1], 0.6 * since[-1])  # s
+    passing, warming = (
+        simulation.independent_pixels(
+            clock, GLASS, Background(), pixels, rng, start=293.15, stop=323.15, time_constant=tau
+        )
+        for clock, tau in ((np.arange(time.size) / 10.0, (8.0, 20.0)), (since, constants))
+    )
+    warm, cold = warming["object_temperature"].values, passing["background_temperature"].values
+    scene = simulation.scene(time, warm, cold, GLASS)
+    return scene, simulation.observe(scene, RIG.response(), rng)
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_real_times_are_as_good_as_even_ones(clock: str) -> None:
+    """At any times the object is known as at even ones, no pixel is flagged, and the 95 % intervals
+    hold in 93 to 98 %.
+    """
+    errors: list[npt.NDArray[np.float64]] = []
+    results: list[xr.Dataset] = []
+    for time in (EVEN, CLOCKS[clock]):
+        scene, capture = seen_at(time, 200, seed=4)
+        results.append(separation.solve(capture, RIG.response()))
+        errors.append((results[-1]["object_temperature"] - scene["object_temperature"]).values)
+    rmse = [float(np.nanmedian(np.sqrt(np.mean(error**2, axis=0)))) for error in errors]
+    score = np.abs(errors[1]) / results[1]["object_temperature_std"].values
+    covered, flagged = float(np.mean(score < 1.96)), float((results[1]["status"] != 0).mean())
+    print(f"{clock}: {rmse[1]:.3f} K, even {rmse[0]:.3f} K; cover {covered:.3f}; {flagged:.3f}")
+    assert rmse[1] < 1.15 * rmse[0]
+    assert 0.93 <= covered <= 0.98
+    assert flagged < 0.01
+    assert np.nanmax(score) < 6.0
+
+
+@pytest.mark.parametrize("method", separation.METHODS)
+@pytest.mark.parametrize("clock", ["nanoseconds", "bursts of 8 in 0.7 ms", "two pauses"])
+def test_every_method_takes_any_clock_or_names_it(clock: str, method: str) -> None:
+    """No clock is an error but for a method of even times, which names it."""
+    _, capture = seen_at(CLOCKS[clock], 12, seed=1)
+    known = separation.get_method(method)
+    emissivity = GLASS if known.knows_emissivity else None
+    if known.even_times and clock != "nanoseconds":
+        with pytest.raises(ValueError, match=r"Invalid interval .* of 'time' after .* s for"):
+            separation.solve(capture, RIG.response(), method)
+        return
+    quick = separation.DbvtSettings(stages=1, steps=2) if method == "dbvt" else None
+    result = separation.solve(
+        capture, RIG.response(), method, settings=quick, emissivity=emissivity
+    )
+    assert bool(result["object_temperature"].notnull().any())
+
+
+@pytest.mark.parametrize("place", [60, 175, 300])
+def test_a_jump_beside_a_pause_is_found(place: int) -> None:
+    """A jump of the object is found at its frame in a recording that pauses for an hour, and what
+    is left has calibrated uncertainty.
+    """
+    time = EVEN + 3600.0 * (FRAME >= 175)
+    scene, _ = seen_at(time, 100, seed=6, slow=True)
+    step = 6.0 * (scene["time"] >= time[place])
+    moved = scene.assign(object_temperature=scene["object_temperature"] + step)
+    capture = simulation.observe(moved, RIG.response(), np.random.default_rng(7))
+    result = separation.solve(capture, RIG.response())
+    error = (result["object_temperature"] - moved["object_temperature"]).values[:, 0]
+    score = np.abs(error) / result["object_temperature_std"].values[:, 0]
+    covered = float(np.mean(score[np.isfinite(error)] < 1.96))
+    jumping = result["status"].values[0] & Status.OBJECT_JUMP != 0
+    print(f"jump at {time[place]:.1f} s: cover {covered:.3f}, {100 * jumping.mean():.0f} % flagged")
+    assert covered > 0.92
+    assert np.isfinite(error).mean() > 0.9
+    if place != 175:  # a jump in the pause is not sudden: the object has had an hour
+        assert jumping.mean() > 0.98
+        assert np.mean(np.isnan(error[place])) > 0.98
+
+
+def test_memory_is_that_of_the_frames() -> None:
+    """A clock of nanoseconds, and one with a pause of 30 years, take no more memory than an even
+    one.
+    """
+    peaks = []
+    for time in (EVEN, CLOCKS["nanoseconds"], CLOCKS["a pause of 30 years"]):
+        _, capture = seen_at(time, 50, seed=1)
+        tracemalloc.start()
+        separation.solve(capture, RIG.response())
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert max(peaks) < 1.5 * peaks[0]
