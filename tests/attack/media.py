@@ -150,13 +150,14 @@ def _film() -> bytes:
 @cache
 def _large() -> bytes:
     """A video of a few kB, whose pictures take a gigabyte."""
-    return _encoded(np.broadcast_to(np.array([204, 71, 120], np.uint8), (72, 1080, 1920, 3)))
+    plain = np.array([204, 71, 120], np.uint8)
+    return _encoded(np.broadcast_to(plain, (72, 1080, 1920, 3)), "ultrafast")
 
 
-def _encoded(frames: Any) -> bytes:
+def _encoded(frames: Any, preset: str = "medium") -> bytes:
     path = workplace() / "whole.mp4"
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "18", "preset": "fast"})
+        stream = container.add_stream("libx264", rate=10, options={"crf": "18", "preset": preset})
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = "yuv420p"
         for frame in frames:

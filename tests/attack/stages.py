@@ -340,7 +340,7 @@ def response_fits(rng: Rng) -> Attack:
         return wrong(f"{off:.2f} K off", where=off > 0.1 + 5 * noise / SLOPE / 10)
 
     names = ("counts|temperature|band|residual|wavelength|noise|units|dims",)
-    more = {"noise": given} if rng.random() < 0.7 else {}
+    more: dict[str, Any] = {"noise": given} if rng.random() < 0.7 else {}
     act = lambda: calibration.fit_response(spoilt, **more)  # noqa: E731
     return Attack(f"fit_response: {what}, {sorted(more)}", act, judge, names, what == "good")
 
