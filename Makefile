@@ -50,7 +50,7 @@ export PYTHONPATH := $(CURDIR)/notebooks
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install format check types pytest smoke chain interop test test-slow reproduce full verify record data bench lock clean FORCE
+.PHONY: help install format check types pytest smoke chain interop test test-slow reproduce full verify record data bench attack lock clean FORCE
 
 help: ## list the tasks
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -108,6 +108,9 @@ data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
 
 bench: .venv/installed ## measure time and memory
 	$(python) -m pytest -m bench --capture=no
+
+attack: .venv/installed ## attack the package with 6,000 hostile inputs, and write their counts into docs/trust.md
+	PYTHONPATH=tests:notebooks $(python) -m attack --inputs 6000 --seed 1 --write docs/trust.md
 
 lock: .venv/installed ## write requirements.lock anew from pyproject.toml, keeping the pins that still fit
 	PIP_CONSTRAINT=requirements.lock $(python) -m pip install --quiet uv

@@ -72,8 +72,8 @@ def originals() -> Path:
 def _copy(name: str) -> Path:
     """Copy to be damaged, in place of the last one."""
     target = workplace() / "damaged" / name
-    shutil.rmtree(target, ignore_errors=True)
-    target.parent.mkdir(exist_ok=True)
+    shutil.rmtree(target.parent, ignore_errors=True)
+    target.parent.mkdir()
     source = originals() / name
     if source.is_dir():
         shutil.copytree(source, target)
