@@ -6,16 +6,19 @@ An interrupted sweep goes on where it was. The user sets the blackbody on reques
 ``--simulate`` the same drivers talk to emulated devices, whose cameras see a blackbody.
 
 Exit status: 0 if all was recorded, 1 if a device or a recording failed, 2 if the session is
-invalid, 130 if it was interrupted; what was recorded is kept. Never tried on hardware.
+invalid, 130 if it was interrupted, 143 and 129 if SIGTERM or SIGHUP ended it; what was recorded is
+kept. If the terminal or pipe that it prints to is closed the recording goes on. Never tried on
+hardware.
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, TextIO
 
 from scipy.constants import zero_Celsius
 
@@ -24,6 +27,7 @@ from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.live import Watch
 from dbthermal.instruments.recording import Preview, Summary
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.signals import SignalExit, raised_signals
 
 __all__ = ["ask_for_blackbody", "main", "plugged_in"]
 
@@ -75,13 +79,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     session = replace(session, simulated=True) if options.simulate else session
     try:
-        return _run(session, options.folder, dry=options.dry_run)
+        with raised_signals():
+            return _run(session, options.folder, dry=options.dry_run)
     except KeyboardInterrupt:
-        print("\nInterrupted: what was recorded is kept.", file=sys.stderr)
+        _say("\nInterrupted: what was recorded is kept.", file=sys.stderr)
         return 130
+    except SignalExit as end:
+        _say(f"\nEnded by {end.name}: what was recorded is kept.", file=sys.stderr)
+        return end.status
     except _FAILURES as error:
-        print(f"\nFailed: {error}", file=sys.stderr)
+        _say(f"\nFailed: {error}", file=sys.stderr)
         return 1
+
+
+def _say(text: str, *, end: str = "\n", file: TextIO | None = None) -> None:
+    """Print a text; where nobody reads any more, this and all that follows is passed over."""
+    stream = file or sys.stdout
+    try:
+        print(text, end=end, file=stream, flush=True)
+    except OSError:
+        with Path(os.devnull).open("wb") as nothing:
+            os.dup2(nothing.fileno(), stream.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -103,19 +121,19 @@ def _run(session: Session, folder: Path, *, dry: bool) -> int:
     if session.blackbody is None and path.exists() and not dry:
         raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
     if session.simulated:
-        print(f"Session '{session.name}': every device is emulated, nothing is measured.")
+        _say(f"Session '{session.name}': every device is emulated, nothing is measured.")
     else:
-        print(plugged_in(session))
+        _say(plugged_in(session))
     with open_devices(session) as devices:
         for name, identity in devices.identities().items():
-            print(f"{name}: " + ", ".join(f"{key} {value}" for key, value in identity.items()))
+            _say(f"{name}: " + ", ".join(f"{key} {value}" for key, value in identity.items()))
         if dry:
             return 0
-        print("Preparing: cameras are set, offsets corrected, the wheel is homed and turned.")
+        _say("Preparing: cameras are set, offsets corrected, the wheel is homed and turned.")
         devices.prepare()
         summaries = _record(devices, folder)
     for summary in summaries:
-        print(f"{summary.path}: {summary.ended}, {dict(summary.totals)}")
+        _say(f"{summary.path}: {summary.ended}, {dict(summary.totals)}")
     return 0 if all(summary.ended == "duration" for summary in summaries) else 1
 
 
@@ -124,7 +142,7 @@ def _record(devices: Devices, folder: Path) -> list[Summary]:
     watch, name = Watch(), devices.session.name
 
     def show(preview: Preview) -> None:
-        print(_progress(watch, preview), end="", flush=True)
+        _say(_progress(watch, preview), end="")
 
     if devices.session.blackbody is None:
         summaries = [protocols.record_scene(devices, folder / f"{name}.zarr", preview=show)]
@@ -134,7 +152,7 @@ def _record(devices: Devices, folder: Path) -> list[Summary]:
             devices, folder, set_temperature=set_temperature, preview=show
         )
         summaries = [step.summary for step in steps]
-    print()
+    _say("")
     return summaries
 
 
@@ -153,7 +171,7 @@ def _set_blackbody(devices: Devices, temperature: float) -> None:
     if devices.world is None:
         ask_for_blackbody(devices.session.name, temperature)
         return
-    print(f"\nSetting the emulated blackbody to {temperature - zero_Celsius:.2f} degC.")
+    _say(f"\nSetting the emulated blackbody to {temperature - zero_Celsius:.2f} degC.")
     devices.world.blackbody_temperature = temperature
 
 

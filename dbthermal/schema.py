@@ -349,11 +349,13 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
     """
     Positions of bands on the dimension `band`, by name as text; the label names the array.
 
-    Raises ValueError if there is no coordinate `band`, or a band is missing.
+    Raises ValueError if there is no coordinate `band`, or a band is missing or repeated.
     """
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
     names = [str(name) for name in np.atleast_1d(array["band"].values)]
+    if len(set(names)) != len(names):
+        raise ValueError(f"Repeated band in {names} of {label}. Each band must occur once.")
     missing = [name for name in wanted if name not in names]
     if missing:
         raise ValueError(f"Missing band '{missing[0]}' in {label}. Has {names}.")

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from dbthermal import bands, planck, schema
 from dbthermal import response as responses
@@ -18,25 +19,45 @@ AMBIENT: Final = 298.15
 MINIMUM_TEMPERATURES: Final = 4
 """Fewest blackbody temperatures: the Sakuma-Hattori curve has four parameters."""
 
-# Bounds of the two shape parameters: the scale A T + B at the middle temperature relative to
-# c2 / 5 (about 1 at 10 um and 300 K), and its relative growth A T / (A T + B), 1 at a single
-# wavelength. The largest scale is that of a straight line.
-_SHAPE_BOUNDS: Final = ((0.02, 0.3), (1e3, 2.0))
-_SHAPE_START: Final = (1.0, 1.0)
+TEMPERATURE_STD: Final = 0.1
+"""Standard deviation of a blackbody's temperature about its reading [K], as of an area blackbody
+or a calibrated thermocouple on it."""
+
+# Range of the curve's mean wavelength A + B / T at the middle temperature: a known band's edges,
+# wider by this factor (a real detector is no top hat), or else all of the thermal infrared.
+_WAVELENGTH_MARGIN: Final = 1.2
+_THERMAL: Final = bands.Band("thermal infrared", 2e-6, 20e-6)
+# Range of its relative growth A T / (A T + B): 1 at a single wavelength, 0.94 in 8-14 um, 0.65 in
+# 3-14 um; more than 1 in no band, but for the little that a detector is not linear.
+_GROWTH: Final = (0.6, 1.1)
 _SHAPE_UNIT: Final = planck.SECOND_RADIATION_CONSTANT / 5.0
-# Counts may bend downward by so many standard deviations, plus this fraction of their span.
-_CURVATURE_SIGMAS: Final = 5.0
-_CURVATURE: Final = 0.003
+# Good counts are refused once in so many sweeps.
+_FALSE_ALARM: Final = 1e-4
+# Standard deviations of a difference by which noise may let counts fall.
+_FALLING: Final = 5.0
+# Variance of rounding to whole counts [count^2].
+_ROUNDING: Final = 1.0 / 12.0
 
 
-def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.Dataset:
+def fit_response(
+    counts: xr.DataArray,
+    noise: xr.DataArray | None = None,
+    *,
+    temperature_std: float = TEMPERATURE_STD,
+) -> xr.Dataset:
     r"""
     Fit the response of each band to blackbody measurements.
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
 
     the Sakuma-Hattori curve [1]_ and the least-squares line. C and O enter linearly and are
-    eliminated [2]_; A and B are found by nonlinear least squares.
+    eliminated [2]_; A and B are found by nonlinear least squares, within what a blackbody can give
+    in the band: the mean wavelength A + B / T lies in it.
+
+    The n residuals r of each band are held against what noise s, rounding and the blackbody's own
+    error explain. If they are that, then at most once in 1e4 sweeps
+
+    .. math:: \sum_T r^2 > \left( s^2 + \tfrac{1}{12} + (a \, s_T)^2 \right) \chi^2_{n-2}
 
     Parameters
     ----------
@@ -45,7 +66,10 @@ def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.
         least four.
     noise : DataArray, optional
         Standard deviation of one pixel's counts from frame to frame, (band) [count]. The response
-        then has it, and its NETD.
+        then has it, and its NETD. Without it the counts are taken for means of so many samples
+        that their noise is none.
+    temperature_std : float
+        Standard deviation of the blackbody's temperature from reading to reading, s_T [K].
 
     Returns
     -------
@@ -61,7 +85,9 @@ def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.
     TypeError, ValueError
         If the counts are not a DataArray of numbers, dims, units or order are wrong, there are too
         few temperatures, a value is NaN, counts do not grow with temperature, or the noise does not
-        fit the bands or is not positive.
+        fit the bands or is not positive; or if the counts follow no Planck curve, as where a camera
+        saturates, changes its range, or gives counts linear in temperature: the error names the
+        temperature that is off the curve of the others, if it is one.
 
     References
     ----------
@@ -87,10 +113,21 @@ def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.
     (True, 0.038)
     """
     _check_blackbody(counts)
+    planck.require_positive("temperature_std [K]", temperature_std)
     names = [str(name) for name in counts["band"].values]
     temperature = counts["temperature"].values.astype(np.float64)
     values = counts.values.astype(np.float64)
-    rows = [_fit_band(temperature, row) for row in values]
+    noises = np.zeros(len(names)) if noise is None else _noise(noise, names)
+    rows = []
+    for name, row, std in zip(names, values, noises, strict=True):
+        line = np.polynomial.Polynomial.fit(temperature, row, 1).convert().coef[::-1]
+        reading = np.hypot(std, np.sqrt(_ROUNDING) if np.all(row == np.rint(row)) else 0.0)
+        _check_growth(name, temperature, row, float(np.hypot(reading, temperature_std * line[0])))
+        curve = _fit_band(name, temperature, row)
+        slope = np.max(np.diff(_values(curve, temperature)) / np.diff(temperature))
+        error = float(np.hypot(reading, temperature_std * slope))
+        _check_residuals(name, temperature, row, curve, error)
+        rows.append([*curve, *line])
     parameters = [*responses.COEFFICIENTS, "linear_slope", "linear_intercept"]
     stage = schema.STAGES["response"]
     variables: dict[str, xr.DataArray] = {
@@ -112,7 +149,7 @@ def fit_response(counts: xr.DataArray, noise: xr.DataArray | None = None) -> xr.
             [responses.curve(result, band, kind).counts(temperature) for band in names]
         )
         result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
-    return result if noise is None else _with_noise(result, noise)
+    return result if noise is None else _with_noise(result, noises)
 
 
 def _check_blackbody(counts: xr.DataArray) -> None:
@@ -133,32 +170,74 @@ def _check_blackbody(counts: xr.DataArray) -> None:
     for name, row in zip(counts["band"].values, counts.values, strict=True):
         if not np.all(np.isfinite(row)):
             raise ValueError(f"Invalid counts in band '{name}': NaN or infinite. Must be finite.")
-        falls = np.diff(row) <= 0
-        if np.any(falls):
-            place = int(np.argmax(falls))
-            raise ValueError(
-                f"Invalid counts {row[place + 1]} at {temperature[place + 1]} K in band '{name}', "
-                f"after {row[place]} at {temperature[place]} K. Must grow with temperature."
-            )
-        _check_curvature(str(name), temperature, row.astype(np.float64))
 
 
-def _check_curvature(band: str, temperature: Array, counts: Array) -> None:
-    """Refuse counts that bend downward by more than their scatter explains."""
-    middle, half = temperature.mean(), 0.5 * (temperature[-1] - temperature[0])
-    design = np.polynomial.legendre.legvander((temperature - middle) / half, 2)
-    coefficients, *_ = np.linalg.lstsq(design, counts, rcond=None)
-    scatter = np.sqrt(np.sum((counts - design @ coefficients) ** 2) / (counts.size - 3))
-    std = scatter * np.sqrt(np.linalg.inv(design.T @ design)[2, 2])
-    if -coefficients[2] > _CURVATURE_SIGMAS * std + _CURVATURE * (counts[-1] - counts[0]):
+def _check_growth(band: str, temperature: Array, counts: Array, std: float) -> None:
+    """Refuse counts that stand or fall where errors of a standard deviation do not explain it."""
+    change, step = np.diff(counts), np.diff(temperature)
+    expected = (counts[-1] - counts[0]) / (temperature[-1] - temperature[0]) * step
+    falls = (change <= 0) & (expected - change > _FALLING * np.sqrt(2.0) * std)
+    if np.any(falls) or counts[-1] <= counts[0]:
+        place = int(np.argmax(np.where(change <= 0, expected - change, -np.inf)))
         raise ValueError(
-            f"Invalid counts in band '{band}': their slope falls with temperature. "
-            "That of a blackbody grows."
+            f"Invalid counts {counts[place + 1]} at {temperature[place + 1]} K in band '{band}', "
+            f"after {counts[place]} at {temperature[place]} K. Must grow with temperature."
         )
 
 
-def _fit_band(temperature: Array, counts: Array) -> tuple[float, ...]:
-    """Amplitude, effective wavelength, shift, offset, linear slope and intercept of one band."""
+def _check_residuals(
+    band: str, temperature: Array, counts: Array, coefficients: Array, std: float
+) -> None:
+    """
+    Refuse counts farther from their Planck curve than errors of a standard deviation explain.
+
+    The nearest curve of any shape is no farther from the counts than the nearest one of the true
+    shape, whose two linear parameters leave a chi-square of n - 2 degrees of freedom.
+    """
+    off = counts - _values(coefficients, temperature)
+    if np.sum(off**2) <= std**2 * chi2.isf(_FALSE_ALARM, counts.size - 2):
+        return
+    explained = f"noise and blackbody explain {std:.3g} count"
+    fitting = []
+    for place in range(counts.size):
+        rest = np.arange(counts.size) != place
+        others = _fit_band(band, temperature[rest], counts[rest])
+        beside = counts - _values(others, temperature)
+        if np.sum(beside[rest] ** 2) <= std**2 * chi2.isf(_FALSE_ALARM, counts.size - 3):
+            fitting.append((place, beside[place]))
+    if len(fitting) == 1:
+        ((place, distance),) = fitting
+        raise ValueError(
+            f"Invalid counts {counts[place]:.6g} at {temperature[place]:.6g} K in band '{band}', "
+            f"{distance:+.4g} count off the Planck curve of the others. "
+            f"Must lie on one; {explained}."
+        )
+    place = int(np.argmax(np.abs(off)))
+    shortest, longest = (1e6 * edge for edge in _wavelengths(band))
+    raise ValueError(
+        f"Invalid counts in band '{band}', off every Planck curve of {shortest:.3g} to "
+        f"{longest:.3g} um, most at {temperature[place]:.6g} K, by {off[place]:+.4g} count. "
+        f"Must follow one; {explained}."
+    )
+
+
+def _values(coefficients: Array, temperature: Array) -> Array:
+    """Counts of the Sakuma-Hattori curve of some `COEFFICIENTS`."""
+    amplitude, wavelength, shift, offset = coefficients
+    exponent = planck.SECOND_RADIATION_CONSTANT / (wavelength * temperature + shift)
+    return np.asarray(amplitude / np.expm1(exponent) + offset)
+
+
+def _wavelengths(band: str) -> tuple[float, float]:
+    """Least and greatest mean wavelength [m] of a response in a band, by its name."""
+    known = bands.FILTERS.get(band)
+    if known is None:
+        return _THERMAL.lower, _THERMAL.upper
+    return known.lower / _WAVELENGTH_MARGIN, known.upper * _WAVELENGTH_MARGIN
+
+
+def _fit_band(band: str, temperature: Array, counts: Array) -> Array:
+    """Amplitude, effective wavelength, shift and offset of one band, as in `COEFFICIENTS`."""
     middle = 0.5 * (temperature[0] + temperature[-1])
     span = counts[-1] - counts[0]
 
@@ -173,37 +252,41 @@ def _fit_band(temperature: Array, counts: Array) -> tuple[float, ...]:
         offset = counts.mean() - amplitude * planckian.mean()
         return np.array([amplitude, offset]), amplitude * planckian + offset - counts
 
+    shortest, longest = np.array(_wavelengths(band)) * middle / _SHAPE_UNIT
     fit = least_squares(
         lambda shape: linear_part(shape)[1] / span,
-        _SHAPE_START,
-        bounds=_SHAPE_BOUNDS,
+        (np.sqrt(shortest * longest), 1.0),
+        bounds=((shortest, _GROWTH[0]), (longest, _GROWTH[1])),
         xtol=1e-15,
         ftol=1e-15,
         gtol=1e-15,
         max_nfev=1000,
     )
     amplitude, offset = linear_part(fit.x)[0]
-    slope, intercept = np.polynomial.Polynomial.fit(temperature, counts, 1).convert().coef[::-1]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle
     shift = _SHAPE_UNIT * fit.x[0] * (1.0 - fit.x[1])
-    return (amplitude, wavelength, shift, offset, slope, intercept)
+    return np.array([amplitude, wavelength, shift, offset])
 
 
-def _with_noise(response: xr.Dataset, noise: xr.DataArray) -> xr.Dataset:
-    """Add noise and NETD (noise over slope at the reference temperature)."""
-    names = [str(name) for name in response["band"].values]
+def _noise(noise: xr.DataArray, names: list[str]) -> Array:
+    """Noise (band) [count] of the named bands, checked."""
     if not isinstance(noise, xr.DataArray):
         raise TypeError(f"Invalid noise of type {type(noise).__name__}. Must be a DataArray.")
     if noise.dims != ("band",):
         raise ValueError(f"Invalid dims {noise.dims} of the noise. Must be ('band',).")
     if noise.attrs.get("units", "count") != "count":
         raise ValueError(f"Invalid units '{noise.attrs['units']}' of the noise. Must be 'count'.")
-    places = schema.band_positions(noise, names, "the noise")
-    values = noise.values[places].astype(np.float64)
+    values = noise.values[schema.band_positions(noise, names, "the noise")].astype(np.float64)
     if not np.all(np.isfinite(values) & (values > 0)):
         raise ValueError(f"Invalid noise {values} count. Must be finite and positive.")
+    return np.asarray(values)
+
+
+def _with_noise(response: xr.Dataset, noise: Array) -> xr.Dataset:
+    """Add noise (band) and NETD (noise over slope at the reference temperature)."""
+    names = [str(name) for name in response["band"].values]
     slopes = np.array([responses.curve(response, name).reference_slope for name in names])
     return response.assign(
-        noise=("band", values, {"units": "count", "long_name": "noise of one pixel and frame"}),
-        netd=("band", values / slopes, {"units": "K", "long_name": "NETD"}),
+        noise=("band", noise, {"units": "count", "long_name": "noise of one pixel and frame"}),
+        netd=("band", noise / slopes, {"units": "K", "long_name": "NETD"}),
     )

@@ -13,21 +13,36 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from dbthermal.store import _recording as recording
+from dbthermal.store._integrity import (
+    MARK,
+    SUMS,
+    CheckedStore,
+    SummedStore,
+    last_sums,
+    valid_part,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Number = float | int | str | bool
 
+_COMPRESSORS = (ZstdCodec(), Crc32cCodec())
 _CHUNK_BYTES = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
+
+_ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str]]]] = {
+    "vp9": ("libvpx-vp9", {"crf": "31", "b": "0", "cpu-used": "4"}),
+    "h264": ("libx264", {}),
+}
+"""FFmpeg's encoder of each codec of a film, with its options."""
 
 
 def _chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
@@ -74,10 +89,22 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     """
     # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
     plain = _with_text_as(dataset.drop_encoding(), "U", np.dtypes.StringDType())
-    plain.attrs = {**dataset.attrs, "provenance": json.loads(_json(provenance))}
-    encoding = {name: {"chunks": _chunks(variable)} for name, variable in plain.variables.items()}
+    plain.attrs = {**MARK, **dataset.attrs, "provenance": json.loads(_json(provenance))}
+    encoding = {
+        name: {"chunks": _chunks(variable), "compressors": _COMPRESSORS}
+        for name, variable in plain.variables.items()
+    }
     with _whole(path, ".zarr") as part:
-        plain.to_zarr(part, mode="w-", encoding=encoding, zarr_format=3, consolidated=False)
+        part.mkdir()
+        plain.to_zarr(
+            SummedStore(part),
+            mode="w-",
+            encoding=encoding,
+            zarr_format=3,
+            consolidated=False,
+            write_empty_chunks=True,
+        )
+        (part / SUMS).write_bytes(last_sums(part))
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
@@ -114,29 +141,29 @@ def open_dataset(path: str | Path) -> xr.Dataset:
         raise FileNotFoundError(
             f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
         )
-    attrs = recording.attributes(path)
-    cut_short = not attrs.get("closed", True)
-    dataset = _open_valid_part(Path(path), attrs) if cut_short else _open(path)
+    checked = CheckedStore(path)
+    dataset = _open(checked) if checked.closed else _open_valid_part(checked)
+    for name in MARK:
+        dataset.attrs.pop(name, None)
     return _with_text_as(dataset, "T", np.dtype(str))
 
 
-def _open(path: str | Path, leave: Iterable[str] = ()) -> xr.Dataset:
+def _open(checked: CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
     dataset: xr.Dataset = xr.open_zarr(
-        path, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
+        checked, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
     )
     return dataset
 
 
-def _open_valid_part(path: Path, attrs: Mapping[str, Any]) -> xr.Dataset:
+def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
     """Open the variables of a recording one by one, for their room differs while it grows."""
-    ends = recording.valid_part(attrs)
-    names = {array.parent.name for array in path.glob("*/zarr.json")}
-    parts = []
+    ends, parts = valid_part(checked.attrs), []
+    names = {array.parent.name for array in checked.root.glob("*/zarr.json")}
     for name in sorted(names):
-        part = _open(path, leave=names - {name})
-        parts.append(part.isel({dim: end for dim, end in ends.items() if dim in part.dims}))
-    # The attributes as read first, for they may have gone on since.
-    return xr.merge(parts, combine_attrs="override").assign_attrs(attrs)
+        part = _open(checked, leave=names - {name})
+        parts.append(part.isel({d: slice(end) for d, end in ends.items() if d in part.dims}))
+    # The attributes as checked, for they may have gone on since.
+    return xr.merge(parts, combine_attrs="override").assign_attrs(checked.attrs)
 
 
 def save_numbers(
@@ -231,9 +258,10 @@ def save_video(
     provenance: Mapping[str, Any],
     *,
     rate: float,
+    codec: Literal["vp9", "h264"] = "vp9",
 ) -> None:
     """
-    Save a film as H.264 in MP4, as browsers play it.
+    Save a film in MP4, as browsers play it.
 
     Parameters
     ----------
@@ -245,12 +273,20 @@ def save_video(
         From `dbthermal.store.provenance`; becomes the file's comment, as JSON.
     rate : float
         Frame rate [Hz].
+    codec : {"vp9", "h264"}
+        Compression. VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of
+        H.264, x264, is under the GPL, and patents may ask for a licence where films are passed on
+        (see docs/licences.md). ValueError for any other.
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 
+    if codec not in _ENCODERS:
+        raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
+    encoder, options = _ENCODERS[codec]
     with _whole(path, ".mp4") as part, av.open(part, "w") as film:
         film.metadata["comment"] = _json(provenance)
-        stream = film.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
+        fraction = Fraction(rate).limit_denominator(1000)
+        stream = film.add_stream(encoder, rate=fraction, options=options)
         stream.pix_fmt, stream.width = "yuv420p", 0
         for frame in frames:
             height, width = frame.shape[:2]

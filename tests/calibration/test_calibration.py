@@ -160,14 +160,6 @@ def test_noisy_counts() -> None:
     assert float(chi2.mean()) == pytest.approx(9.0, rel=0.15)
 
 
-def test_straight_counts_are_followed() -> None:
-    """Counts on a straight line, as a bolometer's may nearly be, are met within a millikelvin."""
-    counts = blackbody(7)
-    line = 100.0 * counts["temperature"] + xr.zeros_like(counts)
-    fitted = calibration.fit_response(line.transpose(*counts.dims).assign_attrs(units="count"))
-    assert float(abs(fitted["residual"]).max()) / 100.0 < 1e-3  # [K]
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -190,7 +182,7 @@ def test_straight_counts_are_followed() -> None:
         ),
         (
             lambda counts: counts.copy(data=1e4 + 2e3 * np.log1p(counts.values - 15000)),
-            "Invalid counts in band '8-14': their slope falls with temperature",
+            "Invalid counts in band '8-14', off every Planck curve of 6.67 to 16.8 um",
         ),
     ],
 )

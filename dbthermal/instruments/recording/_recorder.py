@@ -5,9 +5,9 @@ waits for another: a command that a camera answers late, because it corrects its
 costs no frame. A queue of bounded length leads to the thread that writes. If the disk is too slow
 the queue fills, frames are refused, and the log has their number and time.
 
-The caller's thread shows the preview. A preview that is slow or raises, or an interrupt by the
-keyboard, twice maybe, stops no chunk half-way: the frames that came before are written before the
-writer ends.
+The caller's thread shows the preview. A preview that is slow or raises, an interrupt by the
+keyboard, twice maybe, or a signal stops no chunk half-way: the frames that came before are written
+before the writer ends.
 """
 
 import errno
@@ -33,6 +33,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.signals import SignalExit, raised_signals
 
 Identities = Mapping[str, Mapping[str, str | bool]]
 
@@ -153,26 +154,30 @@ def record(
     Exception
         Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
         what was recorded is kept. A second interrupt ends the wait, not the writing.
+    SignalExit
+        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell; also kept. A
+        signal that the program handles or ignores is left alone.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
-    file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
-    start = monotonic()  # clock of the sources' stamps; to make the file may have taken a while
-    file.begin(start, _utc())
-    end, stop = start + session.duration, stop or threading.Event()
-    run = _Run(file, sources, readings, limits, start, end, stop)
-    # No daemon: it ends its work whatever becomes of this thread.
-    writer = threading.Thread(target=run.write, name="writer")
-    try:
-        writer.start()
-        run.show(preview)
-    except BaseException:
-        run.interrupted = True
-        raise
-    finally:
-        run.over.set()
-        if writer.ident is not None:  # None only where an interrupt came before its start
-            run.done.wait()
+    with raised_signals():
+        file = _new_file(session, sources, readings, identities or {}, Path(path), limits)
+        start = monotonic()  # clock of the sources' stamps; to make the file may have taken a while
+        file.begin(start, _utc())
+        end, stop = start + session.duration, stop or threading.Event()
+        run = _Run(file, sources, readings, limits, start, end, stop)
+        # No daemon: it ends its work whatever becomes of this thread.
+        writer = threading.Thread(target=run.write, name="writer")
+        try:
+            writer.start()
+            run.show(preview)
+        except BaseException as error:
+            run.interrupted = error.name if isinstance(error, SignalExit) else "interrupted"
+            raise
+        finally:
+            run.over.set()
+            if writer.ident is not None:  # None only where an interrupt came before its start
+                run.done.wait()
     if run.errors:
         raise run.errors[0]
     return Summary(file.recording.place(), run.ended, file.totals)
@@ -248,7 +253,7 @@ class _Run:
         self.start, self.end, self.stop = start, end, stop
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
-        self.interrupted, self.ended = False, ""
+        self.interrupted, self.ended = "", ""
         # For the preview, after each frame is written: totals, last frames, last readings.
         self.totals: dict[str, dict[str, int]] = {}
         self.last_frames: dict[str, Frame] = {}
@@ -396,7 +401,7 @@ class _Run:
         if self.errors:
             return "no space" if getattr(self.errors[0], "errno", 0) == errno.ENOSPC else "error"
         if self.interrupted:
-            return "interrupted"
+            return self.interrupted
         if self._lost_sources:
             return "source lost"
         if len(self.last_frames) < len(self._room):

@@ -1,0 +1,159 @@
+"""Blackbody counts that follow no Planck curve are refused, those that do are not."""
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import xarray as xr
+
+from dbthermal import calibration
+
+Floats = npt.NDArray[np.float64]
+# Edges [um] of bands, and the band's slope at 300 K [count/K]; independent of `bands` and `planck`.
+EDGES = {"8-14": (8.0, 14.0, 115.0), "9.5": (9.25, 9.75, 9.9), "12.1": (11.85, 12.35, 9.2)}
+
+
+def sensor(name: str, temperature: Floats) -> Floats:
+    """Counts of a blackbody: Planck's law summed over a band, scaled and shifted."""
+    lower, upper, slope = EDGES[name]
+    wavelength = np.linspace(lower, upper, 401)[:, np.newaxis]  # um
+
+    def radiance(at: Floats) -> Floats:
+        planck = wavelength**-5.0 / np.expm1(14387.77 / (wavelength * at))
+        return np.asarray(planck.sum(axis=0))
+
+    unit = slope / (radiance(np.array([300.5])) - radiance(np.array([299.5])))
+    return np.asarray(15500.0 + unit * radiance(temperature))
+
+
+def sweep(name: str, temperature: Floats, counts: Floats) -> xr.DataArray:
+    """Blackbody counts of one band, labelled."""
+    coords = {"band": [name], "temperature": temperature}
+    return xr.DataArray([counts], dims=("band", "temperature"), coords=coords)
+
+
+def noise_of(name: str, counts: float) -> xr.DataArray:
+    """Noise of one band [count]."""
+    return xr.DataArray([counts], dims="band", coords={"band": [name]})
+
+
+def clipped(counts: Floats, level: float) -> Floats:
+    """A soft limit: counts above it grow at a fiftieth of their slope."""
+    return np.where(counts > level, level + (counts - level) / 50.0, counts)
+
+
+def one_off(counts: Floats, place: int, by: float) -> Floats:
+    """One reading off by some counts."""
+    changed = counts.copy()
+    changed[place] += by
+    return changed
+
+
+BAD = (
+    "top",
+    "top, last",
+    "floor",
+    "5 K off",
+    "first off",
+    "last off",
+    "step",
+    "offset",
+    "line",
+    "root",
+    "log",
+    "exponential",
+    "stefan",
+    "drift",
+    "swapped",
+    "wrapped",
+)
+
+
+def spoilt(bad: str, c: Floats, t: Floats, s: float) -> Floats:
+    """Counts c (temperature) at t [K], of slope s [count/K], spoilt in one of the ways `BAD`."""
+    return {
+        "top": clipped(c, c[len(c) // 2]),
+        "top, last": clipped(c, 0.5 * (c[-2] + c[-1])),
+        "floor": -clipped(-c, -c[len(c) // 2]),
+        "5 K off": one_off(c, len(c) // 2, -4.9 * s),
+        "first off": one_off(c, 0, -5.0 * s),
+        "last off": one_off(c, -1, 5.0 * s),
+        "step": np.where(t > 315.0, 1.3 * c - 0.3 * 15500.0, c),
+        "offset": np.where(t > 315.0, c + 4.0 * s, c),
+        "line": 15500.0 + s * t,
+        "root": 15500.0 + 20.0 * s * np.sqrt(t - 250.0),
+        "log": 15500.0 + 40.0 * s * np.log(t - 250.0),
+        "exponential": 15500.0 + 10.0 * s * np.exp((t - 283.0) / 10.0),
+        "stefan": 15500.0 + s * 300.0 * (t / 300.0) ** 12 / 12.0,
+        "drift": c + s * 4.0 * np.sin((t - 283.0) / 10.0),
+        "swapped": c[[0, 2, 1, *range(3, len(c))]],
+        "wrapped": np.where(c > c[len(c) // 2], c - 65536.0, c).astype(np.int32),
+    }[bad]
+
+
+def refusal(bad: str, name: str, number: int, noise: float | None) -> str:
+    """Message by which a kind of bad counts is refused; empty if they are accepted."""
+    temperature, slope = np.linspace(283.15, 343.15, number), EDGES[name][2]
+    counts = spoilt(bad, sensor(name, temperature), temperature, slope)
+    given = None
+    if noise is not None:
+        counts = counts + noise * slope * np.random.default_rng(1).standard_normal(number)
+        given = noise_of(name, noise * slope)
+    try:
+        calibration.fit_response(sweep(name, temperature, counts), given)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("number", [5, 13])
+def test_counts_of_no_blackbody_are_refused(bad: str, number: int) -> None:
+    """Saturated, stepped, drifting, straight counts are refused, with and without a noise."""
+    for name, noise in (("8-14", 0.03), ("9.5", None), ("12.1", 0.1)):
+        assert f"in band '{name}'" in refusal(bad, name, number, noise)
+
+
+def test_the_wrong_temperature_is_named() -> None:
+    """One reading that is off is named, with its distance from the curve of the others."""
+    message = refusal("5 K off", "8-14", 13, 0.03)
+    assert message.startswith("Invalid counts 24076.9 at 313.15 K in band '8-14', -56")
+    assert "Must lie on one; noise and blackbody explain" in message
+    assert "off every Planck curve of 6.67 to 16.8 um, most at" in refusal("line", "8-14", 7, 0.03)
+
+
+def false_alarms(seeds: range, noise: float | None) -> list[str]:
+    """Refusals of good sweeps: any range and number, even or not, rounded or not."""
+    messages = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        name = list(EDGES)[seed % 3]
+        number, lowest = int(rng.integers(4, 26)), rng.uniform(258.0, 300.0)
+        ends = lowest, lowest + rng.uniform(20.0, 90.0)
+        uneven = np.sort(rng.uniform(*ends, number))
+        temperature = uneven if rng.random() < 0.5 else np.linspace(*ends, number)
+        counts = sensor(name, temperature + 0.1 * rng.standard_normal(number))
+        counts += (noise or 0.0) * EDGES[name][2] * rng.standard_normal(number)
+        given = None if noise is None else noise_of(name, noise * EDGES[name][2])
+        if rng.random() < 0.5:
+            counts = np.rint(counts)
+        try:
+            calibration.fit_response(sweep(name, temperature, counts), given)
+        except ValueError as error:
+            messages.append(str(error))
+    return messages
+
+
+@pytest.mark.parametrize("noise", [None, 0.03, 0.35, 1.0])
+def test_good_sweeps_pass(noise: float | None) -> None:
+    """Sweeps of a blackbody that scatters by 0.1 K, with noise of 0.03 to 1 K, are accepted."""
+    assert false_alarms(range(40), noise) == []
+
+
+@pytest.mark.slow
+def test_good_sweeps_pass_in_all_but_one_of_a_thousand() -> None:
+    """At most 0.1 % of good sweeps are refused."""
+    refused = [
+        text for noise in (None, 0.03, 0.35, 1.0) for text in false_alarms(range(400), noise)
+    ]
+    print(f"{len(refused)} of 1600 good sweeps refused")
+    assert len(refused) <= 1

@@ -1,0 +1,190 @@
+"""SIGTERM, SIGHUP and a closed terminal end a recording whole; its command has their status."""
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from file_operations import before_operation, operations_of
+from rig_session import replaced, scene_text
+from test_record import SMALL, bench, session
+
+from dbthermal import store
+from dbthermal.instruments.recording import Preview, record
+from dbthermal.instruments.recording._capture_file import CaptureFile
+from dbthermal.instruments.signals import SignalExit, raised_signals
+
+ENDING = (signal.SIGTERM, signal.SIGHUP)
+SCENE = scene_text().replace('3: "11"', "3: 10.6")
+
+
+@contextmanager
+def acquiring(
+    folder: Path, duration: float, *, before: str = "pass", output: int = subprocess.DEVNULL
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run the command in a process of its own, once it writes frames."""
+    text = replaced(("duration: 0.15", f"duration: {duration}"), text=SCENE)
+    (folder / "a.yaml").write_text(text, encoding="utf-8")
+    code = f"import sys; {before}; from dbthermal import acquire; sys.exit(acquire.main())"
+    command = [sys.executable, "-c", code, str(folder / "a.yaml"), str(folder), "--simulate"]
+    process = subprocess.Popen(command, stdout=output, stderr=output, start_new_session=True)
+    try:
+        until = time.monotonic() + 60
+        while not written(folder / "plate.zarr") and time.monotonic() < until:
+            assert process.poll() is None
+            time.sleep(0.05)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def written(path: Path) -> int:
+    """Frames of all bands that a recording says it has; 0 before it is begun."""
+    try:
+        return int(sum(store.open_dataset(path).attrs["frames_written"].values()))
+    except FileNotFoundError:
+        return 0
+
+
+@pytest.mark.parametrize("number", [ENDING[0], pytest.param(ENDING[1], marks=pytest.mark.slow)])
+def test_the_command_ends_as_by_the_keyboard(tmp_path: Path, number: signal.Signals) -> None:
+    """Told to end, even twice, the command closes its recording with the reason of the end."""
+    with acquiring(tmp_path, 60.0) as process:
+        process.send_signal(number)
+        time.sleep(0.02)
+        process.send_signal(number)
+        assert process.wait(30) == 128 + number
+    opened = store.open_dataset(tmp_path / "plate.zarr")
+    assert (opened.attrs["closed"], opened.attrs["complete"]) == (True, False)
+    assert opened.attrs["ended"] == number.name
+    assert opened.sizes["time"] == max(opened.attrs["frames_written"].values()) > 0
+
+
+def test_a_closed_terminal_keeps_the_recording(tmp_path: Path) -> None:
+    """A terminal that is closed ends the command, and the recording is closed and whole."""
+    ours, theirs = pty.openpty()
+    control = "import fcntl, termios; fcntl.ioctl(1, termios.TIOCSCTTY, 0)"
+    with acquiring(tmp_path, 60.0, before=control, output=theirs) as process:
+        os.close(theirs)
+        os.close(ours)
+        assert process.wait(30) == 128 + signal.SIGHUP
+    opened = store.open_dataset(tmp_path / "plate.zarr")
+    assert (opened.attrs["closed"], opened.attrs["ended"]) == (True, "SIGHUP")
+
+
+def test_a_closed_pipe_ends_nothing(tmp_path: Path) -> None:
+    """If nobody reads what the command prints, the recording goes on to its end."""
+    ours, theirs = os.pipe()
+    with acquiring(tmp_path, 1.5, output=theirs) as process:
+        os.close(theirs)
+        os.close(ours)
+        assert process.wait(30) == 0
+    assert store.open_dataset(tmp_path / "plate.zarr").attrs["ended"] == "duration"
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_script_ends_whole(tmp_path: Path, number: signal.Signals) -> None:
+    """Called by a script, a recording is closed, the handlers are put back, and the script ends."""
+    before = [signal.getsignal(one) for one in ENDING]
+    with pytest.raises(SignalExit) as end:
+        record(
+            session(60.0),
+            bench(),
+            tmp_path / "a.zarr",
+            limits=SMALL,
+            preview=lambda _: signal.raise_signal(number),
+        )
+    assert end.value.code == 128 + number
+    assert [signal.getsignal(one) for one in ENDING] == before
+    opened = store.open_dataset(tmp_path / "a.zarr")
+    assert (opened.attrs["closed"], opened.attrs["ended"]) == (True, number.name)
+
+
+def test_signals_while_it_is_closed_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More signals while the file is closed neither stop it nor end the wait for it."""
+    close, main = CaptureFile.close, threading.main_thread().ident
+    assert main is not None
+
+    def hit(own: CaptureFile, *, complete: bool, ended: str) -> None:
+        for number in (*ENDING, *ENDING):
+            signal.pthread_kill(main, number)
+            time.sleep(0.02)
+        close(own, complete=complete, ended=ended)
+
+    def end(_: Preview) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(CaptureFile, "close", hit)
+    with pytest.raises(SignalExit):
+        record(session(60.0), bench(), tmp_path / "a.zarr", limits=SMALL, preview=end)
+    attrs = store.open_dataset(tmp_path / "a.zarr").attrs
+    assert (attrs["closed"], attrs["ended"]) == (True, "SIGTERM")
+
+
+def test_what_the_program_handles_is_left_alone() -> None:
+    """A signal that is ignored, as under nohup, or handled, is not raised; nor in a thread."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with raised_signals():
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    found = []
+
+    def look() -> None:
+        with raised_signals():
+            found.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    thread.join()
+    assert found == [signal.SIG_DFL]
+
+
+@pytest.mark.parametrize("every", [250, pytest.param(5, marks=pytest.mark.slow)])
+def test_signals_at_any_moment(tmp_path: Path, every: int) -> None:
+    """Told to end before any file operation, a recording is closed with all its frames."""
+    main = threading.main_thread().ident
+    assert main is not None
+
+    def run(path: Path) -> None:
+        record(session(0.15), bench(), path, limits=SMALL)
+
+    operations = operations_of(lambda: run(tmp_path / "first.zarr"))
+    for moment in range(1, operations, every):
+        path, number = tmp_path / f"{moment}.zarr", ENDING[moment % 2]
+        with before_operation(moment, partial(signal.pthread_kill, main, number)):
+            try:
+                run(path)
+            except SignalExit as end:
+                ended = end.name
+            else:
+                ended = "duration"
+        if not path.exists():  # it came before there was one
+            assert ended == number.name
+            continue
+        opened = store.open_dataset(path)
+        frames = list(opened.attrs["frames_written"].values())
+        assert opened.attrs["closed"] or not any(frames)
+        assert opened.attrs.get("ended", ended) in {ended, "duration"}
+        check_frames(opened, frames)
+    assert not list(tmp_path.glob(".*"))
+
+
+def check_frames(opened: xr.Dataset, frames: list[int]) -> None:
+    """Check that no frame of a band is missing between the first and the last."""
+    for place, number in enumerate(frames):
+        np.testing.assert_array_equal(np.diff(opened["sequence"][place, :number]), 1)
