@@ -188,6 +188,8 @@ def require_one_clock(
 
 def _try(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
     """Offset as `_offset` [s]; NaN where it is not known."""
+    if np.isfinite(stamps).sum(axis=1).min() < _MINIMUM_FRAMES:
+        return np.nan
     try:
         return _offset(pair, signals, stamps, search)
     except ValueError:
