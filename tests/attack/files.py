@@ -4,7 +4,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
-from functools import cache
+from functools import cache as once
 from io import StringIO
 from pathlib import Path
 from tempfile import mkdtemp
@@ -20,20 +20,20 @@ from attack.stages import wrong
 from dbthermal import acquire, schema, store
 from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.session import Session
-from reproduction import manifest, paths
+from reproduction import cache, manifest, paths
 
 Rng = np.random.Generator
 REPOSITORY: Final = Path(__file__).parents[2]
 LINES: Final = "x" * 40  # an attribute of some length
 
 
-@cache
+@once
 def workplace() -> Path:
     """Folder of this process for the damaged copies."""
     return Path(mkdtemp(prefix="attack-"))
 
 
-@cache
+@once
 def originals() -> Path:
     """Folder of a whole result, a recording and numbers."""
     folder = workplace() / "whole"
@@ -248,6 +248,34 @@ _METADATA: Final[Mapping[str, Callable[[Rng, Path, str], Any]]] = {
     "a file": lambda _, path, __: _replaced(path, b"PK"),
     "gone": lambda _, path, __: shutil.rmtree(path),
 }
+
+
+def cell(value: float, seed: int) -> xr.Dataset:
+    """Something to be cached."""
+    return xr.Dataset({"drawn": ("n", value + np.random.default_rng(seed).random(300))})
+
+
+def cells(rng: Rng) -> Attack:
+    """A cached result whose file is flipped, cut, emptied, lost or foreign: computed anew."""
+    folder = workplace() / "cells"
+    shutil.rmtree(folder, ignore_errors=True)
+    cache.memory(folder).cache(cell)(1.0, 1)
+    file = pick(rng, [file for file in _files(folder) if file.stat().st_size])
+    what = pick(rng, ["flipped", "flipped", "cut", "emptied", "lost", "of noise"])
+    content = file.read_bytes()
+    if what == "flipped":
+        flip(rng, file)
+    elif what == "lost":
+        file.unlink()
+    else:
+        kept = {"cut": content[: int(rng.integers(len(content)))], "emptied": b""}
+        file.write_bytes(kept.get(what, rng.bytes(len(content))))
+
+    def judge(found: xr.Dataset) -> Verdict:
+        return wrong("other values", where=not found.identical(cell(1.0, 1)))
+
+    act = lambda: cache.memory(folder).cache(cell)(1.0, 1)  # noqa: E731
+    return Attack(f"cached {file.name} {what}", act, judge, (file.name,))
 
 
 def numbers(rng: Rng) -> Attack:
