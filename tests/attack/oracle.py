@@ -97,7 +97,7 @@ def carry_out(attack: Attack) -> Outcome:
 def _warned(leaked: list[warnings.WarningMessage], attack: Attack) -> Verdict:
     """A warning that names the thing is a flag, any other one leaks from a library."""
     texts = [f"{one.category.__name__}: {one.message}" for one in leaked]
-    unnamed = [text for text in texts if _missing(text, attack)]
+    unnamed = [text for text in texts if not attack.names or _missing(text, attack)]
     return Verdict("warning", unnamed[0]) if unnamed else Verdict("flagged", texts[0])
 
 
