@@ -305,10 +305,10 @@ def shapes(rng: Rng) -> Attack:
     what = str(rng.choice(list(_SHAPES)))
     made.capture = _SHAPES[what](rng, made.capture)
     names = () if what == "tiny" else ("counts|dims|band|time|frame|Dataset|status|segment",)
-    if what == "tiny":
-        small = made.capture.sizes["y"], made.capture.sizes["x"]
-        made.warm = made.warm[:, : small[0], : small[1]]
-        made.emissivity = made.emissivity[:, : small[0], : small[1]]
+    # What is left of the truth, where the capture was cut.
+    sizes = made.capture.sizes
+    time, y, x = (slice(0, sizes.get(dim, 0)) for dim in ("time", "y", "x"))
+    made.warm, made.emissivity = made.warm[time, y, x], made.emissivity[:, y, x]
     method = any_method(rng) if len(made.bands) == 2 else "subspace"
     return solving(f"shape: {what}", made, None, method, *names, good=what == "tiny")
 

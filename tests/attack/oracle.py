@@ -128,9 +128,10 @@ def _verdict(attack: Attack) -> Verdict:
 def refusal(error: Exception, attack: Attack) -> Verdict:
     """Judge an error: it is of a documented kind, raised by the package, and names the thing."""
     text = f"{type(error).__name__}: {error}"
-    documented = isinstance(error, _REFUSALS) and not isinstance(
-        error, (LookupError, ArithmeticError)
-    )
+    other = isinstance(error, (LookupError, ArithmeticError))
+    documented = isinstance(error, _REFUSALS) and not other
+    # Some functions look things up by name, and say so.
+    documented |= isinstance(error, KeyError) and "Must" in text
     missing = _missing(str(error), attack)
     where = _place(error)
     if not documented or missing:
