@@ -93,6 +93,9 @@ FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uin
 SHUTTER_CLOSED: Final = "shutter_closed"
 """Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
 
+NOISE_FACTOR: Final = _of("band", "1", "noise over that before the alignment")
+"""Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
+
 SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
 """Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
 
@@ -158,6 +161,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "frame_flags": FRAME_FLAGS,
             "segment": SEGMENT,
             "drift": _of("band time", "count", "drift taken out"),
+            "noise_factor": NOISE_FACTOR,
             "status": _STATUS,
         },
         "blackbody_frames": {"noise": NOISE},

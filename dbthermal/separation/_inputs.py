@@ -9,8 +9,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import noise as noises
+from dbthermal import planck, schema
 from dbthermal import response as responses
-from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.response import Curve
 from dbthermal.schema import Status
@@ -21,7 +21,7 @@ Labels = npt.NDArray[np.intp]
 
 # Pixels from which the noise is estimated where the response has none.
 _NOISE_PIXELS: Final = 4096
-_READ: Final = ("counts", "status", "segment")
+_READ: Final = ("counts", "status", "segment", "noise_factor")
 _MASK_DIMS: Final = (("time",), ("y", "x"), ("time", "y", "x"))
 
 
@@ -191,10 +191,20 @@ def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Ar
     """Noise (band) [K] of the linearised signals, from the response or else from the capture."""
     if "noise" in response:
         slopes = np.array([curve.reference_slope for curve in curves])
-        return np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
+        known = np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
+        return known * _noise_factor(capture)
     counts, frames = quality.sample(capture, _NOISE_PIXELS)
     signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
     return noises.estimate_bands(signals, capture["time"].values[frames])
+
+
+def _noise_factor(capture: xr.Dataset) -> Array | float:
+    """Noise (band) [1] over that before the alignment, 1 without a variable `noise_factor`."""
+    if "noise_factor" not in capture:
+        return 1.0
+    schema.check_variable(capture["noise_factor"], schema.NOISE_FACTOR, "'noise_factor'")
+    factor = capture["noise_factor"].values.astype(np.float64)
+    return planck.require_positive("noise_factor of the corrected", factor)
 
 
 def _known_emissivity(

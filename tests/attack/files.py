@@ -72,8 +72,8 @@ def originals() -> Path:
 def _copy(name: str) -> Path:
     """Copy to be damaged, in place of the last one."""
     target = workplace() / "damaged" / name
-    shutil.rmtree(target, ignore_errors=True)
-    target.parent.mkdir(exist_ok=True)
+    shutil.rmtree(target.parent, ignore_errors=True)
+    target.parent.mkdir()
     source = originals() / name
     if source.is_dir():
         shutil.copytree(source, target)
@@ -145,7 +145,7 @@ def bits(rng: Rng) -> Attack:
         f"bit of byte {place} of {path.name}/{inside} flipped",
         lambda: _open(path),
         _same(path, attributes=True),
-        (path.name, inside.parts[0] if len(inside.parts) > 1 else path.name),
+        (path.name, inside.parts[0] if len(inside.parts) > 1 else ""),
     )
 
 
@@ -175,8 +175,8 @@ def chunks(rng: Rng) -> Attack:
         kept = file.read_bytes()
         file.write_bytes(other.read_bytes())
         other.write_bytes(kept)
-    array = file.relative_to(path).parts[0]
-    names = (path.name, array)
+    inside = file.relative_to(path).parts
+    names = (path.name, inside[0] if len(inside) > 1 else "")
     what = f"chunk {file.relative_to(path)} of {path.name} {what}"
     return Attack(what, lambda: _open(path), _same(path, attributes=False), names)
 

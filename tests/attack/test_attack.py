@@ -20,7 +20,6 @@ UNMENDED: dict[str, str] = {
     "windows": "maps of another window",
     "pixels": "scattered NaN",
     "numbers": "errors that do not name the file, repeated keys",
-    "manifest": "repeated keys, origins, folders",
     "spectra": "bad UTF-8",
     "videos": "memory of a large video",
 }
