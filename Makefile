@@ -36,6 +36,10 @@ compile = $(python) -m uv pip compile --quiet --universal --python-version 3.11 
     --group lock --no-annotate --no-emit-index-url --no-emit-find-links --custom-compile-command 'make lock'
 parallel := $(MAKE) --no-print-directory --jobs="$$JOBS" $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 
+# A mirror of the outside files is named from here, but read from the notebooks' folder too.
+override DBTHERMAL_DATA := $(value DBTHERMAL_MIRROR)
+export DBTHERMAL_DATA
+
 # The same warnings, threads and settings on every machine, in this process and in the notebooks' kernels. One thread per
 # linear-algebra call, for the order of a sum must not hang on the number of cores; a user's own settings stay out of it.
 export PYTHONWARNINGS := error::RuntimeWarning

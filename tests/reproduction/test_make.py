@@ -180,6 +180,9 @@ def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setenv("PYTHON", f"./python {name.replace('/', '')}")
         assert "Invalid Python './python" in make("smoke").stderr
         monkeypatch.setenv("PYTHON", sys.executable)
+    done = make("results/inputs.txt", "DBTHERMAL_DATA=mirrors")
+    inputs = (checkout / "results/inputs.txt").read_text().splitlines()
+    assert inputs[0] == f"DBTHERMAL_DATA={checkout}/mirrors"
     planned = make("--dry-run", "full", "smoke", "chain")
     assert planned.returncode == 0, planned.stderr
     assert "reproduction.execute full 01_tiny" in planned.stdout
