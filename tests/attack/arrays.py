@@ -440,7 +440,7 @@ def _foreign_result(rng: Rng, made: Scene) -> Attack:
     dim = str(rng.choice(["y", "x", "time", "band"]))
     response = response_of(made)
     result = separate(made, response)
-    other = made.bands[::-1] if dim == "band" else result[dim].values + int(rng.integers(1, 50))
+    other = ("a", "b") if dim == "band" else result[dim].values + int(rng.integers(1, 50))
     result = result.assign_coords({dim: list(other)})
     return Attack(
         f"materials: result of another {dim}",

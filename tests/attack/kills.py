@@ -70,7 +70,10 @@ def _saved(rng: Rng, folder: Path) -> Attack:
         if kind == "numbers.json":
             value = store.read_numbers(target)["rmse_K"]
             return wrong(f"{value}", where=value not in (0.21, 0.42))
-        opened = store.open_dataset(target).load()
+        try:
+            opened = store.open_dataset(target).load()
+        except ValueError as error:
+            return Verdict("rejected", f"the result does not open: {error}")
         before = store.open_dataset(source).load()
         counts = opened["counts"].values
         whole = np.array_equal(counts, before["counts"]) or np.array_equal(counts, _later())
@@ -109,7 +112,10 @@ def _recorded(folder: Path, what: str, status: int) -> Verdict:
         return wrong(f"{len(places)} recordings, ended by {what} with status {status}")
     if not places:
         return Verdict("refused")
-    opened = store.open_dataset(places[0]).load()
+    try:
+        opened = store.open_dataset(places[0]).load()
+    except ValueError as error:
+        return Verdict("rejected", f"the recording does not open: {error}")
     frames = list(opened.attrs["frames_written"].values())
     spoilt = [False] * len(frames)
     for band, number in enumerate(frames):
