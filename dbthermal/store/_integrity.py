@@ -1,18 +1,19 @@
 """Checksums of a store: of every file when it is written, compared when it is read.
 
-``SHA256SUMS`` in the folder has a line for each file, as ``sha256sum --check`` reads them. A line
-is appended before its file is written: a recording that is cut short at any moment has the lines of
-all that is valid. A file that was replaced has a line for each state until the recording is closed.
-A bit that flips, a file that is cut, missing, foreign or in another's place is then seen: metadata
-and file names when the store is opened, values when they are read.
+``checksums.sfv`` in the folder has a line for each file: its name and its CRC-32, as programs for
+"simple file verification" read them. A line is appended before its file is written: a recording
+that is cut short at any moment has the lines of all that is valid. A file that was replaced has a
+line for each state until the recording is closed. A bit that flips, a file that is cut, missing,
+foreign or in another's place is then seen: metadata and file names when the store is opened, values
+when they are read.
 """
 
 import asyncio
-import hashlib
 import json
 import math
 import os
 import warnings
+import zlib
 from collections.abc import AsyncIterator, Iterator, Mapping
 from itertools import product
 from pathlib import Path
@@ -24,8 +25,8 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore
 
 GROUP: Final = "zarr.json"  # file of a zarr group's attributes
-SUMS: Final = "SHA256SUMS"
-MARK: Final = MappingProxyType({"checksums": f"SHA-256 of every file, in {SUMS}"})
+SUMS: Final = "checksums.sfv"
+MARK: Final = MappingProxyType({"checksums": f"CRC-32 of every file, in {SUMS}"})
 """Attribute of every store with checksums, so that their loss is seen."""
 
 
@@ -34,7 +35,7 @@ class SummedStore(LocalStore):
 
     def set_sync(self, key: str, value: Buffer) -> None:
         """Write a file by its relative name, its checksum first."""
-        add_sums(self.root, {key: value.to_bytes()})
+        add_sums(self.root, {key: value.as_numpy_array()})
         super().set_sync(key, value)
 
     async def set(self, key: str, value: Buffer) -> None:
@@ -90,7 +91,7 @@ class CheckedStore(SummedStore):
     ) -> Buffer | None:
         """Read a file that is as it was written."""
         content = super().get_sync(key, prototype=prototype)
-        self._compare(key, None if content is None else content.to_bytes())
+        self._compare(key, None if content is None else content.as_numpy_array())
         if byte_range is None:
             return content
         return super().get_sync(key, prototype=prototype, byte_range=byte_range)
@@ -166,7 +167,7 @@ def valid_part(attrs: Mapping[str, Any]) -> dict[str, int]:
 
 def add_sums(root: Path, contents: Mapping[str, bytes]) -> Path:
     """Append the checksums of files by relative name; path of the file of checksums."""
-    lines = [f"{hashlib.sha256(content).hexdigest()}  {key}\n" for key, content in contents.items()]
+    lines = [f"{key} {zlib.crc32(content):08x}\n" for key, content in contents.items()]
     with (root / SUMS).open("ab") as stream:  # in one piece, for several threads may append
         stream.write("".join(lines).encode())
     return root / SUMS
@@ -175,7 +176,7 @@ def add_sums(root: Path, contents: Mapping[str, bytes]) -> Path:
 def last_sums(root: Path) -> bytes:
     """Content of the file of checksums with the last state of every file alone, by name."""
     sums = _read_sums(root)
-    return "".join(f"{sums[key].split()[-1]}  {key}\n" for key in sorted(sums)).encode()
+    return "".join(f"{key} {sums[key].split()[-1]}\n" for key in sorted(sums)).encode()
 
 
 def _read_sums(root: Path) -> dict[str, str]:
@@ -184,8 +185,8 @@ def _read_sums(root: Path) -> dict[str, str]:
     path = root / SUMS
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     for line in text.split("\n")[:-1]:
-        digest, _, key = line.partition("  ")
-        sums[key] = f"{sums[key]} {digest}" if key in sums else digest
+        key, _, crc = line.rpartition(" ")
+        sums[key] = f"{sums[key]} {crc}" if key in sums else crc
     return sums
 
 
@@ -193,7 +194,7 @@ def _is_listed(sums: Mapping[str, str], key: str, content: bytes | None) -> bool
     """True if a file's content is one of its listed states; without content, if it has none."""
     if content is None:
         return key not in sums
-    return hashlib.sha256(content).hexdigest() in sums.get(key, "")
+    return f"{zlib.crc32(content):08x}" in sums.get(key, "")
 
 
 def _files(root: Path) -> Iterator[str]:
