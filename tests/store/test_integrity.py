@@ -224,7 +224,9 @@ def test_store_without_checksums_opens_with_a_warning(
     content = json.loads((path / "zarr.json").read_text())
     del content["attributes"]["checksums"]
     (path / "zarr.json").write_text(json.dumps(content))
-    with pytest.warns(UserWarning, match=r"No checksums in '.*a\.zarr': damage is not seen"):
+    with pytest.warns(
+        UserWarning, match=r"No checksums in '.*a\.zarr', as of dbthermal 0.1.0: damage is not seen"
+    ):
         opened = store.open_dataset(path)
     xr.testing.assert_identical(opened, store.open_dataset(stores[kind]))
 
