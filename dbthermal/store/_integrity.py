@@ -186,6 +186,11 @@ def last_sums(root: Path) -> bytes:
     return "".join(f"{key} {sums[key].split()[-1]}\n" for key in sorted(sums)).encode()
 
 
+def missing_files(root: Path) -> list[str]:
+    """Files that were written to a store, and are not there any more."""
+    return sorted(_read_sums(root).keys() - set(_files(root)))
+
+
 def _read_sums(root: Path) -> dict[str, str]:
     """Checksums of every state of each file; a line that is cut short, or damaged, has none."""
     sums: dict[str, str] = {}

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +40,12 @@ Number = float | int | str | bool
 _COMPRESSORS = (ZstdCodec(), Crc32cCodec())
 _CHUNK_BYTES = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
+
+_ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str]]]] = {
+    "vp9": ("libvpx-vp9", {"crf": "31", "b": "0", "cpu-used": "4"}),
+    "h264": ("libx264", {}),
+}
+"""FFmpeg's encoder of each codec of a film, with its options."""
 
 
 def _chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
@@ -272,9 +278,10 @@ def save_video(
     provenance: Mapping[str, Any],
     *,
     rate: float,
+    codec: Literal["vp9", "h264"] = "vp9",
 ) -> None:
     """
-    Save a film as H.264 in MP4, as browsers play it.
+    Save a film in MP4, as browsers play it.
 
     Parameters
     ----------
@@ -286,12 +293,20 @@ def save_video(
         From `dbthermal.store.provenance`; becomes the file's comment, as JSON.
     rate : float
         Frame rate [Hz].
+    codec : {"vp9", "h264"}
+        Compression. VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of
+        H.264, x264, is under the GPL, and patents may ask for a licence where films are passed on
+        (see docs/licences.md). ValueError for any other.
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 
+    if codec not in _ENCODERS:
+        raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
+    encoder, options = _ENCODERS[codec]
     with _whole(path, ".mp4") as part, av.open(part, "w") as film:
         film.metadata["comment"] = _json(provenance)
-        stream = film.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
+        fraction = Fraction(rate).limit_denominator(1000)
+        stream = film.add_stream(encoder, rate=fraction, options=options)
         stream.pix_fmt, stream.width = "yuv420p", 0
         for frame in frames:
             height, width = frame.shape[:2]

@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast, get_args
 
 import av
 import numpy as np
@@ -270,10 +270,16 @@ def film(*shapes: tuple[int, int]) -> list[np.ndarray]:
     return [np.full((*shape, 3), 40 * index, np.uint8) for index, shape in enumerate(shapes, 1)]
 
 
-def test_video_comes_back(tmp_path: Path) -> None:
+Codec = Literal["vp9", "h264"]
+
+
+@pytest.mark.parametrize("codec", get_args(Codec))
+def test_video_comes_back(tmp_path: Path, codec: Codec) -> None:
     """A video has its frames, rate and nearly its colours, and the provenance as a comment."""
-    store.save_video(film((32, 48), (32, 48), (32, 48)), tmp_path / "a.mp4", RECORD, rate=10.0)
+    frames = film((64, 96), (64, 96), (64, 96))
+    store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0, codec=codec)
     with av.open(tmp_path / "a.mp4") as video:
+        assert video.streams.video[0].codec_context.codec.canonical_name == codec
         assert video.streams.video[0].average_rate == 10
         assert json.loads(video.metadata["comment"]) == RECORD
         levels = [frame.to_ndarray(format="rgb24").mean() for frame in video.decode(video=0)]
@@ -293,6 +299,18 @@ def test_no_video_of_nonsense(tmp_path: Path, frames: list[np.ndarray], message:
     with pytest.raises(ValueError, match=message):
         store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0)
     assert not any(tmp_path.iterdir())
+
+
+def test_h264_is_a_choice(tmp_path: Path) -> None:
+    """Unless asked for, a video is VP9, the same bytes each time; an unknown codec is refused."""
+    frames = film((32, 48), (32, 48))
+    for name in ("a.mp4", "b.mp4"):
+        store.save_video(frames, tmp_path / name, RECORD, rate=10.0)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    with av.open(tmp_path / "a.mp4") as video:
+        assert video.streams.video[0].codec_context.codec.canonical_name == "vp9"
+    with pytest.raises(ValueError, match=r"Invalid codec 'gif'. Must be one of \['h264', 'vp9'"):
+        store.save_video(frames, tmp_path / "c.mp4", RECORD, rate=10.0, codec=cast("Codec", "gif"))
 
 
 def test_text_keeps_its_record(tmp_path: Path) -> None:
