@@ -220,6 +220,11 @@ def videos(rng: Rng) -> Attack:
 
 
 _ADDRESSES: Final = (
-    *("file://{}", "concat:{}|{}", "subfile,,start,0,end,900,,:{}", "http://localhost:9/film.mp4"),
+    *(
+        "file://{}",
+        "concat:{0}|{0}",
+        "subfile,,start,0,end,900,,:{}",
+        "http://localhost:9/film.mp4",
+    ),
     *("data:video/mp4;base64,AAAA film", "pipe:0 film", "cache:{}", "lavfi:testsrc film"),
 )
