@@ -115,14 +115,10 @@ data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
 bench: .venv/installed ## measure time and memory
 	$(python) -m pytest -m bench --capture=no
 
-<<<<<<< HEAD
 attack: .venv/installed ## attack the package with 6,000 hostile inputs, and write their counts into docs/trust.md
 	PYTHONPATH=tests:notebooks $(python) -m attack --inputs 6000 --seed 1 --write docs/trust.md
 
-lock: .venv/installed ## write requirements.lock anew from pyproject.toml, keeping the pins that still fit
-=======
 lock: .venv/installed ## write both locks anew from pyproject.toml, keeping the pins that still fit
->>>>>>> main
 	PIP_CONSTRAINT=requirements.lock $(python) -m pip install --quiet uv
 	$(compile) --output-file requirements.lock pyproject.toml
 	$(compile) --no-config --generate-hashes --constraint requirements.lock --output-file requirements-hashes.lock pyproject.toml
