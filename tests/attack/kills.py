@@ -126,11 +126,10 @@ def _recorded(folder: Path, what: str, status: int) -> Verdict:
     if any(spoilt):
         return wrong(f"zeros, or frames out of order: {spoilt}")
     attrs = opened.attrs
-    if attrs["complete"] and (status != 0 or min(frames) < _FRAMES):
-        return wrong(f"'complete' with {frames} frames, status {status}")
     unclosed = what in ("SIGTERM", "SIGHUP") and not attrs["closed"] and max(frames) > 0
-    if unclosed:
-        return wrong(f"not closed after {what}, status {status}")
+    early = attrs["complete"] and (status != 0 or min(frames) < _FRAMES)
+    if unclosed or early:
+        return wrong(f"closed {attrs['closed']}, {frames} frames, {what}, status {status}")
     return RIGHT if attrs["complete"] else Verdict("flagged")
 
 

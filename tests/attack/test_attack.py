@@ -18,7 +18,7 @@ UNMENDED: dict[str, str] = {
     "gray": "nearly gray bodies in four bands and more",
     "samples": "signals clipped below the type's end",
     "pixels": "scattered NaN",
-    "steps": "units, text and complex numbers in apparent_temperature, reflected_change, renew_offset",
+    "steps": "units, text, complex numbers in three steps",
     "numbers": "errors that do not name the file, repeated keys",
     "spectra": "bad UTF-8",
 }
