@@ -115,7 +115,9 @@ def _recorded(folder: Path, what: str, status: int) -> Verdict:
     try:
         opened = store.open_dataset(places[0]).load()
     except ValueError as error:
-        return Verdict("rejected", f"the recording does not open: {error}")
+        # Ended with an error before its first frame, it has lost nothing.
+        empty = status > 0 and not list(places[0].glob("counts/c/*"))
+        return Verdict("refused" if empty else "rejected", f"does not open: {error}")
     frames = list(opened.attrs["frames_written"].values())
     spoilt = [False] * len(frames)
     for band, number in enumerate(frames):
