@@ -1,26 +1,38 @@
 # Every task of the project; `make` alone lists them. A task sets up what it needs: Python 3.11 or newer and make are
 # enough. Packages go to .venv, at the versions in requirements.lock, and nothing else is downloaded (but by `make data`).
+# Names of files and values from outside reach a shell as variables of the environment or not at all, never as its text.
 
 PYTHON ?= python3
-python := .venv/bin/python
-stems := $(basename $(notdir $(sort $(wildcard notebooks/*.ipynb))))
-full := $(stems:%=results/full/%.ipynb)
-recorded := $(basename $(notdir $(sort $(wildcard params/recorded/*.yaml))))
-smoke := $(stems:%=results/smoke/%.passed)
-sources := $(shell find dbthermal notebooks/reproduction -type f -not -path '*/__pycache__/*') $(wildcard data_manifest.yaml)
-papermill := $(python) -m papermill --kernel python3 --no-progress-bar --log-level WARNING --cwd notebooks
 JOBS ?= 2
-parallel := $(MAKE) --no-print-directory --jobs=$(JOBS) --output-sync=target
+export PYTHON JOBS
+unexport PYTHONHOME
 
-# A mirror of the outside files is named from here, but read from the notebooks' folder too.
-ifneq ($(strip $(DBTHERMAL_DATA)),)
-mirror := $(shell cd "$(DBTHERMAL_DATA)" && pwd)
-ifeq ($(mirror),)
-$(error Invalid DBTHERMAL_DATA '$(DBTHERMAL_DATA)'. Must name a folder)
+# One make at a time in a checkout: the first one takes its lock and calls another, which has the tasks.
+ifneq ($(filter-out help,$(MAKECMDGOALS)),)
+ifneq ($(value DBTHERMAL_LOCKED),$(CURDIR))
+unlocked := yes
 endif
-override DBTHERMAL_DATA := $(mirror)
 endif
-export DBTHERMAL_DATA
+
+ifdef unlocked
+export GOALS := $(MAKECMDGOALS)
+.PHONY: under-lock $(MAKECMDGOALS)
+$(MAKECMDGOALS): under-lock ; @:
+under-lock:
+	+@"$$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { printf "Invalid Python '%s'. Must be 3.11 or newer: make PYTHON=python3.12\n" "$$PYTHON" >&2; exit 1; }; \
+	    exec "$$PYTHON" -I notebooks/reproduction/locked.py "$(MAKE)"
+else
+
+python := .venv/bin/python
+plainly := -not -path '*[!A-Za-z0-9._/-]*' 2>/dev/null | LC_ALL=C sort
+stems := $(basename $(notdir $(shell LC_ALL=C find notebooks -maxdepth 1 -name '[0-9][0-9]_*.ipynb' $(plainly))))
+full := $(stems:%=results/full/%.ipynb)
+recorded := $(basename $(notdir $(shell LC_ALL=C find params/recorded -name '*.yaml' $(plainly))))
+smoke := $(stems:%=results/smoke/%.ipynb)
+sources := $(shell LC_ALL=C find dbthermal notebooks/reproduction -type f -not -path '*/__pycache__/*' $(plainly)) $(wildcard data_manifest.yaml)
+execute = @$(python) -m reproduction.execute
+parallel := $(MAKE) --no-print-directory --jobs="$$JOBS" $(if $(filter output-sync,$(.FEATURES)),--output-sync=target)
 
 # The same warnings, threads and settings on every machine, in this process and in the notebooks' kernels. One thread per
 # linear-algebra call, for the order of a sum must not hang on the number of cores; a user's own settings stay out of it.
@@ -33,7 +45,7 @@ export JUPYTER_CONFIG_DIR := $(CURDIR)/.venv/etc/jupyter
 export JUPYTER_DATA_DIR := $(CURDIR)/.venv/share/jupyter
 export MPLCONFIGDIR := $(CURDIR)/.venv/share/matplotlib
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
-unexport JUPYTER_PATH MPLBACKEND PYTHONHOME
+unexport JUPYTER_PATH MPLBACKEND
 export PYTHONPATH := $(CURDIR)/notebooks
 
 .DEFAULT_GOAL := help
@@ -57,15 +69,15 @@ types: .venv/installed ## check the types
 	$(python) -m mypy
 
 pytest: .venv/installed ## run the tests alone
-	$(python) -m pytest --numprocesses=$(JOBS)
+	$(python) -m pytest --numprocesses="$$JOBS"
 
 smoke: $(smoke) ## run every notebook with its own small values, as a test
 
 chain: $(recorded:%=results/chain/%.ipynb) ## from the bytes of the emulated rig to its separated video, with small values
 
 interop: ## compare emulators and codecs with independent software, in an environment of its own, which it downloads
-	"$(PYTHON)" -m venv .venv/interop
-	.venv/interop/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
+	"$$PYTHON" -m venv .venv/interop
+	PIP_CONSTRAINT=requirements.lock .venv/interop/bin/python -m pip install --quiet pip
 	.venv/interop/bin/python -m pip install --quiet --group interop --editable '.[instruments,test]'
 	.venv/interop/bin/python -c "import flirpy, thermocouple_its90, thorlabs_apt_protocol"
 	.venv/interop/bin/python -m pytest tests/instruments/test_interop.py
@@ -76,7 +88,7 @@ test: .venv/installed ## check lint, types, the quick tests, and every notebook 
 	$(parallel) smoke
 
 test-slow: .venv/installed ## run the long tests, and the notebooks on the recordings of the emulated rig
-	$(python) -m pytest --numprocesses=$(JOBS) -m slow
+	$(python) -m pytest --numprocesses="$$JOBS" -m slow
 	$(parallel) chain
 
 reproduce: .venv/installed ## run the notebooks with the values in params/, into results/full, two at a time
@@ -107,52 +119,48 @@ clean: ## remove all that make made: results, environment, caches
 	rm -rf results .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find dbthermal tests notebooks -name __pycache__ -prune -exec rm -rf {} +
 
-# The lock constrains the package's own build too; pip renamed the variable for that.
+# The lock constrains the package's own build too; pip renamed the variable for that. What an install that was interrupted left may look
+# whole to pip, so it goes first.
 .venv/installed: pyproject.toml requirements.lock
-	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-	    { echo "Invalid Python '$(PYTHON)'. Must be 3.11 or newer: make PYTHON=python3.12" >&2; exit 1; }
-	"$(PYTHON)" -m venv .venv
+	@if test -e .venv/installing; then find .venv -mindepth 1 -not -path .venv/installing -delete; fi
+	@mkdir -p .venv && touch .venv/installing && rm -f $@
+	"$$PYTHON" -m venv .venv
+	PIP_CONSTRAINT=requirements.lock $(python) -m pip install --quiet pip
 	PIP_CONSTRAINT=requirements.lock PIP_BUILD_CONSTRAINT=requirements.lock \
 	    $(python) -m pip install --quiet --editable '.[notebooks,test]'
-	@touch $@
+	@sync && touch $@ && rm -f .venv/installing
 
 # Which outside files there are changes the results, so a change of theirs counts as a change of a source.
-inputs := DBTHERMAL_DATA=$(DBTHERMAL_DATA) $(sort $(shell find data -type f 2>/dev/null))
-ifneq ($(inputs),$(shell cat results/inputs.txt 2>/dev/null))
+listed := { printf 'DBTHERMAL_DATA=%s\n' "$$DBTHERMAL_DATA"; find data -type f 2>/dev/null | LC_ALL=C sort; }
+ifneq ($(shell $(listed) | cmp -s - results/inputs.txt || echo changed),)
 results/inputs.txt: FORCE
 endif
 results/inputs.txt:
-	@mkdir -p $(@D) && echo '$(inputs)' > $@
+	@mkdir -p $(@D) && $(listed) > $@
 
-# The executed notebook stands for all that it writes: a folder's own time does not change with its content. What an
-# earlier run left goes first. A notebook that fails is kept apart, to be read, and leaves nothing that looks whole.
-define execute
-	@echo "$< -> $@"
-	@mkdir -p $(@D) results/failed && rm -rf $(@D)/$** $(@D)/.$** results/failed/$**
-	@$(papermill) $(1) $< $@ || { mv -f $@ results/failed; rm -rf $(@D)/$**; exit 1; }
-endef
-
+# The executed notebook stands for all that it writes: a folder's own time does not change with its content. It has its
+# name only when it is whole; one that fails is kept in results/failed, to be read, and leaves nothing that looks whole.
 results/full/%.ipynb: notebooks/%.ipynb params/%.yaml $(sources) results/inputs.txt .venv/installed
-	$(call execute,--parameters_file params/$*.yaml)
+	$(execute) full $* -f params/$*.yaml
 
-results/smoke/%.passed: notebooks/%.ipynb $(sources) results/inputs.txt .venv/installed
-	@echo "$<"
-	@mkdir -p $(@D) && rm -rf $(@D)/$** && $(python) -m pytest --quiet -p no:cacheprovider --nbval-lax $< && touch $@
+results/smoke/%.ipynb: notebooks/%.ipynb $(sources) results/inputs.txt .venv/installed
+	$(execute) smoke $*
 
 # The same notebooks on what the emulated rig recorded: full values in results/rig, small ones in results/chain.
 results/rig/%.ipynb: notebooks/%.ipynb params/%.yaml params/recorded/%.yaml results/full/00_acquisition.ipynb
-	$(call execute,--parameters_file params/$*.yaml --parameters_file params/recorded/$*.yaml \
-	    -p results rig -p recorded results/full/00_acquisition)
+	$(execute) rig $* -f params/$*.yaml -f params/recorded/$*.yaml -p recorded results/full/00_acquisition
 
-results/chain/%.ipynb: notebooks/%.ipynb params/recorded/%.yaml results/smoke/00_acquisition.passed
-	$(call execute,--parameters_file params/recorded/$*.yaml -p results chain -p recorded results/smoke/00_acquisition)
+results/chain/%.ipynb: notebooks/%.ipynb params/recorded/%.yaml results/smoke/00_acquisition.ipynb
+	$(execute) chain $* -f params/recorded/$*.yaml -p recorded results/smoke/00_acquisition
 
 # The notebooks that open what another one saved; the last of them reads the numbers of all.
 calibrated := 02_emissivity 04_separation 08_twins
 paper := 09_paper
 $(calibrated:%=results/full/%.ipynb): results/full/01_calibration.ipynb
-$(calibrated:%=results/smoke/%.passed): results/smoke/01_calibration.passed
+$(calibrated:%=results/smoke/%.ipynb): results/smoke/01_calibration.ipynb
 $(paper:%=results/full/%.ipynb): $(filter-out $(paper:%=results/full/%.ipynb),$(full))
-$(paper:%=results/smoke/%.passed): $(filter-out $(paper:%=results/smoke/%.passed),$(smoke))
+$(paper:%=results/smoke/%.ipynb): $(filter-out $(paper:%=results/smoke/%.ipynb),$(smoke))
 results/rig/02_emissivity.ipynb results/rig/04_separation.ipynb: results/rig/01_calibration.ipynb
 results/chain/02_emissivity.ipynb results/chain/04_separation.ipynb: results/chain/01_calibration.ipynb
+
+endif

@@ -5,7 +5,6 @@ its new name and no content. So the new content is synced to the disk first, the
 then the folder that holds the name is synced.
 """
 
-import asyncio
 import os
 import weakref
 from collections.abc import Iterable, Iterator
@@ -16,7 +15,8 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from zarr.core.buffer import Buffer
-from zarr.storage import LocalStore
+
+from dbthermal.store._integrity import SummedStore, add_sums
 
 _THREADS: Final = 8
 
@@ -64,11 +64,11 @@ class HeldFolder:
         return False
 
 
-class DurableStore(LocalStore):
+class DurableStore(SummedStore):
     """
     Zarr store in a folder in which an existing file is replaced in one step.
 
-    New files are written as `LocalStore` does, and are brought to the disk by `tree_to_disk`, for
+    New files are written as `SummedStore` does, and are brought to the disk by `tree_to_disk`, for
     many at once take the time of one.
     """
 
@@ -76,25 +76,25 @@ class DurableStore(LocalStore):
         """Write a file by its relative name; if that fails, the old one stays."""
         path = self.root / key
         if path.exists():
-            replace(path, value.to_bytes(), path.with_name(f".{path.name}.part"))
+            self.replace(key, value.to_bytes(), path.with_name(f".{path.name}.part"))
         else:
             super().set_sync(key, value)
 
-    async def set(self, key: str, value: Buffer) -> None:
-        """Write a file; see `set_sync`."""
-        await asyncio.to_thread(self.set_sync, key, value)
+    def replace(self, key: str, content: bytes, part: Path) -> None:
+        """Replace a file by its relative name, when its checksum is on the disk; see `replace`."""
+        replace(self.root / key, content, part, before=[add_sums(self.root, {key: content})])
 
 
-def replace(path: Path, content: bytes, part: Path) -> None:
+def replace(path: Path, content: bytes, part: Path, before: Iterable[Path] = ()) -> None:
     """
     Replace a file in one step: a power loss leaves the old content or the new one.
 
     The new content is written to `part`, on the same file system. If that fails, the old file
-    stays, and nothing beside it.
+    stays, and nothing beside it. The files `before` are brought to the disk with it.
     """
     try:
         part.write_bytes(content)
-        to_disk([part])
+        to_disk([part, *before])
         part.replace(path)
     except OSError:
         part.unlink(missing_ok=True)

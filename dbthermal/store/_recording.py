@@ -19,7 +19,7 @@ from typing import Any, Final, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 import zarr
-from zarr.codecs import BloscCodec
+from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal.schema import COORDINATES, Variable
 from dbthermal.store._durable import (
@@ -29,14 +29,14 @@ from dbthermal.store._durable import (
     replace,
     tree_to_disk,
 )
+from dbthermal.store._integrity import GROUP, MARK, SUMS, SummedStore, add_sums, last_sums
 
 Values = npt.NDArray[Any]
 Method = TypeVar("Method", bound=Callable[..., Any])
 
-_GROUP: Final = "zarr.json"  # file of a zarr group's attributes
 _NO_NODES: Final = "band"  # folder of an array, in which zarr seeks no nodes: for unfinished files
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
-_COMPRESSOR: Final = BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle")
+_COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec())
 
 
 def _in_held_folder(method: Method) -> Method:
@@ -87,21 +87,29 @@ class Recording:
             raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
         self.frames, self.rows = dict.fromkeys(bands, 0), 0
         self._attrs = json.loads(
-            json.dumps({**attrs, "complete": False, "closed": False}, allow_nan=False)
+            json.dumps({**MARK, **attrs, "complete": False, "closed": False}, allow_nan=False)
         )
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
         whole = {**sizes, "band": len(bands), "time": chunk}
         with made_beside(self.path, self.path.absolute().parent) as part:
-            group = zarr.open_group(part, mode="w-", zarr_format=3, attributes=self._attrs)
+            part.mkdir()
+            group = zarr.open_group(
+                SummedStore(part), mode="w-", zarr_format=3, attributes=self._attrs
+            )
             for name, variable in variables.items():
                 _create(group, name, variable, whole, (fills or {}).get(name))
             names = group.create_array(
-                "band", shape=(len(bands),), dtype=str, dimension_names=("band",)
+                "band",
+                shape=(len(bands),),
+                dtype=str,
+                compressors=_COMPRESSORS,
+                dimension_names=("band",),
             )
             names[:] = np.array(bands, dtype=np.dtypes.StringDType())
             self._folder = HeldFolder(part, self.path)
         self.root = self._folder.root
-        group = zarr.open_group(DurableStore(self.root), mode="r+", use_consolidated=False)
+        self._store = DurableStore(self.root)
+        group = zarr.open_group(self._store, mode="r+", use_consolidated=False)
         # A chunk of zeros is written too: a missing one was never recorded.
         config: Any = {"write_empty_chunks": True}
         self._arrays = {name: array.with_config(config) for name, array in group.arrays()}
@@ -157,7 +165,9 @@ class Recording:
     def commit(self, **attrs: Any) -> None:
         """Declare valid, in one step, all that was appended, and set attributes (JSON)."""
         self._attrs.update(attrs, frames_written=dict(self.frames), log_written=self.rows)
-        _write_attributes(self.root, self._attrs)
+        content = {"zarr_format": 3, "node_type": "group", "attributes": self._attrs}
+        text = json.dumps(content, allow_nan=False)
+        self._store.replace(GROUP, text.encode(), self._part(GROUP))
 
     @_in_held_folder
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
@@ -181,6 +191,7 @@ class Recording:
         if time is not None:
             self._create_time(time)
         self.commit(complete=complete, closed=True, **attrs)
+        replace(self.root / SUMS, last_sums(self.root), self._part(SUMS))
         self.path, self._closed = self.place(), True
         self._folder.close()
 
@@ -202,32 +213,23 @@ class Recording:
             zarr.create_array(
                 part,
                 data=time.astype(np.float64),
+                compressors=_COMPRESSORS,
                 dimension_names=("time",),
                 attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
+                config={"write_empty_chunks": True},
             )
+        # Its metadata last: lines that are cut short are then not those of an array.
+        files = sorted(path for path in (self.root / "time").rglob("*") if path.is_file())
+        names = [path.relative_to(self.root).as_posix() for path in files]
+        add_sums(self.root, {name: (self.root / name).read_bytes() for name in names})
+
+    def _part(self, name: str) -> Path:
+        return self.root / _NO_NODES / f".{name}.part"
 
     def _to_disk(self, names: Iterable[str], chunks: Sequence[Path]) -> None:
-        """Bring chunks of some arrays to the disk, and the folders that they are in."""
-        tree_to_disk([self.root / name / chunk for name in names for chunk in chunks], self.root)
-
-
-def attributes(path: str | Path) -> dict[str, Any]:
-    """Attributes of a store as they are on the disk, without a look at its arrays."""
-    content = json.loads((Path(path) / _GROUP).read_text(encoding="utf-8"))
-    return dict(content.get("attributes", {}))
-
-
-def valid_part(attrs: Mapping[str, Any]) -> dict[str, slice]:
-    """Valid part of a recording that is not closed: frames that all bands have, rows of the log."""
-    frames = min(attrs["frames_written"].values())
-    return {"time": slice(0, frames), "log": slice(0, attrs["log_written"])}
-
-
-def _write_attributes(root: Path, attrs: Mapping[str, Any]) -> None:
-    """Replace the attributes of a store in one step; if that fails, the old ones stay."""
-    content = {"zarr_format": 3, "node_type": "group", "attributes": dict(attrs)}
-    text = json.dumps(content, allow_nan=False)
-    replace(root / _GROUP, text.encode(), root / _NO_NODES / f".{_GROUP}.part")
+        """Bring chunks of some arrays to the disk, their checksums, and the folders around them."""
+        places = [self.root / name / chunk for name in names for chunk in chunks]
+        tree_to_disk([*places, self.root / SUMS], self.root)
 
 
 def _create(
@@ -241,7 +243,7 @@ def _create(
         shape=tuple(whole[dim] for dim in variable.dims),
         chunks=tuple(chunks[dim] for dim in variable.dims),
         dtype=variable.dtype,
-        compressors=_COMPRESSOR,
+        compressors=_COMPRESSORS,
         fill_value=nothing if fill is None else fill,
         dimension_names=variable.dims,
         attributes=dict(variable.attrs),

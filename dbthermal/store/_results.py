@@ -18,14 +18,23 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from dbthermal.store import _recording as recording
+from dbthermal.store._integrity import (
+    MARK,
+    SUMS,
+    CheckedStore,
+    SummedStore,
+    last_sums,
+    valid_part,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Number = float | int | str | bool
 
+_COMPRESSORS = (ZstdCodec(), Crc32cCodec())
 _CHUNK_BYTES = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
 
@@ -74,10 +83,22 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     """
     # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
     plain = _with_text_as(dataset.drop_encoding(), "U", np.dtypes.StringDType())
-    plain.attrs = {**dataset.attrs, "provenance": json.loads(_json(provenance))}
-    encoding = {name: {"chunks": _chunks(variable)} for name, variable in plain.variables.items()}
+    plain.attrs = {**MARK, **dataset.attrs, "provenance": json.loads(_json(provenance))}
+    encoding = {
+        name: {"chunks": _chunks(variable), "compressors": _COMPRESSORS}
+        for name, variable in plain.variables.items()
+    }
     with _whole(path, ".zarr") as part:
-        plain.to_zarr(part, mode="w-", encoding=encoding, zarr_format=3, consolidated=False)
+        part.mkdir()
+        plain.to_zarr(
+            SummedStore(part),
+            mode="w-",
+            encoding=encoding,
+            zarr_format=3,
+            consolidated=False,
+            write_empty_chunks=True,
+        )
+        (part / SUMS).write_bytes(last_sums(part))
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
@@ -114,29 +135,29 @@ def open_dataset(path: str | Path) -> xr.Dataset:
         raise FileNotFoundError(
             f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
         )
-    attrs = recording.attributes(path)
-    cut_short = not attrs.get("closed", True)
-    dataset = _open_valid_part(Path(path), attrs) if cut_short else _open(path)
+    checked = CheckedStore(path)
+    dataset = _open(checked) if checked.closed else _open_valid_part(checked)
+    for name in MARK:
+        dataset.attrs.pop(name, None)
     return _with_text_as(dataset, "T", np.dtype(str))
 
 
-def _open(path: str | Path, leave: Iterable[str] = ()) -> xr.Dataset:
+def _open(checked: CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
     dataset: xr.Dataset = xr.open_zarr(
-        path, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
+        checked, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
     )
     return dataset
 
 
-def _open_valid_part(path: Path, attrs: Mapping[str, Any]) -> xr.Dataset:
+def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
     """Open the variables of a recording one by one, for their room differs while it grows."""
-    ends = recording.valid_part(attrs)
-    names = {array.parent.name for array in path.glob("*/zarr.json")}
-    parts = []
+    ends, parts = valid_part(checked.attrs), []
+    names = {array.parent.name for array in checked.root.glob("*/zarr.json")}
     for name in sorted(names):
-        part = _open(path, leave=names - {name})
-        parts.append(part.isel({dim: end for dim, end in ends.items() if dim in part.dims}))
-    # The attributes as read first, for they may have gone on since.
-    return xr.merge(parts, combine_attrs="override").assign_attrs(attrs)
+        part = _open(checked, leave=names - {name})
+        parts.append(part.isel({d: slice(end) for d, end in ends.items() if d in part.dims}))
+    # The attributes as checked, for they may have gone on since.
+    return xr.merge(parts, combine_attrs="override").assign_attrs(checked.attrs)
 
 
 def save_numbers(

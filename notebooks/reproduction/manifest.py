@@ -178,10 +178,10 @@ def main() -> int:
 
 
 def _folder(collection: str) -> Path:
-    return (_mirror() or paths.data()) / collection
+    return (mirror() or paths.data()) / collection
 
 
-def _mirror() -> Path | None:
+def mirror() -> Path | None:
     """Folder that DBTHERMAL_DATA names, None if it is unset or empty."""
     folder = os.environ.get(MIRROR)
     if folder and not Path(folder).is_dir():
@@ -191,7 +191,7 @@ def _mirror() -> Path | None:
 
 def _fetch(listed: Collection, file: File, folder: Path) -> Path:
     path = folder / file.name
-    if _mirror() is None and not path.is_file():
+    if mirror() is None and not path.is_file():
         source = pooch.create(
             folder,
             base_url=listed.origin,

@@ -1,16 +1,18 @@
 """Folders of the project. Notebook, parameters and results of one stem bear its name.
 
-Papermill runs a notebook from the project's folder and nbval from the notebook's, so no path is
-relative to the current one: the root is the nearest folder upwards with ``data_manifest.yaml``::
+A notebook runs in its own folder or in the project's, so no path is relative to the current one:
+the root is the nearest folder upwards with ``data_manifest.yaml``::
 
     root/
       data_manifest.yaml         manifest()
       data/                      data()
+      notebooks/NN_name.ipynb    notebook("NN_name")
       params/NN_name.yaml        params("NN_name")
       params/sessions/           session("name")
       recordings/<run>/          recordings(run)
       results/<run>/             results(run)
         NN_name.zarr ...         result(run, "NN_name", ".zarr")
+        .NN_name.part.ipynb      unfinished(run, "NN_name")
         NN_name/                 emulated(run, "NN_name")
       results/cells/NN_name/     cells("NN_name")
 """
@@ -45,6 +47,11 @@ def data() -> Path:
     return root() / "data"
 
 
+def notebook(stem: str) -> Path:
+    """Notebook as it is stored, without outputs."""
+    return root() / "notebooks" / f"{_stem(stem)}.ipynb"
+
+
 def params(stem: str) -> Path:
     """Parameters of a notebook's full run."""
     return root() / "params" / f"{_stem(stem)}.yaml"
@@ -76,6 +83,21 @@ def result(run: str, stem: str, ending: str) -> Path:
             f"Invalid ending {ending!r}. Must be '.suffix' or '_name.suffix', in lower case."
         )
     return results(run) / f"{_stem(stem)}{ending}"
+
+
+def unfinished(run: str, stem: str) -> Path:
+    """Executed notebook until it is whole: as long as it is there, its results are not."""
+    return results(run) / f".{_stem(stem)}.part.ipynb"
+
+
+def finished(run: str, stem: str) -> str:
+    """Stem of a notebook whose results are whole; RuntimeError if it runs, or was interrupted."""
+    if (part := unfinished(run, stem)).exists():
+        raise RuntimeError(
+            f"Unfinished notebook '{stem}' of run '{run}': it is running, or was interrupted. Must "
+            f"have run to its end: run it again, or remove '{part}' and what it left."
+        )
+    return stem
 
 
 def emulated(run: str, stem: str) -> Path:

@@ -17,10 +17,9 @@ import joblib
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-import yaml
 
-from dbthermal import store
-from reproduction import cache, manifest, paths
+from dbthermal import readers, store
+from reproduction import cache, manifest, parameters, paths
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,18 +40,20 @@ class Run:
         Name of the notebook, such as ``"03_simulation"``.
     namespace : mapping
         ``globals()`` of the notebook, with a value for each parameter in its YAML file, `results`
-        among them; else KeyError.
+        among them; else KeyError. What papermill injected is checked as by `parameters.check`.
     """
 
     def __init__(self, stem: str, namespace: Mapping[str, Any]) -> None:
         """Read the parameters' names from the YAML file, and their values from `namespace`."""
-        names = yaml.safe_load(paths.params(stem).read_text(encoding="utf-8"))
+        names = readers.read_yaml(paths.params(stem))
+        if values := parameters.injected(namespace):
+            parameters.check(values, parameters.defaults(stem), f"what '{stem}' was run with")
         missing = [name for name in names if name not in namespace]
         if missing:
             raise KeyError(f"Missing parameter '{missing[0]}' of '{stem}'. Must have a value.")
-        parameters = {name: namespace[name] for name in names}
-        self.stem, self.name = stem, str(parameters["results"])
-        self.provenance = store.provenance(parameters)
+        values = {name: namespace[name] for name in names}
+        self.stem, self.name = stem, str(values["results"])
+        self.provenance = store.provenance(values)
 
     def input(self, name: str, path: Path) -> Path:
         """Path of an input, of which the provenance then holds the checksum."""
@@ -60,8 +61,8 @@ class Run:
         return path
 
     def open(self, stem: str, ending: str = "") -> xr.Dataset:
-        """Dataset of this run that another notebook saved."""
-        path = paths.result(self.name, stem, f"{ending}.zarr")
+        """Dataset of this run that another notebook saved; RuntimeError if that is unfinished."""
+        path = paths.result(self.name, paths.finished(self.name, stem), f"{ending}.zarr")
         return store.open_dataset(self.input(f"{stem}{ending}", path)).load()
 
     def data(self, collection: str) -> dict[str, Path]:

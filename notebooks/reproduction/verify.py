@@ -31,13 +31,17 @@ def reference_path() -> Path:
 
 
 def read_run(run: str) -> dict[str, Numbers]:
-    """Headline numbers of every notebook of a run, stem -> name -> number."""
+    """Headline numbers of every notebook of a run, stem -> name -> number.
+
+    RuntimeError if one of the notebooks is running or was interrupted, FileNotFoundError if all are
+    missing.
+    """
     files = sorted(paths.results(run).glob("*.json"))
     if not files:
         raise FileNotFoundError(
             f"Missing numbers of run '{run}'. Must be made by 'make reproduce'."
         )
-    return {path.stem: store.read_numbers(path) for path in files}
+    return {paths.finished(run, path.stem): store.read_numbers(path) for path in files}
 
 
 def kind_of(numbers: Mapping[str, Numbers]) -> str:

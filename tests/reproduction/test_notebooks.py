@@ -6,8 +6,9 @@ from pathlib import Path
 
 import nbformat
 import pytest
-import yaml
 from nbformat import NotebookNode
+
+from reproduction import parameters
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -20,7 +21,7 @@ each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path
 
 def read(path: Path) -> NotebookNode:
     """Notebook as stored, if it is a valid one."""
-    notebook: NotebookNode = nbformat.read(path, nbformat.NO_CONVERT)  # type: ignore[no-untyped-call]
+    notebook: NotebookNode = nbformat.read(path, nbformat.NO_CONVERT)
     nbformat.validate(notebook)
     return notebook
 
@@ -39,12 +40,16 @@ def test_stems_are_equal() -> None:
 @each_notebook
 def test_parameters_are_the_ones_in_yaml(path: Path) -> None:
     """The one cell tagged `parameters` sets plain values for the names that the YAML file has."""
-    tagged = [cell for cell in cells(path, "code") if "parameters" in cell.metadata.get("tags", ())]
-    assert len(tagged) == 1
-    small: dict[str, object] = {}
-    exec(tagged[0].source, {"__builtins__": {}}, small)
-    full = yaml.safe_load((ROOT / "params" / f"{path.stem}.yaml").read_text(encoding="utf-8"))
-    assert small.keys() == full.keys()
+    full = parameters.read(path.stem, [ROOT / "params" / f"{path.stem}.yaml"])
+    assert parameters.defaults(path.stem).keys() == full.keys()
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "params/recorded").iterdir()), ids=lambda path: path.stem
+)
+def test_parameters_of_recordings(path: Path) -> None:
+    """What differs for a recording is among the notebook's parameters, and of their kind."""
+    assert parameters.read(path.stem, [path, path])
 
 
 @each_notebook

@@ -49,6 +49,7 @@ from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 import numpy as np
+from scipy.stats import chi2
 
 from dbthermal import _smooth as smooth
 from dbthermal.schema import Status
@@ -64,7 +65,6 @@ from dbthermal.separation._tiles import Array, Estimate, Mask, Survey, Tile
 _CONTRAST_SIGMAS: Final = 8.0
 _CHI2_SIGMAS: Final = 8.0
 _CORRELATION_SIGMAS: Final = 3.5
-_GRAY_SIGMAS: Final = 4.0
 _DELAY_SIGMAS: Final = 4.0
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Flags of pixels in which a jump of the object is looked for.
@@ -78,6 +78,8 @@ _SUSPECT: Final = np.uint32(
 # Energy of the bend between the two responses, in units of the second band's noise, from which it
 # is worth taking out: it moves no linear function of the signal by more standard deviations.
 _BEND: Final = 0.2
+# Background temperatures at which a gray body's ratios are computed, over the calibrated range.
+_TEMPERATURES: Final = 17
 
 Record = TypeVar("Record", Estimate, Survey)
 
@@ -114,6 +116,7 @@ class _Solution:
     background: Array  # (time, pixel) [K]
     background_variance: Array  # (time, pixel) [K^2]
     straight: Tile  # the tile with signals of proportional reflections
+    gray: Mask  # the signals as they are may be those of a gray body (pixel)
 
 
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
@@ -154,6 +157,8 @@ def _exact(
     signals = part.signals.copy()
     signals[1:] -= bend[..., bent]
     again = _steps(part, replace(part, signals=signals), functions, settings)
+    # The bend of a gray body is not known.
+    again = replace(again, gray=solution.gray[bent])
     return result.replace_pixels(bent, finish(part, functions, again))
 
 
@@ -161,11 +166,18 @@ def _steps(
     tile: Tile, straight: Tile, functions: smooth.Subspace, settings: SubspaceSettings
 ) -> _Solution:
     """Steps 1 to 4; the first three on signals whose reflections are proportional."""
-    noise = np.array(tile.noise)
+    noise, slopes = np.array(tile.noise), _slopes(tile)
     ratios = reflection_ratio.estimate(straight.signals, functions, noise, tile.material)
+    gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
     emission = emissions.estimate(straight, functions, ratios, settings.background_drift)
     background = emissions.estimate_background(tile, emission, ratios)
-    return _Solution(ratios, emission, *background, straight)
+    return _Solution(ratios, emission, *background, straight, gray)
+
+
+def _slopes(tile: Tile) -> Array:
+    """Slopes of the responses (temperature, band) [1] over the calibrated range."""
+    temperature = np.linspace(tile.curves[0].lowest, tile.curves[0].highest, _TEMPERATURES)
+    return np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
 
 
 def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Estimate:
@@ -221,8 +233,10 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     # The quietest band holds no more than its noise either.
     still |= ~ratios.pooled & (ratios.scatter[0, 0] <= 0)
     still |= ~np.isfinite(ratios.inverse_energy)
+    # Ratios of 1, where eq. 5 is singular, are not excluded.
     epsilon = ratios.inverse_energy * ratios.null_variance
-    gray = ~still & (epsilon > 1.0 / _GRAY_SIGMAS**2)
+    singular = epsilon > 1.0 / chi2.isf(reflection_ratio.CHANCE, others)
+    gray = ~still & (singular | solution.gray)
     defined = ~still & ~gray & ~emission.constant
     nonphysical = defined & np.any((emission.emissivity <= 0) | (emission.emissivity >= 1), axis=0)
     swapped = defined & ~nonphysical & (emission.emissivity.mean(axis=0) < 0.5)

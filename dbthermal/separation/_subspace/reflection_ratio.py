@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import chdtrc
 from scipy.stats import chi2, norm
 
 from dbthermal import _smooth as smooth
@@ -20,8 +21,11 @@ LOWEST_ORDER: Final = 3
 HIGHEST_ORDER: Final = 14
 """Smallest and largest smooth subspace that the data may choose (number of functions)."""
 
-# Chance of four standard deviations.
-_CHANCE: Final = float(2.0 * norm.sf(4.0))
+CHANCE: Final = float(2.0 * norm.sf(4.0))
+"""Chance of four standard deviations, at which a hypothesis on the ratios is rejected."""
+
+# Chance at which a gray body passes for another: a tenth of what is promised of a status of 0.
+_GRAY_CHANCE: Final = 1e-4
 
 
 @dataclass(frozen=True)
@@ -156,6 +160,30 @@ def ratio_variance(ratio: Array, inverse: Array, noise: Array) -> Array:
     return np.asarray(result)
 
 
+def may_be_gray(ratios: ReflectionRatio, noise: Array, slopes: Array) -> Mask:
+    r"""
+    Pixels (pixel) of which equal emissivities are not excluded, from its signals as they are.
+
+    All that changes in a gray body changes the bands in proportion to the `slopes`
+    (temperature, band) [1] of their responses, :math:`\dot z_m = (1 - e) \, u_m'(y) \, \dot y`:
+    before a background warmer than the reference its ratios are not 1. That temperature cannot
+    be told beside a gray body; it is as likely to lie between any two of the temperatures. The
+    chance is the mean over them of that of the chi-square, with a degree of freedom for each band
+    but one, of the nearest ratios between the two.
+    """
+    along = ratios.ratio / noise[:, np.newaxis]
+    unit = along / np.sqrt((along**2).sum(axis=0))
+    gray = slopes / slopes[:, :1] / noise
+    # The part of g / s orthogonal to v, as in `null_combination`; its variance is sigma^2.
+    off = gray[..., np.newaxis] - (gray @ unit)[:, np.newaxis] * unit
+    start, step = off[:-1], np.diff(off, axis=0)
+    length = np.maximum((step**2).sum(axis=1), np.finfo(np.float64).tiny)
+    share = np.clip(-(start * step).sum(axis=1) / length, 0.0, 1.0)
+    nearest = ((start + share[:, np.newaxis] * step) ** 2).sum(axis=1)
+    chance = chdtrc(len(noise) - 1, nearest / ratios.inverse_energy).mean(axis=0)
+    return np.asarray(chance > _GRAY_CHANCE)
+
+
 def choose_order(null_energy: Array, frames: int) -> Whole:
     """Order less one (pixel) of the lowest information criterion of an energy (order, pixel)."""
     orders = np.arange(1, null_energy.shape[0] + 1)[:, np.newaxis]
@@ -190,4 +218,4 @@ def _agrees(scatter: Array, order: Whole, axis: Array) -> Mask:
     turned = np.einsum("pbc,cp->bp", chosen, axis)
     along = np.einsum("bp,bp->p", axis, turned)
     statistic = np.einsum("bp,bp->p", turned, turned) / along - along
-    return np.asarray(statistic < chi2.isf(_CHANCE, len(axis) - 1))
+    return np.asarray(statistic < chi2.isf(CHANCE, len(axis) - 1))

@@ -1,0 +1,204 @@
+"""Checksums of a store: of every file when it is written, compared when it is read.
+
+``SHA256SUMS`` in the folder has a line for each file, as ``sha256sum --check`` reads them. A line
+is appended before its file is written: a recording that is cut short at any moment has the lines of
+all that is valid. A file that was replaced has a line for each state until the recording is closed.
+A bit that flips, a file that is cut, missing, foreign or in another's place is then seen: metadata
+and file names when the store is opened, values when they are read.
+"""
+
+import asyncio
+import hashlib
+import json
+import math
+import os
+import warnings
+from collections.abc import AsyncIterator, Iterator, Mapping
+from itertools import product
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from zarr.abc.store import ByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import LocalStore
+
+GROUP: Final = "zarr.json"  # file of a zarr group's attributes
+SUMS: Final = "SHA256SUMS"
+MARK: Final = MappingProxyType({"checksums": f"SHA-256 of every file, in {SUMS}"})
+"""Attribute of every store with checksums, so that their loss is seen."""
+
+
+class SummedStore(LocalStore):
+    """Zarr store in an existing folder, which keeps the checksum of every file it writes."""
+
+    def set_sync(self, key: str, value: Buffer) -> None:
+        """Write a file by its relative name, its checksum first."""
+        add_sums(self.root, {key: value.to_bytes()})
+        super().set_sync(key, value)
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Write a file; see `set_sync`."""
+        await asyncio.to_thread(self.set_sync, key, value)
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        """Names in a group's folder; other files, as that of the checksums, are no part of it."""
+        async for name in super().list_dir(prefix):
+            if name == GROUP or (self.root / prefix / name).is_dir():
+                yield name
+
+
+class CheckedStore(SummedStore):
+    """
+    Zarr store in a folder, to be read: all that differs from what was written is a ValueError.
+
+    `attrs` are the attributes of the store; a recording that is not `closed` has to have its valid
+    part alone. A store without checksums, of dbthermal 0.1.0, opens with a warning.
+    """
+
+    def __init__(self, root: Path | str, *, read_only: bool = True) -> None:  # noqa: ARG002 - zarr's
+        super().__init__(root, read_only=True)
+        # Before the checksums, for a recording that grows may replace it with the next line; and
+        # again if they have changed: it was closed just then.
+        self.closed, content = False, self._content(GROUP)
+        self._sums = _read_sums(self.root)
+        if not _is_listed(self._sums, GROUP, content):
+            content = self._content(GROUP)
+        self._compare(GROUP, content)
+        try:
+            self.attrs: dict[str, Any] = json.loads(content or b"")["attributes"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"Invalid {self._named(GROUP)}. Must be a zarr group.") from error
+        self.closed = bool(self.attrs.get("closed", True))
+        if MARK.keys() & self.attrs.keys() and not self._sums:
+            raise ValueError(f"Missing {self._named(SUMS)}. {_RULE}")
+        if self._sums:
+            self._check_files()
+        else:
+            warnings.warn(
+                f"No checksums in '{self.root}': damage is not seen. Must be a store of dbthermal "
+                "0.1.0; saved again it has them.",
+                stacklevel=3,
+            )
+
+    def get_sync(
+        self,
+        key: str,
+        *,
+        prototype: BufferPrototype | None = None,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
+        """Read a file that is as it was written."""
+        content = super().get_sync(key, prototype=prototype)
+        self._compare(key, None if content is None else content.to_bytes())
+        if byte_range is None:
+            return content
+        return super().get_sync(key, prototype=prototype, byte_range=byte_range)
+
+    async def get(
+        self,
+        key: str,
+        prototype: BufferPrototype | None = None,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
+        """Read a file; see `get_sync`."""
+        return await asyncio.to_thread(
+            self.get_sync, key, prototype=prototype, byte_range=byte_range
+        )
+
+    def _compare(self, key: str, content: bytes | None) -> None:
+        """ValueError unless a file is as it was written, or absent as it was."""
+        if not self._sums or _is_listed(self._sums, key, content):
+            return
+        state, now = "Missing" if content is None else "Damaged", _read_sums(self.root)
+        if _is_listed(now, key, content):
+            if not self.closed:
+                self._sums = now
+                return
+            state = "Since it was opened, replaced"
+        raise ValueError(f"{state} {self._named(key)}. {_RULE}")
+
+    def _check_files(self) -> None:
+        """ValueError if a file is missing, or foreign to a store that grows no more."""
+        files = set(_files(self.root))
+        wanted = self._sums.keys() if self.closed else set(self._valid_files())
+        if missing := sorted(wanted - (files & self._sums.keys())):
+            raise ValueError(f"Missing {self._named(missing[0])}. {_RULE}")
+        # A kill, or a system's file browser, may leave hidden files.
+        foreign = sorted(key for key in files - self._sums.keys() if not f"/{key}".count("/."))
+        if self.closed and foreign:
+            raise ValueError(f"Foreign {self._named(foreign[0])}. {_RULE}")
+
+    def _valid_files(self) -> Iterator[str]:
+        """Metadata of all arrays, and the chunks in the valid part of a recording that grows."""
+        ends = valid_part(self.attrs)
+        for key in [key for key in self._sums if Path(key).name == GROUP]:
+            yield key
+            content = self._content(key)
+            self._compare(key, content)
+            array = json.loads(content or b"")
+            if array["node_type"] == "array":
+                chunks = array["chunk_grid"]["configuration"]["chunk_shape"]
+                sizes = zip(array["dimension_names"], array["shape"], chunks, strict=True)
+                numbers = [
+                    range(math.ceil(min(size, ends.get(dim, size)) / chunk))
+                    for dim, size, chunk in sizes
+                ]
+                name = key.removesuffix(GROUP)
+                yield from (name + "/".join(["c", *map(str, at)]) for at in product(*numbers))
+
+    def _content(self, key: str) -> bytes | None:
+        path = self.root / key
+        return path.read_bytes() if path.is_file() else None
+
+    def _named(self, key: str) -> str:
+        array = key.rpartition("/c/")[0] or key.rpartition("/")[0]
+        return f"file '{key}' of {f'array {array!r} in ' if array else ''}store '{self.root}'"
+
+
+_RULE: Final = "Must be as it was written: copy the store again, or make it anew."
+
+
+def valid_part(attrs: Mapping[str, Any]) -> dict[str, int]:
+    """Valid sizes of a recording that is not closed: frames of all bands, rows of the log."""
+    return {"time": min(attrs["frames_written"].values()), "log": attrs["log_written"]}
+
+
+def add_sums(root: Path, contents: Mapping[str, bytes]) -> Path:
+    """Append the checksums of files by relative name; path of the file of checksums."""
+    lines = [f"{hashlib.sha256(content).hexdigest()}  {key}\n" for key, content in contents.items()]
+    with (root / SUMS).open("ab") as stream:  # in one piece, for several threads may append
+        stream.write("".join(lines).encode())
+    return root / SUMS
+
+
+def last_sums(root: Path) -> bytes:
+    """Content of the file of checksums with the last state of every file alone, by name."""
+    sums = _read_sums(root)
+    return "".join(f"{sums[key].split()[-1]}  {key}\n" for key in sorted(sums)).encode()
+
+
+def _read_sums(root: Path) -> dict[str, str]:
+    """Checksums of every state of each file; a line that is cut short, or damaged, has none."""
+    sums: dict[str, str] = {}
+    path = root / SUMS
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    for line in text.split("\n")[:-1]:
+        digest, _, key = line.partition("  ")
+        sums[key] = f"{sums[key]} {digest}" if key in sums else digest
+    return sums
+
+
+def _is_listed(sums: Mapping[str, str], key: str, content: bytes | None) -> bool:
+    """True if a file's content is one of its listed states; without content, if it has none."""
+    if content is None:
+        return key not in sums
+    return hashlib.sha256(content).hexdigest() in sums.get(key, "")
+
+
+def _files(root: Path) -> Iterator[str]:
+    """Relative names of all files but that of the checksums."""
+    for folder, _, names in os.walk(root):
+        place = Path(folder).relative_to(root).as_posix()
+        start = "" if place == "." else f"{place}/"
+        yield from (f"{start}{name}" for name in names if start or name != SUMS)

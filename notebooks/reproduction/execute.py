@@ -1,0 +1,140 @@
+"""Execute a notebook: its result has its name only when it is whole, and on the disk.
+
+`python -m reproduction.execute RUN STEM -f FILE.yaml -p NAME TEXT` runs ``notebooks/STEM.ipynb``
+with small values, those of the files over them, and those texts over both. The executed notebook is
+``results/RUN/STEM.ipynb`` and stands for all that the notebook wrote. Until its end it is a hidden
+file beside that (see `paths.unfinished`), whatever ends the process. What an earlier run left goes
+first. A notebook that fails is kept in ``results/failed/RUN``, to be read, and nothing else of it.
+"""
+
+import argparse
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+import nbformat
+import papermill
+from jupyter_client.manager import AsyncKernelManager
+
+from reproduction import locked, manifest, parameters, paths
+
+
+class Kernel(AsyncKernelManager):
+    """Kernel that holds the lock of make too, which is not free while a kernel still writes."""
+
+    transport_encryption = "auto"  # of what passes between here and the kernel
+
+    async def start_kernel(self, *arguments: Any, **options: Any) -> None:  # type: ignore[override]
+        """Start the kernel with the lock's open file among its own."""
+        held = os.environ.get(locked.HELD)
+        if held is not None:
+            options["pass_fds"] = (int(held),)
+        await super().start_kernel(*arguments, **options)
+
+
+def execute(run: str, stem: str, values: Mapping[str, Any]) -> Path:
+    """
+    Path of the executed notebook, when it and all that it wrote are whole and on the disk.
+
+    It is as old as its start, so that whatever changed while it ran is newer. Raises what papermill
+    raises for a cell that fails, and a RuntimeError if a cell was not reached.
+    """
+    part, start = paths.unfinished(run, stem), time.time()
+    path = part.with_name(f"{stem}.ipynb")
+    failed = paths.root() / "results" / "failed" / run / path.name
+    part.parent.mkdir(parents=True, exist_ok=True)
+    part.touch()
+    _sync(part, part.parent)
+    failed.unlink(missing_ok=True)
+    _remove(part)
+    try:
+        papermill.execute_notebook(
+            paths.notebook(stem),
+            part,
+            parameters=values,
+            kernel_name="python3",
+            kernel_manager_class=Kernel,
+            progress_bar=False,
+            cwd=paths.root() / "notebooks",
+        )
+        _check_complete(part)
+    except BaseException:
+        _remove(part)
+        failed.parent.mkdir(parents=True, exist_ok=True)
+        part.replace(failed)
+        raise
+    for result in part.parent.glob(f"{stem}*"):
+        _sync(result, *result.rglob("*"))
+    os.utime(part, (start, start))
+    _sync(part)
+    part.replace(path)
+    _sync(path.parent)
+    return path
+
+
+def _remove(part: Path) -> None:
+    """Remove what a notebook wrote, but not the unfinished notebook itself."""
+    stem = part.name.removeprefix(".").removesuffix(".part.ipynb")
+    for result in [*part.parent.glob(f"{stem}*"), *part.parent.glob(f".{stem}*")]:
+        if result.is_dir() and not result.is_symlink():
+            shutil.rmtree(result)
+        elif result != part:
+            result.unlink()
+
+
+def _check_complete(path: Path) -> None:
+    """Raise a RuntimeError if a cell did not run, as after one that ends the kernel."""
+    notebook = nbformat.read(path, nbformat.NO_CONVERT)
+    for number, cell in enumerate(notebook.cells):
+        if cell.cell_type == "code" and cell.source.strip() and cell.execution_count is None:
+            raise RuntimeError(f"Unfinished notebook '{path}': cell {number} did not run.")
+
+
+def _sync(*places: Path) -> None:
+    """Bring files and folders to the disk."""
+    for place in places:
+        file = os.open(place, os.O_RDONLY)
+        try:
+            os.fsync(file)
+        finally:
+            os.close(file)
+
+
+def _stop(number: int, _: FrameType | None) -> NoReturn:
+    raise SystemExit(128 + number)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Execute a notebook; exit status 1 if its parameters are refused, or it fails."""
+    parser = argparse.ArgumentParser(prog="python -m reproduction.execute", description=__doc__)
+    parser.add_argument("run", help="folder below results/")
+    parser.add_argument("stem", help="name of the notebook, such as 03_simulation")
+    parser.add_argument("-f", dest="files", action="append", default=[], type=Path, metavar="FILE")
+    parser.add_argument("-p", dest="texts", action="append", default=[], nargs=2, metavar="TEXT")
+    options = parser.parse_args(arguments)
+    locked.end_with_parent(lambda: os.kill(os.getpid(), signal.SIGKILL))
+    signal.signal(signal.SIGTERM, _stop)
+    try:
+        manifest.mirror()
+        texts = [*options.texts, ["results", options.run]]
+        if "results" not in parameters.defaults(options.stem):
+            texts.pop()
+        values = parameters.read(options.stem, options.files, texts)
+        path = execute(options.run, options.stem, values)
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    except (OSError, RuntimeError, ValueError, papermill.PapermillException) as error:
+        sys.stderr.write(f"{options.run}/{options.stem}: {error}\n")
+        return 1
+    sys.stdout.write(f"{path}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,184 @@
+"""An executed notebook has its name only when it is whole; of one that is not, nothing counts."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import papermill
+import pytest
+
+from reproduction import execute, parameters, paths
+from reproduction.run import Run
+
+CELL = 'results = "smoke"\nframes = 3\nrecorded = ""\nnoise = [0.1, 1]\ntime_constant = None\n'
+CELL += 'plate = {"shape": [2, 3], "kind": "flat"}\nrate = 10.0\nknown = True\n'
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Project with a notebook of two cells."""
+    for folder in ("notebooks", "params"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "data_manifest.yaml").touch()
+    (tmp_path / "params/03_tiny.yaml").write_text("results: full\nframes: 9\n")
+    cells = [nbformat.v4.new_code_cell(text) for text in (CELL, "print(frames)")]
+    cells[0].metadata["tags"] = ["parameters"]
+    nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "notebooks/03_tiny.ipynb")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def folder(project: Path) -> Path:
+    """Folder of a run, with what an earlier one left of this and of another notebook."""
+    folder = project / "results" / "full"
+    (folder / "03_tiny.zarr").mkdir(parents=True)
+    for name in ("03_tiny.ipynb", "03_tiny.json", "03_tiny.zarr/zarr.json", "04_other.json"):
+        (folder / name).write_text("{}")
+    return folder
+
+
+class Papermill:
+    """Stand-in for papermill, which saves a notebook of which so many cells ran, and a number."""
+
+    def __init__(self, cells: int, error: BaseException | None = None) -> None:
+        self.cells, self.error = cells, error
+        self.seen: list[str] = []
+
+    def __call__(self, source: Path, part: Path, **_: Any) -> None:
+        """Save what ran; raise the error."""
+        self.seen = sorted(path.name for path in part.parent.iterdir())
+        notebook = nbformat.read(source, 4)
+        for number, cell in enumerate(notebook.cells[: self.cells], 1):
+            cell.execution_count = number
+        nbformat.write(notebook, part)
+        part.with_name("03_tiny.json").write_text("new")
+        if self.error:
+            raise self.error
+
+
+def replaced(monkeypatch: pytest.MonkeyPatch, stand_in: Papermill) -> Papermill:
+    """Put the stand-in where papermill is."""
+    monkeypatch.setattr(papermill, "execute_notebook", stand_in)
+    return stand_in
+
+
+def test_what_an_earlier_run_left_goes_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a notebook runs nothing has the name of its results; then all of them are there."""
+    runner = replaced(monkeypatch, Papermill(2))
+    assert execute.execute("full", "03_tiny", {}) == folder / "03_tiny.ipynb"
+    assert runner.seen == [".03_tiny.part.ipynb", "04_other.json"]
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["03_tiny.ipynb", "03_tiny.json", "04_other.json"]
+    assert (folder / "03_tiny.json").read_text() == "new"
+
+
+def test_a_change_while_it_ran_is_newer(
+    folder: Path, project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A source that changed while the notebook ran is newer than the result."""
+    replaced(monkeypatch, Papermill(2))
+    execute.execute("full", "03_tiny", {})
+    source = project / "changed"
+    source.touch()
+    path = folder / "03_tiny.ipynb"
+    assert path.stat().st_mtime < source.stat().st_mtime
+    monkeypatch.setattr(time, "time", lambda: 1000.0)
+    execute.execute("full", "03_tiny", {})
+    assert path.stat().st_mtime == 1000
+
+
+@pytest.mark.parametrize(
+    ("cells", "error"),
+    [
+        (1, papermill.PapermillExecutionError(1, 1, "", "ValueError", "wrong", [])),
+        (1, KeyboardInterrupt()),
+        (1, OSError("no space left")),
+        (1, None),  # papermill takes the end of the kernel by `exit()` for success
+    ],
+)
+def test_an_unfinished_notebook_leaves_nothing_whole(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, cells: int, error: BaseException | None
+) -> None:
+    """A notebook that does not reach its end is kept apart, and none of its results is."""
+    replaced(monkeypatch, Papermill(cells, error))
+    with pytest.raises(type(error) if error else RuntimeError, match=None if error else "cell 1"):
+        execute.execute("full", "03_tiny", {})
+    assert [path.name for path in folder.iterdir()] == ["04_other.json"]
+    assert (folder.parent / "failed/full/03_tiny.ipynb").is_file()
+
+
+def test_results_of_an_unfinished_notebook_are_refused(folder: Path) -> None:
+    """Nothing is read of a notebook that runs, or was killed; its file says which one."""
+    assert paths.finished("full", "03_tiny") == "03_tiny"
+    paths.unfinished("full", "03_tiny").touch()
+    run = Run("03_tiny", {"results": "full", "frames": 3})
+    with pytest.raises(RuntimeError, match=rf"Unfinished notebook '03_tiny'.*'{folder}/\.03_tiny"):
+        run.open("03_tiny")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("frmaes: 3", r"Unknown parameter 'frmaes' in '.*a\.yaml'\. Must be one of \['frames',"),
+        ("frames: 3\nframes: 4", r"a\.yaml, line 2.*Repeated key 'frames'"),
+        (
+            "frames: '3'",
+            r"Invalid parameter 'frames' in '.*': '3'. Must be a whole number, as 3 is",
+        ),
+        ("frames: 3.5", "Must be a whole number"),
+        ("frames: true", "Must be a whole number"),
+        ("frames: -3", r"Invalid parameter 'frames' = -3 in '.*'. Must be >= 0"),
+        ("frames: [3]", "Must be a whole number"),
+        ("frames:", "None. Must be a whole number"),
+        ("rate: 1e3", "rate|number"),
+        ("rate: .inf", "finite"),
+        ("known: 1", "Must be true or false"),
+        ("recorded: 3", "Must be text"),
+        ("noise: 0.1", "Must be a list"),
+        ("noise: [0.1, x]", "Invalid entry 1 of parameter 'noise' in .*: 'x'. Must be a number"),
+        ("plate: [2, 3]", "Must be a mapping"),
+        ("plate: {shape: 2}", "Invalid 'shape' of parameter 'plate'.*Must be a list"),
+        ("- frames", "Must be a mapping"),
+    ],
+)
+def test_values_are_refused(project: Path, text: str, message: str) -> None:
+    """A file with other names, kinds, or two of one name is refused before the notebook runs."""
+    path = project / "a.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        parameters.read("03_tiny", [path])
+
+
+def test_values_are_taken_in_order(project: Path) -> None:
+    """A later file's value replaces an earlier one's, and a text replaces both, once."""
+    for name, text in (("a", "frames: 4\nrate: 3\nplate: {shape: []}"), ("b", "frames: 5")):
+        (project / f"{name}.yaml").write_text(text)
+    files = [project / "a.yaml", project / "b.yaml"]
+    values = parameters.read("03_tiny", files, [("recorded", "there")])
+    assert values == {"frames": 5, "rate": 3, "plate": {"shape": []}, "recorded": "there"}
+    with pytest.raises(ValueError, match="Repeated parameter 'recorded' of '03_tiny'"):
+        parameters.read("03_tiny", files, [("recorded", "a"), ("recorded", "b")])
+    with pytest.raises(ValueError, match="Unknown parameter 'recordings' in the texts"):
+        parameters.read("03_tiny", files, [("recordings", "a")])
+
+
+@pytest.mark.usefixtures("project")
+def test_what_papermill_injects_is_checked() -> None:
+    """A run that papermill started by itself, with a name that the notebook has not, is refused."""
+    namespace = {"results": "smoke", "frames": 3, "frmaes": 4, "In": ["", CELL]}
+    assert Run("03_tiny", namespace).name == "smoke"
+    namespace["In"] = ["", CELL, "# Parameters\nfrmaes = 4\n"]
+    with pytest.raises(ValueError, match="Unknown parameter 'frmaes' in what '03_tiny' was run"):
+        Run("03_tiny", namespace)
+
+
+def test_parameters_are_refused_before_the_notebook_runs(
+    folder: Path, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command says what is wrong, fails, and leaves what is there."""
+    (project / "a.yaml").write_text("frmaes: 3")
+    assert execute.main(["full", "03_tiny", "-f", "a.yaml"]) == 1
+    assert "full/03_tiny: Unknown parameter 'frmaes' in 'a.yaml'" in capsys.readouterr().err
+    assert (folder / "03_tiny.ipynb").is_file()

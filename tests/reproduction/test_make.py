@@ -1,0 +1,233 @@
+"""Tasks of the Makefile, in a small checkout of its own: killed, two at a time, odd names."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from reproduction import locked
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOK = """\
+import time
+from pathlib import Path
+
+from reproduction.run import Run
+
+run = Run("01_tiny", globals())
+run.finish({"number": number})
+while Path("../hold").exists():
+    time.sleep(0.02)
+"""
+TARGET = "results/full/01_tiny.ipynb"
+
+
+def script(path: Path, text: str) -> Path:
+    """Make a program of the shell."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Checkout with one notebook, which waits while the file `hold` is there; its name is odd."""
+    root = tmp_path / "it's $HOME; here"
+    shutil.copytree(ROOT / "notebooks/reproduction", root / "notebooks/reproduction")
+    shutil.copy(ROOT / "Makefile", root)
+    for name in ("data_manifest.yaml", "pyproject.toml", "requirements.lock"):
+        (root / name).touch()
+    small = nbformat.v4.new_code_cell('results = "smoke"\nnumber = 1')
+    small.metadata["tags"] = ["parameters"]
+    notebook = nbformat.v4.new_notebook(cells=[small, nbformat.v4.new_code_cell(NOTEBOOK)])
+    notebook.metadata.kernelspec = {"name": "python3", "language": "python", "display_name": ""}
+    nbformat.write(notebook, root / "notebooks/01_tiny.ipynb")
+    (root / "params/recorded").mkdir(parents=True)
+    (root / "params/01_tiny.yaml").write_text("results: full\nnumber: 2\n")
+    packages = f'PYTHONPATH="$PYTHONPATH:{ROOT}" exec {sys.executable} "$@"'
+    script(root / ".venv/bin/python", packages)
+    (root / ".venv/share/ipython").mkdir(parents=True)
+    (root / ".venv/installed").touch()
+    for name in (locked.HELD, locked.LOCKED, "MAKEFLAGS", "MFLAGS", "MAKELEVEL", "DBTHERMAL_DATA"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("PYTHON", sys.executable)
+    monkeypatch.chdir(root)
+    return root
+
+
+def make(*goals: str) -> subprocess.CompletedProcess[str]:
+    """Run make to its end."""
+    return subprocess.run(["make", *goals], capture_output=True, text=True, check=False, timeout=60)
+
+
+@pytest.fixture
+def started() -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Starter of a make in a process group of its own, which is killed at the end."""
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def start(*goals: str) -> subprocess.Popen[bytes]:
+        processes.append(subprocess.Popen(["make", *goals], start_new_session=True))
+        return processes[-1]
+
+    yield start
+    for process in processes:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def wait_for(path: Path) -> None:
+    """Wait until a file is there."""
+    end = time.monotonic() + 30
+    while not path.exists():
+        assert time.monotonic() < end, path
+        time.sleep(0.01)
+
+
+def numbers(root: Path) -> object:
+    """Headline numbers that the notebook kept."""
+    return json.loads((root / "results/full/01_tiny.json").read_text())["numbers"]
+
+
+Start = Callable[..., subprocess.Popen[bytes]]
+
+
+def test_a_killed_notebook_runs_again(checkout: Path, started: Start) -> None:
+    """Killed in a cell, the notebook has no name, its numbers are refused, and it runs anew."""
+    (checkout / "hold").touch()
+    process = started(TARGET)
+    wait_for(checkout / "results/full/01_tiny.json")
+    beside = make("check")  # any task
+    assert beside.returncode == 2
+    assert f"Another make is at work in '{checkout}': 'make {TARGET}', process" in beside.stderr
+    os.killpg(process.pid, signal.SIGKILL)
+    assert not (checkout / TARGET).exists()
+    refused = make("verify")
+    assert refused.returncode == 2
+    assert "Unfinished notebook '01_tiny' of run 'full'" in refused.stderr
+    (checkout / "hold").unlink()
+    again = make(TARGET)
+    assert again.returncode == 0, again.stderr
+    assert numbers(checkout) == {"number": 2}
+    assert sorted(path.name for path in (checkout / "results/full").iterdir()) == [
+        "01_tiny.ipynb",
+        "01_tiny.json",
+    ]
+    assert "up to date" in make(TARGET).stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("victim", "moment"),
+    [
+        ("kernel", "01_tiny.json"),
+        *((victim, ".01_tiny.part.ipynb") for victim in ("make", "group", "ctrl-c", "terminate")),
+        *((victim, "01_tiny.json") for victim in ("make", "ctrl-c", "terminate")),
+    ],
+)
+def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment: str) -> None:
+    """Without make, the runner or the kernel nothing goes on, and the next make does all anew."""
+    (checkout / "hold").touch()
+    process = started(TARGET)
+    wait_for(checkout / "results/full" / moment)
+    if victim == "kernel":
+        (kernel,) = kernels(checkout)
+        os.kill(kernel, signal.SIGKILL)
+    elif victim in {"make", "terminate"}:
+        process.send_signal(signal.SIGKILL if victim == "make" else signal.SIGTERM)
+    else:
+        os.killpg(process.pid, signal.SIGINT if victim == "ctrl-c" else signal.SIGKILL)
+    assert process.wait(30) != 0
+    (checkout / "hold").unlink()
+    assert not (checkout / TARGET).exists()
+    again = make(TARGET)
+    assert again.returncode == 0, again.stderr
+    assert numbers(checkout) == {"number": 2}
+    assert not kernels(checkout)
+
+
+def kernels(root: Path) -> list[int]:
+    """Process numbers of the kernels that run in a checkout."""
+    found = subprocess.run(["pgrep", "-f", "ipykernel_launcher"], capture_output=True, check=False)
+    pids = [int(pid) for pid in found.stdout.split()]
+    return [pid for pid in pids if Path(f"/proc/{pid}/cwd").resolve() == root / "notebooks"]
+
+
+def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names of files and folders, and values from outside, are never read by a shell."""
+    odd = ["'; touch pwned; '", "$(touch pwned)", "`touch pwned`", "a;touch pwned", "a b\nc", "#%:"]
+    for name in odd:
+        for folder in ("data", "dbthermal", "notebooks/reproduction", "params/recorded"):
+            (checkout / folder).mkdir(exist_ok=True)
+            (checkout / folder / f"{name}.yaml").touch()
+        (checkout / "notebooks" / f"02_{name}.ipynb").touch()
+        mirror = checkout / "mirrors" / name
+        mirror.mkdir(parents=True)
+        monkeypatch.setenv("DBTHERMAL_DATA", str(mirror))
+        done = make("results/inputs.txt")
+        assert (done.returncode, done.stderr) == (0, "")
+        assert (checkout / "results/inputs.txt").read_text().startswith(f"DBTHERMAL_DATA={mirror}")
+        assert "up to date" in make("results/inputs.txt").stdout
+        monkeypatch.setenv("PYTHON", f"./python {name.replace('/', '')}")
+        assert "Invalid Python './python" in make("smoke").stderr
+        monkeypatch.setenv("PYTHON", sys.executable)
+    planned = make("--dry-run", "full", "smoke", "chain")
+    assert planned.returncode == 0, planned.stderr
+    assert "reproduction.execute full 01_tiny" in planned.stdout
+    assert "02_" not in planned.stdout
+    assert not list(checkout.rglob("pwned"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("JOBS", "2; touch pwned", "Invalid JOBS '2; touch pwned'. Must be a whole number"),
+        ("JOBS", "0", "Invalid JOBS '0'"),
+        ("DBTHERMAL_DATA", "$(touch pwned)", "Invalid DBTHERMAL_DATA '$(touch pwned)'. Must name"),
+    ],
+)
+def test_values_are_refused(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str, message: str
+) -> None:
+    """A value that make cannot use is refused before anything runs."""
+    monkeypatch.setenv(name, value)
+    done = make("results/inputs.txt")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not list(checkout.rglob("pwned"))
+    assert not (checkout / "results").exists()
+
+
+def test_an_interrupted_install_is_done_anew(checkout: Path, started: Start) -> None:
+    """What a killed pip left goes, for pip would take it for whole; `installed` comes last."""
+    shutil.rmtree(checkout / ".venv")
+    # A Python whose environment has a pip that first leaves half a package, and then succeeds.
+    pip = 'if test -e hold; then mkdir -p .venv/lib/half; sleep 60; else echo "$@" >> calls; fi'
+    venv = f"mkdir -p .venv/bin; printf '#!/bin/sh\\n%s\\n' '{pip}' > .venv/bin/python"
+    python = script(
+        checkout / "fake python",
+        f'if test "$2" = venv; then {venv}; chmod +x .venv/bin/python\n'
+        f'else exec {sys.executable} "$@"; fi',
+    )
+    (checkout / "hold").touch()
+    process = started("install", f"PYTHON=./{python.name}")
+    wait_for(checkout / ".venv/lib/half")
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (checkout / ".venv/installed").exists()
+    (checkout / "hold").unlink()
+    done = make("install", f"PYTHON=./{python.name}")
+    assert done.returncode == 0, done.stderr
+    assert not (checkout / ".venv/lib/half").exists()
+    assert (checkout / ".venv/installed").exists()
+    assert not (checkout / ".venv/installing").exists()
+    assert len((checkout / "calls").read_text().splitlines()) == 2  # pip itself, then the packages

@@ -1,0 +1,245 @@
+"""No fault in a store passes as data: every file is as it was written, or an error names it."""
+
+import json
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import store
+from dbthermal.schema import Variable
+
+KINDS = ("result", "recording", "cut short")
+VARIABLES = {
+    "counts": Variable(("band", "time", "y", "x"), "uint16", "count", "raw counts"),
+    "exposure_time": Variable(("band", "time"), "float64", "s", "time of exposure"),
+    "log_time": Variable(("log",), "float64", "s", "time of a note"),
+    "log_value": Variable(("log",), "float64", "1", "value of a note"),
+}
+
+
+def record(path: Path, *, close: bool) -> store.Recording:
+    """Two bands in chunks of two frames, the second one frame behind, zeros among them."""
+    rng = np.random.default_rng(1)
+    sizes = {"y": 3, "x": 4}
+    recording = store.Recording(path, VARIABLES, sizes, ["8-14", "9.5"], chunk=2, attrs={"a": "b"})
+    for start in range(0, 6, 2):
+        for band, number in (("8-14", 2), ("9.5", 2 if start < 4 else 1)):
+            counts = rng.integers(0, 60000 * (start > 0) + 1, (number, 3, 4)).astype("uint16")
+            times = start / 60 + np.arange(number) / 60
+            recording.append(band, {"counts": counts, "exposure_time": times})
+        rows = {"log_time": np.array([start / 60]), "log_value": np.array([0.0])}
+        recording.append_log(rows)
+        recording.commit()
+    if close:
+        recording.close(time=np.arange(6) / 60)
+    return recording
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A result, a recording, and one that was cut short."""
+    folder = tmp_path_factory.mktemp("whole")
+    paths = {kind: folder / f"{kind}.zarr" for kind in KINDS}
+    record(paths["recording"], close=True)
+    record(paths["cut short"], close=False)
+    result = xr.Dataset(
+        {
+            "counts": (("time", "y", "x"), np.arange(9e5, dtype="float32").reshape(3, 600, 500)),
+            "object_temperature": (("time", "y", "x"), np.full((3, 600, 500), np.nan, "float32")),
+            "status": (("y", "x"), np.zeros((600, 500), "uint32"), {"units": "1"}),
+        },
+        {"band": ["8-14", "9.5"], "material": "glass", "time": [0.0, 0.1, 0.2]},
+    )
+    store.save(result, paths["result"], {"parameters": {"frames": 3}})
+    return paths
+
+
+def files(path: Path) -> list[Path]:
+    """All files of a store, in order."""
+    return sorted(file for file in path.rglob("*") if file.is_file())
+
+
+def chunks(path: Path) -> list[Path]:
+    """All chunks of a store, in order."""
+    return [file for file in files(path) if "c" in file.relative_to(path).parts]
+
+
+def flip(file: Path, rng: np.random.Generator) -> None:
+    """Flip one bit."""
+    content = bytearray(file.read_bytes())
+    bit = int(rng.integers(8 * len(content)))
+    content[bit // 8] ^= 1 << bit % 8
+    file.write_bytes(content)
+
+
+def outcome(path: Path, whole: Path, fault: Callable[[Path], Path]) -> str:
+    """Result of a fault in a copy of a store: refused by name, harmless, or silent."""
+    shutil.copytree(whole, path)
+    damaged = fault(path).relative_to(path)
+    message = ""
+    try:
+        opened = store.open_dataset(path).load()
+    except ValueError as error:
+        message = str(error)
+    shutil.rmtree(path)
+    if not message:
+        return "harmless" if opened.identical(store.open_dataset(whole).load()) else "silent"
+    named = re.fullmatch(
+        rf"(Damaged|Missing|Foreign) file '(.*)' of (array '(.*)' in )?store '{path}'\. .*", message
+    )
+    assert named, message
+    if damaged.name != "SHA256SUMS":  # whose lines may then name any file
+        assert named[2].startswith(damaged.as_posix())
+        assert named[4] == (named[2].split("/")[0] if "/" in named[2] else None)
+    return "refused"
+
+
+@pytest.mark.parametrize(
+    ("flips", "removals"), [(40, 12), pytest.param(240, 48, marks=pytest.mark.slow)]
+)
+def test_no_single_fault_is_silent(
+    stores: dict[str, Path], tmp_path: Path, flips: int, removals: int
+) -> None:
+    """A flipped bit in any file, and any missing chunk, is refused by name, or changes nothing."""
+    rng = np.random.default_rng(3)
+
+    def flipped(path: Path) -> Path:
+        file = files(path)[rng.integers(len(files(path)))]
+        flip(file, rng)
+        return file
+
+    def removed(path: Path) -> Path:
+        file = chunks(path)[rng.integers(len(chunks(path)))]
+        file.unlink()
+        return file
+
+    for name, fault, number in (("bits", flipped, flips), ("missing chunks", removed, removals)):
+        found: dict[str, Counter[str]] = {kind: Counter() for kind in KINDS}
+        for place in range(number):
+            kind = KINDS[place % len(KINDS)]
+            found[kind][outcome(tmp_path / "a.zarr", stores[kind], fault)] += 1
+        print(f"{number} {name}: { {kind: dict(counted) for kind, counted in found.items()} }")
+        for kind in KINDS[:2]:
+            assert found[kind].keys() == {"refused"}
+        # What was written behind the valid part of a recording is not read.
+        assert found["cut short"]["silent"] == 0
+        assert found["cut short"]["refused"] > number // 6
+
+
+def cut(path: Path) -> Path:
+    """Cut a chunk."""
+    chunk = chunks(path)[0]
+    chunk.write_bytes(chunk.read_bytes()[:-1])
+    return chunk
+
+
+def emptied(path: Path) -> Path:
+    """Leave a chunk's name alone."""
+    chunks(path)[0].write_bytes(b"")
+    return chunks(path)[0]
+
+
+def swapped(path: Path) -> Path:
+    """Let two chunks of an array change places: their codec finds no fault."""
+    first, second, *_ = (file for file in chunks(path) if "counts" in file.parts)
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+    return path / "counts"
+
+
+def no_attributes(path: Path) -> Path:
+    """Lose the attributes of the store."""
+    (path / "zarr.json").unlink()
+    return path / "zarr.json"
+
+
+def no_checksums(path: Path) -> Path:
+    """Lose the checksums."""
+    (path / "SHA256SUMS").unlink()
+    return path / "SHA256SUMS"
+
+
+def cut_checksums(path: Path) -> Path:
+    """Lose the last half of the checksums."""
+    file = path / "SHA256SUMS"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    return file
+
+
+def no_array(path: Path) -> Path:
+    """Lose the first array."""
+    shutil.rmtree(path / "band")
+    return path / "band"
+
+
+def older_array(path: Path) -> Path:
+    """Bring the metadata of an array into an earlier state."""
+    file = files(path / "band")[-1]
+    file.write_text(file.read_text().replace('"shape"', '"shape" '))
+    return file
+
+
+FAULTS = [cut, emptied, swapped, no_attributes, no_checksums, cut_checksums, no_array, older_array]
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_faults_of_files_are_refused(
+    stores: dict[str, Path], tmp_path: Path, kind: str, fault: Callable[[Path], Path]
+) -> None:
+    """A store that was cut, mixed, or copied in part is refused, with the file and the array."""
+    assert outcome(tmp_path / "a.zarr", stores[kind], fault) == "refused"
+
+
+@pytest.mark.parametrize("kind", KINDS[:2])
+def test_foreign_files_are_refused(stores: dict[str, Path], tmp_path: Path, kind: str) -> None:
+    """A file that was not written into the store is refused; a hidden one is passed over."""
+
+    def foreign(path: Path) -> Path:
+        (path / "band" / "c" / "0.copy").touch()
+        return path / "band" / "c" / "0.copy"
+
+    def hidden(path: Path) -> Path:
+        (path / ".DS_Store").touch()
+        return path / ".DS_Store"
+
+    assert outcome(tmp_path / "a.zarr", stores[kind], foreign) == "refused"
+    assert outcome(tmp_path / "a.zarr", stores[kind], hidden) == "harmless"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_store_without_checksums_opens_with_a_warning(
+    stores: dict[str, Path], tmp_path: Path, kind: str
+) -> None:
+    """A store of dbthermal 0.1.0 opens as before, and says that damage is not seen."""
+    path = shutil.copytree(stores[kind], tmp_path / "a.zarr")
+    (path / "SHA256SUMS").unlink()
+    content = json.loads((path / "zarr.json").read_text())
+    del content["attributes"]["checksums"]
+    (path / "zarr.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"No checksums in '.*a\.zarr': damage is not seen"):
+        opened = store.open_dataset(path)
+    xr.testing.assert_identical(opened, store.open_dataset(stores[kind]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_array_has_a_checksum_codec(stores: dict[str, Path], kind: str) -> None:
+    """Another reader of zarr sees a damaged chunk too."""
+    for file in stores[kind].glob("*/zarr.json"):
+        assert json.loads(file.read_text())["codecs"][-1] == {"name": "crc32c"}
+
+
+def test_recording_is_read_while_it_grows(tmp_path: Path) -> None:
+    """Values that were valid when it was opened are read, though their files were replaced."""
+    recording = record(tmp_path / "a.zarr", close=False)
+    opened = store.open_dataset(tmp_path / "a.zarr")
+    recording.append_log({"log_time": np.array([9.0]), "log_value": np.array([9.0])})
+    recording.close()
+    assert opened["log_value"].values.tolist() == [0.0, 0.0, 0.0]
