@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import maximum_filter1d, median_filter
-from scipy.special import ndtri
 
+from dbthermal import _samples as samples
 from dbthermal import schema
 from dbthermal.correction._nonuniformity import OUTLIER
 from dbthermal.noise import MAD
@@ -21,12 +21,6 @@ Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-# Fewest frames from which a pixel is judged.
-_MINIMUM_FRAMES: Final = 16
-# Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
-_QUIET = 0.8
-# Mean magnitude of that share of a standard normal distribution.
-_QUIET_MEAN = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
 # A pixel is held against those around it: the median of a window this wide, and the eight nearest.
 _WINDOW = 5
 _NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
@@ -99,7 +93,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     >>> np.argwhere(marked.status.values).tolist(), marked.jumping_pixels
     ([[5, 7]], 1)
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = schema.check_corrected(corrected)["counts"]
     if not threshold > 0:
         raise ValueError(f"Invalid threshold {threshold} of bad pixels. Must be positive.")
     segment = corrected["segment"].values if "segment" in corrected else None
@@ -108,15 +102,15 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     reach = _reach(counts["time"].values.astype(np.float64))
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
-        frames = _frames(movie, max(_MINIMUM_FRAMES, 2 * reach + 3))
+        frames = _frames(movie, max(samples.MINIMUM_FRAMES, 2 * reach + 3))
         part = np.zeros(frames.size) if segment is None else segment[frames]
         movie, stepped = movie.isel(time=frames), np.diff(part) != 0
         level = _noise(movie)
         known = np.isfinite(level)
         if not known.any():
             raise ValueError(
-                f"Invalid band '{movie['band'].item()}': no pixel has {_MINIMUM_FRAMES} samples "
-                "that are not NaN. Must have them, to be judged."
+                f"Invalid band '{movie['band'].item()}': no pixel has "
+                f"{samples.MINIMUM_FRAMES} samples that are not NaN. Must have them, to be judged."
             )
         unjudged |= ~known
         usual = np.where(known, level, np.median(level[known]))
@@ -133,9 +127,62 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     )
 
 
+def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> xr.Dataset:
+    """
+    Mark pixels that are clipped at a level below the end of the raw counts, or frozen for a while.
+
+    The counts (band, time, y, x) are raw, where nothing has been rounded yet; samples that are NaN
+    in the corrected dataset do not count. Frozen pixels are looked for only where the frames of a
+    closed `shutter` were taken out. See `_samples`.
+    """
+    saturated, frozen = (np.zeros((raw.sizes["y"], raw.sizes["x"]), dtype=bool) for _ in range(2))
+    for movie, measured in zip(raw, corrected["counts"], strict=True):
+        clipped, still = _repeats(movie, measured)
+        saturated |= clipped
+        frozen |= still & shutter
+    bits = saturated * np.uint32(Status.SATURATED) | frozen * np.uint32(Status.FROZEN_FRAMES)
+    status = corrected["status"].values.astype(np.uint32) | bits
+    return corrected.assign(status=(("y", "x"), status, schema.status_attrs())).assign_attrs(
+        saturated_pixels=int(np.count_nonzero(status & np.uint32(Status.SATURATED))),
+        frozen_pixels=int(frozen.sum()),
+    )
+
+
+def _repeats(movie: xr.DataArray, measured: xr.DataArray) -> tuple[Mask, Mask]:
+    """
+    Pixels (y, x) of one band, raw counts (time, y, x), that are clipped, and that are frozen.
+
+    A level on which several pixels have their highest or lowest samples is the camera's: all pixels
+    that reach it are clipped, be it once.
+    """
+    image = (movie.sizes["y"], movie.sizes["x"])
+    middle = movie.isel(y=image[0] // 2).values
+    grain = samples.grain(middle, np.ones(middle.shape, dtype=bool))
+    clipped, frozen = np.zeros(image, dtype=bool), np.zeros(image, dtype=bool)
+    ends = np.zeros((2, 3, *image))
+    for rows in _blocks(movie):
+        counts = movie.isel(y=rows).values.reshape(len(movie), -1)
+        valid = np.isfinite(measured.isel(y=rows).values).reshape(counts.shape)
+        still = samples.frozen(samples.repeated(counts, valid), grain.chance)
+        frozen[rows] = still.reshape(-1, image[1])
+        for highest in (False, True):
+            end, number = samples.end_of(counts, valid, highest=highest)
+            parts = (end, number, samples.near_end(counts, valid, end, grain))
+            ends[int(highest), :, rows] = np.reshape(parts, (3, -1, image[1]))
+    moving = ends[0, 0] < ends[1, 0]
+    for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
+        clipped |= moving & samples.is_heap(number, near, grain)
+        level = moving & (end == sign * np.max(sign * end[moving], initial=-np.inf))
+        first = level.sum() - 1  # one sample of each makes its end
+        clipped |= level & samples.is_heap(
+            number[level].sum() - first, near[level].sum() - first, grain
+        )
+    return clipped, frozen & moving
+
+
 def _reach(time: Array) -> int:
     """Frames by which neighbours may show a change earlier or later."""
-    if time.size < _MINIMUM_FRAMES:
+    if time.size < samples.MINIMUM_FRAMES:
         return _REACH_FRAMES
     return max(_REACH_FRAMES, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
 
@@ -161,27 +208,11 @@ def _blocks(movie: xr.DataArray) -> list[slice]:
 
 
 def _noise(movie: xr.DataArray) -> Array:
-    """Noise (y, x) [count] from the quiet part of the second differences; NaN of too few frames."""
+    """Noise (y, x) [count] of each pixel; NaN of too few frames."""
     level = np.empty((movie.sizes["y"], movie.sizes["x"]))
     for rows in _blocks(movie):
-        signal = movie.isel(y=rows).values.astype(np.float32)
-        valid = np.isfinite(signal)
-        frames = valid.sum(axis=0)
-        if not valid.all():
-            # The samples of each pixel that are no measurement go behind the others.
-            order = np.argsort(~valid, axis=0, kind="stable")
-            signal = np.take_along_axis(np.where(valid, signal, np.inf), order, axis=0)
-        with np.errstate(invalid="ignore"):
-            second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
-        quiet = np.maximum((_QUIET * (frames - 2)).astype(np.intp), 1)
-        if valid.all():
-            second.partition(int(quiet[0, 0]), axis=0)
-        else:
-            second.sort(axis=0)
-        used = np.arange(len(second))[:, np.newaxis, np.newaxis] < quiet
-        total = second.sum(axis=0, dtype=np.float64, where=used)
-        level[rows] = np.where(frames < _MINIMUM_FRAMES, np.nan, total / quiet)
-    return np.asarray(level / (_QUIET_MEAN * np.sqrt(1.5)))
+        level[rows] = samples.noise(movie.isel(y=rows).values.astype(np.float32))
+    return level
 
 
 def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
@@ -205,8 +236,8 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
         changes = _changes(movie.isel(y=slice(top, bottom)).values.astype(np.float32), stepped)
         here = slice(rows.start - top, rows.stop - top)
         for sign in (1.0, -1.0):
-            signed = (np.float32(sign) * part for part in changes)
-            jumping[rows] |= _alone(*signed, limit[top:bottom], reach)[here]
+            change, seen = (np.float32(sign) * part for part in changes)
+            jumping[rows] |= _alone(change, seen, limit[top:bottom], reach)[here]
     return jumping
 
 

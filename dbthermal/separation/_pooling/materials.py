@@ -156,7 +156,7 @@ def materials(
 
 
 def _check(result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolution: float) -> None:
-    schema.check(corrected, "corrected")
+    schema.check_corrected(corrected)
     for name, value in (("error_rate", error_rate), ("resolution", resolution)):
         if not 0 < value < 1:
             raise ValueError(f"Invalid {name} {value}. Must lie in (0, 1).")
