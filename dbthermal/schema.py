@@ -94,6 +94,9 @@ FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uin
 SHUTTER_CLOSED: Final = "shutter_closed"
 """Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
 
+NOISE_FACTOR: Final = _of("band", "1", "noise over that before the alignment")
+"""Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
+
 SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
 """Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
 
@@ -159,6 +162,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "frame_flags": FRAME_FLAGS,
             "segment": SEGMENT,
             "drift": _of("band time", "count", "drift taken out"),
+            "noise_factor": NOISE_FACTOR,
             "status": _STATUS,
         },
         "blackbody_frames": {"noise": NOISE},
@@ -362,11 +366,13 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
     """
     Positions of bands on the dimension `band`, by name as text; the label names the array.
 
-    Raises ValueError if there is no coordinate `band`, or a band is missing.
+    Raises ValueError if there is no coordinate `band`, or a band is missing or repeated.
     """
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
     names = [str(name) for name in np.atleast_1d(array["band"].values)]
+    if len(set(names)) != len(names):
+        raise ValueError(f"Repeated band in {names} of {label}. Each band must occur once.")
     missing = [name for name in wanted if name not in names]
     if missing:
         raise ValueError(f"Missing band '{missing[0]}' in {label}. Has {names}.")

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
+from dbthermal._coordinates import laid_on
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -155,15 +156,11 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
         return np.zeros(shape, dtype=bool)
     if closed.dtype != bool:
         raise TypeError(f"Invalid dtype {closed.dtype} of the closed frames. Must be bool.")
-    if closed.dims not in {("time",), ("band", "time")} or closed.sizes["time"] != shape[1]:
+    if closed.dims not in {("time",), ("band", "time")}:
         raise ValueError(
-            f"Invalid closed frames of sizes {dict(closed.sizes)}. Must be (time) or "
-            f"(band, time), of {shape[1]} frames."
+            f"Invalid dims {closed.dims} of the closed frames. Must be (time) or (band, time)."
         )
-    if "band" in closed.dims:
-        names = [str(name) for name in counts["band"].values]
-        places = schema.band_positions(closed, names, "the closed frames")
-        closed = closed.isel(band=places)
+    closed = laid_on(closed, counts, "the closed frames", "the capture")
     return np.broadcast_to(closed.values, shape)
 
 
@@ -240,6 +237,9 @@ def _positions(events: xr.Dataset, counts: xr.DataArray) -> tuple[Integers, Inte
             f"Invalid event of frames {first[wrong[0]]} to {after[wrong[0]] - 1}. Must lie in "
             f"[0, {counts.sizes['time'] - 1}], not fall."
         )
+    if "start" in events:
+        starts = events["start"].rename(event="time").assign_coords(time=events["start"].values)
+        laid_on(starts, counts.isel(time=first), "the events", "the capture")
     return first, after, bands
 
 

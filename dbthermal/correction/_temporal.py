@@ -6,6 +6,7 @@ import xarray as xr
 
 from dbthermal import _smooth as smooth
 from dbthermal import planck, schema
+from dbthermal._coordinates import laid_on
 
 Array = npt.NDArray[np.float64]
 
@@ -159,14 +160,11 @@ def _noise_amplification(ratio: Array) -> Array:
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:
     """Good pixels (y, x) of the reference patch."""
-    image = tuple(corrected.sizes[dim] for dim in ("y", "x"))
     if reference.dtype != bool:
         raise TypeError(f"Invalid dtype {reference.dtype} of the reference. Must be bool.")
-    if reference.dims != ("y", "x") or reference.shape != image:
-        raise ValueError(
-            f"Invalid reference of sizes {dict(reference.sizes)}. Must be (y, x), of {image}."
-        )
-    good = reference.values.copy()
+    if reference.dims != ("y", "x"):
+        raise ValueError(f"Invalid dims {reference.dims} of the reference. Must be ('y', 'x').")
+    good = laid_on(reference, corrected, "the reference", "the capture").values.copy()
     if "status" in corrected:
         good &= corrected["status"].values == 0
     if not good.any():
