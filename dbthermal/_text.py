@@ -19,8 +19,10 @@ TEXT_LIMIT: Final = 2**26
 YAML_LIMIT: Final = 2**22
 """Largest YAML file that is read [byte]."""
 
+SHOWN: Final = 60
+"""Longest value in a message [character]."""
+
 _DEPTH: Final = 50  # of nested lists and mappings in YAML
-_SHOWN: Final = 60  # characters of a value in a message
 _LARGEST: Final = 2**53  # up to here whole numbers are exact also as float
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 _DECIMAL: Final = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
@@ -87,7 +89,7 @@ def at(source: str, line: int, column: int | None = None) -> str:
 def shown(value: object) -> str:
     """Value as a message shows it: in one line, and cut where it is long."""
     text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}... ({len(text)} characters)"
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} characters)"
 
 
 def number(text: str, place: str) -> float:
@@ -233,7 +235,7 @@ class _Builder:
         is_text = self.resolver.resolve(ScalarNode, text, (True, False)).endswith(":str")
         if not is_text or _DECIMAL.fullmatch(text) or re.fullmatch("0o[0-7]+", text):
             rule = "Must be a finite decimal number, true, false, or in quotes if it is text"
-            self._refuse(event, f"value {text[:_SHOWN]}", rule)
+            self._refuse(event, f"value {text[:SHOWN]}", rule)
         return text
 
     def _at(self, event: Any) -> str:

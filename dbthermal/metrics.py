@@ -1,14 +1,16 @@
 """Agreement of an estimate with a reference: maps, and temperatures as the paper compares them.
 
-Both take labelled arrays of the same coordinates; a shorter array, such as a curve in time, is
-broadcast over the pixels. A value inside the mask that is not finite is an error: an average over
-the pixels that happened to work would flatter the method.
+Both take labelled arrays of the same coordinates, bands by name; an array of fewer dims, such as a
+curve in time, is broadcast over the pixels. A value inside the mask that is not finite is an error:
+an average over the pixels that happened to work would flatter the method.
 """
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
+
+from dbthermal._coordinates import laid_on
 
 __all__ = ["correlation", "relative_error_celsius"]
 
@@ -51,7 +53,7 @@ def correlation(
     >>> round(float(correlation(emissivity, 290.0 + 10.0 * emissivity)), 6)
     1.0
     """
-    first, second = xr.broadcast(*xr.align(first, second, join="exact"))
+    first, second = xr.broadcast(first, laid_on(second, first, "the second map", "the first"))
     left, right = (_centred(values, mask) for values in (first, second))
     norm = np.linalg.norm(left, axis=-1) * np.linalg.norm(right, axis=-1)
     if np.any(norm <= 0):
@@ -102,7 +104,7 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
             f"Invalid true temperature {truth.values[bad].flat[0]} K. Must be above "
             f"{zero_Celsius} K, the zero of degrees Celsius."
         )
-    estimate, truth = xr.align(estimate, truth, join="exact")
+    truth = laid_on(truth, estimate, "the truth", "the estimate")
     result = 100.0 * abs(estimate - truth) / (truth - zero_Celsius)
     label = "error relative to the true temperature in degrees Celsius"
     return _labelled(result, "relative_error", "percent", label)
@@ -117,7 +119,7 @@ def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
     if mask is not None:
         if mask.dtype != bool or {*mask.dims} != {"y", "x"}:
             raise ValueError(f"Invalid mask {mask.dims} of {mask.dtype}. Must be bool, (y, x).")
-        mask = xr.align(mask, maps, join="exact")[0].transpose("y", "x")
+        mask = laid_on(mask, maps, "the mask", "the map").transpose("y", "x")
         chosen = chosen[..., mask.values.ravel()]
     if chosen.shape[-1] < 2:
         raise ValueError(f"Invalid mask: {chosen.shape[-1]} pixels remain. Must keep at least 2.")

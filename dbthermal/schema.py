@@ -31,6 +31,7 @@ __all__ = [
     "Variable",
     "band_positions",
     "check",
+    "check_corrected",
     "check_variable",
     "has_flag",
     "nomenclature",
@@ -92,6 +93,9 @@ FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uin
 
 SHUTTER_CLOSED: Final = "shutter_closed"
 """Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
+
+NOISE_FACTOR: Final = _of("band", "1", "noise over that before the alignment")
+"""Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
 
 SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
 """Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
@@ -158,6 +162,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "frame_flags": FRAME_FLAGS,
             "segment": SEGMENT,
             "drift": _of("band time", "count", "drift taken out"),
+            "noise_factor": NOISE_FACTOR,
             "status": _STATUS,
         },
         "blackbody_frames": {"noise": NOISE},
@@ -224,11 +229,11 @@ class Status(Flags):
     NONPHYSICAL_EMISSIVITY = 1 << 4, "estimate outside (0, 1): no background temperature"
     INVALID_SAMPLES = 1 << 5, "too many samples NaN, infinite or masked: nothing is estimated"
     CONSTANT_SIGNAL = 1 << 6, "the signal of a band never changes: nothing is estimated"
-    SATURATED = 1 << 7, "samples at the detector's limit"
+    SATURATED = 1 << 7, "samples at the detector's limit, or heaped on one level"
     OBJECT_NOT_SMOOTH = 1 << 8, "object changes too fast for a smooth curve, or noise is higher"
     OUTSIDE_RESPONSE = 1 << 9, "a temperature outside the calibrated range of the response"
     DEAD_PIXEL = 1 << 10, "bad pixel, marked by the correction"
-    FROZEN_FRAMES = 1 << 11, "the same counts in both bands for several frames, read as signal"
+    FROZEN_FRAMES = 1 << 11, "the same counts in a band for several frames in a row"
     NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
     OBJECT_JUMP = 1 << 13, "one step of the object, taken into its curve; the values hold"
     BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
@@ -323,6 +328,22 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     return dataset
 
 
+def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
+    """
+    Check a dataset against the stage `corrected`, see `check`, and that its counts are no raw ones.
+
+    Raises TypeError for whole numbers: those are raw, and corrected counts need NaN besides.
+    """
+    counts = check(dataset, "corrected")["counts"]
+    if counts.dtype.kind != "f":
+        raise TypeError(
+            f"Invalid dtype {counts.dtype} of 'counts' of the corrected: raw counts. Must be "
+            "floating: corrected by correction.correct_capture or, of a camera that corrects "
+            "itself, counts.astype('float32')."
+        )
+    return dataset
+
+
 def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
     """Check one array against its definition, as `check`; the label names it in the error."""
     if array.dims != variable.dims:
@@ -345,11 +366,13 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
     """
     Positions of bands on the dimension `band`, by name as text; the label names the array.
 
-    Raises ValueError if there is no coordinate `band`, or a band is missing.
+    Raises ValueError if there is no coordinate `band`, or a band is missing or repeated.
     """
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
     names = [str(name) for name in np.atleast_1d(array["band"].values)]
+    if len(set(names)) != len(names):
+        raise ValueError(f"Repeated band in {names} of {label}. Each band must occur once.")
     missing = [name for name in wanted if name not in names]
     if missing:
         raise ValueError(f"Missing band '{missing[0]}' in {label}. Has {names}.")

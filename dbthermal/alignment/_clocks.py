@@ -20,6 +20,8 @@ _GAP: Final = 1.5
 # Largest relative deviation of a time step from the median of an even clock [1].
 _EVEN: Final = 0.05
 _MINIMUM_FRAMES: Final = 2
+PAUSE: Final = 20
+"""Length from which a gap in a camera's frames is a pause of the recording [frame period]."""
 
 
 @dataclass(frozen=True)
@@ -161,12 +163,13 @@ def frame_period(stamps: Array) -> float:
     return float(np.median(np.diff(stamps[np.isfinite(stamps)])))
 
 
-def even_times(stamps: Array) -> Array:
+def even_times(stamps: Array, reach: int) -> Array:
     """
     Evenly spaced times [s] that all cameras, exposure times (band, time), can be brought to.
 
     The stamps themselves where all bands share even ones (steps within 5 % of their median); else
-    from the last camera's start to the first one's end, in steps of the longest frame period.
+    from the last camera's start to the first one's end, in steps of the longest frame period. Where
+    the cameras pause, only times within `reach` steps of a frame: as many as there are frames.
     """
     step = max(frame_period(row) for row in stamps)
     shared = bool(np.all(stamps == stamps[0]))
@@ -178,7 +181,15 @@ def even_times(stamps: Array) -> Array:
             f"Invalid exposure times: the bands overlap from {start} to {stop} s. Must overlap by "
             f"two frames, {step} s apart."
         )
-    return np.arange(start, stop, step)
+    nearest = np.unique(np.rint((stamps[np.isfinite(stamps)] - start) / step))
+    slots = np.unique(nearest[:, np.newaxis] + np.arange(-reach, reach + 1.0))
+    return np.asarray(start + step * slots[(slots >= 0) & (slots * step < stop - start)])
+
+
+def pauses(times: Array) -> Array:
+    """Times (pause, 2) [s] of the frames before and after each pause of a camera."""
+    after = 1 + np.flatnonzero(np.diff(times) > PAUSE * frame_period(times))
+    return np.stack([times[after - 1], times[after]], axis=1)
 
 
 def interpolation(stamps: Array, present: Mask, wanted: Array) -> Interpolation:

@@ -34,6 +34,14 @@ Mask = npt.NDArray[np.bool_]
 
 # Pixels, at most, of which a capture is judged; a full frame would say it no better.
 _PIXELS: Final = 16384
+SEARCH: Final = 5
+"""Largest lag that is searched by default, either way [frame]."""
+
+# Step of one clock against the other from which a lost frame, or a clock that is set, is suspected
+# [frame period].
+_CLOCK_STEP: Final = 0.5
+# Least share of the frames that both bands must have [1].
+_COMMON: Final = 0.5
 # Fewest frames from which an offset is estimated.
 _MINIMUM_FRAMES: Final = 32
 # Groups of pixels of the jackknife, which gives the offset's standard deviation.
@@ -83,7 +91,7 @@ class _Covariances:
     auto: Array
 
 
-def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int = 5) -> float:
+def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int = SEARCH) -> float:
     """
     Delay of a band's exposures behind the first band's [s]; negative if it is ahead.
 
@@ -96,7 +104,8 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
         Stage `corrected` of `schema`, of registered views; optionally `status` (y, x), of which
         dead and saturated pixels are left out, `exposure_time` (band, time) [s], and `segment`
         (time): the steps of shutter events are no motion. Missing frames are NaN or copies of the
-        frame before. Frames dropped with neither stamp nor copy are not noticed.
+        frame before. Frames dropped with neither stamp nor copy are not noticed. A pause of the
+        recording is skipped.
     band : str, optional
         Name of the band; by default the second.
     search : int
@@ -112,7 +121,8 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     TypeError, ValueError
         If the band is missing, the search does not fit the capture's length, there are fewer than
         16 usable pixels, nothing moves in both bands, their covariance is greatest at an end of the
-        search, or the offset is not known within 0.1 frame.
+        search, the bands share less than half of their frames, the offset is not known within 0.1
+        frame, or the clock of a band was set while it ran.
 
     Notes
     -----
@@ -139,11 +149,69 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     """
     place = _check(corrected, band, search)
     pair = corrected.isel(band=[0, place])
-    shared = _on_one_clock(sample(pair), clocks.exposure_times(pair), clocks.segments(pair))
-    label = f"of band '{pair['band'].values[1]}' against '{pair['band'].values[0]}'"
-    lag = _peak(_covariances(shared, search), label)
+    signals, stamps = sample(pair), clocks.exposure_times(pair)
+    require_one_clock(pair, signals, stamps, search)
+    return _offset(pair, signals, stamps, search)
+
+
+def require_one_clock(
+    pair: xr.Dataset, signals: Array, stamps: Array, search: int = SEARCH
+) -> None:
+    """
+    Refuse exposure times (band, time) [s] of two bands if the clock of one of them was set.
+
+    Where their clocks step against one another the longest, frames were lost, or not taken, if the
+    signals (band, time, pixel) [count] keep their offset at the times as they are; if they keep it
+    without the step, a clock was set.
+    """
+    rows = np.flatnonzero(np.all(np.isfinite(stamps), axis=0))
+    steps = np.diff(stamps[:, rows], axis=1)
+    apart = steps[1] - steps[0]
+    if not apart.size or np.abs(apart).max() <= _CLOCK_STEP * clocks.frame_period(stamps[0]):
+        return
+    place = int(np.argmax(np.abs(apart)))
+    excess = steps[:, place] - np.median(steps, axis=1)
+    band, last = int(np.argmax(np.abs(excess))), int(rows[place])
+    before, after, undone = (stamps.copy() for _ in range(3))
+    before[band, last + 1 :] = after[band, : last + 1] = undone[band, : last + 1] = np.nan
+    undone[band] -= excess[band]
+    known, as_is, without = (_try(pair, signals, part, search) for part in (before, after, undone))
+    # NaN is no smaller: without motion before or after nothing can be said.
+    if abs(without - known) < np.nan_to_num(abs(as_is - known), nan=np.inf):
+        raise ValueError(
+            f"Invalid exposure times of band '{pair['band'].values[band]}': a step of "
+            f"{steps[band, place]:.6g} s after {stamps[band, last]:.6g} s, but the images go on "
+            "as without it. Must be of a clock that is not set while it runs; give the capture "
+            "before or after."
+        )
+
+
+def _try(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
+    """Offset as `_offset` [s]; NaN where it is not known."""
+    if np.isfinite(stamps).sum(axis=1).min() < _MINIMUM_FRAMES:
+        return np.nan
+    try:
+        return _offset(pair, signals, stamps, search)
+    except ValueError:
+        return np.nan
+
+
+def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
+    """Offset of two bands [s], of signals (band, time, pixel) [count] at stamps (band, time)."""
+    names = [str(name) for name in pair["band"].values]
+    label = f"of band '{names[1]}' against '{names[0]}'"
+    # Frames of the one side of a pause never meet those of the other, at any lag.
+    reach = search + 3
+    shared = _on_one_clock(signals, stamps, clocks.segments(pair), reach)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _estimate(shared, search, names, label)
+
+
+def _estimate(shared: _Pair, search: int, names: list[str], label: str) -> float:
+    """Offset [s] of bands on one clock, from the lag of their largest covariance."""
+    lag = _peak(_covariances(shared, search, names), label)
     # Whole frames first: smooth functions over the same scene take the same out of both bands.
-    covariances = _covariances(shared.shifted(lag), 1)
+    covariances = _covariances(shared.shifted(lag), 1, names)
     delays = [lag + _delay(part) for part in (covariances, *_leave_one_out(covariances))]
     # Jackknife over n groups: var = (n - 1) mean (d_i - mean d)^2.
     std = np.sqrt((_GROUPS - 1) * np.var(delays[1:]))
@@ -206,9 +274,9 @@ def present(frames: npt.NDArray[Any]) -> Mask:
     return np.asarray(~np.isnan(frames[:, 0]))
 
 
-def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices) -> _Pair:
+def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices, reach: int) -> _Pair:
     """Both bands on evenly spaced times; as they are, where they are already."""
-    times = clocks.even_times(stamps)
+    times = clocks.even_times(stamps, reach)
     if stamps.shape[1] == times.size and np.all(stamps == times):
         return _Pair(signals, np.stack([segment, segment]), times)
     result = np.empty((len(signals), times.size, signals.shape[2]))
@@ -220,28 +288,45 @@ def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices) -> _Pa
     return _Pair(result, segments, times)
 
 
-def _covariances(shared: _Pair, search: int) -> _Covariances:
+def _covariances(shared: _Pair, search: int, names: list[str]) -> _Covariances:
     """Covariances of the rapid changes, in groups of pixels."""
     # One step at a shutter event of either band, the same for both.
     _, segment = np.unique(shared.segments, axis=1, return_inverse=True)
-    one, other = (present(movie) for movie in shared.signals)
-    first, second = (
-        _rapid(movie, shared.times, here, segment)
-        for movie, here in zip(shared.signals, (one, other), strict=True)
-    )
+    here = _common(shared, names)
+    first, second = (_rapid(movie, shared.times, here, segment) for movie in shared.signals)
     lags = np.arange(-search - 2, search + 3)
-    cross = [_lagged(first, second, one, other, int(lag)) for lag in lags]
-    auto = [_lagged(first, first, one, one, lag) for lag in (1, 2)]
+    cross = [_lagged(first, second, here, int(lag)) for lag in lags]
+    auto = [_lagged(first, first, here, lag) for lag in (1, 2)]
     return _Covariances(lags, np.stack(cross, axis=1), np.stack(auto, axis=1))
 
 
-def _rapid(movie: Array, times: Array, here: Mask, segment: clocks.Indices) -> Array:
-    """Residual of a signal (time, pixel) on smooth functions and steps; 0 in missing frames."""
-    if here.sum() < _MINIMUM_FRAMES:
+def _common(shared: _Pair, names: list[str]) -> Mask:
+    """
+    Frames (time) that both bands have.
+
+    The smooth part must be taken out over the same frames of both: a part of it that is left in one
+    band only would be taken for rapid changes.
+    """
+    here = np.stack([present(movie) for movie in shared.signals])
+    both, either = here.all(axis=0), here.any(axis=0).sum()
+    if both.sum() < _COMMON * either:
+        lacking = int(np.argmin(here.sum(axis=1)))
+        share = 1.0 - here[lacking].sum() / either
         raise ValueError(
-            f"Invalid capture of {here.sum()} valid frames. "
-            f"Must be at least {_MINIMUM_FRAMES} for a time offset."
+            f"Invalid frames of band '{names[lacking]}': {100 * share:.0f} % are missing, and the "
+            f"bands '{names[0]}' and '{names[1]}' share {100 * both.sum() / either:.0f} %. Must "
+            f"share at least {100 * _COMMON:.0f} %, for a time offset; give the offset."
         )
+    if both.sum() < _MINIMUM_FRAMES:
+        raise ValueError(
+            f"Invalid capture of {both.sum()} valid frames of both bands '{names[0]}' and "
+            f"'{names[1]}'. Must be at least {_MINIMUM_FRAMES} for a time offset."
+        )
+    return np.asarray(both)
+
+
+def _rapid(movie: Array, times: Array, here: Mask, segment: clocks.Indices) -> Array:
+    """Residual of a signal (time, pixel) on smooth functions and steps; 0 in other frames."""
     steps = segment[here][:, np.newaxis] == np.unique(segment[here])[1:]
     functions, _ = np.linalg.qr(np.hstack([smooth.polynomial_basis(times[here], _ORDER), steps]))
     residual = np.zeros_like(movie)
@@ -249,7 +334,7 @@ def _rapid(movie: Array, times: Array, here: Mask, segment: clocks.Indices) -> A
     return residual
 
 
-def _lagged(first: Array, second: Array, one: Mask, other: Mask, lag: int) -> Array:
+def _lagged(first: Array, second: Array, here: Mask, lag: int) -> Array:
     """Covariance (group) of the first signal, so many frames later, with the second."""
     frames = len(first)
     late, early = (
@@ -259,7 +344,7 @@ def _lagged(first: Array, second: Array, one: Mask, other: Mask, lag: int) -> Ar
     products = np.einsum("tp,tp->p", first[late], second[early])
     size = products.size - products.size % _GROUPS
     grouped = products[:size].reshape(-1, _GROUPS).sum(axis=0)
-    return np.asarray(grouped / np.sum(one[late] & other[early]))
+    return np.asarray(grouped / np.sum(here[late] & here[early]))
 
 
 def _peak(covariances: _Covariances, label: str) -> int:

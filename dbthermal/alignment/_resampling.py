@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from dbthermal import noise as noises
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment._offset import present, sample, time_offset
+from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
 from dbthermal.noise import MAD
 
 Array = npt.NDArray[np.float64]
@@ -45,10 +45,10 @@ def align(
 
     Frames are NaN in a band where the line would reach over a gap, over a change of `segment`, or
     past an end, and where its camera gave none: NaN, or a copy of the frame before. Nothing is
-    extrapolated. Where a signal steps between two frames, by five standard deviations of noise, the
-    sample is NaN, too: when it changed is not known. Interpolation makes the noise of a band
-    smaller, by up to 0.7, and correlates neighbouring frames; in the quieter of two bands it hardly
-    counts.
+    extrapolated: a recording that pauses is aligned in its parts. Where a signal steps between two
+    frames, by five standard deviations of noise, the sample is NaN, too: when it changed is not
+    known. Interpolation makes the noise of a band smaller, by up to 0.7 (`noise_factor`), and
+    correlates neighbouring frames; in the quieter of two bands that hardly counts.
 
     Parameters
     ----------
@@ -71,15 +71,18 @@ def align(
     Dataset
         Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
         exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
-        `status` is that of all the pixels that it may be made of. Attributes: `clock`,
-        `time_offset` (of each band) [s], `frames_lost` (of each band), `transform` (the matrices,
-        row by row). `exposure_time` and other variables over `time` on the clocks before, as
-        `drift`, are dropped.
+        `status` is that of all the pixels that it may be made of; `noise_factor` (band) [1], by how
+        much interpolation lessens the noise, which `separation.solve` takes into account.
+        Attributes: `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band),
+        `pauses` (times of the frames before and after each gap of more than 20 frame periods, in
+        turn) [s], `transform` (the matrices, row by row). `exposure_time` and other variables over
+        `time` on the clocks before, as `drift`, are dropped.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is not as described, or `time_offset` finds no offset.
+        If an argument is not as described, `time_offset` finds no offset, or a band's clock was set
+        while it ran: its stamps step, and the images go on as without the step.
 
     Examples
     --------
@@ -96,17 +99,21 @@ def align(
     >>> bool((aligned.counts[1, :-1] == counts[1, 1:]).all()), aligned.frames_lost
     (True, [0, 1])
     """
-    names = [str(name) for name in schema.check(corrected, "corrected")["band"].values]
+    names = [str(name) for name in schema.check_corrected(corrected)["band"].values]
     matrices = None if transform is None else _matrices(transform, names)
     if matrices is not None:
         # Registered first: a moving reflection passes an unregistered view earlier or later.
         corrected = _registered(corrected, matrices)
     counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
-    noise, relative = _noise(corrected, stamps)
+    signals = sample(corrected)
+    for band in () if offset is None else range(1, len(names)):  # `time_offset` has done it
+        pair = [0, band]
+        require_one_clock(corrected.isel(band=pair), signals[pair], stamps[pair])
+    noise, relative = _noise(signals, stamps)
     reference = int(np.argmax(relative)) if clock is None else _place(clock, names)
     times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
-    aligned = np.empty(counts.shape, dtype=np.float32)
+    aligned, factors = np.empty(counts.shape, dtype=np.float32), np.ones(len(names))
     for band, row in enumerate(stamps):
         movie = np.asarray(counts.isel(band=band).values, dtype=np.float32)
         absent = clocks.missing(movie)
@@ -115,12 +122,19 @@ def align(
         plan = clocks.interpolation(row, ~absent, times).within(segment)
         plan = replace(plan, valid=plan.valid & (plan.labels(segment) == segment))
         plan.apply(movie, aligned[band], _largest(noise[band], movie))
+        # (1 - w) I + w I' of two frames with independent noises, root mean square over time.
+        shares = plan.weight[plan.valid]
+        factors[band] = np.sqrt(np.mean((1.0 - shares) ** 2 + shares**2)) if shares.size else 1.0
     lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
     result = _assembled(corrected, aligned, times)
+    attrs = schema.NOISE_FACTOR.attrs
+    factor = xr.DataArray(factors, coords={"band": counts["band"]}, dims="band", attrs=attrs)
+    result = result.assign(noise_factor=factor)
     return result.assign_attrs(
         clock=names[reference],
         time_offset=offsets.tolist(),
         frames_lost=lost.tolist(),
+        pauses=clocks.pauses(times).ravel().tolist(),
         **({} if matrices is None else {"transform": matrices.ravel().tolist()}),
     )
 
@@ -199,10 +213,10 @@ def _largest(noise: float, movie: Movie) -> float:
     return float(_STEP * np.sqrt(3.0) * noise + rounding)
 
 
-def _noise(corrected: xr.Dataset, stamps: Array) -> Array:
+def _noise(signals: Array, stamps: Array) -> Array:
     """Noise of each band by second differences in time: in counts, and relative to its signal."""
     levels = []
-    for frames, times in zip(sample(corrected), stamps, strict=True):
+    for frames, times in zip(signals, stamps, strict=True):
         here = present(frames) & np.isfinite(times)
         signal = frames[here]
         rough = noises.second_difference(signal, times[here])

@@ -14,6 +14,7 @@ import xarray as xr
 from scipy.stats import chi2
 
 from dbthermal import planck, schema
+from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 
@@ -213,13 +214,11 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     schema.check(correction, "correction")
     if "bad" not in correction:
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
-    names = [str(name) for name in correction["band"].values]
-    flat = flat.isel(band=schema.band_positions(flat, names, "the flat image"))
-    if flat.dims != ("band", "y", "x") or flat.shape != correction["gain"].shape:
+    if flat.dims != ("band", "y", "x") or "band" not in flat.coords:
         raise ValueError(
-            f"Invalid flat image of sizes {dict(flat.sizes)}. Must be those of the correction, "
-            f"{dict(correction['gain'].sizes)}."
+            f"Invalid dims {flat.dims} of the flat image. Must be (band, y, x), bands by name."
         )
+    flat = laid_on(flat, correction, "the flat image", "the correction")
     good = ~correction["bad"].values
     if not np.all(np.isfinite(flat.values[good])):
         raise ValueError("Invalid flat image: a good pixel is not finite. Must be finite.")
@@ -275,9 +274,9 @@ def correct(
     """
     counts = _require_raw(capture)
     names = [str(name) for name in counts["band"].values]
-    maps = _maps(correction, counts, names)
+    maps = _maps(correction, counts)
     if after is not None:
-        last = _maps(after, counts, names)
+        last = _maps(after, counts)
         time = counts["time"].values.astype(np.float64)
         planck.require_positive("length of the capture [s]", time[-1] - time[0])
         weight = (time - time[0]) / (time[-1] - time[0])
@@ -398,22 +397,13 @@ def _require_raw(capture: xr.Dataset) -> xr.DataArray:
     return counts
 
 
-def _maps(correction: xr.Dataset, counts: xr.DataArray, names: list[str]) -> xr.Dataset:
+def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
     """Finite `gain`, `offset` and `bad` (band, y, x) of the bands and pixels of a capture."""
     schema.check(correction, "correction")
-    for dim in ("y", "x"):
-        if counts.sizes[dim] != correction.sizes[dim]:
-            raise ValueError(
-                f"Invalid size {counts.sizes[dim]} of '{dim}' of the capture. Must be that of the "
-                f"correction, {correction.sizes[dim]}."
-            )
-        both = dim in counts.coords and dim in correction.coords
-        if both and not np.array_equal(counts[dim], correction[dim]):
-            raise ValueError(f"Invalid '{dim}' of the capture. Must be those of the correction.")
-    places = schema.band_positions(correction, names, "the correction")
+    correction = laid_on(correction, counts, "the correction", "the capture")
     if "bad" not in correction or correction["bad"].dims != ("band", "y", "x"):
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
-    maps = correction[["gain", "offset", "bad"]].isel(band=places)
+    maps = correction[["gain", "offset", "bad"]]
     for name in ("gain", "offset"):
         if not np.all(np.isfinite(maps[name])):
             raise ValueError(f"Invalid {name} of the correction: not finite. Must be finite.")

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
+from dbthermal._coordinates import laid_on
 
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -124,11 +125,9 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
         If the counts are whole numbers, which have no NaN, the dataset was marked before, or an
         event lacks a variable, is of no band or of frames outside the dataset.
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = schema.check_corrected(corrected)["counts"]
     if "segment" in corrected:
         raise ValueError("Invalid dataset: shutter events were marked before. Must be unmarked.")
-    if counts.dtype.kind != "f":
-        raise TypeError(f"Invalid dtype {counts.dtype} of the counts. Must be floating, for NaN.")
     events = find_shutter(corrected) if events is None else events
     first, after, bands = _positions(events, counts)
     frames = counts.sizes["time"]
@@ -157,15 +156,11 @@ def _closed_frames(counts: xr.DataArray, closed: xr.DataArray | None) -> Mask:
         return np.zeros(shape, dtype=bool)
     if closed.dtype != bool:
         raise TypeError(f"Invalid dtype {closed.dtype} of the closed frames. Must be bool.")
-    if closed.dims not in {("time",), ("band", "time")} or closed.sizes["time"] != shape[1]:
+    if closed.dims not in {("time",), ("band", "time")}:
         raise ValueError(
-            f"Invalid closed frames of sizes {dict(closed.sizes)}. Must be (time) or "
-            f"(band, time), of {shape[1]} frames."
+            f"Invalid dims {closed.dims} of the closed frames. Must be (time) or (band, time)."
         )
-    if "band" in closed.dims:
-        names = [str(name) for name in counts["band"].values]
-        places = schema.band_positions(closed, names, "the closed frames")
-        closed = closed.isel(band=places)
+    closed = laid_on(closed, counts, "the closed frames", "the capture")
     return np.broadcast_to(closed.values, shape)
 
 
@@ -242,6 +237,9 @@ def _positions(events: xr.Dataset, counts: xr.DataArray) -> tuple[Integers, Inte
             f"Invalid event of frames {first[wrong[0]]} to {after[wrong[0]] - 1}. Must lie in "
             f"[0, {counts.sizes['time'] - 1}], not fall."
         )
+    if "start" in events:
+        starts = events["start"].rename(event="time").assign_coords(time=events["start"].values)
+        laid_on(starts, counts.isel(time=first), "the events", "the capture")
     return first, after, bands
 
 

@@ -6,6 +6,7 @@ import xarray as xr
 
 from dbthermal import _smooth as smooth
 from dbthermal import planck, schema
+from dbthermal._coordinates import laid_on
 
 Array = npt.NDArray[np.float64]
 
@@ -43,7 +44,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
         If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
         or a time constant is not finite and positive or a band has none.
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:
         raise ValueError("Invalid dataset: the lag was undone before. Must be as the pixels lag.")
     if counts.sizes["time"] < 2:
@@ -118,7 +119,7 @@ def undo_drift(corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5
         pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are
         not.
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:
         raise ValueError("Invalid dataset: the drift was undone before. Must be as it drifts.")
     if order < 2:
@@ -159,14 +160,11 @@ def _noise_amplification(ratio: Array) -> Array:
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:
     """Good pixels (y, x) of the reference patch."""
-    image = tuple(corrected.sizes[dim] for dim in ("y", "x"))
     if reference.dtype != bool:
         raise TypeError(f"Invalid dtype {reference.dtype} of the reference. Must be bool.")
-    if reference.dims != ("y", "x") or reference.shape != image:
-        raise ValueError(
-            f"Invalid reference of sizes {dict(reference.sizes)}. Must be (y, x), of {image}."
-        )
-    good = reference.values.copy()
+    if reference.dims != ("y", "x"):
+        raise ValueError(f"Invalid dims {reference.dims} of the reference. Must be ('y', 'x').")
+    good = laid_on(reference, corrected, "the reference", "the capture").values.copy()
     if "status" in corrected:
         good &= corrected["status"].values == 0
     if not good.any():

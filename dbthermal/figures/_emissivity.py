@@ -4,6 +4,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
+from dbthermal._coordinates import laid_on
 from dbthermal.figures.drawing import COLORS, band_label, canvas, limits_of, provenance_note
 
 
@@ -90,6 +91,8 @@ def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = Non
         One point per band and material.
     """
     figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
+    if table is not None:
+        table = laid_on(table, measured, "the table", "what was measured")
     place = np.arange(measured.sizes["material"])
     bands = measured["band"].values
     for index, band in enumerate(bands):

@@ -12,6 +12,7 @@ from matplotlib.image import AxesImage
 from matplotlib.text import Text
 from scipy.constants import zero_Celsius
 
+from dbthermal._coordinates import laid_on
 from dbthermal.figures.drawing import (
     COLORS,
     band_label,
@@ -45,6 +46,7 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
         Object above, background below.
     """
     figure, axes = canvas(2, 1, (7.4, 5.6))
+    truth = laid_on(truth, result, "the truth", "the result", dims=("y", "x"))
     place = {"y": pixel[0], "x": pixel[1]}
     true, estimate = truth.isel(place), result.isel(place)
     for axis, name in zip(
@@ -89,6 +91,8 @@ def separated_frames(
     Figure
         As many rows as there are times.
     """
+    emission = laid_on(emission, inputs, "the emission", "the inputs")
+    reflection = laid_on(reflection, inputs, "the reflection", "the inputs")
     bands, frames = inputs["band"].values, inputs.sizes["time"]
     aspect = inputs.sizes["y"] / inputs.sizes["x"]
     columns = len(bands) + 2
@@ -177,6 +181,8 @@ def separated_film(
     ndarray of uint8, shape (rows, columns, 3)
         Colours; both sizes even, as video codecs want them.
     """
+    emission = laid_on(emission, apparent, "the emission", "the inputs")
+    change = laid_on(change, apparent, "the reflection", "the inputs")
     parts = [apparent.sel(band=band) - zero_Celsius for band in apparent["band"].values]
     titles = [f"input {band_label(band)}" for band in apparent["band"].values]
     parts += [emission - zero_Celsius, change]

@@ -33,7 +33,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.instruments.filterwheel import FilterWheel, NotHomedError
 from dbthermal.instruments.recording import Reading
-from dbthermal.instruments.session import Session, check_one_of
+from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 
 __all__ = ["Devices", "ReadingError", "Thermocouples", "open_devices"]
@@ -295,9 +295,7 @@ def _frames(
     """Open the frames of a band's camera."""
     camera = session.cameras[band]
     kind, url = camera_kind(camera.kind), session.url(camera.video)
-    rows = session.telemetry_rows
-    check_one_of(f"telemetry_rows of camera kind '{camera.kind}'", [rows], kind.telemetry_rows)
-    stream = Stream(session.shape, session.frame_rate, rows)
+    stream = Stream(session.shape, session.frame_rate, session.telemetry_rows)
     if world is None:
         return kind.open_frames(url, stream)
     unfiltered = None if band == session.filtered else band
@@ -315,18 +313,13 @@ def _control(
     if camera.control is None:
         return None
     open_control = camera_kind(camera.kind).open_control
-    if open_control is None:
-        raise ValueError(
-            f"Invalid control of band '{band}'. Must be left out: a camera of kind "
-            f"'{camera.kind}' has no command port."
-        )
+    assert open_control is not None, camera.kind  # as the session has checked
     return open_control(session.url(camera.control), world)
 
 
 def _wheel(session: Session, world: Any) -> FilterWheel:
-    known = {entry.name for entry in fields(filterwheel.Settings)} - {"filters"}
-    check_one_of("setting of the wheel", session.wheel, sorted(known))
-    settings = filterwheel.Settings(filters=session.filters, **session.wheel)
+    chosen = {entry.name: getattr(session.wheel, entry.name) for entry in fields(session.wheel)}
+    settings = filterwheel.Settings(**{**chosen, "filters": session.filters})
     return FilterWheel.from_url(session.url(session.devices[WHEEL]), settings, world=world)
 
 

@@ -25,20 +25,24 @@ One key, ``simulated``, switches the whole rig; every device has an address for 
     thermocouples: {1: blackbody, 2: plate}
     blackbody: {temperatures: [293.15, 303.15], stability: 0.02, window: 30, timeout: 1800}
 
-Temperatures are in kelvin, times in seconds. A key that is not known is an error. The camera whose
-band is one of the filters is the one behind the wheel. The simulated address of its frames names
-the camera's kind.
+Temperatures are in kelvin, times in seconds. A key that is not known or listed twice is an error,
+and so is a value that YAML 1.1 and 1.2 read differently, see `dbthermal.readers.read_yaml`. The
+camera whose band is one of the filters is the one behind the wheel. The simulated address of its
+frames names the camera's kind. No address names a library: that of the thermocouple logger is the
+environment variable ``DBTHERMAL_USBTC08``.
 """
 
 import errno
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, Self
 
-import yaml
 from pydantic import (
+    AfterValidator,
     ConfigDict,
     Field,
     StrictBool,
@@ -50,9 +54,12 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from dbthermal.instruments.camera import FFC_READING, FPA_READING, KINDS
+from dbthermal import _text as texts
+from dbthermal.instruments import _addresses as addresses
+from dbthermal.instruments import filterwheel, telemetry
+from dbthermal.instruments.camera import FFC_READING, FPA_READING, KINDS, camera_kind
 
-__all__ = ["Blackbody", "Camera", "Device", "Session"]
+__all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
 
 
 def __dir__() -> list[str]:
@@ -61,11 +68,33 @@ def __dir__() -> list[str]:
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
+BLACKBODY: Final = "blackbody"  # name of its thermocouple
+
+_SCHEMES: Final[Mapping[str, tuple[tuple[str, ...], str]]] = MappingProxyType(
+    {
+        "video": (("sim",), "v4l2"),
+        "control": (("sim", "pty"), "serial"),
+        "filter_wheel": (("sim", "pty"), "serial"),
+        "thermocouples": (("sim",), "tc08"),
+    }
+)
+"""Schemes of a device's simulated address, and of that of the hardware."""
+
+
+def _printable(text: str) -> str:
+    if not text.isprintable() or text != text.strip():
+        raise ValueError("Must be printable, without space at its ends")
+    return text
+
+
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(strict=True, gt=0)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+Temperature = Annotated[float, Field(strict=True, ge=200.0, le=2000.0)]  # no degrees Celsius [K]
+Pixels = Annotated[int, Field(strict=True, ge=2, le=8192)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=64)]
+Label = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
 Slot = Annotated[int, Field(strict=True, ge=1, le=6)]
 Channel = Annotated[int, Field(strict=True, ge=1, le=8)]
+Byte = Annotated[int, Field(strict=True, ge=0, le=255)]
 DeviceName = Literal["filter_wheel", "thermocouples"]
 
 
@@ -78,12 +107,11 @@ class Device:
 
     @field_validator("simulated", "hardware")
     @classmethod
-    def _check_kind(cls, address: str, info: ValidationInfo) -> str:
+    def _check_scheme(cls, url: str, info: ValidationInfo) -> str:
+        emulated = ("sim", "pty")
         is_simulated = info.field_name == "simulated"
-        if address.startswith(("sim:", "pty:")) != is_simulated:
-            rule = "begin" if is_simulated else "not begin"
-            raise ValueError(f"Must {rule} with sim: or pty:")
-        return address
+        addresses.parse(url, emulated if is_simulated else addresses.RULES.keys() - {*emulated})
+        return url
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -94,6 +122,13 @@ class Camera:
     control: Device | None = None
     # One of `dbthermal.instruments.camera.KINDS`, and that of its simulated address.
     kind: Annotated[str, Field(validate_default=True)] = "boson"
+
+    @field_validator("video", "control")
+    @classmethod
+    def _check_addresses(cls, device: Device | None, info: ValidationInfo) -> Device | None:
+        if device is not None:
+            _check_schemes(str(info.field_name), device)
+        return device
 
     @field_validator("kind")
     @classmethod
@@ -108,18 +143,58 @@ class Camera:
             )
         return kind
 
+    @model_validator(mode="after")
+    def _check_control(self) -> Self:
+        if self.control is None:
+            return self
+        if camera_kind(self.kind).open_control is None:
+            raise ValueError(f"Invalid control of kind '{self.kind}', which has none")
+        url, video = (addresses.parse(device.simulated) for device in (self.control, self.video))
+        if url.scheme == "sim" and url[:3] != video[:3]:
+            raise ValueError(
+                f"Invalid control '{self.control.simulated}' of '{self.video.simulated}'. "
+                "Must be the same camera"
+            )
+        return self
+
 
 @dataclass(frozen=True, config=_CHECKED)
 class Blackbody:
     """Temperatures of a calibration, and the rule by which each counts as reached."""
 
-    temperatures: Annotated[tuple[Positive, ...], Field(min_length=1)]  # in their order [K]
-    stability: Positive = 0.05  # largest range of the readings in the window [K]
-    window: Positive = 30.0  # how long the readings must stay within it [s]
+    # In their order [K].
+    temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
+    stability: Annotated[Positive, Field(le=10.0)] = (
+        0.05  # largest range of the readings in the window [K]
+    )
+    window: Annotated[Positive, Field(le=3600.0)] = (
+        30.0  # how long the readings must stay within it [s]
+    )
     # Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
     # by half a kelvin or so each, and the recordings keep the reading.
-    tolerance: Positive = 1.5
-    timeout: Positive = 1800.0  # longest wait for it [s]
+    tolerance: Annotated[Positive, Field(le=50.0)] = 1.5
+    timeout: Annotated[Positive, Field(le=1e5)] = 1800.0  # longest wait for it [s]
+
+    @model_validator(mode="after")
+    def _check_window(self) -> Self:
+        if self.window >= self.timeout:
+            raise ValueError(f"Invalid window {self.window} s. Must be below the timeout")
+        return self
+
+
+@dataclass(frozen=True, config=_CHECKED)
+class Wheel(filterwheel.Settings):
+    """Settings of the wheel but its filters, see `dbthermal.instruments.filterwheel.Settings`."""
+
+    filters: Mapping[int, str] = field(default_factory=dict, init=False)
+    addresses: tuple[tuple[Byte, Byte], ...] = filterwheel.Settings.addresses
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _check_number(cls, value: Any) -> Any:
+        if isinstance(value, bool | str):
+            raise ValueError("Must be a number")
+        return value
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -140,16 +215,16 @@ class Session:
     name: Name  # of the recordings, too
     simulated: StrictBool  # one switch for all devices
     protocol: Literal["gain_offset", "response", "emissivity_bench", "scene"]
-    duration: Positive  # of the recording, or of each of its steps [s]
+    duration: Annotated[Positive, Field(le=1e6)]  # of the recording, or of each of its steps [s]
     cameras: Annotated[dict[Name, Camera], Field(min_length=1)]  # by band, in recording order
-    frame_rate: Positive = 60.0  # [Hz]
-    shape: tuple[Count, Count] = (512, 640)  # rows, columns
+    frame_rate: Annotated[Positive, Field(le=1e4)] = 60.0  # [Hz]
+    shape: tuple[Pixels, Pixels] = (512, 640)  # rows, columns
     telemetry_rows: Literal[0, 2] = 0
     devices: dict[DeviceName, Device] = field(default_factory=dict)
     filters: dict[Slot, Name] = field(default_factory=dict)  # slot of the wheel to band
-    wheel: dict[str, Any] = field(default_factory=dict)  # see `filterwheel.Settings`
+    wheel: Wheel = field(default_factory=Wheel)
     sweep: tuple[Name, ...] = ()  # filters at each temperature; see `swept`
-    thermocouples: dict[Channel, str] = field(default_factory=dict)  # channel to measured object
+    thermocouples: dict[Channel, Label] = field(default_factory=dict)  # channel to measured object
     blackbody: Blackbody | None = None
 
     @model_validator(mode="after")
@@ -159,6 +234,32 @@ class Session:
             raise ValueError(f"Invalid session of protocol '{self.protocol}'. Must have {rule}")
         if self.blackbody is not None and self.protocol != "emissivity_bench":
             _check_unique("temperature [K]", self.blackbody.temperatures)
+        if self.blackbody is not None and BLACKBODY not in self.thermocouples.values():
+            rule = f"Must have one named '{BLACKBODY}'"
+            raise ValueError(f"Invalid thermocouples {dict(self.thermocouples)}. {rule}")
+        if self.duration * self.frame_rate < 1:
+            raise ValueError(f"Invalid duration {self.duration} s. Must be one frame at least")
+        return self
+
+    @model_validator(mode="after")
+    def _check_frames(self) -> Self:
+        rows, columns = self.telemetry_rows, self.shape[1]
+        for band, camera in self.cameras.items():
+            allowed = camera_kind(camera.kind).telemetry_rows
+            _check_one_of(f"telemetry_rows of band '{band}', a {camera.kind},", [rows], allowed)
+        if rows and rows * columns < telemetry.WORDS:
+            rule = f"Must have {telemetry.WORDS // rows} columns for the telemetry"
+            raise ValueError(f"Invalid shape {list(self.shape)}. {rule}")
+        return self
+
+    @model_validator(mode="after")
+    def _check_addresses(self) -> Self:
+        for name, device in self.devices.items():
+            _check_schemes(name, device)
+        if not self.simulated:  # emulated cameras are told apart by their world
+            pairs = [(camera.video, camera.control) for camera in self.cameras.values()]
+            listed = [device for pair in pairs for device in pair if device is not None]
+            _check_unique("address", [one.hardware for one in (*listed, *self.devices.values())])
         return self
 
     @model_validator(mode="after")
@@ -178,7 +279,7 @@ class Session:
         behind = [band for band in self.bands if band in self.filters.values()]
         if self.filters and len(behind) != 1:
             raise ValueError(f"Invalid cameras {behind} behind the wheel. Must be exactly one")
-        check_one_of("filter of the sweep", self.sweep, tuple(self.filters.values()))
+        _check_one_of("filter of the sweep", self.sweep, tuple(self.filters.values()))
         _check_unique("filter of the sweep", self.sweep)
         if self.sweep and self.blackbody is None:
             raise ValueError(f"Invalid sweep {list(self.sweep)}. Must have a blackbody")
@@ -226,7 +327,7 @@ class Session:
         Traceback (most recent call last):
         ValueError: session: Invalid duration -60. Must be greater than 0.
         """
-        return cls._checked(_read_yaml(text, "session"), {}, "session")
+        return cls._checked(texts.parse_yaml(text, "session"), {}, "session")
 
     @classmethod
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
@@ -246,23 +347,29 @@ class Session:
         FileNotFoundError
             If a file does not exist.
         ValueError
-            If it is not YAML, or a key is missing, unknown or in both files, or a value is invalid:
-            the message has the file, the place in it, the value and the rule.
+            If it is not YAML, or a key is missing, unknown, repeated or in both files, or a value
+            is invalid: one line for each error, with file, place in it, value and rule.
         """
-        content = _read_yaml(Path(path).read_text(encoding="utf-8"), str(path))
+        content = texts.read_yaml(path)
         files = {}
         if "rig" in content:
-            rig = Path(path).parent / str(content.pop("rig"))
+            name = content.pop("rig")
+            if not isinstance(name, str) or not name.isprintable():
+                raise ValueError(f"{path}: Invalid rig {texts.shown(name)}. Must be a file's name.")
+            rig = Path(path).parent / name
             if not rig.exists():
                 message = f"Missing file of key 'rig' of session '{path}'. Must be copied with it"
                 raise FileNotFoundError(errno.ENOENT, message, str(rig))
-            shared = _read_yaml(rig.read_text(encoding="utf-8"), str(rig))
-            _check_unique("key of session and rig", [*map(str, content), *map(str, shared)])
+            shared = texts.read_yaml(rig)
+            if twice := [key for key in content if key in shared]:
+                raise ValueError(
+                    f"{path}: Repeated key of session and rig '{twice[0]}'. Must be listed once."
+                )
             files = dict.fromkeys(shared, str(rig))
             content = {**shared, **content}
         changed = {**content, **(changes or {})}
-        if changes and "blackbody" in changes and "blackbody" in content:
-            changed["blackbody"] = {**content["blackbody"], **changes["blackbody"]}
+        if changes and isinstance(both := content.get(BLACKBODY), dict) and BLACKBODY in changes:
+            changed[BLACKBODY] = {**both, **changes[BLACKBODY]}
         return cls._checked(changed, files, str(path))
 
     @classmethod
@@ -279,39 +386,45 @@ class Session:
         return session
 
 
-def check_one_of(name: str, values: Iterable[Any], allowed: Collection[Any]) -> None:
-    """Raise ValueError if one of the values is not allowed."""
+def _check_schemes(name: str, device: Device) -> None:
+    """Raise ValueError unless the addresses are of the schemes of such a device."""
+    simulated, hardware = _SCHEMES[name]
+    url = addresses.parse(device.simulated, simulated)
+    addresses.parse(device.hardware, (hardware,))
+    emulator = {"filter_wheel": "apt", "thermocouples": "tc08"}.get(name, url.target)
+    if url.scheme == "sim" and (url.target != emulator or (emulator == "tc08" and url.name)):
+        raise ValueError(
+            f"Invalid address '{device.simulated}' of {name}. Must be sim://{emulator}"
+        )
+
+
+def _check_one_of(name: str, values: Iterable[Any], allowed: Iterable[Any]) -> None:
     for value in values:
-        if isinstance(value, bool) or value not in allowed:
-            raise ValueError(f"Invalid {name} {value!r}. Must be one of {list(allowed)}")
+        if value not in (allowed := list(allowed)):
+            raise ValueError(f"Invalid {name} {value!r}. Must be one of {allowed}")
 
 
 def _check_unique(name: str, values: Iterable[Any]) -> None:
-    names = list(values)
-    for value in names:
-        if names.count(value) > 1:
+    for value, count in Counter(values).items():
+        if count > 1:
             raise ValueError(f"Repeated {name} '{value}'. Must be listed once")
-
-
-def _read_yaml(text: str, file: str) -> dict[Any, Any]:
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"{file}: Must be YAML: {error}.") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{file}: Invalid content {content!r}. Must be a mapping.")
-    return content
 
 
 def _message(error: Any) -> str:
     """One error of pydantic as a sentence: place, value and rule."""
-    place = ".".join(str(part) for part in error["loc"] if part != "[key]")
+    place = ".".join(_named(str(part)) for part in error["loc"] if part != "[key]")
     if error["type"] == "missing":
         return f"Missing '{place}'. Must be set."
     if error["type"] in {"unexpected_keyword_argument", "extra_forbidden"}:
         return f"Unknown key '{place}'. Must be one of those in dbthermal.instruments.session."
-    rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"])
-    if not place:
-        return f"{rule}."
+    rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"]).rstrip(".")
+    rule = re.sub(r"a (valid dictionary|dictionary or an instance of \w+)", "a mapping", rule)
+    if re.match("(Invalid|Missing|Repeated) ", rule):  # of more than one key, or of an address
+        return f"{place}: {rule}." if place else f"{rule}."
     rule = rule if rule.startswith("Must ") else f"Must {rule}"
-    return f"Invalid {place} {error['input']!r}. {rule}."
+    return f"Invalid {place} {texts.shown(error['input'])}. {rule}."
+
+
+def _named(key: str) -> str:
+    """Key as a message shows it, in one short line."""
+    return key if key.isprintable() and len(key) <= texts.SHOWN else texts.shown(key)

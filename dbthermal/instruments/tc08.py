@@ -27,6 +27,7 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.transport import Closing
 
 __all__ = ["ERRORS", "TC08", "Flag", "Identity", "Scan", "TC08Error", "load"]
@@ -178,8 +179,8 @@ class TC08(Closing):
         Parameters
         ----------
         url : str
-            ``tc08:``, the library being found as by `load`, ``tc08:///path/of/library.so``, or
-            ``sim://tc08`` for an emulated unit.
+            ``tc08:``, the library being found as by `load`, or ``sim://tc08`` for an emulated
+            unit. No address names a library: only the variable `ENVIRONMENT` does.
         world : object, optional
             Emulated bench, needed for ``sim://tc08`` alone.
 
@@ -202,14 +203,13 @@ class TC08(Closing):
         """
         if (url == "sim://tc08") != (world is not None):
             raise ValueError(
-                f"Invalid URL '{url}'. Must be sim://tc08 with a world, and only then."
+                f"Invalid address '{url}'. Must be sim://tc08 with a world, and only then."
             )
         if world is not None:
             module = importlib.import_module("dbthermal.instruments.emulated.tc08")
             return cls(module.EmulatedTC08.from_world(world)).open()
-        if url != "tc08:" and not url.startswith("tc08:///"):
-            raise ValueError(f"Invalid URL '{url}'. Must be tc08:, tc08:///path or sim://tc08.")
-        return cls(load(url.removeprefix("tc08:").removeprefix("//") or None)).open()
+        addresses.parse(url, ("tc08",))
+        return cls(load()).open()
 
     @property
     def is_simulated(self) -> bool:

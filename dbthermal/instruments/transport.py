@@ -12,7 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final, Protocol, Self
-from urllib.parse import parse_qsl, urlsplit
+
+from dbthermal.instruments import _addresses as addresses
 
 if TYPE_CHECKING:
     import serial
@@ -191,47 +192,34 @@ def open_serial(
     TransportError
         If the port cannot be opened.
     """
-    parts = urlsplit(url)
-    if parts.scheme not in _SCHEMES or not parts.netloc + parts.path:
-        raise ValueError(f"Invalid device '{url}'. Must begin with serial://, pty:// or sim://.")
-    if parts.scheme == "sim":
-        return _open_emulated(url, world, baudrate=baudrate, rtscts=rtscts)
-    if parts.query or parts.fragment:
-        raise ValueError(f"Invalid device '{url}' with options. Must have none but after sim://.")
-    path = parts.netloc + parts.path
-    if parts.scheme == "serial" and Path(path).resolve().is_relative_to("/dev/pts"):
-        raise ValueError(f"Invalid device '{url}', a pseudo-terminal. Must begin with pty://.")
+    address = addresses.parse(url, _SCHEMES)
+    if address.scheme == "sim":
+        return _open_emulated(address, url, world, baudrate=baudrate, rtscts=rtscts)
+    path = address.target
+    if address.scheme == "serial" and Path(path).resolve().is_relative_to("/dev/pts"):
+        raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must begin with pty://.")
     port = _open_port(path, baudrate=baudrate, rtscts=rtscts)
-    return SerialTransport(port, url, is_simulated=parts.scheme == "pty")
+    return SerialTransport(port, url, is_simulated=address.scheme == "pty")
 
 
 def _open_emulated(
-    url: str, world: object | None, *, baudrate: int, rtscts: bool
+    address: addresses.Address, url: str, world: object | None, *, baudrate: int, rtscts: bool
 ) -> SerialTransport:
-    """Start the emulator that `url` names, and open its end of the line."""
-    parts = urlsplit(url)
-    if parts.netloc not in EMULATORS:
+    """Start the emulator that an address names, and open its end of the line."""
+    if address.target not in EMULATORS:
         raise ValueError(
-            f"Invalid device '{url}'. Must be one of {sorted(EMULATORS)} after sim://."
+            f"Invalid address '{url}'. Must be one of {sorted(EMULATORS)} after sim://."
         )
-    emulated = importlib.import_module(EMULATORS[parts.netloc]).start(_options(url), world)
+    options = {**address.options, **({"name": address.name} if address.name else {})}
+    if address.name and "name" in address.options:
+        raise ValueError(f"Repeated option 'name' in address '{url}'. Must be listed once.")
+    emulated = importlib.import_module(EMULATORS[address.target]).start(options, world)
     try:
         port = _open_port(emulated.path, baudrate=baudrate, rtscts=rtscts)
     except TransportError:
         emulated.close()
         raise
     return SerialTransport(port, url, is_simulated=True, after=emulated.close)
-
-
-def _options(url: str) -> dict[str, str]:
-    """Options of an emulator, by their names: its path is its name."""
-    parts = urlsplit(url)
-    pairs = parse_qsl(parts.query, keep_blank_values=True)
-    pairs += [("name", parts.path.removeprefix("/"))] if parts.path else []
-    options = dict(pairs)
-    if "" in options.values() or len(options) < len(pairs) or parts.fragment:
-        raise ValueError(f"Invalid device '{url}'. Must have each option once, as option=value.")
-    return options
 
 
 def _open_port(path: str, *, baudrate: int, rtscts: bool) -> "serial.Serial":

@@ -17,10 +17,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Self
-from urllib.parse import urlsplit
 
 import numpy as np
 
+from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.camera import (
     DAMAGED,
     FRAME_TIMEOUT,
@@ -293,9 +293,7 @@ class Capture(Closing):
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
     """Open the node of an address ``v4l2:///dev/video0``; ValueError if it is of another kind."""
-    if not url.startswith("v4l2:///"):
-        raise ValueError(f"Invalid address '{url}' of frames. Must be 'v4l2:///dev/...'.")
-    return Capture.open(urlsplit(url).path, stream, decode=decode)
+    return Capture.open(addresses.parse(url, ("v4l2",)).target, stream, decode=decode)
 
 
 def _capability(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:

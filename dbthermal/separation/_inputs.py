@@ -9,8 +9,9 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import noise as noises
+from dbthermal import planck, schema
 from dbthermal import response as responses
-from dbthermal import schema
+from dbthermal._coordinates import laid_on
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -18,9 +19,12 @@ from dbthermal.separation import _quality as quality
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.intp]
 
-# Pixels from which the noise is estimated where the response has none.
+# Pixels from which the noise is estimated where the response has none, and a clock is judged.
 _NOISE_PIXELS: Final = 4096
-_READ: Final = ("counts", "status", "segment")
+_CLOCK_PIXELS: Final = 256
+# Mean steps, by which a time may be off an even clock, unlooked at.
+_NEARLY_EVEN: Final = 1.0
+_READ: Final = ("counts", "status", "segment", "noise_factor")
 _MASK_DIMS: Final = (("time",), ("y", "x"), ("time", "y", "x"))
 
 
@@ -36,6 +40,7 @@ class Method:
     every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
     even_times: bool = False  # refuses frames at uneven times, by name
     survey: Callable[..., Any] | None = None  # `Survey` of the same arguments, for pooling
+    check_clock: Callable[..., None] | None = None  # refuses times that are not of exposure
     any_bands: bool = False  # takes more than two bands
     not_estimated: tuple[str, ...] = ()  # variables of the result that are NaN everywhere
 
@@ -77,7 +82,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
     settings = _checked_settings(method, name, settings)
-    schema.check(corrected, "corrected")
+    schema.check_corrected(corrected)
     _check_status(corrected)
     bands = [str(band) for band in corrected["band"].values]
     _check_demands(method, name, bands, corrected.sizes["time"])
@@ -93,6 +98,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     if mask is not None:
         capture = capture.assign(mask=_checked_mask(capture, mask))
     noise = _noise(capture, response, curves)
+    _check_clock(capture, method, curves, noise)
     value, std = _known_emissivity(corrected, emissivity, emissivity_std)
     return Inputs(
         method=method,
@@ -180,12 +186,9 @@ def _checked_mask(capture: xr.Dataset, mask: xr.DataArray) -> xr.DataArray:
         raise TypeError(f"Invalid mask of type {type(mask).__name__}. Must be a DataArray.")
     if mask.dtype != bool:
         raise TypeError(f"Invalid dtype {mask.dtype} of the mask. Must be bool.")
-    sizes = {str(dim): capture.sizes.get(str(dim), 0) for dim in mask.dims}
-    if mask.dims not in _MASK_DIMS or dict(mask.sizes) != sizes:
-        raise ValueError(
-            f"Invalid mask {dict(mask.sizes)}. Must have dims of {_MASK_DIMS} and the capture's "
-            "sizes."
-        )
+    if mask.dims not in _MASK_DIMS:
+        raise ValueError(f"Invalid dims {mask.dims} of the mask. Must be of {_MASK_DIMS}.")
+    mask = laid_on(mask, capture, "the mask", "the capture")
     return mask.drop_vars(list(mask.coords))
 
 
@@ -193,10 +196,36 @@ def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Ar
     """Noise (band) [K] of the linearised signals, from the response or else from the capture."""
     if "noise" in response:
         slopes = np.array([curve.reference_slope for curve in curves])
-        return np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
+        known = np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
+        return known * _noise_factor(capture)
     counts, frames = quality.sample(capture, _NOISE_PIXELS)
     signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
     return noises.estimate_bands(signals, capture["time"].values[frames])
+
+
+def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise: Array) -> None:
+    """Check a clock that is far from even by the signals, for a method that relies on it."""
+    time = capture["time"].values.astype(np.float64)
+    even = np.linspace(time[0], time[-1], time.size)
+    off = np.abs(time - even).max() * (time.size - 1)
+    if method.check_clock is None or off <= _NEARLY_EVEN * (time[-1] - time[0]):
+        return
+    counts, frames = quality.sample(capture, _CLOCK_PIXELS)
+    if frames.sum() < method.minimum_frames:
+        return
+    order = np.argsort(noise, kind="stable")
+    signals = np.stack([curves[band].linearise(counts[band]) for band in order])
+    segment = capture["segment"].values[frames] if "segment" in capture else None
+    method.check_clock(signals, time[frames], noise[order], segment)
+
+
+def _noise_factor(capture: xr.Dataset) -> Array | float:
+    """Noise (band) [1] over that before the alignment, 1 without a variable `noise_factor`."""
+    if "noise_factor" not in capture:
+        return 1.0
+    schema.check_variable(capture["noise_factor"], schema.NOISE_FACTOR, "'noise_factor'")
+    factor = capture["noise_factor"].values.astype(np.float64)
+    return planck.require_positive("noise_factor of the corrected", factor)
 
 
 def _known_emissivity(
@@ -238,16 +267,9 @@ def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str) -> Array:
         )
     if array.attrs.get("units", "1") != "1":
         raise ValueError(f"Invalid units '{array.attrs['units']}' of {name}. Must be '1'.")
-    bands = [str(band) for band in corrected["band"].values]
-    if "band" not in array.coords and array.sizes["band"] == len(bands):
-        places = list(range(len(bands)))  # unlabelled dimensions align by position, as in xarray
-    else:
-        places = schema.band_positions(array, bands, name)
-    values = array.values[places].astype(np.float64)
-    shape = (len(bands), corrected.sizes["y"], corrected.sizes["x"])
-    if values.ndim == 3 and values.shape != shape:
-        raise ValueError(f"Invalid shape {values.shape} of {name}. Must be {shape}.")
-    return np.broadcast_to(values.reshape(len(bands), *values.shape[1:] or (1, 1)), shape)
+    values = laid_on(array, corrected, name, "the capture").values.astype(np.float64)
+    shape = tuple(corrected.sizes[dim] for dim in ("band", "y", "x"))
+    return np.broadcast_to(values.reshape(shape[0], *values.shape[1:] or (1, 1)), shape)
 
 
 def _labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:
@@ -258,9 +280,8 @@ def _labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:
         raise TypeError(f"Invalid pool of type {type(pool).__name__}. Must be a DataArray.")
     if pool.dtype.kind not in "iu":
         raise TypeError(f"Invalid dtype {pool.dtype} of the pool. Must be whole numbers.")
-    sizes = {dim: corrected.sizes[dim] for dim in ("y", "x")}
-    if pool.dims != ("y", "x") or dict(pool.sizes) != sizes:
-        raise ValueError(f"Invalid pool {dict(pool.sizes)}. Must be {sizes}.")
-    flat = pool.values.ravel()
+    if pool.dims != ("y", "x"):
+        raise ValueError(f"Invalid dims {pool.dims} of the pool. Must be ('y', 'x').")
+    flat = laid_on(pool, corrected, "the pool", "the capture").values.ravel()
     names = np.unique(flat[flat >= 0])
     return np.where(flat >= 0, np.searchsorted(names, flat), -1).astype(np.intp)

@@ -8,6 +8,7 @@ import xarray as xr
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
+from dbthermal._coordinates import laid_on
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -43,7 +44,7 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     Raises
     ------
     ValueError
-        If the first bands differ.
+        If the first bands, sizes or coordinates differ.
 
     Examples
     --------
@@ -65,6 +66,7 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
             f"Must be '{result['band'].values[0]}', as in the result."
         )
     first = apparent.isel(band=0, drop=True)
+    first = laid_on(first, result, "the apparent temperature", "the result")
     background = result["background_temperature"]
     reflectivity = 1.0 - result["emissivity"].isel(band=0, drop=True)
     change = (background - background.mean("time")) * reflectivity
@@ -185,12 +187,11 @@ def _check(signal: xr.DataArray, mask: xr.DataArray | None, correlated: float) -
         raise ValueError(f"Invalid correlation {correlated}. Must lie in (0, 1).")
     if not np.all(np.isfinite(signal.values)):
         raise ValueError("Invalid signal: NaN or infinite. Must be finite.")
-    image = (signal.sizes["y"], signal.sizes["x"])
     if mask is None:
-        return np.ones(image[0] * image[1], dtype=bool)
-    if mask.dims != ("y", "x") or mask.shape != image:
-        raise ValueError(f"Invalid mask {dict(mask.sizes)}. Must be (y, x) of {image}.")
-    return np.asarray(mask.values.astype(bool).ravel())
+        return np.ones(signal.sizes["y"] * signal.sizes["x"], dtype=bool)
+    if mask.dims != ("y", "x"):
+        raise ValueError(f"Invalid dims {mask.dims} of the mask. Must be ('y', 'x').")
+    return np.asarray(laid_on(mask, signal, "the mask", "the signal").values.astype(bool).ravel())
 
 
 def _require(pixels: Mask, rule: str) -> None:

@@ -75,7 +75,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         bands or more, and at least 32 frames; the other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
-        where present, otherwise the noise is estimated from the capture.
+        where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture;
+        otherwise the noise is estimated from the capture.
     method : {"subspace", "calibrated", "dbvt", "naive", "ratio", "bcp", "apparent"}
         This project's separator; known emissivities; the paper's optimiser; and to compare with,
         least squares, dual-wavelength pyrometry, the blackbody channel prior, and the camera's
@@ -118,8 +119,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     TypeError
         If an argument is of the wrong type, or the settings are those of another method.
     ValueError
-        If a dim, unit, band, coordinate, method or emissivity is not as described, or the capture
-        is too short for the method. A bad pixel is not an error but a bit of `status`.
+        If a dim, unit, band, coordinate, method or emissivity is not as described, the capture is
+        too short for the method, or its `time` is that of arrival or of a clock that was set:
+        "subspace" finds slow changes smooth over the numbers of the frames and not over the times.
+        A bad pixel is not an error but a bit of `status`.
 
     Notes
     -----

@@ -8,6 +8,7 @@ import xarray as xr
 
 from dbthermal import bands, calibration, correction, mixing, planck, schema
 from dbthermal import response as responses
+from dbthermal._coordinates import laid_on
 from dbthermal.response import require_range
 
 _CALIBRATION_POINTS: Final = 25
@@ -229,6 +230,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     >>> raw["counts"].dtype.name, round(float((raw["counts"] == 0).mean()), 1)  # dead pixels
     ('uint16', 0.1)
     """
+    detector = laid_on(detector, corrected, "the detector", "the counts")
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
         counts[index] = digitise(movie.values, _of_band(detector, str(movie["band"].item())))

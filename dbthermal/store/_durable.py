@@ -5,6 +5,7 @@ its new name and no content. So the new content is synced to the disk first, the
 then the folder that holds the name is synced.
 """
 
+import errno
 import os
 import weakref
 from collections.abc import Iterable, Iterator
@@ -72,13 +73,20 @@ class DurableStore(SummedStore):
     many at once take the time of one.
     """
 
+    def __init__(self, root: Path, *, read_only: bool = False) -> None:
+        super().__init__(root, read_only=read_only)
+        self._written: set[str] = set()
+
     def set_sync(self, key: str, value: Buffer) -> None:
-        """Write a file by its relative name; if that fails, the old one stays."""
+        """Write a file by its relative name; if that fails, the old one stays, if it is there."""
         path = self.root / key
         if path.exists():
             self.replace(key, value.to_bytes(), path.with_name(f".{path.name}.part"))
+        elif key in self._written:
+            raise FileNotFoundError(errno.ENOENT, "Deleted while it was written to", str(path))
         else:
             super().set_sync(key, value)
+        self._written.add(key)
 
     def replace(self, key: str, content: bytes, part: Path) -> None:
         """Replace a file by its relative name, when its checksum is on the disk; see `replace`."""

@@ -29,7 +29,15 @@ from dbthermal.store._durable import (
     replace,
     tree_to_disk,
 )
-from dbthermal.store._integrity import GROUP, MARK, SUMS, SummedStore, add_sums, last_sums
+from dbthermal.store._integrity import (
+    GROUP,
+    MARK,
+    SUMS,
+    SummedStore,
+    add_sums,
+    last_sums,
+    missing_files,
+)
 
 Values = npt.NDArray[Any]
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -190,6 +198,11 @@ class Recording:
             array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
         if time is not None:
             self._create_time(time)
+        if lost := missing_files(self.root):
+            raise FileNotFoundError(
+                f"No file '{lost[0]}' in the recording '{self.place()}' any more, of {len(lost)} "
+                "that were deleted. Must stay while it is written to."
+            )
         self.commit(complete=complete, closed=True, **attrs)
         replace(self.root / SUMS, last_sums(self.root), self._part(SUMS))
         self.path, self._closed = self.place(), True

@@ -6,6 +6,7 @@ under a result's name is always whole. Each result carries its provenance (see
 input. No other package opens or writes zarr.
 """
 
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,7 +14,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -21,12 +22,14 @@ import xarray as xr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from dbthermal.store._integrity import (
+    AS_WRITTEN,
     MARK,
     SUMS,
     CheckedStore,
     SummedStore,
     last_sums,
     valid_part,
+    warn_unchecked,
 )
 
 if TYPE_CHECKING:
@@ -37,6 +40,12 @@ Number = float | int | str | bool
 _COMPRESSORS = (ZstdCodec(), Crc32cCodec())
 _CHUNK_BYTES = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
+
+_ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str]]]] = {
+    "vp9": ("libvpx-vp9", {"crf": "31", "b": "0", "cpu-used": "4"}),
+    "h264": ("libx264", {}),
+}
+"""FFmpeg's encoder of each codec of a film, with its options."""
 
 
 def _chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
@@ -186,24 +195,41 @@ def save_numbers(
     ...     store.read_numbers(path)
     {'object_rmse_K': 0.21}
     """
-    content = {
+    content: dict[str, Any] = {
         "numbers": {name: _number(name, value) for name, value in numbers.items()},
         "provenance": dict(provenance),
     }
+    content["sha256"] = _digest(content)
     with _whole(path, ".json") as part:
         part.write_text(_json(content, indent=2) + "\n", encoding="utf-8")
 
 
 def read_numbers(path: str | Path) -> dict[str, Number]:
-    """Read a file of `save_numbers`: name to value. ValueError if it is not such a file."""
+    """
+    Read a file of `save_numbers`: name to value.
+
+    ValueError if it is not such a file, or differs from what was written. A file without a
+    checksum, of dbthermal 0.1.0, is read with a warning.
+    """
 
     def refuse(constant: str) -> NoReturn:
         raise ValueError(f"Invalid number {constant} in '{path}'. Must be finite.")
 
-    content = json.loads(Path(path).read_text(encoding="utf-8"), parse_constant=refuse)
+    try:
+        content = json.loads(Path(path).read_bytes(), parse_constant=refuse)
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"Invalid file '{path}': {error}. Must be JSON.") from error
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
         raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
+    if content.keys() <= {"numbers", "provenance"}:
+        warn_unchecked(path, stacklevel=2)
+    elif content.pop("sha256", None) != _digest(content):
+        raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
     return {name: _number(name, value) for name, value in content["numbers"].items()}
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(_json(content).encode()).hexdigest()
 
 
 def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
@@ -252,9 +278,10 @@ def save_video(
     provenance: Mapping[str, Any],
     *,
     rate: float,
+    codec: Literal["vp9", "h264"] = "vp9",
 ) -> None:
     """
-    Save a film as H.264 in MP4, as browsers play it.
+    Save a film in MP4, as browsers play it.
 
     Parameters
     ----------
@@ -266,12 +293,20 @@ def save_video(
         From `dbthermal.store.provenance`; becomes the file's comment, as JSON.
     rate : float
         Frame rate [Hz].
+    codec : {"vp9", "h264"}
+        Compression. VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of
+        H.264, x264, is under the GPL, and patents may ask for a licence where films are passed on
+        (see docs/licences.md). ValueError for any other.
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 
+    if codec not in _ENCODERS:
+        raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
+    encoder, options = _ENCODERS[codec]
     with _whole(path, ".mp4") as part, av.open(part, "w") as film:
         film.metadata["comment"] = _json(provenance)
-        stream = film.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
+        fraction = Fraction(rate).limit_denominator(1000)
+        stream = film.add_stream(encoder, rate=fraction, options=options)
         stream.pix_fmt, stream.width = "yuv420p", 0
         for frame in frames:
             height, width = frame.shape[:2]

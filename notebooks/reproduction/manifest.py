@@ -3,24 +3,27 @@
 ``data_manifest.yaml`` lists the files of every collection with their checksums. If the variable
 DBTHERMAL_DATA names a folder, they are read from there, as ``<collection>/<name>``, and nothing is
 downloaded. Otherwise they lie in the project's ``data/``, and `fetch`, `fetch_collection` and
-``make data``, which runs this module, download the missing ones. Every path from this module is of
-a file whose SHA-256 has just been compared.
+``make data``, which runs this module, download the missing ones: no more bytes than are listed, in
+limited time, and from no other scheme. Every path from this module is of a file whose SHA-256 has
+just been compared.
 """
 
 import hashlib
 import os
 import re
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any, Final
-from urllib.parse import quote
+from urllib.parse import quote, urljoin, urlsplit
 
 import pooch
-import yaml
+import requests
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, field_validator
 
+from dbthermal import readers
 from reproduction import paths
 
 MIRROR: Final = "DBTHERMAL_DATA"
@@ -28,7 +31,9 @@ MIRROR: Final = "DBTHERMAL_DATA"
 
 _CONNECTIONS: Final = 8
 _RETRIES: Final = 3
-_LOADER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C ten times as fast
+_REDIRECTS: Final = 5
+_TIMEOUT: Final = 30.0  # without a byte [s]
+_SLOWEST: Final = 10_000  # of a whole download, beside one `_TIMEOUT` [byte/s]
 
 
 class File(BaseModel):
@@ -45,8 +50,11 @@ class File(BaseModel):
     @field_validator("name")
     @classmethod
     def _check_name(cls, name: str) -> str:
-        if Path(name).name != name:
-            raise ValueError(f"Invalid file name '{name}'. Must name no folder.")
+        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9 _.-]{0,199}", name):
+            raise ValueError(
+                f"Invalid file name {name!r}. Must be letters, digits, '_', '.', '-' and spaces, "
+                "none of the last three first: it names no folder."
+            )
         return name
 
     @field_validator("sha256")
@@ -84,6 +92,13 @@ class Collection(BaseModel):
     note: str
     files: Annotated[dict[str, File], BeforeValidator(_by_name)]
 
+    @field_validator("origin")
+    @classmethod
+    def _check_origin(cls, origin: str) -> str:
+        if not re.fullmatch(r"https?://[^?#@\\\x00-\x1f]+/", origin):
+            raise ValueError(f"Invalid origin {origin!r}. Must begin with https:// and end in '/'.")
+        return origin
+
     def url(self, name: str) -> str:
         """Address of a file, with spaces and the like quoted."""
         return quote(self.origin + self[name].name, safe=":/")
@@ -102,6 +117,17 @@ class Manifest(BaseModel):
 
     collections: Mapping[str, Collection]
 
+    @field_validator("collections")
+    @classmethod
+    def _check_collections(cls, collections: Mapping[str, Collection]) -> Mapping[str, Collection]:
+        for name in collections:
+            if not re.fullmatch("[a-z][a-z0-9_]{0,49}", name):
+                raise ValueError(
+                    f"Invalid collection {name!r}. Must be lower-case letters, digits and '_', a "
+                    "letter first: it names a folder in 'data'."
+                )
+        return collections
+
     def __getitem__(self, name: str) -> Collection:
         """Collection by name; ValueError if it is not listed."""
         if name not in self.collections:
@@ -113,8 +139,7 @@ def load() -> Manifest:
     """``data_manifest.yaml``; ValueError if an entry is missing, unknown, malformed or repeated."""
     path = paths.manifest()
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _LOADER)
-        return Manifest.model_validate(content)
+        return Manifest.model_validate(readers.read_yaml(path))
     except (KeyError, TypeError, ValidationError) as error:
         raise ValueError(f"Invalid '{path.name}': {error}") from error
 
@@ -142,7 +167,8 @@ def fetch(name: str, collection: str) -> Path:
     """Verified file, downloaded if it is not in ``data/`` and DBTHERMAL_DATA is not set.
 
     A download with another checksum is thrown away: ValueError. OSError if the origin cannot be
-    reached, FileNotFoundError if the mirror lacks the file.
+    reached, sends more bytes than are listed or sends them too slowly, or leads to another scheme;
+    FileNotFoundError if the mirror lacks the file.
     """
     listed, folder = load()[collection], _folder(collection)
     return _fetch(listed, listed[name], folder)
@@ -199,15 +225,57 @@ def _fetch(listed: Collection, file: File, folder: Path) -> Path:
             urls={file.name: listed.url(file.name)},
             retry_if_failed=_RETRIES,
         )
-        source.fetch(file.name)
+        source.fetch(file.name, downloader=_download(file))
     return _verified(path, file)
+
+
+def _download(file: File) -> Callable[[str, str, object], None]:
+    """Downloader for pooch, which gives up when it has more than the file, or takes too long."""
+
+    def download(url: str, path: str, _: object) -> None:
+        end, size = time.monotonic() + _TIMEOUT + file.bytes / _SLOWEST, 0
+        with _answer(url) as response, Path(path).open("wb") as output:
+            while part := response.raw.read1(2**16, decode_content=False):
+                size += output.write(part)
+                if size > file.bytes:
+                    raise OSError(
+                        f"Invalid size of '{url}'. Must be the listed {file.bytes} bytes."
+                    )
+                if time.monotonic() > end:
+                    raise OSError(
+                        f"Slow download of '{url}'. Must have {_SLOWEST} bytes/s or more."
+                    )
+
+    return download
+
+
+def _answer(url: str) -> requests.Response:
+    """Answer of a server, after redirects of which none leaves the scheme, unless for https."""
+    for _ in range(_REDIRECTS + 1):
+        response = requests.get(
+            url,
+            stream=True,
+            timeout=_TIMEOUT,
+            allow_redirects=False,
+            headers={"Accept-Encoding": "identity"},
+        )
+        if not response.is_redirect:
+            response.raise_for_status()
+            return response
+        response.close()
+        following = urljoin(url, response.headers["location"])
+        if urlsplit(following).scheme not in {urlsplit(url).scheme, "https"}:
+            raise OSError(f"Invalid redirect of '{url}' to '{following}'. Must stay at its scheme.")
+        url = following
+    raise OSError(f"Invalid redirects to '{url}'. Must be at most {_REDIRECTS}.")
 
 
 def _verified(path: Path, file: File) -> Path:
     """Path of a file that exists and has the listed checksum."""
     if not path.is_file():
         raise FileNotFoundError(f"Missing file '{path}'. Must be in the folder {MIRROR} names.")
-    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as content:
+        sha256 = hashlib.file_digest(content, "sha256").hexdigest()
     if sha256 != file.sha256:
         raise ValueError(
             f"Wrong checksum of '{path}': {sha256}. Must be {file.sha256}; remove the file and "

@@ -81,6 +81,58 @@ def test_time_offset_of_a_restless_background(correlation_time: float, delay: fl
     assert abs(error) < 0.1
 
 
+def lacking(kind: str, seed: int) -> np.ndarray:
+    """Frames (band, time) that one band lacks: 10 to 40 % at the start, in the middle, at the end,
+    or in several blocks.
+    """
+    rng = np.random.default_rng(seed)
+    lost = np.zeros((2, FRAMES), dtype=bool)
+    row = lost[rng.integers(2)]
+    width = rng.integers(FRAMES // 10, 2 * FRAMES // 5)
+    if kind == "several":
+        for first in rng.integers(0, FRAMES - width // 4, 4):
+            row[first : first + width // 4] = True
+    else:
+        first = {"start": 0, "end": FRAMES - width, "middle": rng.integers(20, FRAMES - 20 - width)}
+        row[first[kind] : first[kind] + width] = True
+    return lost
+
+
+@pytest.mark.parametrize(
+    ("kind", "delay", "seed"),
+    [("start", -3, 1), ("middle", 0.5, 2), ("end", -1.7, 3), ("several", 2.25, 4)]
+    + [
+        pytest.param(kind, delay, seed, marks=pytest.mark.slow)
+        for kind in ("start", "middle", "end", "several")
+        for delay in (-3, -1.5, -0.75, 0, 0.3, 0.5, 1, 1.7, 3)
+        for seed in (5, 6)
+    ],
+)
+@pytest.mark.parametrize("driver", ["nan", "stamps"])
+def test_a_block_of_frames_of_one_band(
+    scene: xr.Dataset, kind: str, delay: float, seed: int, driver: str
+) -> None:
+    """Where one band lacks 10 to 40 % of its frames the offset is right within a tenth."""
+    capture, lost = recorded(scene, delay, stamped=driver == "stamps"), lacking(kind, seed)
+    if driver == "stamps":
+        capture, delay = drop_frames(capture, lost), 0.0
+    else:
+        capture["counts"].values[lost] = np.nan
+    error = alignment.time_offset(capture) / PERIOD - delay
+    print(f"{kind}, {100 * lost.sum() / FRAMES:.0f} % lost, {delay}: error {error:.4f} frames")
+    assert abs(error) < 0.1
+
+
+def test_too_few_common_frames(scene: xr.Dataset) -> None:
+    """With fewer than half of the frames in both bands the band and the shares are named."""
+    capture = recorded(scene, 0.5)
+    capture["counts"].values[1, 100:300] = np.nan
+    with pytest.raises(
+        ValueError, match=r"frames of band '9.5': 57 % are missing, .* share 43 %. Must share at le"
+    ):
+        alignment.time_offset(capture)
+
+
 def test_nothing_moves() -> None:
     """An object that warms before a background at rest gives no offset."""
     with pytest.raises(ValueError, match=r"no rapid change that both bands see|Must be known"):
@@ -152,6 +204,48 @@ def test_offset_is_undone(stop: float, delay: float) -> None:
     assert aligned.attrs["clock"] == "9.5"
     assert aligned.sizes["time"] == FRAMES
     assert values[1] < 1.2 * values[0]
+
+
+@pytest.mark.parametrize(
+    ("delay", "kind", "seeds"),
+    [(0.5, "middle", (3, 4))]
+    + [
+        pytest.param(delay, kind, (4, 5, 6), marks=pytest.mark.slow)
+        for delay in (-2.4, -0.75, 0.3, 1.5, 3.0)
+        for kind in ("whole", "start", "middle", "end", "several")
+    ],
+)
+def test_intervals_hold_after_an_alignment(delay: float, kind: str, seeds: tuple[int, ...]) -> None:
+    """Where frames were interpolated, and where a band lacks a block, 95 % intervals of the object
+    hold in 93 to 97 %.
+    """
+    scores = []
+    for seed in seeds:
+        warm = glass(seed=seed)
+        capture = recorded(warm, delay, seed=seed)
+        if kind != "whole":
+            capture["counts"].values[lacking(kind, seed)] = np.nan
+        result = separation.solve(alignment.align(capture), RIG.response())
+        error = result["object_temperature"] - warm["object_temperature"].interp(
+            time=result["time"]
+        )
+        score = (abs(error) / result["object_temperature_std"]).values
+        score = score[:, result["status"].values == 0]
+        scores.append(score[np.isfinite(score)])
+    covered = float(np.mean(np.concatenate(scores) < 1.96))
+    print(f"{delay} frames late, {kind}: cover {covered:.3f}")
+    assert 0.93 <= covered <= 0.97
+
+
+def test_noise_factor_is_that_of_the_interpolation() -> None:
+    """White noise between two frames is lessened as the factor says, and the separation uses it."""
+    capture = ramp(frames=400)
+    capture["counts"].values[...] = np.random.default_rng(1).normal(size=capture["counts"].shape)
+    aligned = alignment.align(capture, offset=0.3 * PERIOD, clock="b1")
+    factor = aligned["noise_factor"].values
+    np.testing.assert_allclose(factor, [np.sqrt(0.3**2 + 0.7**2), 1.0], rtol=0, atol=1e-3)
+    scatter = np.nanstd(aligned["counts"].values, axis=(1, 2, 3))
+    np.testing.assert_allclose(scatter, factor, rtol=0.04, atol=0)
 
 
 @pytest.mark.parametrize("driver", ["stamps", "copies"])
@@ -324,7 +418,7 @@ def test_nothing_is_left_on_the_clocks_before(scene: xr.Dataset) -> None:
     capture = simulation.observe(scene, Rig().response(), np.random.default_rng(0))
     told = (("band", "time"), np.zeros(capture["counts"].shape[:2]), {"units": "count"})
     aligned = alignment.align(capture.assign(drift=told), offset=0.02)
-    assert set(aligned.data_vars) == {"counts"}
+    assert set(aligned.data_vars) == {"counts", "noise_factor"}
     offset = xr.DataArray([0.0, 20.0], dims="band", coords={"band": capture["band"]})
     with pytest.raises(ValueError, match="Invalid unit 'ms' of the offset"):
         alignment.align(capture, offset=offset.assign_attrs(units="ms"))

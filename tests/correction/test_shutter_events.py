@@ -100,7 +100,7 @@ def test_frames_known_to_be_closed() -> None:
     one = closed.expand_dims(band=list(RIG.bands)) & xr.DataArray([False, True], dims="band")
     by_band = find_shutter(capture, closed=one.transpose("band", "time"))
     assert rows(by_band)[-1] == ("9.5", 50, 1, True)
-    with pytest.raises(ValueError, match="Invalid closed frames of sizes"):
+    with pytest.raises(ValueError, match="Invalid size 50 of 'time' of the closed frames"):
         find_shutter(capture, closed=closed[:50])
     with pytest.raises(TypeError, match="Invalid dtype int64 of the closed frames"):
         find_shutter(capture, closed=closed.astype(int))

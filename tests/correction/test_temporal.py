@@ -57,7 +57,7 @@ def test_drift_refuses_nonsense() -> None:
     capture = still()
     with pytest.raises(ValueError, match="it marks no good pixel"):
         undo_drift(capture, patch() & False)
-    with pytest.raises(ValueError, match=re.escape("Invalid reference of sizes {'y': 20, 'x': 5}")):
+    with pytest.raises(ValueError, match="Invalid size 5 of 'x' of the reference"):
         undo_drift(capture, patch()[:, :5])
     with pytest.raises(TypeError, match="Invalid dtype int64 of the reference"):
         undo_drift(capture, patch().astype(int))

@@ -82,7 +82,8 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ("text", "status", "message"),
     [
         ("name: plate", 2, "Missing 'simulated'. Must be set"),
-        (TEXT.replace("sim://tc08", "sim://tc09"), 1, "Failed: Invalid URL 'sim://tc09'"),
+        (TEXT.replace("sim://tc08", "sim://tc09"), 2, "Invalid address 'sim://tc09' of thermo"),
+        (TEXT.replace("sim://apt/wheel", "sim://apt?sn=x"), 1, "Failed: Invalid option sn=x"),
     ],
 )
 def test_failures_have_a_status(

@@ -217,7 +217,7 @@ VIDEO, CONTROL = (f'{key}: {{simulated: "sim://boson/wide"' for key in ("video",
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ((VIDEO, VIDEO.replace("wide", "tele")), "Unknown camera 'tele'"),
+        ((VIDEO, VIDEO.replace("wide", "tele")), "of 'sim://boson/tele'. Must be the same camera"),
         (
             (VIDEO, VIDEO.replace("boson", "y16")),
             r"cameras\.8-14\.kind 'boson'\. Must be the kind in its simulated address 'sim://y16/wide'",
@@ -226,10 +226,10 @@ VIDEO, CONTROL = (f'{key}: {{simulated: "sim://boson/wide"' for key in ("video",
             (VIDEO, VIDEO.replace("wide", "wide?ffc=120")),
             r"Unknown option 'ffc' of an emulator\. It has no options\.",
         ),
-        ((CONTROL, CONTROL.replace("boson", "apt")), "Must be 'sim://boson/<name>'"),
-        ((CONTROL, CONTROL.replace("wide", "tele")), "Unknown camera 'tele'"),
-        (("sim://tc08", "sim://tc09"), "Invalid URL 'sim://tc09'"),
-        (("{velocity", "{speed"), "Invalid setting of the wheel 'speed'"),
+        ((CONTROL, CONTROL.replace("boson", "apt")), "Invalid control 'sim://apt/wide' of"),
+        ((CONTROL, CONTROL.replace("wide", "tele")), "Invalid control 'sim://boson/tele' of"),
+        (("sim://tc08", "sim://tc09"), "Invalid address 'sim://tc09' of thermocouples. Must be"),
+        (("{velocity", "{speed"), "Unknown key 'wheel.speed'"),
     ],
 )
 def test_other_addresses_are_refused(change: tuple[str, str], message: str) -> None:

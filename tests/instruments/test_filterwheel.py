@@ -170,11 +170,13 @@ def test_wrong_devices() -> None:
         ({"tolerance": float("nan")}, "Invalid tolerance nan"),
         ({"home_offset": 400.0}, "Invalid home_offset 400.0"),
         ({"home_direction": 3}, "Invalid home_direction 3"),
-        ({"reply_timeout": 0.0}, r"Invalid reply_timeout 0\.0 of the wheel. Must be positive"),
+        ({"reply_timeout": 0.0}, r"Invalid reply_timeout 0\.0. Must lie in \[0.001, 3600.0\]"),
         ({"poll_interval": -0.1}, r"Invalid poll_interval -0\.1"),
         ({"stall_timeout": float("nan")}, "Invalid stall_timeout nan"),
         ({"addresses": ()}, r"Invalid addresses \(\)"),
-        ({"tolerance": 30.0}, r"Invalid tolerance 30\.0 deg. Must be less than 30"),
+        ({"addresses": ((0, 0),)}, r"Invalid addresses \(\(0, 0\),\). Must be pairs of \[17, 33,"),
+        ({"velocity": 100.0}, r"Invalid velocity 100.0. Must lie in"),
+        ({"tolerance": 30.0}, r"Invalid tolerance 30\.0. Must lie in \[0.001, 29.999\]"),
     ],
 )
 def test_settings_are_checked(options: dict[str, object], error: str) -> None:

@@ -155,6 +155,29 @@ def test_without_a_part_it_ends(tmp_path: Path, lose: Callable[[Path], None], ev
             check(opened, 2 * [opened.sizes["time"]])
 
 
+@pytest.mark.parametrize(
+    "part", ["counts/c/0/0", "counts/c", "exposure_time/c/0/1", "log_time/c/0"]
+)
+def test_without_a_chunk_it_is_not_complete(tmp_path: Path, part: str) -> None:
+    """Chunks that are deleted while it is written are missed by name, and never filled up."""
+    file = two_bands(path := tmp_path / "a.zarr")
+
+    def write_on() -> None:
+        for number in range(FRAMES):
+            file.note(Note.READING, "plate", number / RATE, number)
+            for band in BANDS:
+                file.frame(band, frame(number))
+            if number == 8:
+                gone = path / part
+                shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
+        file.close(complete=True, ended="stopped")
+
+    with pytest.raises(FileNotFoundError, match=rf"{part}.*'"):
+        write_on()
+    with pytest.raises(ValueError, match=f"Missing file '{part}"):
+        store.open_dataset(path)
+
+
 def test_a_recorder_follows_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Moved while it records, by a relative path that leads elsewhere since, it goes on."""
     (tmp_path / "a").mkdir()

@@ -225,12 +225,12 @@ def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
 
 def test_blackbody_must_be_read(tmp_path: Path) -> None:
     """A sweep without a reading of the blackbody raises an error before it begins."""
-    text = replaced(("{1: blackbody, 4: plate}", "{4: plate}"))
-    with (
-        rig(Session.from_yaml(text)) as devices,
-        pytest.raises(ValueError, match="Must have and read a blackbody"),
-    ):
-        swept(devices, tmp_path)
+    with pytest.raises(ValueError, match="Must have one named 'blackbody'"):
+        Session.from_yaml(replaced(("{1: blackbody, 4: plate}", "{4: plate}")))
+    with rig(Session.from_yaml(TEXT)) as devices:
+        silent = replace(devices, thermocouples=None)
+        with pytest.raises(ValueError, match="Must have and read a blackbody"):
+            swept(silent, tmp_path)
 
 
 def test_sweep_without_a_wheel(tmp_path: Path) -> None:

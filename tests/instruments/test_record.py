@@ -3,6 +3,7 @@
 import errno
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ def picture(time: float) -> Counts:
 
 def session(duration: float = 0.3) -> Session:
     """Two emulated cameras with small frames."""
-    cameras = {band: Camera(VIDEO) for band in BANDS}
+    videos = [replace(VIDEO, hardware=f"v4l2:///dev/video{number}") for number in range(len(BANDS))]
+    cameras = dict(zip(BANDS, map(Camera, videos), strict=True))
     return Session("test", True, "scene", duration, cameras, RATE, SHAPE)
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from rig_session import TEXT, replaced
 
-from dbthermal.instruments import filterwheel
 from dbthermal.instruments import session as description
 from dbthermal.instruments.session import Session
 from reproduction import paths
@@ -45,7 +44,7 @@ def test_session_is_read(tmp_path: Path) -> None:
         ("duration: 0.15", "duration: long", "Invalid duration 'long'. Must be a valid number"),
         ("[300.0, 290.0, 310.0]", "[290.0, -3]", "blackbody.temperatures.1 -3. Must be"),
         ("[300.0, 290.0, 310.0]", "[]", "Invalid blackbody.temperatures []. Must have at least"),
-        (SWEEP, "sweep: [", "session: Must be YAML"),
+        (SWEEP, "sweep: [", "session, line 22, column 1: Must be YAML"),
         (
             SWEEP,
             'sweep: ["12"]\n',
@@ -80,11 +79,11 @@ def test_session_is_read(tmp_path: Path) -> None:
             "Invalid devices.thermometer 'thermometer'. Must be",
         ),
         ("  filter_wheel: {", "  # {", "Missing device 'filter_wheel' of {1: '9.5', 3: '11'}"),
-        ("sim://tc08", "tc08:", "thermocouples.simulated 'tc08:'. Must begin with sim: or pty:"),
+        ("sim://tc08", "tc08:", "thermocouples.simulated: Invalid address 'tc08:'. Must be sim://"),
         (
             "v4l2:///dev/video0",
             "pty://a",
-            "8-14.video.hardware 'pty://a'. Must not begin with",
+            "8-14.video.hardware: Invalid address 'pty://a'. Must be",
         ),
         (
             '{simulated: "sim://apt/wheel", ',
@@ -128,7 +127,7 @@ def test_described_session_is_valid() -> None:
     (text,) = re.findall(r"::\n\n(.*?)\n\n\S", description.__doc__, re.DOTALL)
     session = Session.from_yaml(textwrap.dedent(text))
     assert session.swept == ("9.5", "11")
-    assert filterwheel.Settings(filters=session.filters, **session.wheel).home_offset == 12.5
+    assert session.wheel.home_offset == 12.5
 
 
 @pytest.mark.parametrize("kind", ["boson", "y16"])

@@ -195,10 +195,12 @@ def test_thermocouples_of_the_world() -> None:
     assert np.isnan(after[2])
 
 
-@pytest.mark.parametrize("url", ["usb:", "tc08:relative.so", "sim://tc08", ""])
+@pytest.mark.parametrize(
+    "url", ["usb:", "tc08:relative.so", "tc08:///tmp/other.so", "tc08://x", "sim://tc08", ""]
+)
 def test_url_is_checked(url: str) -> None:
-    """A URL names the library, or the emulated unit of a world."""
-    with pytest.raises(ValueError, match="Invalid URL"):
+    """An address names the logger, or the emulated unit of a world, and never a library."""
+    with pytest.raises(ValueError, match=f"Invalid address '{url}'"):
         TC08.from_url(url)
 
 
@@ -257,9 +259,10 @@ def compiled(folder: Path, text: str) -> str:
     return str(shared)
 
 
-def test_types_of_a_real_library(tmp_path: Path) -> None:
+def test_types_of_a_real_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Strings, structures, floats and an error come through C as they are."""
-    with TC08.from_url(f"tc08://{compiled(tmp_path, STUB)}") as driver:
+    monkeypatch.setenv(tc08.ENVIRONMENT, compiled(tmp_path, STUB))
+    with TC08.from_url("tc08:") as driver:
         assert not driver.is_simulated
         driver.set_channels({2: "T", 8: "T"})
         info, scan = driver.identity(), driver.single()

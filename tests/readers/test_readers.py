@@ -260,12 +260,12 @@ def test_unknown_palette(plasma: Path, palette: str) -> None:
 
 
 def test_damaged_video(plasma: Path, tmp_path: Path) -> None:
-    """A file whose last frames are lost is refused, with the number of frames read and declared."""
+    """A file whose last frames are lost is refused by name."""
     path = tmp_path / "cut.mp4"
     whole = plasma.read_bytes()
     index = whole.index(b"moov") - 4  # the encoder writes it after the frames
     path.write_bytes(whole[: index - 900] + bytes(900) + whole[index:])
-    with pytest.raises(ValueError, match=r"Damaged video 'cut\.mp4': [0-9]+ of 12 frames"):
+    with pytest.raises(ValueError, match=r"Damaged video 'cut\.mp4': .* Must decode"):
         readers.palette_video(path)
 
 
@@ -275,7 +275,7 @@ def test_truncated_video(plasma: Path, tmp_path: Path) -> None:
     whole = plasma.read_bytes()
     play = whole.index(b"elst") + 12  # the length of the play [ms]
     path.write_bytes(whole[:play] + (500).to_bytes(4) + whole[play + 4 :])
-    with pytest.raises(ValueError, match=r"'short\.mp4': 5 frames decoded, 12 declared"):
+    with pytest.raises(ValueError, match=r"'short\.mp4': 5 frames decoded, 12 present"):
         readers.palette_video(path)
 
 
@@ -284,7 +284,7 @@ def test_no_video(tmp_path: Path, content: bytes) -> None:
     """A file that cannot be decoded as video raises a ValueError with its name."""
     path = tmp_path / "text.mp4"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"Damaged video 'text\.mp4'"):
+    with pytest.raises(ValueError, match=r"Invalid video 'text\.mp4'\. Must be MP4, MOV, Matroska"):
         readers.palette_video(path)
 
 

@@ -1,12 +1,15 @@
 """Outside files: a list with checksums, downloads from their origin, errors for altered files."""
 
+import contextlib
 import hashlib
 import re
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.parse import quote, unquote
 
 import pytest
 
@@ -69,7 +72,23 @@ def served(tmp_path: Path, project: Path) -> Iterator[Path]:
 
 
 class Quiet(SimpleHTTPRequestHandler):
-    """Serve files without a line for each."""
+    """Serve files without a line for each; the names of some say what is wrong with them."""
+
+    def do_GET(self) -> None:
+        """Send a file, an endless one, one that trickles, or lead elsewhere."""
+        if not (found := re.search("/(endless|slow|to-(.*)).txt$", self.path)):
+            super().do_GET()
+        elif found[2]:
+            self.send_response(302)
+            self.send_header("Location", unquote(found[2]).replace(" ", "/"))
+            self.end_headers()
+        else:
+            self.send_response(200)
+            self.end_headers()
+            with contextlib.suppress(OSError):
+                while True:
+                    self.wfile.write(b"x" * (2**16 if found[1] == "endless" else 1))
+                    time.sleep(0 if found[1] == "endless" else 0.02)
 
     def log_message(self, *_: object) -> None:
         """Print no line."""
@@ -178,11 +197,44 @@ def test_download(served: Path, project: Path) -> None:
 
 def test_download_of_an_altered_file(served: Path, project: Path) -> None:
     """A download with a wrong checksum raises an error and is removed."""
-    (served / "two.txt").write_bytes(b"seconds")
+    (served / "two.txt").write_bytes(b"SECOND")
     expected = hashlib.sha256(b"second").hexdigest()
     with pytest.raises(ValueError, match=rf"two\.txt.*{expected}"):
         manifest.fetch("two.txt", "notes")
     assert not (project / "data" / "notes" / "two.txt").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("endless.txt", r"Invalid size of 'http.*endless\.txt'\. Must be the listed 6 bytes"),
+        ("to-ftp:  127.0.0.1 x.txt", "Invalid redirect of 'http.*' to 'ftp://127.0.0.1/x'"),
+        ("to-file:   etc passwd.txt", "Invalid redirect of 'http.*' to 'file:///etc/passwd'"),
+        ("to-.. all%20notes to-two.txt.txt", "404"),
+    ],
+)
+def test_a_download_that_misbehaves(
+    served: Path, project: Path, name: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A download that is too large, or leads to another scheme, ends and leaves nothing."""
+    assert served.is_dir()
+    monkeypatch.setattr(
+        manifest.Collection, "url", lambda self, _: quote(f"{self.origin}{name}", ":/")
+    )
+    with pytest.raises(OSError, match=message):
+        manifest.fetch("two.txt", "notes")
+    assert not any((project / "data" / "notes").iterdir())
+
+
+def test_a_slow_download_ends(served: Path, project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A download that trickles on ends after the time that its listed size allows."""
+    assert served.is_dir()
+    edit(project, "bytes: 6", "bytes: 1000")
+    for name, value in (("_SLOWEST", 5000), ("_TIMEOUT", 0.3)):
+        monkeypatch.setattr(manifest, name, value)
+    monkeypatch.setattr(manifest.Collection, "url", lambda self, _: f"{self.origin}slow.txt")
+    with pytest.raises(OSError, match=r"Slow download of 'http.*slow\.txt'"):
+        manifest.fetch("two.txt", "notes")
 
 
 def test_only_fetch_downloads(served: Path, project: Path) -> None:
@@ -223,6 +275,16 @@ def test_unknown_names(copies: Path) -> None:
         ("bytes: 5", "bytes: 0", r"files\.`one\.txt`\.bytes\n.*Invalid size 0\."),
         ("sha256: ", "sha256: A", r"files\.`one\.txt`\.sha256\n.*Invalid sha256 'A"),
         ("name: one.txt", "name: ../one.txt", r"Invalid file name '\.\./one\.txt'"),
+        ("name: one.txt", "name: ..", r"Invalid file name '\.\.'"),
+        ("name: one.txt", "name: '..\\one.txt'", "Invalid file name '"),
+        ("name: one.txt", "name: /etc/one.txt", "Invalid file name '/etc/one.txt'"),
+        ("name: one.txt", 'name: "one\\0.txt"', r"Invalid file name 'one\\x00.txt'"),
+        ("name: one.txt", "name: .one.txt", "Invalid file name '.one.txt'"),
+        ("  notes:", "  ../notes:", "Invalid collection '../notes'"),
+        ("  notes:", "  /notes:", "Invalid collection '/notes'"),
+        ("  notes:", "  '':", "Invalid collection ''"),
+        ("origin: http:", "origin: file:", "Invalid origin 'file:"),
+        ("origin: http:", "origin: ftp:", "Invalid origin 'ftp:"),
         ("name: one.txt", "name: two.txt", r"notes\.files\n.*Repeated file name"),
         ("bytes: 5", "bytes: 5, colour: red", "colour"),
         ("    terms: free\n", "", "terms"),
@@ -234,6 +296,15 @@ def test_a_malformed_list_is_refused(project: Path, old: str, new: str, message:
     """A malformed list raises an error with its name."""
     edit(project, old, new)
     with pytest.raises(ValueError, match=rf"(?s)Invalid 'data_manifest\.yaml'.*{message}"):
+        manifest.load()
+
+
+@pytest.mark.usefixtures("project")
+def test_no_collection_is_listed_twice() -> None:
+    """Of two collections with one name neither wins."""
+    path = Path("data_manifest.yaml")
+    path.write_text(path.read_text() + path.read_text().removeprefix("collections:\n"))
+    with pytest.raises(ValueError, match=r"data_manifest\.yaml, line 12.*Repeated key 'notes'"):
         manifest.load()
 
 

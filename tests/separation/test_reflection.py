@@ -151,7 +151,7 @@ def test_mask(signal: xr.DataArray, found: xr.Dataset) -> None:
         (lambda it: it, {"correlated": 0.999}, "0 pixels have a correlation above 0.999"),
         (lambda it: it, {"order": 0}, "Invalid order 0 of the smooth subspace"),
         (lambda it: it, {"order": 241}, "Invalid order 241 of the smooth subspace"),
-        (lambda it: it, {"mask": xr.DataArray(np.ones((2, 2)), dims=("y", "x"))}, "Invalid mask"),
+        (lambda it: it, {"mask": xr.DataArray(np.ones((2, 2)), dims=("y", "x"))}, "of the mask"),
         (lambda it: it[..., :20], {}, "correlation below 0.1 in magnitude. Must be at least 100"),
         (lambda it: it[..., 20:], {}, "0 pixels have a correlation above 0.5"),
     ],

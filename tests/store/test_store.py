@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast, get_args
 
 import av
 import numpy as np
@@ -177,8 +177,35 @@ def test_numbers_are_scalars(tmp_path: Path) -> None:
 def test_damaged_numbers_are_refused(text: str, tmp_path: Path) -> None:
     """A truncated, invalid or foreign file of numbers raises an error."""
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=r"NaN|No 'numbers'|Expecting"):
+    with pytest.raises(ValueError, match=r"(NaN in|No 'numbers' in|Invalid file) '.*a\.json'"):
         store.read_numbers(tmp_path / "a.json")
+
+
+def test_no_flipped_bit_passes_as_a_number(tmp_path: Path) -> None:
+    """Any bit that flips in a file of numbers is an error that names it, or changes no number."""
+    numbers: dict[str, store.Number] = {"rmse_K": 0.21, "frames": 350, "method": "subspace"}
+    store.save_numbers(numbers, tmp_path / "a.json", RECORD)
+    whole, refused = (tmp_path / "a.json").read_bytes(), 0
+    for bit in range(8 * len(whole)):
+        content = bytearray(whole)
+        content[bit // 8] ^= 1 << bit % 8
+        (tmp_path / "a.json").write_bytes(content)
+        try:
+            assert store.read_numbers(tmp_path / "a.json") == numbers, bit
+        except ValueError as error:
+            assert "a.json'" in str(error)  # noqa: PT017
+            refused += 1
+    assert refused > 0.98 * 8 * len(whole)
+
+
+def test_numbers_without_a_checksum_are_read_with_a_warning(tmp_path: Path) -> None:
+    """Numbers of dbthermal 0.1.0 are read as before, and said to be unchecked."""
+    store.save_numbers({"rmse_K": 0.21}, tmp_path / "a.json", RECORD)
+    content = json.loads((tmp_path / "a.json").read_text())
+    del content["sha256"]
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"No checksums in '.*a\.json'"):
+        assert store.read_numbers(tmp_path / "a.json") == {"rmse_K": 0.21}
 
 
 def test_figure_is_the_same_twice(tmp_path: Path) -> None:
@@ -243,10 +270,16 @@ def film(*shapes: tuple[int, int]) -> list[np.ndarray]:
     return [np.full((*shape, 3), 40 * index, np.uint8) for index, shape in enumerate(shapes, 1)]
 
 
-def test_video_comes_back(tmp_path: Path) -> None:
+Codec = Literal["vp9", "h264"]
+
+
+@pytest.mark.parametrize("codec", get_args(Codec))
+def test_video_comes_back(tmp_path: Path, codec: Codec) -> None:
     """A video has its frames, rate and nearly its colours, and the provenance as a comment."""
-    store.save_video(film((32, 48), (32, 48), (32, 48)), tmp_path / "a.mp4", RECORD, rate=10.0)
+    frames = film((64, 96), (64, 96), (64, 96))
+    store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0, codec=codec)
     with av.open(tmp_path / "a.mp4") as video:
+        assert video.streams.video[0].codec_context.codec.canonical_name == codec
         assert video.streams.video[0].average_rate == 10
         assert json.loads(video.metadata["comment"]) == RECORD
         levels = [frame.to_ndarray(format="rgb24").mean() for frame in video.decode(video=0)]
@@ -266,6 +299,18 @@ def test_no_video_of_nonsense(tmp_path: Path, frames: list[np.ndarray], message:
     with pytest.raises(ValueError, match=message):
         store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0)
     assert not any(tmp_path.iterdir())
+
+
+def test_h264_is_a_choice(tmp_path: Path) -> None:
+    """Unless asked for, a video is VP9, the same bytes each time; an unknown codec is refused."""
+    frames = film((32, 48), (32, 48))
+    for name in ("a.mp4", "b.mp4"):
+        store.save_video(frames, tmp_path / name, RECORD, rate=10.0)
+    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    with av.open(tmp_path / "a.mp4") as video:
+        assert video.streams.video[0].codec_context.codec.canonical_name == "vp9"
+    with pytest.raises(ValueError, match=r"Invalid codec 'gif'. Must be one of \['h264', 'vp9'"):
+        store.save_video(frames, tmp_path / "c.mp4", RECORD, rate=10.0, codec=cast("Codec", "gif"))
 
 
 def test_text_keeps_its_record(tmp_path: Path) -> None:

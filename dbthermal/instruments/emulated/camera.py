@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, NamedTuple
-from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
 
+from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import (
     FRAME_TIMEOUT,
@@ -186,24 +186,23 @@ def open_frames(
 
     The option ``ffc`` of ``sim://y16/<name>?ffc=120`` is `EmulatedCamera.ffc_period` [s].
     """
-    parts = urlsplit(url)
-    options = dict(parse_qsl(parts.query, keep_blank_values=True))
-    if parts.scheme != "sim" or parts.netloc not in MODELS:
+    address = addresses.parse(url, ("sim",))
+    if address.target not in MODELS:
         raise ValueError(
             f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
             f"one of {sorted(MODELS)}."
         )
-    require_known(options, MODELS[parts.netloc].options)
+    require_known(address.options, MODELS[address.target].options)
     return EmulatedCamera(
         world,
-        parts.path.lstrip("/"),
+        address.name,
         pictures,
         band,
         stream.shape,
         stream.frame_rate,
         stream.telemetry_rows,
-        kind=parts.netloc,
-        ffc_period=number(options, "ffc", math.inf, FFC_PERIODS),
+        kind=address.target,
+        ffc_period=number(address.options, "ffc", math.inf, FFC_PERIODS),
     )
 
 

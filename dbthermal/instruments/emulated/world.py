@@ -14,8 +14,8 @@ import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
-from urllib.parse import urlsplit
 
+from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.session import Session
 
 __all__ = ["FFC_DURATION", "FPA", "POSITIONS", "ROOM", "CameraState", "World", "emulated_world"]
@@ -175,7 +175,7 @@ class World:
         """Put the cameras and thermocouples of an emulated session on the bench."""
         self.thermocouples.update(session.thermocouples)
         for number, camera in enumerate(session.cameras.values()):
-            name = urlsplit(session.url(camera.video)).path.lstrip("/")
+            name = addresses.parse(camera.video.simulated).name
             self.add_camera(name, SERIAL_NUMBERS + number)
 
     def start_ffc(self, name: str, duration: float = FFC_DURATION) -> None:

@@ -7,10 +7,10 @@ pylablib 1.4.5, ``Thorlabs/kinesis.py`` (scales and units of speed); instrumentk
 units, and addresses). Facts alone, no code.
 """
 
-import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from types import MappingProxyType
 from typing import Final
 
@@ -18,10 +18,16 @@ from dbthermal.instruments import apt
 
 POSITIONS: Final = 6  # slots of the wheel, numbered from 1
 
-_POSITIVE = (
-    *("velocity", "home_velocity", "acceleration", "tolerance", "reply_timeout", "home_timeout"),
-    *("move_timeout", "start_timeout", "stall_timeout", "poll_interval"),
-)
+# Speeds are whole numbers of 32 bits to the controllers, which is 97 turns/s in the finer units.
+_LIMITS: Final = {
+    **dict.fromkeys(("velocity", "home_velocity"), (1e-3, 90.0)),
+    "acceleration": (1e-3, 1e5),
+    "tolerance": (1e-3, 180.0 / POSITIONS - 1e-3),
+    "home_offset": (-359.999, 359.999),
+    **dict.fromkeys(("reply_timeout", "home_timeout", "move_timeout"), (1e-3, 3600.0)),
+    **dict.fromkeys(("start_timeout", "stall_timeout", "poll_interval"), (1e-3, 3600.0)),
+    "serial_number": (1, 2**32 - 1),
+}
 _HOME = {"home_direction": (1, 2), "home_limit_switch": (1, 4)}
 
 
@@ -152,16 +158,14 @@ class Settings:
         repeated = [name for name, count in Counter(self.filters.values()).items() if count > 1]
         if repeated:
             raise ValueError(f"Repeated filter '{repeated[0]}'. Each must have a name of its own.")
-        for name in _POSITIVE:
+        for name, (least, most) in _LIMITS.items():
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"Invalid {name} {value} of the wheel. Must be positive.")
-        if self.tolerance >= 180.0 / POSITIONS:
-            raise ValueError(f"Invalid tolerance {self.tolerance} deg. Must be less than 30 deg.")
-        if not self.addresses:
-            raise ValueError("Invalid addresses () of the wheel. Must be one pair at least.")
-        if not -360.0 < self.home_offset < 360.0:
-            raise ValueError(f"Invalid home_offset {self.home_offset}. Must lie in (-360, 360).")
+            if value is not None and not least <= value <= most:
+                raise ValueError(f"Invalid {name} {value}. Must lie in [{least}, {most}].")
+        if not self.addresses or not {*chain(*self.addresses)} <= apt.CONTROLLERS:
+            raise ValueError(
+                f"Invalid addresses {self.addresses}. Must be pairs of {sorted(apt.CONTROLLERS)}."
+            )
         for name, allowed in _HOME.items():
             value = getattr(self, name)
             if value is not None and value not in allowed:

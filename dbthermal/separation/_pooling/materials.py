@@ -24,6 +24,7 @@ from scipy.stats import chi2
 
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal._coordinates import laid_on
 from dbthermal.separation._pooling import feature_maps, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
 
@@ -102,7 +103,7 @@ def materials(
     ImportError
         If scikit-image is not installed (extra "materials").
     ValueError
-        If a rate is not in (0, 1), a variable is missing, or bands or sizes differ.
+        If a rate is not in (0, 1), a variable is missing, or bands, sizes or coordinates differ.
 
     Notes
     -----
@@ -131,7 +132,7 @@ def materials(
     0
     >>> pooled = separation.solve(capture, response, pool=labels)
     """
-    _check(result, corrected, error_rate, resolution)
+    result = _checked(result, corrected, error_rate, resolution)
     frames = _longest_segment(corrected)
     corrected, result = corrected.isel(time=frames), result.isel(time=frames)
     bands, noise = _order(result, response)
@@ -155,8 +156,11 @@ def materials(
     return _labelled(cells, regions, result)
 
 
-def _check(result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolution: float) -> None:
-    schema.check(corrected, "corrected")
+def _checked(
+    result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolution: float
+) -> xr.Dataset:
+    """Result in the capture's order of bands."""
+    schema.check_corrected(corrected)
     for name, value in (("error_rate", error_rate), ("resolution", resolution)):
         if not 0 < value < 1:
             raise ValueError(f"Invalid {name} {value}. Must lie in (0, 1).")
@@ -168,13 +172,7 @@ def _check(result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolut
             f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
             "reflection ratio. Must be of one that does, as 'subspace'."
         )
-    names, wanted = ([str(name) for name in part["band"].values] for part in (result, corrected))
-    if names != wanted:
-        raise ValueError(f"Invalid bands {names} of the result. Must be the capture's, {wanted}.")
-    for dim in ("y", "x"):
-        size, rule = result.sizes[dim], f"the capture's, {corrected.sizes[dim]}"
-        if size != corrected.sizes[dim]:
-            raise ValueError(f"Invalid size {size} of '{dim}' of the result. Must be {rule}.")
+    return laid_on(result, corrected, "the result", "the capture")
 
 
 def _longest_segment(corrected: xr.Dataset) -> Mask:

@@ -1,0 +1,72 @@
+"""Coordinates of two arrays of which one is laid on the other: the same, or an error.
+
+One rule for every function that takes a second array: bands go by name, in any order; along all
+other dims the two have the same size and, where both have a coordinate, the same values in the same
+order. An array without a coordinate is laid on by position.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import schema
+
+Laid = TypeVar("Laid", xr.DataArray, xr.Dataset)
+
+_STEP: Final = 1e-4  # share of the smallest step that a rounded coordinate may be off
+_ROUNDING: Final = 4.0  # units in the last place of the largest value, likewise
+
+
+def laid_on(
+    array: Laid,
+    reference: xr.DataArray | xr.Dataset,
+    label: str,
+    of: str,
+    dims: Sequence[str] = ("band", "time", "temperature", "material", "y", "x"),
+) -> Laid:
+    """
+    Array with the bands, in the order, and the coordinates of a reference, along the dims of both.
+
+    `label` and `of` name the two in the ValueError, for other bands, sizes or values.
+    """
+    shared = [dim for dim in dims if dim in array.dims and dim in reference.dims]
+    if "band" in shared and "band" in array.coords and "band" in reference.coords:
+        names = [str(name) for name in reference["band"].values]
+        array = array.isel(band=schema.band_positions(array, names, label))
+    for dim in shared:
+        if array.sizes[dim] != reference.sizes[dim]:
+            raise ValueError(
+                f"Invalid size {array.sizes[dim]} of '{dim}' of {label}. Must be that of {of}, "
+                f"{reference.sizes[dim]}."
+            )
+        if dim in array.coords and dim in reference.coords:
+            _require_same(array[dim].values, reference[dim].values, f"'{dim}' of {label}", of)
+    return array.assign_coords(
+        {dim: reference[dim].variable for dim in shared if dim in reference.coords}
+    )
+
+
+def _require_same(here: npt.NDArray[Any], there: npt.NDArray[Any], label: str, of: str) -> None:
+    differ = np.flatnonzero(_differ(here, there))
+    if differ.size:
+        first = differ[0]
+        raise ValueError(
+            f"Invalid {label}: {here[first]} at position {first}, where that of {of} is "
+            f"{there[first]}. Must be the same."
+        )
+
+
+def _differ(here: npt.NDArray[Any], there: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+    """Positions at which two coordinates differ: numbers beyond rounding, all else as text."""
+    if not {here.dtype.kind, there.dtype.kind} <= set("iuf"):
+        return np.asarray(here.astype(str) != there.astype(str))
+    left, right = here.astype(np.float64), there.astype(np.float64)
+    floats = [part for part in (here, there) if part.dtype.kind == "f"]
+    rounding = _ROUNDING * max([float(np.finfo(part.dtype).eps) for part in floats], default=0.0)
+    steps = np.abs(np.diff(right))
+    tolerance = rounding * np.abs(right).max(initial=0.0)
+    tolerance += _STEP * steps.min() if steps.size else 0.0
+    return np.asarray(~(np.abs(left - right) <= tolerance))

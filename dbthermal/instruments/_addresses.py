@@ -1,0 +1,56 @@
+"""Addresses of devices: one rule for each scheme, which sessions and drivers share.
+
+An address never names a program or a library: that of the TC-08 is told by an environment variable.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from dbthermal import _text as texts
+
+_NODE = r"(?P<target>/dev/(?!\S*\.\.)[^\s?#\\]+)"
+_WORD = r"[A-Za-z0-9][A-Za-z0-9._-]*"
+_OPTION = r"[a-z]+=[^\s=&?#]+"
+
+RULES: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
+    {
+        "v4l2": ("v4l2:///dev/<node>", f"v4l2://{_NODE}"),
+        "serial": ("serial:///dev/<port>", f"serial://({_NODE}|(?P<windows>COM[0-9]+))"),
+        "pty": ("pty:///dev/<terminal>", f"pty://{_NODE}"),
+        "tc08": ("tc08:", "tc08:(?P<target>)"),
+        "sim": (
+            "sim://<emulator>/<name>?<option>=<value>",
+            rf"sim://(?P<target>[a-z0-9]+)(/(?P<name>{_WORD}))?(\?(?P<options>{_OPTION}(&{_OPTION})*))?",
+        ),
+    }
+)
+"""Form of the addresses of each scheme, and its regular expression."""
+
+_LONGEST: Final = 200  # [character]
+
+
+class Address(NamedTuple):
+    """Parts of an address: `target` is the device's file, or the kind of emulator."""
+
+    scheme: str
+    target: str
+    name: str = ""
+    options: Mapping[str, str] = MappingProxyType({})
+
+
+def parse(url: str, schemes: Iterable[str] = tuple(RULES)) -> Address:
+    """Parts of an address of one of the schemes; ValueError names it and their forms."""
+    schemes = tuple(schemes)
+    scheme = url.partition(":")[0]
+    found = re.fullmatch(RULES[scheme][1], url) if scheme in schemes else None
+    if found is None or len(url) > _LONGEST:
+        forms = " or ".join(RULES[name][0] for name in schemes)
+        raise ValueError(f"Invalid address {texts.shown(url)}. Must be {forms}.")
+    parts = {name: text or "" for name, text in found.groupdict().items()}
+    pairs = [pair.split("=") for pair in parts.get("options", "").split("&") if pair]
+    if len({name for name, _ in pairs}) < len(pairs):
+        raise ValueError(f"Repeated option in address '{url}'. Must be listed once.")
+    target = parts["target"] or parts.get("windows", "")
+    return Address(scheme, target, parts.get("name", ""), dict(pairs))

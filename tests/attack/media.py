@@ -1,0 +1,230 @@
+"""Hostile spectra and videos: look-alikes of the public files, or these themselves, damaged."""
+
+import os
+import struct
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import av
+import numpy as np
+from matplotlib import colormaps
+
+from attack.files import flip, workplace
+from attack.oracle import Attack, Verdict
+from attack.stages import RIGHT, wrong
+from dbthermal import readers
+
+Rng = np.random.Generator
+
+_HEADER: Final = """Name: Plate Glass
+Type: manmade
+Measurement: Hemispherical reflectance
+X Units: Wavelength (micrometers)
+Y Units: Reflectance (percent)
+First X Value: {first:.4f}
+Last X Value: {last:.4f}
+Number of X Values: {number}
+Additional Information: none
+
+"""
+
+
+@cache
+def _whole(kind: str) -> tuple[bytes, ...]:
+    """Files of a library: a look-alike, and some of the public ones where they are."""
+    wavelength = np.linspace(6, 16, 41)
+    values = 0.85 + 0.1 * np.sin(wavelength)
+    rows = list(zip(wavelength, values, strict=True))
+    if kind == "ecostress":
+        ends = {"first": 6.0, "last": 16.0, "number": 41}
+        text = _HEADER.format(**ends) + "".join(f"{w:.4f} {100 - 100 * v:.4f}\n" for w, v in rows)
+        pattern = "ecostress/*.txt"
+    elif kind == "slum":
+        text = "wavelength,A001,A002\n" + "".join(f"{w:.4f},{v:.4f},{v:.5f}\n" for w, v in rows)
+        pattern = "slum/LUMA*.csv"
+    else:
+        text = "x1,x2,y_glass\n" + "".join(f"{w:.4f},{1e4 / w:.4f},{v:.4f}\n" for w, v in rows)
+        pattern = "ucsb/*[!T].csv"
+    folder = os.environ.get("DBTHERMAL_DATA")
+    public = sorted(Path(folder).glob(pattern))[::40] if folder else []
+    return (text.encode("latin-1"), *(path.read_bytes() for path in public))
+
+
+def spectra(rng: Rng) -> Attack:
+    """Spectra of three libraries: cut, with rows lost, swapped or spoilt, of other text."""
+    kind = str(rng.choice(["ecostress", "slum", "ucsb"]))
+    choices = _whole(kind)
+    whole = choices[int(rng.integers(len(choices)))]
+    path = workplace() / f"{kind}.spectrum"
+    what = str(rng.choice(list(_TABLES)))
+    spoilt = _TABLES[what](rng, whole)
+    read: Callable[[Path], Any] = getattr(readers, kind)
+    path.write_bytes(whole)
+    truth = _values(read(path))
+    path.write_bytes(spoilt)
+
+    def judge(found: Any) -> Verdict:
+        values = _values(found)
+        same = len(values) == len(truth) and all(
+            a.shape == b.shape and np.allclose(a, b, rtol=0, atol=1e-12)
+            for a, b in zip(values, truth, strict=True)
+        )
+        return wrong(
+            f"{what} accepted: {len(values)} arrays, sizes {[v.size for v in values][:4]}",
+            where=not same,
+        )
+
+    # Neither library says how many rows there are.
+    endless = "cut" in what and kind != "ecostress"
+    limit = "no number of rows in the file" if endless else ""
+    return Attack(f"{kind}: {what}", lambda: read(path), judge, (path.name,), limit=limit)
+
+
+def _values(found: Any) -> list[np.ndarray]:
+    parts = found.values() if isinstance(found, dict) else [found]
+    return [one[name].values for one in parts for name in ("emissivity", "wavelength")]
+
+
+def _line(rng: Rng, whole: bytes, change: Callable[[list[bytes], int], Any]) -> bytes:
+    """Change one line of the table, behind the header."""
+    lines = whole.split(b"\n")
+    filled = [n for n, line in enumerate(lines) if line[:1].strip() and line.strip()[:1].isdigit()]
+    change(lines, filled[int(rng.integers(1, len(filled) - 1))])
+    return b"\n".join(lines)
+
+
+def _put(value: bytes) -> Callable[[list[bytes], int], None]:
+    """Another value in place of the line's first or last number."""
+
+    def change(lines: list[bytes], place: int) -> None:
+        mark = b"," if b"," in lines[place] else None
+        parts = lines[place].split(mark)
+        parts[0 if value == b"-1" else -1] = value
+        lines[place] = (mark or b" ").join(parts)
+
+    return change
+
+
+def _swap(lines: list[bytes], place: int) -> None:
+    lines[place], lines[place + 1] = lines[place + 1], lines[place]
+
+
+def _cut_at_row(rng: Rng, whole: bytes) -> bytes:
+    lines = whole.rstrip().split(b"\n")
+    return b"\n".join(lines[: int(rng.integers(len(lines) * 2 // 3, len(lines) - 1))]) + b"\n"
+
+
+_TABLES: Final[Mapping[str, Callable[[Rng, bytes], bytes]]] = {
+    "cut": lambda rng, whole: whole[: int(rng.integers(len(whole) - 30))],
+    "cut at a row": _cut_at_row,
+    "emptied": lambda *_: b"",
+    "zeros": lambda _, whole: b"\x00" * len(whole),
+    "of noise": lambda rng, whole: rng.bytes(len(whole)),
+    "NaN": lambda rng, whole: _line(rng, whole, _put(b"nan")),
+    "infinite": lambda rng, whole: _line(rng, whole, _put(b"inf")),
+    "negative wavelength": lambda rng, whole: _line(rng, whole, _put(b"-1")),
+    "a word": lambda rng, whole: _line(rng, whole, _put(b"oops")),
+    "bad UTF-8": lambda rng, whole: _line(rng, whole, _put(b"\xff\xfe")),
+    "a value of 10^9": lambda rng, whole: _line(rng, whole, _put(b"1e9")),
+    "rows swapped": lambda rng, whole: _line(rng, whole, _swap),
+    "a row short": lambda rng, whole: _line(
+        rng, whole, lambda lines, n: lines.__setitem__(n, b"8.1")
+    ),
+    "a row twice": lambda rng, whole: _line(rng, whole, lambda lines, n: lines.insert(n, lines[n])),
+    "no header": lambda _, whole: whole.split(b"\n\n" if b"\n\n" in whole else b"\n", 1)[1],
+    "another library": lambda _, whole: _whole("slum" if b"Name" in whole else "ecostress")[0],
+    "semicolons": lambda _, whole: whole.replace(b",", b";").replace(b"Name:", b"Title"),
+}
+
+
+@cache
+def _film() -> bytes:
+    """A small video of a wave drawn in plasma."""
+    time, y, x = np.ogrid[:24, :48, :64]
+    wave = 0.5 + 0.35 * np.sin(y / 9 + time / 4) * np.cos(x / 11)
+    return _encoded(colormaps["plasma"](np.rint(wave * 255).astype(int), bytes=True)[..., :3])
+
+
+@cache
+def _large() -> bytes:
+    """A video of a few kB, whose pictures take a gigabyte."""
+    plain = np.array([204, 71, 120], np.uint8)
+    return _encoded(np.broadcast_to(plain, (72, 1080, 1920, 3)), "ultrafast")
+
+
+def _encoded(frames: Any, preset: str = "medium") -> bytes:
+    path = workplace() / "whole.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"crf": "18", "preset": preset})
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+        for frame in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+    return path.read_bytes()
+
+
+def _spoil(rng: Rng, content: bytearray, what: str) -> None:
+    """Damage the bytes of a video."""
+    if what == "noise":
+        first = content.index(b"mdat") + 4 + int(rng.integers(50, 1500))
+        content[first : first + 20] = rng.bytes(20)
+    elif what == "cut":
+        del content[int(rng.integers(len(content))) :]
+    elif what == "size":
+        # The width and height that the container states; the stream has its own.
+        place = content.index(b"avc1", content.index(b"stsd") + 12) + 28
+        content[place : place + 4] = struct.pack(">HH", 32000, 32000)
+    elif what == "text":
+        content = bytearray(
+            b"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nwhole.mp4\n#EXT-X-ENDLIST\n"
+        )
+    elif what == "zeros":
+        place = int(rng.integers(len(content) - 100))
+        content[place : place + 100] = bytes(100)
+
+
+def videos(rng: Rng) -> Attack:
+    """Videos cut, flipped, emptied, of a false size, no files, addresses and playlists."""
+    whole, folder = _film(), workplace() / "video"
+    folder.mkdir(exist_ok=True)
+    path = folder / "film.mp4"
+    path.write_bytes(whole)
+    truth = readers.palette_video(path).values
+    what = str(rng.choice(["flipped"] * 4 + ["noise", "cut", "size", "address", "text", "zeros"]))
+    large = rng.random() < 0.05
+    content, given = bytearray(_large() if large else whole), str(path)
+    what = "large" if large else what
+    _spoil(rng, content, what)
+    path.write_bytes(bytes(content))
+    if what == "flipped":
+        flip(rng, path)
+    if what == "address":
+        given = str(rng.choice(_ADDRESSES)).format(path)
+
+    def judge(found: Any) -> Verdict:
+        if what == "address":
+            return wrong(f"'{given[:30]}' was opened")
+        if found.shape != truth.shape:
+            return wrong(f"{what}: {found.shape[0]} of {truth.shape[0]} frames")
+        off = float(np.abs(found.values - truth).max())
+        # A bit that the codec cannot tell from another picture changes little of it.
+        return wrong(f"{what}: positions off by {off:.2f}", where=off > 0.25) if off else RIGHT
+
+    limit = "H.264 has no checksum" if what in ("flipped", "noise", "zeros") else ""
+    told = given if what == "address" else ""
+    act = lambda: readers.palette_video(given)  # noqa: E731
+    return Attack(f"video {what} {told}", act, judge, (f"film|{Path(given).name}",), limit=limit)
+
+
+_ADDRESSES: Final = (
+    *(
+        "file://{}",
+        "concat:{0}|{0}",
+        "subfile,,start,0,end,900,,:{}",
+        "http://localhost:9/film.mp4",
+    ),
+    *("data:video/mp4;base64,AAAA film", "pipe:0 film", "cache:{}", "lavfi:testsrc film"),
+)
