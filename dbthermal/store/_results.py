@@ -13,13 +13,14 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
+from dbthermal import _text as texts
 from dbthermal.store._integrity import (
     MARK,
     SUMS,
@@ -201,15 +202,22 @@ def save_numbers(
 
 
 def read_numbers(path: str | Path) -> dict[str, Number]:
-    """Read a file of `save_numbers`: name to value. ValueError if it is not such a file."""
+    """
+    Read a file of `save_numbers`: name to value.
 
-    def refuse(constant: str) -> NoReturn:
-        raise ValueError(f"Invalid number {constant} in '{path}'. Must be finite.")
-
-    content = json.loads(Path(path).read_text(encoding="utf-8"), parse_constant=refuse)
+    ValueError, with file and line, if it is not such a file, a name is listed twice or a number is
+    not finite.
+    """
+    content = texts.parse_json(texts.read_text(path), str(path))
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
         raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
-    return {name: _number(name, value) for name, value in content["numbers"].items()}
+    for name, value in content["numbers"].items():
+        if not isinstance(value, bool | int | float | str):
+            raise ValueError(
+                f"Invalid {texts.shown(name)} = {texts.shown(value)} in '{path}'. Must be a "
+                "number, a string or a boolean."
+            )
+    return dict(content["numbers"])
 
 
 def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
