@@ -32,9 +32,7 @@ class Kernel(AsyncKernelManager):
 
     async def start_kernel(self, *arguments: Any, **options: Any) -> None:  # type: ignore[override]
         """Start the kernel with the lock's open file among its own."""
-        held = os.environ.get(locked.HELD)
-        if held is not None:
-            options["pass_fds"] = (int(held),)
+        options["pass_fds"] = (int(os.environ[locked.HELD]),)
         await super().start_kernel(*arguments, **options)
 
 
@@ -49,6 +47,8 @@ def execute(run: str, stem: str, values: Mapping[str, Any]) -> Path:
     path = part.with_name(f"{stem}.ipynb")
     failed = paths.root() / "results" / "failed" / run / path.name
     part.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists():  # from here on no name says that it is whole
+        path.replace(part)
     part.touch()
     _sync(part, part.parent)
     failed.unlink(missing_ok=True)
@@ -106,6 +106,14 @@ def _sync(*places: Path) -> None:
             os.close(file)
 
 
+def _lock(task: str) -> None:
+    """Be beneath the lock of make, and end with it; without make, take the lock."""
+    if locked.held(root := paths.root()):
+        locked.end_with_parent(lambda: os.kill(os.getpid(), signal.SIGKILL))
+    else:
+        os.environ[locked.HELD] = str(locked.lock(root, task))
+
+
 def _stop(number: int, _: FrameType | None) -> NoReturn:
     raise SystemExit(128 + number)
 
@@ -118,9 +126,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-f", dest="files", action="append", default=[], type=Path, metavar="FILE")
     parser.add_argument("-p", dest="texts", action="append", default=[], nargs=2, metavar="TEXT")
     options = parser.parse_args(arguments)
-    locked.end_with_parent(lambda: os.kill(os.getpid(), signal.SIGKILL))
     signal.signal(signal.SIGTERM, _stop)
     try:
+        _lock(f"reproduction.execute {options.run} {options.stem}")
         manifest.mirror()
         texts = [*options.texts, ["results", options.run]]
         if "results" not in parameters.defaults(options.stem):

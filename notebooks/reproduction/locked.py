@@ -8,7 +8,6 @@ The lock is one of the operating system on the file `LOCK`. All that make starts
 notebooks' kernels among them, so that it is free when the last of them has ended, however it ended.
 """
 
-import contextlib
 import fcntl
 import os
 import re
@@ -30,6 +29,9 @@ HELD: Final = "DBTHERMAL_LOCK"
 
 LOCKED: Final = "DBTHERMAL_LOCKED"
 """Variable with the folder that is locked, which tells the Makefile that it is."""
+
+MIRROR: Final = "DBTHERMAL_MIRROR"
+"""Variable with the absolute path of the folder that DBTHERMAL_DATA names."""
 
 _PATIENCE: Final = 3.0  # the kernels of a make that was killed notice it within a second [s]
 _POLL: Final = 0.2  # [s]
@@ -56,10 +58,20 @@ def lock(folder: Path, task: str) -> int:
 
 
 def _locked(file: int) -> bool:
-    with contextlib.suppress(BlockingIOError):
+    try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return True
-    return False
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise RuntimeError(
+            f"No lock on '{LOCK}': {error}. Must be on a file system with locks."
+        ) from error
+    return True
+
+
+def held(folder: Path) -> bool:
+    """Whether this process runs beneath a make that holds the lock of a folder."""
+    return os.environ.get(LOCKED) == str(folder)
 
 
 def end_with_parent(end: Callable[[], object]) -> None:
@@ -85,8 +97,9 @@ def settings() -> dict[str, str]:
     if mirror := environment.get("DBTHERMAL_DATA", "").strip():
         if not Path(mirror).is_dir():
             raise ValueError(f"Invalid DBTHERMAL_DATA {mirror!r}. Must name a folder.")
-        environment["DBTHERMAL_DATA"] = str(Path(mirror).absolute())
-    return environment
+        mirror = str(Path(mirror).absolute())
+    # The second name is for the Makefile: what was said to make itself goes over the environment.
+    return environment | {"DBTHERMAL_DATA": mirror, MIRROR: mirror}
 
 
 def main(make: str) -> int:

@@ -46,14 +46,18 @@ def read(stem: str, files: Iterable[Path], texts: Iterable[tuple[str, str]] = ()
     """
     Values for a notebook from YAML files, a later one over an earlier one, and from texts.
 
-    `texts` are pairs of name and text. Raises a ValueError that names file and parameter for what
-    `check` refuses, for a file that `readers.read_yaml` refuses, as one with repeated keys, and for
-    a name that is twice in `texts`.
+    The file in ``params/`` must have all of them. `texts` are pairs of name and text. Raises
+    a ValueError that names file and parameter for what `check` refuses, for a file that
+    `readers.read_yaml` refuses, as one with repeated keys, and for a name twice in `texts`.
     """
     small, values, named = defaults(stem), dict[str, Any](), dict[str, Any]()
     for path in files:
         content = readers.read_yaml(path)
         check(content, small, f"'{path}'")
+        if path.absolute() == paths.params(stem) and (missing := small.keys() - content.keys()):
+            raise ValueError(
+                f"Missing parameter '{min(missing)}' in '{path}'. Must have all values."
+            )
         values |= content
     for name, text in texts:
         if name in named:
@@ -67,7 +71,8 @@ def check(values: Mapping[str, Any], small: Mapping[str, Any], source: str) -> N
     """Refuse values of other names or kinds than those of a notebook's cell; `source` has them.
 
     A number must be finite; a whole one must stay whole, and not be negative where the small one is
-    not. In lists and mappings the kinds must agree too; a mapping may have other names.
+    not. In lists and mappings the kinds must agree too. A mapping with values of several kinds has
+    fixed names, as `{"shape": [2, 3], "rate": 10.0}`; one of like things may have others.
     """
     for name, value in values.items():
         if name not in small:
@@ -75,6 +80,13 @@ def check(values: Mapping[str, Any], small: Mapping[str, Any], source: str) -> N
                 f"Unknown parameter '{name}' in {source}. Must be one of {sorted(small)}."
             )
         _check_kind(f"parameter '{name}' in {source}", value, small[name])
+        if (
+            isinstance(value, dict)
+            and _is_record(small[name])
+            and value.keys() != small[name].keys()
+        ):
+            rule = f"Must have the names {[*small[name]]}."
+            raise ValueError(f"Invalid names {[*value]} of parameter '{name}' in {source}. {rule}")
         if type(small[name]) is int and small[name] >= 0 and value < 0:
             raise ValueError(f"Invalid parameter '{name}' = {value} in {source}. Must be >= 0.")
 
@@ -105,6 +117,10 @@ def _check_kind(place: str, value: Any, small: Any, *, whole: bool = True) -> No
         one = parts[0] if len({_kind(part, whole=False) for part in parts}) == 1 else None
         for number, part in enumerate(value):
             _check_kind(f"entry {number} of {place}", part, one, whole=False)
+
+
+def _is_record(small: Mapping[str, Any]) -> bool:
+    return len({_kind(value, whole=False) for value in small.values()}) > 1
 
 
 def _kind(value: Any, *, whole: bool) -> str:

@@ -8,7 +8,7 @@ import nbformat
 import papermill
 import pytest
 
-from reproduction import execute, parameters, paths
+from reproduction import execute, locked, parameters, paths
 from reproduction.run import Run
 
 CELL = 'results = "smoke"\nframes = 3\nrecorded = ""\nnoise = [0.1, 1]\ntime_constant = None\n'
@@ -72,6 +72,22 @@ def test_what_an_earlier_run_left_goes_first(folder: Path, monkeypatch: pytest.M
     names = sorted(path.name for path in folder.iterdir())
     assert names == ["03_tiny.ipynb", "03_tiny.json", "04_other.json"]
     assert (folder / "03_tiny.json").read_text() == "new"
+
+
+def test_results_are_on_the_disk_before_the_name_is(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power loss leaves no name of a notebook whose results are only in the system's cache."""
+    replaced(monkeypatch, Papermill(2))
+    synced: list[tuple[Path, bool]] = []
+    named = folder / "03_tiny.ipynb"
+    monkeypatch.setattr(
+        execute, "_sync", lambda *places: synced.extend((place, named.exists()) for place in places)
+    )
+    execute.execute("full", "03_tiny", {})
+    for name in ("03_tiny.json", ".03_tiny.part.ipynb"):
+        assert (folder / name, False) in synced
+    assert synced[-1] == (folder, True)
 
 
 def test_a_change_while_it_ran_is_newer(
@@ -140,6 +156,11 @@ def test_results_of_an_unfinished_notebook_are_refused(folder: Path) -> None:
         ("noise: [0.1, x]", "Invalid entry 1 of parameter 'noise' in .*: 'x'. Must be a number"),
         ("plate: [2, 3]", "Must be a mapping"),
         ("plate: {shape: 2}", "Invalid 'shape' of parameter 'plate'.*Must be a list"),
+        (
+            "plate: {shape: [2]}",
+            r"Invalid names \['shape'\] of parameter 'plate' in .* \['shape', 'kind'",
+        ),
+        ("plate: {shape: [2], kind: a, knid: b}", "Invalid names"),
         ("- frames", "Must be a mapping"),
     ],
 )
@@ -151,13 +172,28 @@ def test_values_are_refused(project: Path, text: str, message: str) -> None:
         parameters.read("03_tiny", [path])
 
 
+@pytest.mark.usefixtures("project")
+def test_the_full_values_are_complete() -> None:
+    """A file of full values that was cut does not leave small ones in a full run."""
+    with pytest.raises(ValueError, match=r"Missing parameter 'known' in '.*03_tiny\.yaml'"):
+        parameters.read("03_tiny", [Path("params/03_tiny.yaml")])
+
+
 def test_values_are_taken_in_order(project: Path) -> None:
     """A later file's value replaces an earlier one's, and a text replaces both, once."""
-    for name, text in (("a", "frames: 4\nrate: 3\nplate: {shape: []}"), ("b", "frames: 5")):
+    for name, text in (
+        ("a", "frames: 4\nrate: 3\nplate: {shape: [], kind: a}"),
+        ("b", "frames: 5"),
+    ):
         (project / f"{name}.yaml").write_text(text)
     files = [project / "a.yaml", project / "b.yaml"]
     values = parameters.read("03_tiny", files, [("recorded", "there")])
-    assert values == {"frames": 5, "rate": 3, "plate": {"shape": []}, "recorded": "there"}
+    assert values == {
+        "frames": 5,
+        "rate": 3,
+        "plate": {"shape": [], "kind": "a"},
+        "recorded": "there",
+    }
     with pytest.raises(ValueError, match="Repeated parameter 'recorded' of '03_tiny'"):
         parameters.read("03_tiny", files, [("recorded", "a"), ("recorded", "b")])
     with pytest.raises(ValueError, match="Unknown parameter 'recordings' in the texts"):
@@ -175,10 +211,14 @@ def test_what_papermill_injects_is_checked() -> None:
 
 
 def test_parameters_are_refused_before_the_notebook_runs(
-    folder: Path, project: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path,
+    project: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The command says what is wrong, fails, and leaves what is there."""
     (project / "a.yaml").write_text("frmaes: 3")
+    monkeypatch.setenv(locked.HELD, "")  # which the command sets
     assert execute.main(["full", "03_tiny", "-f", "a.yaml"]) == 1
     assert "full/03_tiny: Unknown parameter 'frmaes' in 'a.yaml'" in capsys.readouterr().err
     assert (folder / "03_tiny.ipynb").is_file()

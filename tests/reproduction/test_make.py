@@ -157,9 +157,10 @@ def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment:
 
 def kernels(root: Path) -> list[int]:
     """Process numbers of the kernels that run in a checkout."""
-    found = subprocess.run(["pgrep", "-f", "ipykernel_launcher"], capture_output=True, check=False)
-    pids = [int(pid) for pid in found.stdout.split()]
-    return [pid for pid in pids if Path(f"/proc/{pid}/cwd").resolve() == root / "notebooks"]
+    command = ["ps", "-axww", "-o", "pid=,command="]
+    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    of_checkout = f"ipykernel_launcher -f {root}"
+    return [int(line.split()[0]) for line in listed.splitlines() if of_checkout in line]
 
 
 def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,6 +181,9 @@ def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setenv("PYTHON", f"./python {name.replace('/', '')}")
         assert "Invalid Python './python" in make("smoke").stderr
         monkeypatch.setenv("PYTHON", sys.executable)
+    done = make("results/inputs.txt", "DBTHERMAL_DATA=mirrors")
+    inputs = (checkout / "results/inputs.txt").read_text().splitlines()
+    assert inputs[0] == f"DBTHERMAL_DATA={checkout}/mirrors"
     planned = make("--dry-run", "full", "smoke", "chain")
     assert planned.returncode == 0, planned.stderr
     assert "reproduction.execute full 01_tiny" in planned.stdout

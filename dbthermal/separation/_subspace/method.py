@@ -55,8 +55,8 @@ from dbthermal import _smooth as smooth
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
+from dbthermal.separation._subspace import clock, reflection_ratio, residuals
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import reflection_ratio, residuals
 from dbthermal.separation._subspace.emission import Emission
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
 from dbthermal.separation._tiles import Array, Estimate, Mask, Survey, Tile
@@ -282,6 +282,11 @@ def _with_jumps(tile: Tile, settings: SubspaceSettings) -> Estimate:
 
 
 METHOD: Final = Method(
-    separate, settings=SubspaceSettings, minimum_frames=32, survey=survey, any_bands=True
+    separate,
+    settings=SubspaceSettings,
+    minimum_frames=32,
+    check_clock=clock.check,
+    survey=survey,
+    any_bands=True,
 )
 """The subspace separator, for `solve`."""
