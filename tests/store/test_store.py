@@ -177,7 +177,10 @@ def test_numbers_are_scalars(tmp_path: Path) -> None:
 def test_damaged_numbers_are_refused(text: str, tmp_path: Path) -> None:
     """A truncated, invalid or foreign file of numbers raises an error."""
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=r"a\.json(: Invalid number NaN|'. Must be a file|, line 1, .*Must be JSON)"):
+    with pytest.raises(
+        ValueError,
+        match=r"a\.json(: Invalid number NaN|'. Must be a file|, line 1, .*Must be JSON)",
+    ):
         store.read_numbers(tmp_path / "a.json")
 
 
