@@ -123,8 +123,8 @@ def _recorded(folder: Path, what: str, status: int) -> Verdict:
     for band, number in enumerate(frames):
         part = opened.isel(band=band, time=slice(0, min(number, opened.sizes["time"])))
         leaps = np.diff(part["sequence"].values.astype(int))
-        empty = (part["counts"] == 0).all(["y", "x"])
-        spoilt[band] = bool(empty.any()) or bool((leaps < 1).any())
+        black = (part["counts"] == 0).all(["y", "x"])
+        spoilt[band] = bool(black.any()) or bool((leaps < 1).any())
     if any(spoilt):
         return wrong(f"zeros, or frames out of order: {spoilt}")
     attrs = opened.attrs
