@@ -140,6 +140,12 @@ def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     return np.flatnonzero(finite)
 
 
+def _samples(movie: xr.DataArray, rows: slice) -> Single:
+    """Counts of some rows, NaN where they are no measurement."""
+    counts = movie.isel(y=rows).values
+    return np.where(schema.measured(counts), counts, np.nan).astype(np.float32)
+
+
 def _blocks(movie: xr.DataArray) -> list[slice]:
     """Rows that are read at once."""
     height = movie.sizes["y"]
@@ -151,7 +157,7 @@ def _noise(movie: xr.DataArray) -> Array:
     """Noise (y, x) [count] from the quiet part of the second differences; see `mark_bad`."""
     level = np.empty((movie.sizes["y"], movie.sizes["x"]))
     for rows in _blocks(movie):
-        signal = movie.isel(y=rows).values.astype(np.float32)
+        signal = _samples(movie, rows)
         second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
         quiet = int(_QUIET * second.shape[0])
         second.partition(quiet, axis=0)
@@ -177,7 +183,7 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
     for rows in _blocks(movie):
         # A row more on each side: the neighbours.
         top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
-        change = np.diff(movie.isel(y=slice(top, bottom)).values.astype(np.float32), axis=0)
+        change = np.diff(_samples(movie, slice(top, bottom)), axis=0)
         change[stepped] = 0.0  # new offsets after a shutter event
         change[~np.isfinite(change)] = 0.0
         here = slice(rows.start - top, rows.stop - top)
