@@ -19,8 +19,11 @@ from dbthermal.separation import _quality as quality
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.intp]
 
-# Pixels from which the noise is estimated where the response has none.
+# Pixels from which the noise is estimated where the response has none, and a clock is judged.
 _NOISE_PIXELS: Final = 4096
+_CLOCK_PIXELS: Final = 256
+# Mean steps, by which a time may be off an even clock, unlooked at.
+_NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor")
 _MASK_DIMS: Final = (("time",), ("y", "x"), ("time", "y", "x"))
 
@@ -37,6 +40,7 @@ class Method:
     every_frame: bool = False  # does not solve a pixel that lacks a frame of the others
     even_times: bool = False  # refuses frames at uneven times, by name
     survey: Callable[..., Any] | None = None  # `Survey` of the same arguments, for pooling
+    check_clock: Callable[..., None] | None = None  # refuses times that are not of exposure
     any_bands: bool = False  # takes more than two bands
     not_estimated: tuple[str, ...] = ()  # variables of the result that are NaN everywhere
 
@@ -78,7 +82,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
     settings = _checked_settings(method, name, settings)
-    schema.check(corrected, "corrected")
+    schema.check_corrected(corrected)
     _check_status(corrected)
     bands = [str(band) for band in corrected["band"].values]
     _check_demands(method, name, bands, corrected.sizes["time"])
@@ -94,6 +98,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     if mask is not None:
         capture = capture.assign(mask=_checked_mask(capture, mask))
     noise = _noise(capture, response, curves)
+    _check_clock(capture, method, curves, noise)
     value, std = _known_emissivity(corrected, emissivity, emissivity_std)
     return Inputs(
         method=method,
@@ -196,6 +201,22 @@ def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Ar
     counts, frames = quality.sample(capture, _NOISE_PIXELS)
     signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
     return noises.estimate_bands(signals, capture["time"].values[frames])
+
+
+def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise: Array) -> None:
+    """Check a clock that is far from even by the signals, for a method that relies on it."""
+    time = capture["time"].values.astype(np.float64)
+    even = np.linspace(time[0], time[-1], time.size)
+    off = np.abs(time - even).max() * (time.size - 1)
+    if method.check_clock is None or off <= _NEARLY_EVEN * (time[-1] - time[0]):
+        return
+    counts, frames = quality.sample(capture, _CLOCK_PIXELS)
+    if frames.sum() < method.minimum_frames:
+        return
+    order = np.argsort(noise, kind="stable")
+    signals = np.stack([curves[band].linearise(counts[band]) for band in order])
+    segment = capture["segment"].values[frames] if "segment" in capture else None
+    method.check_clock(signals, time[frames], noise[order], segment)
 
 
 def _noise_factor(capture: xr.Dataset) -> Array | float:

@@ -119,8 +119,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     TypeError
         If an argument is of the wrong type, or the settings are those of another method.
     ValueError
-        If a dim, unit, band, coordinate, method or emissivity is not as described, or the capture
-        is too short for the method. A bad pixel is not an error but a bit of `status`.
+        If a dim, unit, band, coordinate, method or emissivity is not as described, the capture is
+        too short for the method, or its `time` is that of arrival or of a clock that was set:
+        "subspace" finds slow changes smooth over the numbers of the frames and not over the times.
+        A bad pixel is not an error but a bit of `status`.
 
     Notes
     -----

@@ -1,18 +1,19 @@
 """Checksums of a store: of every file when it is written, compared when it is read.
 
-``SHA256SUMS`` in the folder has a line for each file, as ``sha256sum --check`` reads them. A line
-is appended before its file is written: a recording that is cut short at any moment has the lines of
-all that is valid. A file that was replaced has a line for each state until the recording is closed.
-A bit that flips, a file that is cut, missing, foreign or in another's place is then seen: metadata
-and file names when the store is opened, values when they are read.
+``checksums.sfv`` in the folder has a line for each file: its name and its CRC-32, as programs for
+"simple file verification" read them. A line is appended before its file is written: a recording
+that is cut short at any moment has the lines of all that is valid. A file that was replaced has a
+line for each state until the recording is closed. A bit that flips, a file that is cut, missing,
+foreign or in another's place is then seen: metadata and file names when the store is opened, values
+when they are read.
 """
 
 import asyncio
-import hashlib
 import json
 import math
 import os
 import warnings
+import zlib
 from collections.abc import AsyncIterator, Iterator, Mapping
 from itertools import product
 from pathlib import Path
@@ -23,9 +24,11 @@ from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore
 
+Content = bytes | memoryview
+
 GROUP: Final = "zarr.json"  # file of a zarr group's attributes
-SUMS: Final = "SHA256SUMS"
-MARK: Final = MappingProxyType({"checksums": f"SHA-256 of every file, in {SUMS}"})
+SUMS: Final = "checksums.sfv"
+MARK: Final = MappingProxyType({"checksums": f"CRC-32 of every file, in {SUMS}"})
 """Attribute of every store with checksums, so that their loss is seen."""
 
 
@@ -34,7 +37,7 @@ class SummedStore(LocalStore):
 
     def set_sync(self, key: str, value: Buffer) -> None:
         """Write a file by its relative name, its checksum first."""
-        add_sums(self.root, {key: value.to_bytes()})
+        add_sums(self.root, {key: value.as_numpy_array().data})
         super().set_sync(key, value)
 
     async def set(self, key: str, value: Buffer) -> None:
@@ -71,15 +74,11 @@ class CheckedStore(SummedStore):
             raise ValueError(f"Invalid {self._named(GROUP)}. Must be a zarr group.") from error
         self.closed = bool(self.attrs.get("closed", True))
         if MARK.keys() & self.attrs.keys() and not self._sums:
-            raise ValueError(f"Missing {self._named(SUMS)}. {_RULE}")
+            raise ValueError(f"Missing {self._named(SUMS)}. {AS_WRITTEN}")
         if self._sums:
             self._check_files()
         else:
-            warnings.warn(
-                f"No checksums in '{self.root}': damage is not seen. Must be a store of dbthermal "
-                "0.1.0; saved again it has them.",
-                stacklevel=3,
-            )
+            warn_unchecked(self.root, stacklevel=3)
 
     def get_sync(
         self,
@@ -90,7 +89,7 @@ class CheckedStore(SummedStore):
     ) -> Buffer | None:
         """Read a file that is as it was written."""
         content = super().get_sync(key, prototype=prototype)
-        self._compare(key, None if content is None else content.to_bytes())
+        self._compare(key, None if content is None else content.as_numpy_array().data)
         if byte_range is None:
             return content
         return super().get_sync(key, prototype=prototype, byte_range=byte_range)
@@ -106,7 +105,7 @@ class CheckedStore(SummedStore):
             self.get_sync, key, prototype=prototype, byte_range=byte_range
         )
 
-    def _compare(self, key: str, content: bytes | None) -> None:
+    def _compare(self, key: str, content: Content | None) -> None:
         """ValueError unless a file is as it was written, or absent as it was."""
         if not self._sums or _is_listed(self._sums, key, content):
             return
@@ -116,18 +115,18 @@ class CheckedStore(SummedStore):
                 self._sums = now
                 return
             state = "Since it was opened, replaced"
-        raise ValueError(f"{state} {self._named(key)}. {_RULE}")
+        raise ValueError(f"{state} {self._named(key)}. {AS_WRITTEN}")
 
     def _check_files(self) -> None:
         """ValueError if a file is missing, or foreign to a store that grows no more."""
         files = set(_files(self.root))
         wanted = self._sums.keys() if self.closed else set(self._valid_files())
         if missing := sorted(wanted - (files & self._sums.keys())):
-            raise ValueError(f"Missing {self._named(missing[0])}. {_RULE}")
+            raise ValueError(f"Missing {self._named(missing[0])}. {AS_WRITTEN}")
         # A kill, or a system's file browser, may leave hidden files.
         foreign = sorted(key for key in files - self._sums.keys() if not f"/{key}".count("/."))
         if self.closed and foreign:
-            raise ValueError(f"Foreign {self._named(foreign[0])}. {_RULE}")
+            raise ValueError(f"Foreign {self._named(foreign[0])}. {AS_WRITTEN}")
 
     def _valid_files(self) -> Iterator[str]:
         """Metadata of all arrays, and the chunks in the valid part of a recording that grows."""
@@ -156,7 +155,16 @@ class CheckedStore(SummedStore):
         return f"file '{key}' of {f'array {array!r} in ' if array else ''}store '{self.root}'"
 
 
-_RULE: Final = "Must be as it was written: copy the store again, or make it anew."
+AS_WRITTEN: Final = "Must be as it was written: copy it again, or make it anew."
+
+
+def warn_unchecked(path: str | Path, stacklevel: int) -> None:
+    """Warn that damage of a file or store cannot be seen."""
+    warnings.warn(
+        f"No checksums in '{path}', as of dbthermal 0.1.0: damage is not seen. Saved again, it has "
+        "them.",
+        stacklevel=stacklevel + 1,
+    )
 
 
 def valid_part(attrs: Mapping[str, Any]) -> dict[str, int]:
@@ -164,9 +172,9 @@ def valid_part(attrs: Mapping[str, Any]) -> dict[str, int]:
     return {"time": min(attrs["frames_written"].values()), "log": attrs["log_written"]}
 
 
-def add_sums(root: Path, contents: Mapping[str, bytes]) -> Path:
+def add_sums(root: Path, contents: Mapping[str, Content]) -> Path:
     """Append the checksums of files by relative name; path of the file of checksums."""
-    lines = [f"{hashlib.sha256(content).hexdigest()}  {key}\n" for key, content in contents.items()]
+    lines = [f"{key} {zlib.crc32(content):08x}\n" for key, content in contents.items()]
     with (root / SUMS).open("ab") as stream:  # in one piece, for several threads may append
         stream.write("".join(lines).encode())
     return root / SUMS
@@ -175,7 +183,7 @@ def add_sums(root: Path, contents: Mapping[str, bytes]) -> Path:
 def last_sums(root: Path) -> bytes:
     """Content of the file of checksums with the last state of every file alone, by name."""
     sums = _read_sums(root)
-    return "".join(f"{sums[key].split()[-1]}  {key}\n" for key in sorted(sums)).encode()
+    return "".join(f"{key} {sums[key].split()[-1]}\n" for key in sorted(sums)).encode()
 
 
 def missing_files(root: Path) -> list[str]:
@@ -189,16 +197,16 @@ def _read_sums(root: Path) -> dict[str, str]:
     path = root / SUMS
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     for line in text.split("\n")[:-1]:
-        digest, _, key = line.partition("  ")
-        sums[key] = f"{sums[key]} {digest}" if key in sums else digest
+        key, _, crc = line.rpartition(" ")
+        sums[key] = f"{sums[key]} {crc}" if key in sums else crc
     return sums
 
 
-def _is_listed(sums: Mapping[str, str], key: str, content: bytes | None) -> bool:
+def _is_listed(sums: Mapping[str, str], key: str, content: Content | None) -> bool:
     """True if a file's content is one of its listed states; without content, if it has none."""
     if content is None:
         return key not in sums
-    return hashlib.sha256(content).hexdigest() in sums.get(key, "")
+    return f"{zlib.crc32(content):08x}" in sums.get(key, "")
 
 
 def _files(root: Path) -> Iterator[str]:

@@ -6,6 +6,7 @@ under a result's name is always whole. Each result carries its provenance (see
 input. No other package opens or writes zarr.
 """
 
+import hashlib
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,20 +14,23 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
+from dbthermal import _text as texts
 from dbthermal.store._integrity import (
+    AS_WRITTEN,
     MARK,
     SUMS,
     CheckedStore,
     SummedStore,
     last_sums,
     valid_part,
+    warn_unchecked,
 )
 
 if TYPE_CHECKING:
@@ -192,24 +196,41 @@ def save_numbers(
     ...     store.read_numbers(path)
     {'object_rmse_K': 0.21}
     """
-    content = {
+    content: dict[str, Any] = {
         "numbers": {name: _number(name, value) for name, value in numbers.items()},
         "provenance": dict(provenance),
     }
+    content["sha256"] = _digest(content)
     with _whole(path, ".json") as part:
         part.write_text(_json(content, indent=2) + "\n", encoding="utf-8")
 
 
 def read_numbers(path: str | Path) -> dict[str, Number]:
-    """Read a file of `save_numbers`: name to value. ValueError if it is not such a file."""
+    """
+    Read a file of `save_numbers`: name to value.
 
-    def refuse(constant: str) -> NoReturn:
-        raise ValueError(f"Invalid number {constant} in '{path}'. Must be finite.")
-
-    content = json.loads(Path(path).read_text(encoding="utf-8"), parse_constant=refuse)
+    ValueError, with file and line, if it is not such a file, a name is listed twice, a number is
+    not finite, or it differs from what was written. A file without a checksum, of dbthermal 0.1.0,
+    is read with a warning.
+    """
+    content = texts.parse_json(texts.read_text(path), str(path))
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
         raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
-    return {name: _number(name, value) for name, value in content["numbers"].items()}
+    if content.keys() <= {"numbers", "provenance"}:
+        warn_unchecked(path, stacklevel=2)
+    elif content.pop("sha256", None) != _digest(content):
+        raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
+    for name, value in content["numbers"].items():
+        if not isinstance(value, bool | int | float | str):
+            raise ValueError(
+                f"Invalid {texts.shown(name)} = {texts.shown(value)} in '{path}'. Must be a "
+                "number, a string or a boolean."
+            )
+    return dict(content["numbers"])
+
+
+def _digest(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(_json(content).encode()).hexdigest()
 
 
 def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:

@@ -305,10 +305,10 @@ def shapes(rng: Rng) -> Attack:
     what = str(rng.choice(list(_SHAPES)))
     made.capture = _SHAPES[what](rng, made.capture)
     names = () if what == "tiny" else ("counts|dims|band|time|frame|Dataset|status|segment",)
-    if what == "tiny":
-        small = made.capture.sizes["y"], made.capture.sizes["x"]
-        made.warm = made.warm[:, : small[0], : small[1]]
-        made.emissivity = made.emissivity[:, : small[0], : small[1]]
+    # What is left of the truth, where the capture was cut.
+    sizes = made.capture.sizes
+    time, y, x = (slice(0, sizes.get(dim, 0)) for dim in ("time", "y", "x"))
+    made.warm, made.emissivity = made.warm[time, y, x], made.emissivity[:, y, x]
     method = any_method(rng) if len(made.bands) == 2 else "subspace"
     return solving(f"shape: {what}", made, None, method, *names, good=what == "tiny")
 
@@ -413,6 +413,8 @@ def windows(rng: Rng) -> Attack:
         "emissivity": made.known,
         "emissivity_std": 0 * made.known + 0.01,
     }
+    if rng.random() < 0.1:
+        return _foreign_result(rng, made)
     name = str(rng.choice(list(maps)))
     array = maps[name].assign_coords(y=edge, x=left)
     what = str(rng.choice(list(_WINDOWS)))
@@ -431,6 +433,21 @@ def windows(rng: Rng) -> Attack:
             (name,),
         )
     return solving(f"{name} of {what}", made, None, method, name, good=good, **more)
+
+
+def _foreign_result(rng: Rng, made: Scene) -> Attack:
+    """`materials` with a result of another window, time or band."""
+    dim = str(rng.choice(["y", "x", "time", "band"]))
+    response = response_of(made)
+    result = separate(made, response)
+    other = made.bands[::-1] if dim == "band" else result[dim].values + int(rng.integers(1, 50))
+    result = result.assign_coords({dim: list(other)})
+    return Attack(
+        f"materials: result of another {dim}",
+        lambda: separation.materials(result, made.capture, response),
+        lambda _: Verdict("silent", f"a result of another {dim} was taken by position", 1, 1),
+        (f"result|'{dim}'",),
+    )
 
 
 def _permuted(_: Rng, array: xr.DataArray) -> xr.DataArray:

@@ -4,7 +4,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
-from functools import cache
+from functools import cache as once
 from io import StringIO
 from pathlib import Path
 from tempfile import mkdtemp
@@ -20,20 +20,20 @@ from attack.stages import wrong
 from dbthermal import acquire, schema, store
 from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.session import Session
-from reproduction import manifest, paths
+from reproduction import cache, manifest, paths
 
 Rng = np.random.Generator
 REPOSITORY: Final = Path(__file__).parents[2]
 LINES: Final = "x" * 40  # an attribute of some length
 
 
-@cache
+@once
 def workplace() -> Path:
     """Folder of this process for the damaged copies."""
     return Path(mkdtemp(prefix="attack-"))
 
 
-@cache
+@once
 def originals() -> Path:
     """Folder of a whole result, a recording and numbers."""
     folder = workplace() / "whole"
@@ -250,6 +250,34 @@ _METADATA: Final[Mapping[str, Callable[[Rng, Path, str], Any]]] = {
 }
 
 
+def cell(value: float, seed: int) -> xr.Dataset:
+    """Something to be cached."""
+    return xr.Dataset({"drawn": ("n", value + np.random.default_rng(seed).random(300))})
+
+
+def cells(rng: Rng) -> Attack:
+    """A cached result whose file is flipped, cut, emptied, lost or foreign: computed anew."""
+    folder = workplace() / "cells"
+    shutil.rmtree(folder, ignore_errors=True)
+    cache.kept(cell, folder)(1.0, 1)
+    file = pick(rng, [file for file in _files(folder) if file.stat().st_size])
+    what = pick(rng, ["flipped", "flipped", "cut", "emptied", "lost", "of noise"])
+    content = file.read_bytes()
+    if what == "flipped":
+        flip(rng, file)
+    elif what == "lost":
+        file.unlink()
+    else:
+        kept = {"cut": content[: int(rng.integers(len(content)))], "emptied": b""}
+        file.write_bytes(kept.get(what, rng.bytes(len(content))))
+
+    def judge(found: xr.Dataset) -> Verdict:
+        return wrong("other values", where=not found.identical(cell(1.0, 1)))
+
+    act = lambda: cache.kept(cell, folder)(1.0, 1)  # noqa: E731
+    return Attack(f"cached {file.name} {what}", act, judge, (file.name,))
+
+
 def numbers(rng: Rng) -> Attack:
     """Files of numbers cut, flipped, with other types, infinite, repeated or foreign."""
     path = _copy("numbers.json")
@@ -450,7 +478,7 @@ def manifests(rng: Rng) -> Attack:
     elif what == "origin":
         collection["origin"] = pick(rng, ["file:///etc/", "", "/etc/"])
     elif what in ("sha256", "bytes"):
-        entry[what] = pick(rng, [-1, 0, 10**15, 1.5]) if what == "bytes" else "z" * 64
+        entry[what] = pick(rng, [-1, 0, 1.5]) if what == "bytes" else "z" * 64
     elif what == "key":
         collection["keyx"] = 1
     text = yaml.safe_dump(content)

@@ -90,8 +90,24 @@ def carry_out(attack: Attack) -> Outcome:
     if verdict.kind in _WORK and used > MEGABYTES:
         verdict = Verdict("memory", f"{used:.0f} MB")
     if verdict.kind in GOOD and leaked:
-        verdict = Verdict("warning", f"{leaked[0].category.__name__}: {leaked[0].message}")
+        verdict = _warned(leaked, attack)
     return Outcome(verdict.kind, attack.what, verdict.note, used, verdict.unflagged, verdict.wrong)
+
+
+def _warned(leaked: list[warnings.WarningMessage], attack: Attack) -> Verdict:
+    """A warning that names the thing is a flag, any other one leaks from a library."""
+    texts = [f"{one.category.__name__}: {one.message}" for one in leaked]
+    unnamed = [text for text in texts if not attack.names or _missing(text, attack)]
+    return Verdict("warning", unnamed[0]) if unnamed else Verdict("flagged", texts[0])
+
+
+def _missing(text: str, attack: Attack) -> list[str]:
+    """Names that a text should contain, and does not."""
+    return [
+        names
+        for names in attack.names
+        if not any(name.lower() in text.lower() for name in names.split("|"))
+    ]
 
 
 def _verdict(attack: Attack) -> Verdict:
@@ -112,14 +128,11 @@ def _verdict(attack: Attack) -> Verdict:
 def refusal(error: Exception, attack: Attack) -> Verdict:
     """Judge an error: it is of a documented kind, raised by the package, and names the thing."""
     text = f"{type(error).__name__}: {error}"
-    documented = isinstance(error, _REFUSALS) and not isinstance(
-        error, (LookupError, ArithmeticError)
-    )
-    missing = [
-        names
-        for names in attack.names
-        if not any(name.lower() in str(error).lower() for name in names.split("|"))
-    ]
+    other = isinstance(error, (LookupError, ArithmeticError))
+    documented = isinstance(error, _REFUSALS) and not other
+    # Some functions look things up by name, and say so.
+    documented |= isinstance(error, KeyError) and "Must" in text
+    missing = _missing(str(error), attack)
     where = _place(error)
     if not documented or missing:
         rule = f"; names none of '{missing[0]}'" if missing else ""

@@ -37,6 +37,7 @@ CLASSES: Final[Mapping[str, tuple[Make, int]]] = {
     "bits": (files.bits, 8),
     "chunks": (files.chunks, 5),
     "stores": (files.stores, 5),
+    "cells": (files.cells, 1),
     "numbers": (files.numbers, 3),
     "sessions": (files.sessions, 10),
     "parameters": (files.parameters, 3),

@@ -74,6 +74,22 @@ def test_what_an_earlier_run_left_goes_first(folder: Path, monkeypatch: pytest.M
     assert (folder / "03_tiny.json").read_text() == "new"
 
 
+def test_results_are_on_the_disk_before_the_name_is(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power loss leaves no name of a notebook whose results are only in the system's cache."""
+    replaced(monkeypatch, Papermill(2))
+    synced: list[tuple[Path, bool]] = []
+    named = folder / "03_tiny.ipynb"
+    monkeypatch.setattr(
+        execute, "_sync", lambda *places: synced.extend((place, named.exists()) for place in places)
+    )
+    execute.execute("full", "03_tiny", {})
+    for name in ("03_tiny.json", ".03_tiny.part.ipynb"):
+        assert (folder / name, False) in synced
+    assert synced[-1] == (folder, True)
+
+
 def test_a_change_while_it_ran_is_newer(
     folder: Path, project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,6 +170,13 @@ def test_values_are_refused(project: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         parameters.read("03_tiny", [path])
+
+
+@pytest.mark.usefixtures("project")
+def test_the_full_values_are_complete() -> None:
+    """A file of full values that was cut does not leave small ones in a full run."""
+    with pytest.raises(ValueError, match=r"Missing parameter 'known' in '.*03_tiny\.yaml'"):
+        parameters.read("03_tiny", [Path("params/03_tiny.yaml")])
 
 
 def test_values_are_taken_in_order(project: Path) -> None:

@@ -157,9 +157,10 @@ def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment:
 
 def kernels(root: Path) -> list[int]:
     """Process numbers of the kernels that run in a checkout."""
-    found = subprocess.run(["pgrep", "-f", "ipykernel_launcher"], capture_output=True, check=False)
-    pids = [int(pid) for pid in found.stdout.split()]
-    return [pid for pid in pids if Path(f"/proc/{pid}/cwd").resolve() == root / "notebooks"]
+    command = ["ps", "-axww", "-o", "pid=,command="]
+    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    of_checkout = f"ipykernel_launcher -f {root}"
+    return [int(line.split()[0]) for line in listed.splitlines() if of_checkout in line]
 
 
 def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:

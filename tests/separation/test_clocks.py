@@ -79,6 +79,36 @@ def test_real_times_are_as_good_as_even_ones(clock: str) -> None:
     assert np.nanmax(score) < 6.0
 
 
+@pytest.mark.parametrize("pixels", [12, 200])
+@pytest.mark.parametrize(
+    "clock",
+    ["bursts of 8 in 0.7 ms", "bursts of 32 in 31 us", "at random", "slower by five", "set by 2 s"],
+)
+def test_times_of_arrival_are_refused(clock: str, pixels: int) -> None:
+    """Times at which evenly exposed frames arrived, or of a clock that was set, are refused."""
+    _, capture = seen_at(EVEN, pixels, seed=5)
+    time = EVEN + 2.0 * (FRAME >= 175) if clock == "set by 2 s" else CLOCKS[clock]
+    message = r"Invalid 'time' of the capture, in steps of .* to .* s: slow changes are not smooth"
+    with pytest.raises(ValueError, match=message):
+        separation.solve(capture.assign_coords(time=time), RIG.response())
+
+
+@pytest.mark.slow
+def test_no_real_clock_is_refused() -> None:
+    """Of 100 captures with gaps, at real times, none is refused, whatever the object does."""
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        kept = np.sort(rng.permutation(450)[:350]) / 10.0
+        gap = rng.uniform(1.0, 3600.0) * (rng.integers(30, 320) <= FRAME)
+        time = (kept, EVEN + gap)[seed % 2]
+        scene, _ = seen_at(time, int(rng.integers(1, 60)), seed, slow=bool(seed % 3))
+        moved = 6.0 * (scene["time"] >= time[rng.integers(350)]) * (seed % 5 == 0)
+        wave = 2.0 * np.sin(scene["time"] / rng.uniform(1.0, 10.0)) * (seed % 7 == 0)
+        warm = scene["object_temperature"] + moved + wave
+        capture = simulation.observe(scene.assign(object_temperature=warm), RIG.response(), rng)
+        separation.solve(capture, RIG.response())
+
+
 @pytest.mark.parametrize("method", separation.METHODS)
 @pytest.mark.parametrize("clock", ["nanoseconds", "bursts of 8 in 0.7 ms", "two pauses"])
 def test_every_method_takes_any_clock_or_names_it(clock: str, method: str) -> None:

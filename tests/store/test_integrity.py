@@ -94,7 +94,7 @@ def outcome(path: Path, whole: Path, fault: Callable[[Path], Path]) -> str:
         rf"(Damaged|Missing|Foreign) file '(.*)' of (array '(.*)' in )?store '{path}'\. .*", message
     )
     assert named, message
-    if damaged.name != "SHA256SUMS":  # whose lines may then name any file
+    if damaged.name != "checksums.sfv":  # whose lines may then name any file
         assert named[2].startswith(damaged.as_posix())
         assert named[4] == (named[2].split("/")[0] if "/" in named[2] else None)
     return "refused"
@@ -162,13 +162,13 @@ def no_attributes(path: Path) -> Path:
 
 def no_checksums(path: Path) -> Path:
     """Lose the checksums."""
-    (path / "SHA256SUMS").unlink()
-    return path / "SHA256SUMS"
+    (path / "checksums.sfv").unlink()
+    return path / "checksums.sfv"
 
 
 def cut_checksums(path: Path) -> Path:
     """Lose the last half of the checksums."""
-    file = path / "SHA256SUMS"
+    file = path / "checksums.sfv"
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     return file
 
@@ -220,11 +220,13 @@ def test_store_without_checksums_opens_with_a_warning(
 ) -> None:
     """A store of dbthermal 0.1.0 opens as before, and says that damage is not seen."""
     path = shutil.copytree(stores[kind], tmp_path / "a.zarr")
-    (path / "SHA256SUMS").unlink()
+    (path / "checksums.sfv").unlink()
     content = json.loads((path / "zarr.json").read_text())
     del content["attributes"]["checksums"]
     (path / "zarr.json").write_text(json.dumps(content))
-    with pytest.warns(UserWarning, match=r"No checksums in '.*a\.zarr': damage is not seen"):
+    with pytest.warns(
+        UserWarning, match=r"No checksums in '.*a\.zarr', as of dbthermal 0.1.0: damage is not seen"
+    ):
         opened = store.open_dataset(path)
     xr.testing.assert_identical(opened, store.open_dataset(stores[kind]))
 

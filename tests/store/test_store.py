@@ -177,8 +177,38 @@ def test_numbers_are_scalars(tmp_path: Path) -> None:
 def test_damaged_numbers_are_refused(text: str, tmp_path: Path) -> None:
     """A truncated, invalid or foreign file of numbers raises an error."""
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=r"NaN|No 'numbers'|Expecting"):
+    with pytest.raises(
+        ValueError,
+        match=r"a\.json(: Invalid number NaN|'. Must be a file|, line 1, .*Must be JSON)",
+    ):
         store.read_numbers(tmp_path / "a.json")
+
+
+def test_no_flipped_bit_passes_as_a_number(tmp_path: Path) -> None:
+    """Any bit that flips in a file of numbers is an error that names it, or changes no number."""
+    numbers: dict[str, store.Number] = {"rmse_K": 0.21, "frames": 350, "method": "subspace"}
+    store.save_numbers(numbers, tmp_path / "a.json", RECORD)
+    whole, refused = (tmp_path / "a.json").read_bytes(), 0
+    for bit in range(8 * len(whole)):
+        content = bytearray(whole)
+        content[bit // 8] ^= 1 << bit % 8
+        (tmp_path / "a.json").write_bytes(content)
+        try:
+            assert store.read_numbers(tmp_path / "a.json") == numbers, bit
+        except ValueError as error:
+            assert "a.json" in str(error)  # noqa: PT017
+            refused += 1
+    assert refused > 0.98 * 8 * len(whole)
+
+
+def test_numbers_without_a_checksum_are_read_with_a_warning(tmp_path: Path) -> None:
+    """Numbers of dbthermal 0.1.0 are read as before, and said to be unchecked."""
+    store.save_numbers({"rmse_K": 0.21}, tmp_path / "a.json", RECORD)
+    content = json.loads((tmp_path / "a.json").read_text())
+    del content["sha256"]
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"No checksums in '.*a\.json'"):
+        assert store.read_numbers(tmp_path / "a.json") == {"rmse_K": 0.21}
 
 
 def test_figure_is_the_same_twice(tmp_path: Path) -> None:
