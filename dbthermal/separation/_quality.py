@@ -8,6 +8,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _samples as samples
+from dbthermal import schema
 from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
@@ -50,7 +51,7 @@ def read(part: xr.Dataset, fewest: int = 1, noise: Array | None = None) -> tuple
     """
     raw = part["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1).astype(np.float64)
-    valid = np.all(np.isfinite(counts), axis=0)
+    valid = np.all(schema.measured(counts), axis=0)
     if "mask" in part:
         valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
     counts[:, ~valid] = 0.0

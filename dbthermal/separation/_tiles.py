@@ -48,7 +48,7 @@ class _Pixels:
         parts: dict[str, Any] = {name: v if v is None else v[..., selected] for name, v in values}
         return replace(self, **parts)
 
-    def replace_pixels(self, selected: Mask, part: Self) -> Self:
+    def replace_pixels(self, selected: Mask | Whole, part: Self) -> Self:
         """Return the record with the selected pixels replaced by those of a part, in order."""
         parts: dict[str, Any] = {}
         for field in fields(self):
