@@ -34,6 +34,8 @@ Mask = npt.NDArray[np.bool_]
 
 # Pixels, at most, of which a capture is judged; a full frame would say it no better.
 _PIXELS: Final = 16384
+# Samples of a band, at most: of a long capture fewer pixels.
+_SAMPLES: Final = 2**25
 SEARCH: Final = 5
 """Largest lag that is searched by default, either way [frame]."""
 
@@ -250,7 +252,9 @@ def sample(corrected: xr.Dataset) -> Array:
     Usable is a pixel that is not flagged as dead, saturated or invalid, changes in every band, and
     is finite in every frame that is not missing.
     """
-    step = max(1, int(np.sqrt(corrected.sizes["y"] * corrected.sizes["x"] / _PIXELS)))
+    pixels = corrected.sizes["y"] * corrected.sizes["x"]
+    fitting = int(np.ceil(np.sqrt(pixels * corrected.sizes["time"] / _SAMPLES)))
+    step = max(1, int(np.sqrt(pixels / _PIXELS)), fitting)
     part = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
     counts = part["counts"].values.astype(np.float64)
     counts = counts.reshape(*counts.shape[:2], -1)
