@@ -1,21 +1,32 @@
-"""Cache of long experiments: `memory(folder).cache(experiment)(...)` computes each result once.
+"""Cache of long experiments: `kept(experiment, folder)(...)` computes each result once.
 
 A result is read back only if arguments, source code and package versions are those that it was
-computed with. A damaged file fails the checksum of its compression and is computed again.
+computed with. It is one file, its SHA-256 first; if that fails the result is computed again.
 """
 
 import hashlib
+import inspect
+import logging
 import math
+import pickle
 import platform
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any, Final
 
 import joblib
 import xarray as xr
 
 import dbthermal
+
+Experiment = Callable[..., xr.Dataset]
+
+_DIGEST: Final = 32  # length of a SHA-256 [byte]
+_LOGGER: Final = logging.getLogger(__name__)
 
 
 def _fingerprint() -> str:
@@ -32,11 +43,38 @@ def _fingerprint() -> str:
 _IMPORTED: Final = _fingerprint()
 
 
-def memory(folder: Path) -> joblib.Memory:
-    """Cache in a folder; raises a RuntimeError if the source changed since it was imported."""
+def kept(experiment: Experiment, folder: Path) -> Experiment:
+    """Experiment whose results are kept; RuntimeError if the source changed since its import."""
     if _fingerprint() != _IMPORTED:
         raise RuntimeError("Changed source code. Must be as it was imported: restart the kernel.")
-    return joblib.Memory(folder / _IMPORTED[:32], compress=True, verbose=0)
+    name = f"{experiment.__module__}.{experiment.__qualname__}"
+    return partial(_result, experiment, folder / _IMPORTED[:32] / name)
+
+
+def _result(experiment: Experiment, folder: Path, *args: Any, **options: Any) -> xr.Dataset:
+    """Result from its file, computed if there is none, or if it is not as it was written."""
+    inputs = inspect.signature(experiment).bind(*args, **options)
+    inputs.apply_defaults()
+    path = folder / f"{joblib.hash(inputs.arguments)}.pkl"
+    if path.exists():
+        content = path.read_bytes()
+        packed = content[_DIGEST:]
+        if _digest(path, packed) == content[:_DIGEST]:
+            result: xr.Dataset = pickle.loads(zlib.decompress(packed))
+            return result
+        _LOGGER.warning("Damaged result '%s'. It is computed again.", path)
+    result = experiment(*args, **options)
+    packed = zlib.compress(pickle.dumps(result))
+    folder.mkdir(parents=True, exist_ok=True)
+    with NamedTemporaryFile(dir=folder, prefix=".", delete=False) as part:
+        part.write(_digest(path, packed) + packed)
+    Path(part.name).replace(path)
+    return result
+
+
+def _digest(path: Path, packed: bytes) -> bytes:
+    """SHA-256 of a result and its name, which another's file does not have."""
+    return hashlib.sha256(path.name.encode() + packed).digest()
 
 
 def gridded(results: Sequence[xr.Dataset], coords: Mapping[str, Sequence[Any]]) -> xr.Dataset:

@@ -92,7 +92,7 @@ class Run:
 
     def cached(self, experiment: Callable[..., xr.Dataset]) -> Callable[..., Any]:
         """Experiment whose results are kept, delayed for `joblib.Parallel`."""
-        kept = cache.memory(paths.cells(self.stem)).cache(experiment)
+        kept = cache.kept(experiment, paths.cells(self.stem))
         delayed: Callable[..., Any] = joblib.delayed(kept)
         return delayed
 

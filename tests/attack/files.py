@@ -259,7 +259,7 @@ def cells(rng: Rng) -> Attack:
     """A cached result whose file is flipped, cut, emptied, lost or foreign: computed anew."""
     folder = workplace() / "cells"
     shutil.rmtree(folder, ignore_errors=True)
-    cache.memory(folder).cache(cell)(1.0, 1)
+    cache.kept(cell, folder)(1.0, 1)
     file = pick(rng, [file for file in _files(folder) if file.stat().st_size])
     what = pick(rng, ["flipped", "flipped", "cut", "emptied", "lost", "of noise"])
     content = file.read_bytes()
@@ -274,7 +274,7 @@ def cells(rng: Rng) -> Attack:
     def judge(found: xr.Dataset) -> Verdict:
         return wrong("other values", where=not found.identical(cell(1.0, 1)))
 
-    act = lambda: cache.memory(folder).cache(cell)(1.0, 1)  # noqa: E731
+    act = lambda: cache.kept(cell, folder)(1.0, 1)  # noqa: E731
     return Attack(f"cached {file.name} {what}", act, judge, (file.name,))
 
 

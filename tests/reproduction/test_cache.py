@@ -34,17 +34,17 @@ def calls(marks: Path) -> int:
 
 def test_a_result_is_computed_once(tmp_path: Path, marks: Path) -> None:
     """A second call returns the same from disk; other arguments are computed."""
-    first = cache.memory(tmp_path).cache(counted)(str(marks), 1.0, seed=1)
-    again = cache.memory(tmp_path).cache(counted)(str(marks), value=1.0, seed=1)
+    first = cache.kept(counted, tmp_path)(str(marks), 1.0, seed=1)
+    again = cache.kept(counted, tmp_path)(str(marks), value=1.0, seed=1)
     xr.testing.assert_identical(first, again)
     assert calls(marks) == 1
-    cache.memory(tmp_path).cache(counted)(str(marks), 1.0, seed=2)
+    cache.kept(counted, tmp_path)(str(marks), 1.0, seed=2)
     assert calls(marks) == 2
 
 
 def test_an_interruption_keeps_what_was_done(tmp_path: Path, marks: Path) -> None:
     """Results before a failure are kept; the failed call leaves none."""
-    experiment = cache.memory(tmp_path).cache(counted)
+    experiment = cache.kept(counted, tmp_path)
     experiment(str(marks), 1.0, 1)
     for _ in range(2):
         with pytest.raises(ValueError, match="interrupted"):
@@ -54,34 +54,52 @@ def test_an_interruption_keeps_what_was_done(tmp_path: Path, marks: Path) -> Non
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "removed"])
-@pytest.mark.filterwarnings("ignore")
-def test_a_damaged_file_is_computed_again(tmp_path: Path, marks: Path, damage: str) -> None:
-    """A truncated, empty or corrupted file is computed again."""
-    experiment = cache.memory(tmp_path / "cells").cache(counted)
+def test_a_damaged_file_is_computed_again(
+    tmp_path: Path, marks: Path, caplog: pytest.LogCaptureFixture, damage: str
+) -> None:
+    """A result of which any file is cut, empty, flipped or gone is computed again."""
+    experiment = cache.kept(counted, tmp_path / "cells")
     first = experiment(str(marks), 1.0, 1)
-    (path,) = (tmp_path / "cells").rglob("output.pkl")
+    (path,) = (file for file in (tmp_path / "cells").rglob("*") if file.is_file())
     whole = path.read_bytes()
-    places = range(2, len(whole), len(whole) // 12) if damage == "flipped" else [len(whole) // 2]
+    places = range(0, len(whole), len(whole) // 50) if damage == "flipped" else [len(whole) // 2]
     for place in places:
         path.write_bytes(whole[: 0 if damage == "empty" else place])
         if damage == "flipped":
-            path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+            flipped = bytes([whole[place] ^ 1 << place % 8])
+            path.write_bytes(whole[:place] + flipped + whole[place + 1 :])
         if damage == "removed":
             path.unlink()
         xr.testing.assert_identical(experiment(str(marks), 1.0, 1), first)
     assert calls(marks) == 1 + len(places)
+    said = [record.getMessage() for record in caplog.records]
+    again = [f"Damaged result '{path}'. It is computed again."]
+    assert said == (damage != "removed") * len(places) * again
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_file_of_other_arguments_is_computed_again(tmp_path: Path, marks: Path) -> None:
+    """A result that has another's name is not its result."""
+    experiment = cache.kept(counted, tmp_path / "cells")
+    first, _ = (experiment(str(marks), 1.0, seed) for seed in (1, 2))
+    one, other = (file for file in (tmp_path / "cells").rglob("*.pkl"))
+    one.rename(one.with_suffix(""))
+    other.rename(one)
+    one.with_suffix("").rename(other)
+    xr.testing.assert_identical(experiment(str(marks), 1.0, 1), first)
+    assert calls(marks) == 3
 
 
 def test_changed_code_starts_anew(
     tmp_path: Path, marks: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A result of other source code is not used, nor is code that changed since its import."""
-    cache.memory(tmp_path).cache(counted)(str(marks), 1.0, 1)
+    cache.kept(counted, tmp_path)(str(marks), 1.0, 1)
     monkeypatch.setattr(cache, "_fingerprint", lambda: "other")
     with pytest.raises(RuntimeError, match=r"Changed source code\. Must be as it was imported"):
-        cache.memory(tmp_path)
+        cache.kept(counted, tmp_path)
     monkeypatch.setattr(cache, "_IMPORTED", "other")
-    cache.memory(tmp_path).cache(counted)(str(marks), 1.0, 1)
+    cache.kept(counted, tmp_path)(str(marks), 1.0, 1)
     assert calls(marks) == 2
 
 
@@ -92,7 +110,7 @@ def test_several_processes_find_the_same(tmp_path: Path) -> None:
     common = {"emissivity": [0.86, 0.72], "noise": [0.03, 0.35], "plate": PLATE, "pixels": 4}
     alone, shared = (
         joblib.Parallel(workers)(
-            joblib.delayed(cache.memory(tmp_path / str(workers)).cache(experiments.compare))(
+            joblib.delayed(cache.kept(experiments.compare, tmp_path / str(workers)))(
                 **common, variants=variants, seed=seed
             )
             for seed in (1, 2)

@@ -74,4 +74,4 @@ def test_experiment_is_cached(run: Run, tmp_path: Path) -> None:
     """Results of an experiment are cached in the notebook's own folder."""
     twice = run.cached(doubled)
     assert [float(part["value"]) for part in joblib.Parallel(1)([twice(3.0)])] == [6.0]
-    assert len(list((tmp_path / "results" / "cells" / "03_simulation").rglob("output.pkl"))) == 1
+    assert len(list((tmp_path / "results" / "cells" / "03_simulation").rglob("*.pkl"))) == 1
