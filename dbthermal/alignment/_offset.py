@@ -124,7 +124,8 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
         If the band is missing, the search does not fit the capture's length, there are fewer than
         16 usable pixels, nothing moves in both bands, their covariance is greatest at an end of the
         search, the bands share less than half of their frames, the offset is not known within 0.1
-        frame, or the clock of a band was set while it ran.
+        frame, the clock of a band was set while it ran, or its times are no exposure times, as of
+        frames that arrive in bursts.
 
     Notes
     -----
@@ -152,6 +153,7 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     place = _check(corrected, band, search)
     pair = corrected.isel(band=[0, place])
     signals, stamps = sample(pair), clocks.exposure_times(pair)
+    clocks.require_steady(stamps, [str(name) for name in pair["band"].values])
     require_one_clock(pair, signals, stamps, search)
     return _offset(pair, signals, stamps, search)
 
