@@ -14,13 +14,14 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
+from dbthermal._text import read_text
 from dbthermal.store._integrity import (
     AS_WRITTEN,
     MARK,
@@ -211,21 +212,42 @@ def read_numbers(path: str | Path) -> dict[str, Number]:
     ValueError if it is not such a file, or differs from what was written. A file without a
     checksum, of dbthermal 0.1.0, is read with a warning.
     """
-
-    def refuse(constant: str) -> NoReturn:
-        raise ValueError(f"Invalid number {constant} in '{path}'. Must be finite.")
-
     try:
-        content = json.loads(Path(path).read_bytes(), parse_constant=refuse)
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"Invalid file '{path}': {error}. Must be JSON.") from error
+        content = json.loads(
+            read_text(path),
+            parse_constant=_finite,
+            parse_float=_finite,
+            object_pairs_hook=_without_repetition,
+        )
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"Invalid file '{path}': {error}") from error
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
         raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
     if content.keys() <= {"numbers", "provenance"}:
         warn_unchecked(path, stacklevel=2)
     elif content.pop("sha256", None) != _digest(content):
         raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
-    return {name: _number(name, value) for name, value in content["numbers"].items()}
+    try:
+        return {name: _number(name, value) for name, value in content["numbers"].items()}
+    except TypeError as error:
+        raise ValueError(f"Invalid file '{path}': {error}") from error
+
+
+def _finite(text: str) -> float:
+    """Finite number of JSON."""
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"Invalid number {text}. Must be finite.")
+    return number
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Mapping of JSON in which no name is twice."""
+    content: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in content:
+            raise ValueError(f"Repeated name {name!r}. Must occur once.")
+        content[name] = value
+    return content
 
 
 def _digest(content: Mapping[str, Any]) -> str:
