@@ -82,7 +82,7 @@ smoke: $(smoke) ## run every notebook with its own small values, as a test
 chain: $(recorded:%=results/chain/%.ipynb) ## from the bytes of the emulated rig to its separated video, with small values
 
 interop: ## compare emulators and codecs with independent software, in an environment of its own, which it downloads
-	"$$PYTHON" -m venv .venv/interop
+	"$$PYTHON" -m venv --clear .venv/interop
 	PIP_CONSTRAINT=requirements.lock .venv/interop/bin/python -m pip install --quiet pip
 	.venv/interop/bin/python -m pip install --quiet --group interop --editable '.[instruments,test]'
 	.venv/interop/bin/python -c "import flirpy, thermocouple_its90, thorlabs_apt_protocol"
@@ -139,7 +139,7 @@ clean: ## remove all that make made: results, environment, caches
 	@sync && touch $@ && rm -f .venv/installing
 
 # Which outside files there are changes the results, so a change of theirs counts as a change of a source.
-listed := { printf 'DBTHERMAL_DATA=%s\n' "$$DBTHERMAL_DATA"; find data -type f 2>/dev/null | LC_ALL=C sort; }
+listed := { printf 'DBTHERMAL_DATA=%s\n' "$$DBTHERMAL_DATA"; find -L data -type f 2>/dev/null | LC_ALL=C sort; }
 ifneq ($(shell $(listed) | cmp -s - results/inputs.txt || echo changed),)
 results/inputs.txt: FORCE
 endif

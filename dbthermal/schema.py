@@ -31,6 +31,7 @@ __all__ = [
     "Variable",
     "band_positions",
     "check",
+    "check_corrected",
     "check_variable",
     "has_flag",
     "nomenclature",
@@ -228,11 +229,11 @@ class Status(Flags):
     NONPHYSICAL_EMISSIVITY = 1 << 4, "estimate outside (0, 1): no background temperature"
     INVALID_SAMPLES = 1 << 5, "too many samples NaN, infinite or masked: nothing is estimated"
     CONSTANT_SIGNAL = 1 << 6, "the signal of a band never changes: nothing is estimated"
-    SATURATED = 1 << 7, "samples at the detector's limit"
+    SATURATED = 1 << 7, "samples at the detector's limit, or heaped on one level"
     OBJECT_NOT_SMOOTH = 1 << 8, "object changes too fast for a smooth curve, or noise is higher"
     OUTSIDE_RESPONSE = 1 << 9, "a temperature outside the calibrated range of the response"
     DEAD_PIXEL = 1 << 10, "bad pixel, marked by the correction"
-    FROZEN_FRAMES = 1 << 11, "the same counts in both bands for several frames, read as signal"
+    FROZEN_FRAMES = 1 << 11, "the same counts in a band for several frames in a row"
     NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
     OBJECT_JUMP = 1 << 13, "one step of the object, taken into its curve; the values hold"
     BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
@@ -324,6 +325,22 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
                 f"Missing variable '{name}' in the {stage}. Has {sorted(map(str, dataset))}."
             )
         check_variable(dataset[name], variable, f"'{name}' of the {stage}")
+    return dataset
+
+
+def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
+    """
+    Check a dataset against the stage `corrected`, see `check`, and that its counts are no raw ones.
+
+    Raises TypeError for whole numbers: those are raw, and corrected counts need NaN besides.
+    """
+    counts = check(dataset, "corrected")["counts"]
+    if counts.dtype.kind != "f":
+        raise TypeError(
+            f"Invalid dtype {counts.dtype} of 'counts' of the corrected: raw counts. Must be "
+            "floating: corrected by correction.correct_capture or, of a camera that corrects "
+            "itself, counts.astype('float32')."
+        )
     return dataset
 
 

@@ -99,7 +99,7 @@ def align(
     >>> bool((aligned.counts[1, :-1] == counts[1, 1:]).all()), aligned.frames_lost
     (True, [0, 1])
     """
-    names = [str(name) for name in schema.check(corrected, "corrected")["band"].values]
+    names = [str(name) for name in schema.check_corrected(corrected)["band"].values]
     matrices = None if transform is None else _matrices(transform, names)
     if matrices is not None:
         # Registered first: a moving reflection passes an unregistered view earlier or later.

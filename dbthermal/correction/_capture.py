@@ -9,7 +9,7 @@ from dbthermal.correction._nonuniformity import (
     correct,
     renew_offset,
 )
-from dbthermal.correction._pixels import mark_bad
+from dbthermal.correction._pixels import mark_bad, mark_repeats
 from dbthermal.correction._shutter import find_shutter, mark_shutter
 from dbthermal.correction._temporal import undo_drift, undo_lag
 
@@ -34,7 +34,9 @@ def correct_capture(
     2. `renew_offset` and `correct`: gain and offset of each pixel, saturated and dead pixels. The
        limits of the detector hold for raw counts, so this comes before anything mixes frames.
     3. `mark_shutter`: repeated and closed frames become NaN, and so do frames without an exposure
-       time, which are damaged; `segment` counts the events.
+       time, which are damaged; `segment` counts the events. In what is left a pixel is saturated
+       too, if its highest or lowest raw counts heap on one level, and frozen if it repeats its
+       counts for longer than its noise does.
     4. `undo_lag`, only now: a repeated frame says nothing of the pixel's past. With constant gain
        and offset the order of 2 and 4 does not matter, for the weights of the lag add up to one.
     5. `mark_bad`: pixels that are noisy, stuck or jump in this capture, in units of its own noise.
@@ -116,7 +118,7 @@ def correct_capture(
                 f"Invalid flat_after: {result.attrs['shutter_events']} shutter events renew the "
                 "offsets within the capture. Must have none, for offsets in proportion to time."
             )
-    result = _without_damaged(result)
+    result = mark_repeats(_without_damaged(result), capture["counts"], shutter=shutter)
     if time_constant is not None:
         result = undo_lag(result, time_constant)
     if bad_pixels is not None:

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import maximum_filter1d, median_filter
-from scipy.special import ndtri
 
+from dbthermal import _samples as samples
 from dbthermal import schema
 from dbthermal.correction._nonuniformity import OUTLIER
 from dbthermal.noise import MAD
@@ -21,12 +21,6 @@ Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
 
-# Fewest frames from which a pixel is judged.
-_MINIMUM_FRAMES: Final = 16
-# Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
-_QUIET = 0.8
-# Mean magnitude of that share of a standard normal distribution.
-_QUIET_MEAN = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
 # A pixel is held against those around it: the median of a window this wide, and the eight nearest.
 _WINDOW = 5
 _NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
@@ -35,6 +29,8 @@ _NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
 _SHARED = 0.3
 _REACH_SECONDS = 0.2
 _REACH_FRAMES = 5
+# Samples in a row that may be NaN within a jump.
+_LONGEST_GAP: Final = 2
 # Differences of the logarithm of the noise that are rounding [1].
 _ROUNDING = 0.01
 # Samples of a block of rows.
@@ -55,7 +51,8 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     deviations of a difference, :math:`\sqrt 2 m`, while none of its eight neighbours changes in the
     same direction by 0.3 of it within 0.2 s or five frames, the longer. Someone walking by is seen
     by neighbours, be it a little later; a detector that blinks is alone. Frames that are NaN, the
-    steps between segments, and 0.2 s or five frames at either end do not count. A scene's detail
+    steps between segments, and 0.2 s or five frames at either end do not count; over two samples of
+    a pixel that are NaN a jump is still seen, over more it is not. A scene's detail
     that is one pixel wide, such as a wire, cannot be told from a pixel that blinks, and is marked,
     too.
 
@@ -72,13 +69,14 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     Dataset
         The dataset with the bit `Status.DEAD_PIXEL` set in `status` (y, x), other bits as they
         were, the counts unchanged; and the attributes ``noisy_pixels`` and ``jumping_pixels``,
-        their numbers, and ``bad_threshold``.
+        their numbers, ``unjudged_pixels``, the number of those with fewer than 16 samples that are
+        not NaN in a band, which get no bit here, and ``bad_threshold``.
 
     Raises
     ------
     TypeError, ValueError
         If the threshold is not positive, or a band has fewer frames that are not NaN than 16, or
-        than 0.4 s and three frames more.
+        than 0.4 s and three frames more, or no pixel that can be judged.
 
     Examples
     --------
@@ -95,20 +93,28 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     >>> np.argwhere(marked.status.values).tolist(), marked.jumping_pixels
     ([[5, 7]], 1)
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = schema.check_corrected(corrected)["counts"]
     if not threshold > 0:
         raise ValueError(f"Invalid threshold {threshold} of bad pixels. Must be positive.")
     segment = corrected["segment"].values if "segment" in corrected else None
     image = (counts.sizes["y"], counts.sizes["x"])
-    noisy, jumping = np.zeros(image, dtype=bool), np.zeros(image, dtype=bool)
+    noisy, jumping, unjudged = (np.zeros(image, dtype=bool) for _ in range(3))
     reach = _reach(counts["time"].values.astype(np.float64))
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
-        frames = _frames(movie, max(_MINIMUM_FRAMES, 2 * reach + 3))
+        frames = _frames(movie, max(samples.MINIMUM_FRAMES, 2 * reach + 3))
         part = np.zeros(frames.size) if segment is None else segment[frames]
         movie, stepped = movie.isel(time=frames), np.diff(part) != 0
         level = _noise(movie)
-        usual = median_filter(level, size=_WINDOW, mode="mirror")
+        known = np.isfinite(level)
+        if not known.any():
+            raise ValueError(
+                f"Invalid band '{movie['band'].item()}': no pixel has "
+                f"{samples.MINIMUM_FRAMES} samples that are not NaN. Must have them, to be judged."
+            )
+        unjudged |= ~known
+        usual = np.where(known, level, np.median(level[known]))
+        usual = median_filter(usual, size=_WINDOW, mode="mirror")
         noisy |= _outliers(level, usual, threshold)
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
@@ -116,13 +122,67 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     return corrected.assign(status=(("y", "x"), status, schema.status_attrs())).assign_attrs(
         noisy_pixels=int(noisy.sum()),
         jumping_pixels=int(jumping.sum()),
+        unjudged_pixels=int(unjudged.sum()),
         bad_threshold=threshold,
     )
 
 
+def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> xr.Dataset:
+    """
+    Mark pixels that are clipped at a level below the end of the raw counts, or frozen for a while.
+
+    The counts (band, time, y, x) are raw, where nothing has been rounded yet; samples that are NaN
+    in the corrected dataset do not count. Frozen pixels are looked for only where the frames of a
+    closed `shutter` were taken out. See `_samples`.
+    """
+    saturated, frozen = (np.zeros((raw.sizes["y"], raw.sizes["x"]), dtype=bool) for _ in range(2))
+    for movie, measured in zip(raw, corrected["counts"], strict=True):
+        clipped, still = _repeats(movie, measured)
+        saturated |= clipped
+        frozen |= still & shutter
+    bits = saturated * np.uint32(Status.SATURATED) | frozen * np.uint32(Status.FROZEN_FRAMES)
+    status = corrected["status"].values.astype(np.uint32) | bits
+    return corrected.assign(status=(("y", "x"), status, schema.status_attrs())).assign_attrs(
+        saturated_pixels=int(np.count_nonzero(status & np.uint32(Status.SATURATED))),
+        frozen_pixels=int(frozen.sum()),
+    )
+
+
+def _repeats(movie: xr.DataArray, measured: xr.DataArray) -> tuple[Mask, Mask]:
+    """
+    Pixels (y, x) of one band, raw counts (time, y, x), that are clipped, and that are frozen.
+
+    A level on which several pixels have their highest or lowest samples is the camera's: all pixels
+    that reach it are clipped, be it once.
+    """
+    image = (movie.sizes["y"], movie.sizes["x"])
+    middle = movie.isel(y=image[0] // 2).values
+    grain = samples.grain(middle, np.ones(middle.shape, dtype=bool))
+    clipped, frozen = np.zeros(image, dtype=bool), np.zeros(image, dtype=bool)
+    ends = np.zeros((2, 3, *image))
+    for rows in _blocks(movie):
+        counts = movie.isel(y=rows).values.reshape(len(movie), -1)
+        valid = np.isfinite(measured.isel(y=rows).values).reshape(counts.shape)
+        still = samples.frozen(samples.repeated(counts, valid), grain.chance)
+        frozen[rows] = still.reshape(-1, image[1])
+        for highest in (False, True):
+            end, number = samples.end_of(counts, valid, highest=highest)
+            parts = (end, number, samples.near_end(counts, valid, end, grain))
+            ends[int(highest), :, rows] = np.reshape(parts, (3, -1, image[1]))
+    moving = ends[0, 0] < ends[1, 0]
+    for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
+        clipped |= moving & samples.is_heap(number, near, grain)
+        level = moving & (end == sign * np.max(sign * end[moving], initial=-np.inf))
+        first = level.sum() - 1  # one sample of each makes its end
+        clipped |= level & samples.is_heap(
+            number[level].sum() - first, near[level].sum() - first, grain
+        )
+    return clipped, frozen & moving
+
+
 def _reach(time: Array) -> int:
     """Frames by which neighbours may show a change earlier or later."""
-    if time.size < _MINIMUM_FRAMES:
+    if time.size < samples.MINIMUM_FRAMES:
         return _REACH_FRAMES
     return max(_REACH_FRAMES, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
 
@@ -148,15 +208,11 @@ def _blocks(movie: xr.DataArray) -> list[slice]:
 
 
 def _noise(movie: xr.DataArray) -> Array:
-    """Noise (y, x) [count] from the quiet part of the second differences; see `mark_bad`."""
+    """Noise (y, x) [count] of each pixel; NaN of too few frames."""
     level = np.empty((movie.sizes["y"], movie.sizes["x"]))
     for rows in _blocks(movie):
-        signal = movie.isel(y=rows).values.astype(np.float32)
-        second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
-        quiet = int(_QUIET * second.shape[0])
-        second.partition(quiet, axis=0)
-        level[rows] = second[:quiet].mean(axis=0, dtype=np.float64)
-    return np.asarray(level / (_QUIET_MEAN * np.sqrt(1.5)))
+        level[rows] = samples.noise(movie.isel(y=rows).values.astype(np.float32))
+    return level
 
 
 def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
@@ -177,19 +233,35 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
     for rows in _blocks(movie):
         # A row more on each side: the neighbours.
         top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
-        change = np.diff(movie.isel(y=slice(top, bottom)).values.astype(np.float32), axis=0)
-        change[stepped] = 0.0  # new offsets after a shutter event
-        change[~np.isfinite(change)] = 0.0
+        changes = _changes(movie.isel(y=slice(top, bottom)).values.astype(np.float32), stepped)
         here = slice(rows.start - top, rows.stop - top)
-        for signed in (change, -change):
-            jumping[rows] |= _alone(signed, limit[top:bottom], reach)[here]
+        for sign in (1.0, -1.0):
+            change, seen = (np.float32(sign) * part for part in changes)
+            jumping[rows] |= _alone(change, seen, limit[top:bottom], reach)[here]
     return jumping
 
 
-def _alone(change: Single, limit: Array, reach: int) -> Mask:
-    """Pixels (y, x) that rise by more than their limit in a frame, and no neighbour about then."""
+def _changes(signal: Single, stepped: Mask) -> tuple[Single, Single]:
+    """Changes from the last valid sample, by the frame and in all, 0 where new offsets are."""
+    valid = np.isfinite(signal)
+    if valid.all():
+        change = np.diff(signal, axis=0)
+        change[stepped] = 0.0
+        return change, change
+    places = np.arange(len(signal))[:, np.newaxis, np.newaxis]
+    last = np.maximum.accumulate(np.where(valid, places, 0), axis=0)[:-1]
+    with np.errstate(invalid="ignore"):
+        change = signal[1:] - np.take_along_axis(signal, last, axis=0)
+    part = np.concatenate([[0], np.cumsum(stepped)])
+    change[(part[places[1:]] != part[last]) | ~np.isfinite(change)] = 0.0
+    gap = (places[1:] - last).astype(np.float32)
+    return np.where(gap > _LONGEST_GAP + 1, np.float32(0.0), change / gap), change
+
+
+def _alone(change: Single, seen: Single, limit: Array, reach: int) -> Mask:
+    """Pixels (y, x) that rise by more than their limit in a frame, and none is seen to nearby."""
     shape = limit.shape
-    nearby = maximum_filter1d(change, 2 * reach + 1, axis=0, mode="constant")
+    nearby = maximum_filter1d(seen, 2 * reach + 1, axis=0, mode="constant")
     nearby = np.pad(nearby, ((0, 0), (1, 1), (1, 1)))
     around = np.zeros_like(change)
     for y, x in _NEIGHBOURS:

@@ -125,11 +125,9 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
         If the counts are whole numbers, which have no NaN, the dataset was marked before, or an
         event lacks a variable, is of no band or of frames outside the dataset.
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = schema.check_corrected(corrected)["counts"]
     if "segment" in corrected:
         raise ValueError("Invalid dataset: shutter events were marked before. Must be unmarked.")
-    if counts.dtype.kind != "f":
-        raise TypeError(f"Invalid dtype {counts.dtype} of the counts. Must be floating, for NaN.")
     events = find_shutter(corrected) if events is None else events
     first, after, bands = _positions(events, counts)
     frames = counts.sizes["time"]

@@ -44,7 +44,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
         If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
         or a time constant is not finite and positive or a band has none.
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:
         raise ValueError("Invalid dataset: the lag was undone before. Must be as the pixels lag.")
     if counts.sizes["time"] < 2:
@@ -119,7 +119,7 @@ def undo_drift(corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5
         pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are
         not.
     """
-    counts = schema.check(corrected, "corrected")["counts"]
+    counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:
         raise ValueError("Invalid dataset: the drift was undone before. Must be as it drifts.")
     if order < 2:

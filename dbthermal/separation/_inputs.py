@@ -82,7 +82,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
     settings = _checked_settings(method, name, settings)
-    schema.check(corrected, "corrected")
+    schema.check_corrected(corrected)
     _check_status(corrected)
     bands = [str(band) for band in corrected["band"].values]
     _check_demands(method, name, bands, corrected.sizes["time"])

@@ -1,12 +1,13 @@
 """Data quality: which samples of a capture are valid, and which pixels cannot be used."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _samples as samples
 from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
@@ -22,8 +23,6 @@ LONGEST_GAP: Final = 2
 MOST_BRIDGED: Final = 0.15
 """Share of the frames from which a pixel lacks too many to be bridged."""
 
-# Frames in a row that noise repeats by chance in less than one of 1e8 pixels.
-_FROZEN_FRAMES: Final = 4
 _UNUSABLE: Final = np.uint32(Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
 
 
@@ -38,21 +37,28 @@ def unusable(status: Bits) -> Mask:
     return np.asarray((status & _UNUSABLE) != 0)
 
 
-def read(part: xr.Dataset, fewest: int = 1) -> tuple[Array, Mask, Bits]:
+def read(part: xr.Dataset, fewest: int = 1, noise: Array | None = None) -> tuple[Array, Mask, Bits]:
     """
     Read the samples of a part of the capture, and judge its pixels.
 
     Returns the counts (band, time, pixel) [count], zero where they are invalid and in unusable
     pixels; the samples that are valid in all bands (time, pixel), by their values and by the
-    variable `mask`; and the status (pixel). A pixel with fewer valid frames than `fewest`, or than
-    `MOST_MISSING` of all, cannot be solved; see `bridge` for pixels that lack a few.
+    variable `mask`, in frames that repeat none (`_samples.copies`); and the status (pixel). A pixel
+    with fewer valid frames than `fewest`, or than `MOST_MISSING` of all, cannot be solved; see
+    `bridge` for pixels that lack a few. The noise (band) [count], if known, tells better what
+    repeats by chance.
     """
     raw = part["counts"].values
-    raw = raw.reshape(*raw.shape[:2], -1)
-    counts = raw.astype(np.float64)
+    counts = raw.reshape(*raw.shape[:2], -1).astype(np.float64)
     valid = np.all(np.isfinite(counts), axis=0)
     if "mask" in part:
         valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
+    counts[:, ~valid] = 0.0
+    limits = np.full(len(counts), np.inf) if noise is None else noise
+    grains = [samples.grain(band, valid, limit) for band, limit in zip(counts, limits, strict=True)]
+    saturated = [samples.heaped(band, valid, it) for band, it in zip(counts, grains, strict=True)]
+    frozen, copied = _frozen(counts, valid, [it.chance for it in grains])
+    valid &= ~copied[:, np.newaxis]
     counts[:, ~valid] = 0.0
     frames = valid.sum(axis=0)
     invalid = frames < max(fewest, MOST_MISSING * len(valid))
@@ -63,8 +69,8 @@ def read(part: xr.Dataset, fewest: int = 1) -> tuple[Array, Mask, Bits]:
         {
             Status.INVALID_SAMPLES: invalid,
             Status.CONSTANT_SIGNAL: constant & (frames > 1),
-            Status.SATURATED: _saturated(raw, valid),
-            Status.FROZEN_FRAMES: _frozen(counts, valid) & ~invalid & ~constant,
+            Status.SATURATED: np.any(saturated, axis=0),
+            Status.FROZEN_FRAMES: frozen & ~invalid & ~constant,
         }
     )
     if "status" in part:
@@ -154,21 +160,11 @@ def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
     return counts[:, frames][:, :, good], frames
 
 
-def _saturated(raw: npt.NDArray[Any], valid: Mask) -> Mask:
-    """Return the pixels of which valid whole-number counts reach an end of their type."""
-    if raw.dtype.kind not in "ui":
-        return np.zeros(raw.shape[-1], dtype=bool)
-    ends = np.iinfo(raw.dtype)
-    at_an_end = (raw == ends.max) | (raw == max(ends.min, 0))
-    return np.asarray(np.any(at_an_end & valid, axis=(0, 1)))
-
-
-def _frozen(counts: Array, valid: Mask) -> Mask:
-    """Return the pixels of which all bands repeat their counts in several frames in a row."""
-    if counts.shape[1] <= _FROZEN_FRAMES:
-        return np.zeros(counts.shape[2], dtype=bool)
-    same = np.all(counts[:, 1:] == counts[:, :-1], axis=0) & valid[1:] & valid[:-1]
-    run = same[: same.shape[0] - _FROZEN_FRAMES + 1].copy()
-    for shift in range(1, _FROZEN_FRAMES):
-        run &= same[shift : shift + run.shape[0]]
-    return np.asarray(np.any(run, axis=0))
+def _frozen(counts: Array, valid: Mask, chances: list[float]) -> tuple[Mask, Mask]:
+    """Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy."""
+    same = [samples.repeated(band, valid) for band in counts]
+    copied = [samples.copies(*pair, valid) for pair in zip(same, chances, strict=True)]
+    pixels = samples.frozen(np.all(same, axis=0), float(np.prod(chances)))
+    for band, copy, chance in zip(same, copied, chances, strict=True):
+        pixels |= samples.frozen(band, chance) | samples.frozen(copy[:, np.newaxis], 0.0)
+    return pixels, np.any(copied, axis=0)

@@ -48,7 +48,7 @@ class _Pixels:
         parts: dict[str, Any] = {name: v if v is None else v[..., selected] for name, v in values}
         return replace(self, **parts)
 
-    def replace_pixels(self, selected: Mask, part: Self) -> Self:
+    def replace_pixels(self, selected: Mask | Whole, part: Self) -> Self:
         """Return the record with the selected pixels replaced by those of a part, in order."""
         parts: dict[str, Any] = {}
         for field in fields(self):
@@ -251,11 +251,12 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
     curves = tuple(inputs.curves[band] for band in bands)
+    noise = inputs.noise * [curve.reference_slope for curve in inputs.curves]
     for window in windows(rows, width, size):
         rng, places = generator(inputs.seed, window), numbers(window, width)
         local = slice(window[0].start - rows.start, window[0].stop - rows.start)
         counts, valid, status = quality.read(
-            block.isel(y=local, x=window[1]), method.minimum_frames
+            block.isel(y=local, x=window[1]), method.minimum_frames, noise
         )
         counts, usable = quality.bridge(counts, valid, time)
         if method.whole_image or method.every_frame:

@@ -21,7 +21,11 @@ import numpy.typing as npt
 import xarray as xr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
+<<<<<<< HEAD
 from dbthermal._text import read_text
+=======
+from dbthermal import _text as texts
+>>>>>>> main
 from dbthermal.store._integrity import (
     AS_WRITTEN,
     MARK,
@@ -209,9 +213,11 @@ def read_numbers(path: str | Path) -> dict[str, Number]:
     """
     Read a file of `save_numbers`: name to value.
 
-    ValueError if it is not such a file, or differs from what was written. A file without a
-    checksum, of dbthermal 0.1.0, is read with a warning.
+    ValueError, with file and line, if it is not such a file, a name is listed twice, a number is
+    not finite, or it differs from what was written. A file without a checksum, of dbthermal 0.1.0,
+    is read with a warning.
     """
+<<<<<<< HEAD
     try:
         content = json.loads(
             read_text(path),
@@ -221,12 +227,16 @@ def read_numbers(path: str | Path) -> dict[str, Number]:
         )
     except (ValueError, RecursionError) as error:
         raise ValueError(f"Invalid file '{path}': {error}") from error
+=======
+    content = texts.parse_json(texts.read_text(path), str(path))
+>>>>>>> main
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
         raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
     if content.keys() <= {"numbers", "provenance"}:
         warn_unchecked(path, stacklevel=2)
     elif content.pop("sha256", None) != _digest(content):
         raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
+<<<<<<< HEAD
     try:
         return {name: _number(name, value) for name, value in content["numbers"].items()}
     except TypeError as error:
@@ -248,6 +258,15 @@ def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise ValueError(f"Repeated name {name!r}. Must occur once.")
         content[name] = value
     return content
+=======
+    for name, value in content["numbers"].items():
+        if not isinstance(value, bool | int | float | str):
+            raise ValueError(
+                f"Invalid {texts.shown(name)} = {texts.shown(value)} in '{path}'. Must be a "
+                "number, a string or a boolean."
+            )
+    return dict(content["numbers"])
+>>>>>>> main
 
 
 def _digest(content: Mapping[str, Any]) -> str:

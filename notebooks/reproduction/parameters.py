@@ -46,14 +46,18 @@ def read(stem: str, files: Iterable[Path], texts: Iterable[tuple[str, str]] = ()
     """
     Values for a notebook from YAML files, a later one over an earlier one, and from texts.
 
-    `texts` are pairs of name and text. Raises a ValueError that names file and parameter for what
-    `check` refuses, for a file that `readers.read_yaml` refuses, as one with repeated keys, and for
-    a name that is twice in `texts`.
+    The file in ``params/`` must have all of them. `texts` are pairs of name and text. Raises
+    a ValueError that names file and parameter for what `check` refuses, for a file that
+    `readers.read_yaml` refuses, as one with repeated keys, and for a name twice in `texts`.
     """
     small, values, named = defaults(stem), dict[str, Any](), dict[str, Any]()
     for path in files:
         content = readers.read_yaml(path)
         check(content, small, f"'{path}'")
+        if path.absolute() == paths.params(stem) and (missing := small.keys() - content.keys()):
+            raise ValueError(
+                f"Missing parameter '{min(missing)}' in '{path}'. Must have all values."
+            )
         values |= content
     for name, text in texts:
         if name in named:

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import xarray as xr
 from captures import still, walkers
@@ -44,6 +45,49 @@ def test_shutter_makes_no_bad_pixel() -> None:
     assert marked.attrs["jumping_pixels"] == 0
 
 
+def holes(kind: str, seed: int = 3) -> npt.NDArray[np.bool_]:
+    """Samples (band, time, y, x) that are no measurement: a share of all, or of a band, or rows."""
+    shape = (2, 350, 64, 80)
+    if kind.endswith("%"):
+        return np.random.default_rng(seed).random(shape) < float(kind[:-1]) / 100.0
+    band, frame, row, _ = np.indices(shape, sparse=True)
+    places = {
+        "rows": (row >= 5) & (row < 8),
+        "frames of a band": (band == 0) & (frame >= 40) & (frame < 90),
+        "every other frame": (frame % 2 == 0) & (row % 2 == 0),
+    }
+    return np.broadcast_to(places[kind], shape)
+
+
+def check_holes(kind: str) -> None:
+    """Bad pixels are found beside the holes, and few others."""
+    capture = walkers(0)
+    spoiled = simulation.spoil_pixels(capture, 0.005, np.random.default_rng(0))
+    valid = ~holes(kind)
+    found = [
+        mark_bad(part.assign(counts=part["counts"].where(valid))) for part in (capture, spoiled)
+    ]
+    judged = valid.sum(axis=1).min(axis=0) >= 16
+    assert found[0].attrs["unjudged_pixels"] == np.count_nonzero(~judged)
+    false, marked = ((part["status"].values & DEAD != 0)[judged] for part in found)
+    bad = spoiled["spoiled"].max("band").values[judged] > 0
+    print(f"{kind} NaN: {false.mean():.1e} false alarms, {marked[bad].mean():.3f} found")
+    assert false.mean() < 3e-3
+    assert marked[bad].mean() > 0.85
+
+
+def test_holes_do_not_hide_bad_pixels() -> None:
+    """With a tenth of the samples NaN bad pixels are found, as without."""
+    check_holes("10%")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["1%", "40%", "rows", "frames of a band", "every other frame"])
+def test_no_pattern_of_holes_hides_bad_pixels(kind: str) -> None:
+    """So they are whatever lacks, up to 40 % of the samples, or rows, or every other frame."""
+    check_holes(kind)
+
+
 def test_bad_pixels_are_added_to_the_status() -> None:
     """Bits that were set stay, the counts stay, the input stays, and numbers are written."""
     capture = still()
@@ -66,3 +110,6 @@ def test_bad_pixels_refuse_nonsense() -> None:
         mark_bad(capture.isel(time=slice(15)))
     with pytest.raises(ValueError, match="Invalid threshold 0 of bad pixels"):
         mark_bad(capture, threshold=0)
+    sparse = capture.assign(counts=capture["counts"].where(~holes("90%")[:, :60, :20, :24]))
+    with pytest.raises(ValueError, match="'8-14': no pixel has 16 samples that are not NaN"):
+        mark_bad(sparse.isel(time=slice(16)))

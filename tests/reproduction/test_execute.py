@@ -172,6 +172,13 @@ def test_values_are_refused(project: Path, text: str, message: str) -> None:
         parameters.read("03_tiny", [path])
 
 
+@pytest.mark.usefixtures("project")
+def test_the_full_values_are_complete() -> None:
+    """A file of full values that was cut does not leave small ones in a full run."""
+    with pytest.raises(ValueError, match=r"Missing parameter 'known' in '.*03_tiny\.yaml'"):
+        parameters.read("03_tiny", [Path("params/03_tiny.yaml")])
+
+
 def test_values_are_taken_in_order(project: Path) -> None:
     """A later file's value replaces an earlier one's, and a text replaces both, once."""
     for name, text in (

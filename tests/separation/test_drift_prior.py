@@ -94,7 +94,7 @@ def test_a_random_walk_is_extrapolated(walk: float) -> None:
     steps = walk * rng.standard_normal(own.shape) / np.sqrt(350)
     ordinate = 0.8 * own + np.cumsum(steps, axis=0) + 0.03 * rng.standard_normal(own.shape)
     line = residuals.regress(own, ordinate, 0.03)
-    found = emission.drift_variance(line, own, np.full(2000, 0.2), functions, 0.03, 0.0)
+    found = emission.walk_variance(line, own, functions, 0.03)[1]
     true, stated = float(np.std(line.slope)), np.sqrt(found)
     share = float(
         np.mean(np.abs(line.slope - 0.8) < 1.96 * np.hypot(stated, np.sqrt(line.variance)))

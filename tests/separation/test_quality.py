@@ -2,6 +2,7 @@
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 import xarray as xr
 
 from dbthermal.schema import Status
@@ -62,15 +63,70 @@ def test_bits_of_bad_pixels() -> None:
     np.testing.assert_array_equal(quality.unusable(status), [False, True, True] + 3 * [False])
 
 
-def test_saturation_is_of_whole_numbers_in_use() -> None:
-    """Whole-number counts at an end of their type are flagged, except in masked samples."""
-    wild = spoilt(((1, 5, 4), 65535), ((1, 6, 5), 65535), dtype="uint16")
+def test_a_heap_on_one_level_is_saturation() -> None:
+    """Samples that heap on the highest or lowest value are flagged, except masked ones."""
+    low, high = ((0, slice(2, 9), 1), 900.0), ((1, slice(2, 9), 4), 1100.0)
+    wild = spoilt(low, high, ((1, slice(2, 9), 5), 1100.0))
     mask = np.ones((FRAMES, 1, 6), dtype=bool)
-    mask[6, 0, 5] = False
+    mask[2:9, 0, 5] = False
     _, valid, status = quality.read(wild.assign(mask=(("time", "y", "x"), mask)))
-    np.testing.assert_array_equal(status, bits((4, Status.SATURATED)))
-    assert not valid[6, 5]
-    assert not quality.read(spoilt(((1, 5, 4), 65535)))[2].any()
+    flagged = np.flatnonzero(status & np.uint32(Status.SATURATED))
+    np.testing.assert_array_equal(flagged, [1, 4])
+    assert not valid[2:9, 5].any()
+
+
+def test_one_band_that_stands_is_frozen_and_copies_are_left_out() -> None:
+    """A frame that repeats in one band is no sample; three are flagged, and so is one pixel."""
+    for copies, flag in ((1, 0), (2, 0), (3, Status.FROZEN_FRAMES)):
+        _, valid, status = quality.read(spoilt(*repeats(1, 7, copies)))
+        np.testing.assert_array_equal(np.flatnonzero(~valid[:, 0]), 7 + np.arange(copies))
+        assert np.all(status == flag)
+    _, valid, status = quality.read(spoilt(((0, slice(4, 13), 3), 1000.0)))
+    np.testing.assert_array_equal(status, bits((3, Status.FROZEN_FRAMES)))
+    assert valid.all()
+
+
+def repeats(band: int, first: int, number: int) -> list[tuple[Place, float]]:
+    """Replacements that make so many frames of a band copies of the one before."""
+    before = part()["counts"].values[band, first - 1, 0]
+    frames = slice(first, first + number)
+    return [((band, frames, pixel), float(value)) for pixel, value in enumerate(before)]
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.3, 0.8, 1.2, 3.4, 30.0])
+def test_whole_counts_repeat_by_chance(noise: float) -> None:
+    """Rounded counts that rest, rise and step stay without a flag, from 0.05 to 30 counts."""
+    assert flags_of_whole_counts(noise, range(2)) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.05, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.4, 30.0])
+def test_whole_counts_repeat_by_chance_in_many(noise: float) -> None:
+    """At most one in 1e3 of 6400 such pixels is flagged."""
+    number = flags_of_whole_counts(noise, range(20))
+    print(f"noise {noise} count: {number} of 6400 clean pixels flagged")
+    assert number <= 6
+
+
+def flags_of_whole_counts(noise: float, seeds: range) -> int:
+    """Flagged pixels, 320 a seed, of rounded counts under a gain, an offset a pixel."""
+    number = 0
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        frames = (350, 100, 1000)[seed % 3]
+        rise = 300.0 * (1.0 - np.exp(-np.arange(frames) / 80.0)) * (seed % 4 > 0)
+        pulses = np.zeros((frames, 320))
+        for pixel in range(320):
+            for start in rng.integers(0, frames, rng.integers(0, 6)):
+                pulses[start : start + rng.integers(2, 60), pixel] += rng.uniform(-40, 150)
+        signal = np.stack([0.9 * rise[:, None] + 0.1 * pulses, 0.2 * rise[:, None] + 0.1 * pulses])
+        raw = np.rint(20000.0 + signal + noise * rng.standard_normal(signal.shape))
+        gain, offset = 1.0 + 0.02 * rng.standard_normal(320), 40.0 * rng.standard_normal(320)
+        counts = (raw * gain + offset).astype(np.float32)[:, :, np.newaxis]
+        capture = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)})
+        status = quality.read(capture, 1, None if seed % 2 else np.array([noise, noise]))[2]
+        number += int(np.count_nonzero(status & np.uint32(Status.SATURATED | Status.FROZEN_FRAMES)))
+    return number
 
 
 def test_status_of_the_capture_is_kept() -> None:

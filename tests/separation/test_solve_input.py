@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 from captures import emissivity_of
 
+from dbthermal import alignment, schema, separation
 from dbthermal import response as responses
-from dbthermal import schema, separation
 from dbthermal.separation._tiles import Estimate
 from dbthermal.simulation import Rig
 
@@ -128,14 +128,25 @@ def test_bad_input_is_a_clear_error(glass: Glass, what: str) -> None:
 
 
 def test_saturated_counts_are_flagged(glass: Glass) -> None:
-    """Whole-number counts at the end of their type are flagged where they occur, and only there."""
+    """Counts that heap at the end of a type, or below it, are flagged where they occur."""
     _, capture, response = glass
     counts = np.rint(capture["counts"].values).astype(np.uint16)
     counts[0, 100:110, 1, 1] = 65535
-    result = separation.solve(capture.assign(counts=(capture["counts"].dims, counts)), response)
-    flagged = result["status"].values & schema.Status.SATURATED != 0
-    assert flagged[1, 1]
-    assert flagged.sum() == 1
+    counts[1, :, 2, 3] = np.minimum(counts[1, :, 2, 3], np.quantile(counts[1, :, 2, 3], 0.8))
+    whole = capture.assign(counts=(capture["counts"].dims, counts.astype(np.float32)))
+    flagged = separation.solve(whole, response)["status"].values & schema.Status.SATURATED != 0
+    np.testing.assert_array_equal(np.argwhere(flagged), [[1, 1], [2, 3]])
+
+
+def test_raw_counts_are_refused(glass: Glass) -> None:
+    """Whole numbers are raw counts, and the error says both ways on."""
+    _, capture, response = glass
+    raw = capture.assign(counts=capture["counts"].astype(np.uint16))
+    message = "correct_capture or, of a camera that corrects itself, counts.astype"
+    with pytest.raises(TypeError, match=message):
+        separation.solve(raw, response)
+    with pytest.raises(TypeError, match=message):
+        alignment.align(raw, offset=0.0)
 
 
 def test_masked_samples_do_not_saturate_a_pixel(glass: Glass) -> None:
@@ -144,7 +155,8 @@ def test_masked_samples_do_not_saturate_a_pixel(glass: Glass) -> None:
     counts = np.rint(capture["counts"].values).astype(np.uint16)
     counts[:, 100:110] = 65535
     used = xr.DataArray((TIME < 10.0) | (TIME >= 11.0), dims="time")
-    whole = capture.assign(counts=(capture["counts"].dims, counts, capture["counts"].attrs))
+    dims, attrs = capture["counts"].dims, capture["counts"].attrs
+    whole = capture.assign(counts=(dims, counts.astype(np.float32), attrs))
     result = separation.solve(whole, response, mask=used)
     assert not np.any(result["status"].values & schema.Status.SATURATED)
     assert np.all(separation.solve(whole, response)["status"] & schema.Status.SATURATED)
@@ -157,6 +169,21 @@ def test_frozen_frames_are_flagged(glass: Glass) -> None:
     frozen["counts"].values[:, 201:206] = frozen["counts"].values[:, [200]]
     assert np.all(separation.solve(frozen, response)["status"] & schema.Status.FROZEN_FRAMES)
     assert not np.any(separation.solve(capture, response)["status"])
+
+
+@pytest.mark.parametrize("band", [0, 1])
+def test_frozen_frames_of_one_band_are_flagged_or_left_out(glass: Glass, band: int) -> None:
+    """Two lost frames of one band cost nothing but themselves, ten are flagged everywhere."""
+    scene, capture, response = glass
+    for copies in (2, 10):
+        frozen = capture.copy(deep=True)
+        frozen["counts"].values[band, 201 : 201 + copies] = frozen["counts"].values[band, 200]
+        result = separation.solve(frozen, response)
+        flagged = result["status"].values & schema.Status.FROZEN_FRAMES != 0
+        assert np.all(flagged) if copies > 2 else not np.any(result["status"])
+        error = result["object_temperature"] - scene["object_temperature"]
+        assert np.all(np.isnan(error[201 : 201 + copies]))
+        assert float(np.sqrt((error**2).mean())) < 0.5  # [K]
 
 
 @pytest.mark.parametrize("name", ["gray", None])

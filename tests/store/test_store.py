@@ -191,7 +191,14 @@ def test_numbers_are_scalars(tmp_path: Path) -> None:
 def test_damaged_numbers_are_refused(text: str, tmp_path: Path) -> None:
     """A truncated, invalid or foreign file of numbers raises an error with its name."""
     (tmp_path / "a.json").write_text(text)
+<<<<<<< HEAD
     with pytest.raises(ValueError, match=r"(No 'numbers' in|Invalid file) '.*a\.json'"):
+=======
+    with pytest.raises(
+        ValueError,
+        match=r"a\.json(: Invalid number NaN|'. Must be a file|, line 1, .*Must be JSON)",
+    ):
+>>>>>>> main
         store.read_numbers(tmp_path / "a.json")
 
 
@@ -207,7 +214,7 @@ def test_no_flipped_bit_passes_as_a_number(tmp_path: Path) -> None:
         try:
             assert store.read_numbers(tmp_path / "a.json") == numbers, bit
         except ValueError as error:
-            assert "a.json'" in str(error)  # noqa: PT017
+            assert "a.json" in str(error)  # noqa: PT017
             refused += 1
     assert refused > 0.98 * 8 * len(whole)
 

@@ -160,7 +160,7 @@ def _checked(
     result: xr.Dataset, corrected: xr.Dataset, error_rate: float, resolution: float
 ) -> xr.Dataset:
     """Result in the capture's order of bands."""
-    schema.check(corrected, "corrected")
+    schema.check_corrected(corrected)
     for name, value in (("error_rate", error_rate), ("resolution", resolution)):
         if not 0 < value < 1:
             raise ValueError(f"Invalid {name} {value}. Must lie in (0, 1).")

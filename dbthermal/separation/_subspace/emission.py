@@ -2,12 +2,12 @@ r"""Object temperature, emissivities and background of one tile, given the refle
 
 Steps 2 to 4 of `method`, whose numbers of equations are used here. The error of the ratios enters
 the object through one number, the error :math:`\epsilon` of :math:`w \cdot \kappa`, of variance
-:math:`\sigma^2` times the null variance.
+:math:`\sigma^2` times the null variance, and that of `_level`.
 
 The emissivity is the slope of the first band's signal against the object's own (eq. 7). A part of
 the background that changes as the object does, :math:`y = \ldots + c \, u_1(x)`, changes the slope
 by :math:`(1 - e_1) c`, and nothing in the data tells the two apart. So its size is assumed, in two
-ways that add (`drift_variance`):
+ways that add:
 
 - a drift: over the capture, the background's change along the object's curve lies anywhere within
   a limit that the user states;
@@ -51,10 +51,21 @@ class Emission:
     smooth_variance: Array  # its variance from the smoothed noise (time, pixel) [K^2]
     emissivity: Array  # (band, pixel) [1]
     emissivity_variance: Array  # (band, pixel) [1]
+    epsilon_variance: Array  # of epsilon (pixel) [1]
+    level: "Level"  # errors that the background's level makes
     noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
     drift_variance: Array  # of e_1, from the background's slow part (pixel) [1]
     constant: Mask  # the object changes too little for its emissivity (pixel)
     restless: Mask  # the background hardly rests (pixel)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Errors of the ratios through the background's mean temperature, the bend's argument."""
+
+    std: Array  # of that temperature (pixel) [K]
+    ratio: Array  # change of the ratios with it (band, pixel) [1/K]
+    epsilon: Array  # change of epsilon with it (pixel) [1/K]
 
 
 def estimate(
@@ -70,18 +81,20 @@ def estimate(
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
     omitted = smooth_variance * np.log(tile.time.size) / ratios.order
-    epsilon = ratios.inverse_energy * ratios.null_variance
-    # Residual of the line in a frame of rest: s_1^2 + e_1^2 var x.
-    expected = noise[0] ** 2 + first**2 * (sensitivity**2 * epsilon + smooth_variance + omitted)
     # Variance of the slope: of the ordinate's noise, and of the abscissa's, e_1^2 var q / sum u^2.
     noise_variance = line.variance + first**2 * ratios.null_variance / line.energy
-    drifting = drift_variance(
-        line, fit.emitted, 1.0 - first, functions, tile.noise[0], background_drift
-    )
+    walk, upper = walk_variance(line, fit.emitted, functions, tile.noise[0])
+    # A uniform distribution in [-d, d] has the variance d^2 / 3.
+    drift = ((1.0 - first) * background_drift / np.ptp(fit.emitted, axis=0)) ** 2 / 3.0
+    drifting = drift + upper
     if tile.material is not None:
         known = ratios.pooled & np.isfinite(tile.material.emissivity)
         noise_variance = np.where(known, tile.material.noise_variance, noise_variance)
         drifting = np.where(known, tile.material.drift_variance, drifting)
+    level = _level(tile, ratios, fit, noise_variance + walk)
+    epsilon = ratios.inverse_energy * ratios.null_variance + (level.epsilon * level.std) ** 2
+    # Residual of the line in a frame of rest: s_1^2 + e_1^2 var x.
+    expected = noise[0] ** 2 + first**2 * (sensitivity**2 * epsilon + smooth_variance + omitted)
     emissivity = 1.0 - ratios.ratio * (1.0 - first)
     return Emission(
         temperature=fit.temperature,
@@ -90,8 +103,10 @@ def estimate(
         smooth_variance=smooth_variance,
         emissivity=emissivity,
         emissivity_variance=_emissivity_variance(
-            emissivity[0], noise_variance + drifting, ratios, noise
+            emissivity[0], noise_variance + drifting, ratios, noise, level
         ),
+        epsilon_variance=epsilon,
+        level=level,
         noise_variance=noise_variance,
         drift_variance=drifting,
         constant=fit.constant,
@@ -145,6 +160,32 @@ def _plain_slope(abscissa: Array, ordinate: Array) -> Array:
     return np.asarray(np.einsum("tp,tp->p", centred, ordinate) / energy)
 
 
+def _level(tile: Tile, ratios: ReflectionRatio, fit: _Fit, variance: Array) -> Level:
+    r"""
+    Errors of the ratios through the background's mean temperature, with the variance of e_1.
+
+    Rapid changes have the ratios :math:`\kappa_m u_m'(y) / u_1'(y)`, and y is known as well as e_1,
+
+    .. math:: \delta \kappa_m = \kappa_m \, \delta y \, \mathrm{d} \ln (u_m' / u_1') / \mathrm{d} y,
+              \quad \delta y = (u_1(y) - u_1(x)) \, \delta e_1 / (1 - e_1)
+
+    in the mean over time; or as a temperature that may be any in the calibrated range.
+    """
+    curve = tile.curves[0]
+    around = tile.reference + np.array([-0.5, 0.5])  # [K]
+    slopes = np.log(np.stack([one.slope(around) for one in tile.curves]))
+    rates = np.diff(slopes - slopes[0], axis=1)
+    reflected = (tile.signals[0] - fit.emitted).mean(axis=0)
+    std = np.abs(reflected) * np.sqrt(variance) / (1.0 - fit.emissivity) ** 2
+    change = ratios.ratio * rates
+    # A uniform distribution of width d has the variance d^2 / 12.
+    return Level(
+        std=np.fmin(std, (curve.highest - curve.lowest) / np.sqrt(12.0)),
+        ratio=change,
+        epsilon=(ratios.null_weights * change).sum(axis=0),
+    )
+
+
 def _fieller(sensitivity: Array, epsilon: Array) -> Array:
     """
     Variance (time, pixel) [K^2] of the object through epsilon, of variance (pixel) [1].
@@ -156,7 +197,7 @@ def _fieller(sensitivity: Array, epsilon: Array) -> Array:
 
 
 def _emissivity_variance(
-    first: Array, slope_variance: Array, ratios: ReflectionRatio, noise: Array
+    first: Array, slope_variance: Array, ratios: ReflectionRatio, noise: Array, level: Level
 ) -> Array:
     r"""
     Variance of the emissivities (band, pixel) [1], from the ratios and from the slope (eq. 8).
@@ -173,27 +214,23 @@ def _emissivity_variance(
     through = (ratio * first * reflectivity) ** 2 * ratios.null_variance
     through += 2.0 * ratio * first * reflectivity**2 * covariance
     direct = reflectivity**2 * ratios.variance
-    return np.asarray(ratio**2 * slope_variance + through * ratios.inverse_energy + direct)
+    # Through the background's level y: -(1 - e_1) (kappa_m e_1 deps/dy + dkappa_m/dy).
+    by_level = reflectivity * (ratio * first * level.epsilon + level.ratio) * level.std
+    noisy = through * ratios.inverse_energy + direct
+    return np.asarray(ratio**2 * slope_variance + noisy + by_level**2)
 
 
-def drift_variance(
-    line: residuals.Line,
-    emitted: Array,
-    reflectivity: Array,
-    functions: smooth.Subspace,
-    noise: float,
-    background_drift: float,
-) -> Array:
+def walk_variance(
+    line: residuals.Line, emitted: Array, functions: smooth.Subspace, noise: float
+) -> tuple[Array, Array]:
     r"""
-    Variance (pixel) [1] of the regression's slope from the background's slow part.
+    Variance (pixel) [1] of the regression's slope from a background that walks; its upper bound.
 
-    With the largest drift d [K], uniform, unit coefficients :math:`\xi_j` of the object's curve
-    `emitted` (time, pixel) of norm :math:`|u|` and range :math:`\Delta`, and the energy A of a
-    random walk in the residual's spectrum, the larger of those of two octaves at the upper end of
-    their 95 % interval,
+    With the unit coefficients :math:`\xi_j` of the object's curve `emitted` (time, pixel) of norm
+    :math:`|u|`, and the energy A of a random walk in the residual's spectrum, the larger of those
+    of two octaves; for the bound, at the upper end of their 95 % interval,
 
-    .. math:: \mathrm{var}(e_1) = \frac{(1 - e_1)^2 d^2}{3 \Delta^2}
-              + \frac{A}{|u|^2} \sum_j \frac{\xi_j^2}{j^2}
+    .. math:: \mathrm{var}(e_1) = \frac{A}{|u|^2} \sum_j \frac{\xi_j^2}{j^2}
     """
     columns = functions.functions[:, functions.steps + 1 :]
     degree = np.arange(1.0, columns.shape[1] + 1)[:, np.newaxis]
@@ -207,16 +244,14 @@ def drift_variance(
     spectrum = spectrum - unit * (unit * spectrum).sum(axis=0)
     # Energy of a walk at degree 1: j^2 times that at degree j, less the noise's.
     walk = degree**2 * (spectrum**2 - noise**2 / share)
-    octaves = []
+    octaves, widened = [], []
     for low, high, lost in _OCTAVES:
         if (freedom := len(walk[low - 1 : high - 1]) - lost) > 0:
-            widened = (stdtrit(freedom, 0.975) / NORMAL95) ** 2
-            octaves.append(walk[low - 1 : high - 1].sum(axis=0) / freedom * widened)
-    strongest = np.max(octaves, axis=0, initial=0.0)
-    extrapolated = strongest * (unit**2 / degree**2).sum(axis=0) / energy
-    # A uniform distribution in [-d, d] has the variance d^2 / 3.
-    drift = (reflectivity * background_drift / np.ptp(emitted, axis=0)) ** 2 / 3.0
-    return np.asarray(drift + extrapolated)
+            octaves.append(walk[low - 1 : high - 1].sum(axis=0) / freedom)
+            widened.append(octaves[-1] * (stdtrit(freedom, 0.975) / NORMAL95) ** 2)
+    scale = (unit**2 / degree**2).sum(axis=0) / energy
+    expected, upper = (scale * np.max(one, axis=0, initial=0.0) for one in (octaves, widened))
+    return np.asarray(expected), np.asarray(upper)
 
 
 def estimate_background(
@@ -265,6 +300,7 @@ def estimate_background(
         through * (ratios.null_variance * ratios.inverse_energy) - contrast * covariance
     )
     variance += contrast**2 * (of_first * ratios.inverse_energy + slope)
+    variance += (through * emission.level.epsilon * emission.level.std) ** 2
     return background, np.asarray(variance)
 
 

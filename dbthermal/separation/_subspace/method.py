@@ -78,6 +78,8 @@ _SUSPECT: Final = np.uint32(
 # Energy of the bend between the two responses, in units of the second band's noise, from which it
 # is worth taking out: it moves no linear function of the signal by more standard deviations.
 _BEND: Final = 0.2
+# Times that it is taken out at most: it changes with the background that it is computed of.
+_BENDS: Final = 2
 # Background temperatures at which a gray body's ratios are computed, over the calibrated range.
 _TEMPERATURES: Final = 17
 
@@ -144,31 +146,48 @@ def _exact(
     finish: Callable[[Tile, smooth.Subspace, _Solution], Record],
     least: float = _BEND,
 ) -> Record:
-    """Steps 1 to 4, where it matters a second time on signals with proportional reflections."""
+    """Steps 1 to 4, where it matters again on signals with proportional reflections."""
     solution = _steps(tile, tile, functions, settings)
     result = finish(tile, functions, solution)
-    bend = emissions.bend(tile, solution.emission, solution.background)
-    change = bend - bend.mean(axis=1, keepdims=True)
-    energy = np.einsum("btp,btp->bp", change, change)
-    bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
-    if not np.any(bent):
-        return result
-    part = tile.select_pixels(bent)
-    signals = part.signals.copy()
-    signals[1:] -= bend[..., bent]
-    again = _steps(part, replace(part, signals=signals), functions, settings)
-    # The bend of a gray body is not known.
-    again = replace(again, gray=solution.gray[bent])
-    return result.replace_pixels(bent, finish(part, functions, again))
+    part, removed, places = tile, np.zeros(1), np.arange(solution.gray.size)
+    for _ in range(_BENDS):
+        bend = emissions.bend(part, solution.emission, solution.background)
+        change = bend - removed
+        change -= change.mean(axis=1, keepdims=True)
+        energy = np.einsum("btp,btp->bp", change, change)
+        bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
+        if not np.any(bent):
+            break
+        part, removed, places, least = (
+            part.select_pixels(bent),
+            bend[..., bent],
+            places[bent],
+            _BEND,
+        )
+        signals = part.signals.copy()
+        signals[1:] -= removed
+        straight = replace(part, signals=signals)
+        solution = _steps(part, straight, functions, settings, solution.gray[bent])
+        result = result.replace_pixels(places, finish(part, functions, solution))
+    return result
 
 
 def _steps(
-    tile: Tile, straight: Tile, functions: smooth.Subspace, settings: SubspaceSettings
+    tile: Tile,
+    straight: Tile,
+    functions: smooth.Subspace,
+    settings: SubspaceSettings,
+    gray: Mask | None = None,
 ) -> _Solution:
-    """Steps 1 to 4; the first three on signals whose reflections are proportional."""
+    """
+    Steps 1 to 4; the first three on signals whose reflections are proportional.
+
+    The bend of a gray body is not known: whether it is one is told from signals as they are.
+    """
     noise, slopes = np.array(tile.noise), _slopes(tile)
     ratios = reflection_ratio.estimate(straight.signals, functions, noise, tile.material)
-    gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
+    if gray is None:
+        gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
     emission = emissions.estimate(straight, functions, ratios, settings.background_drift)
     background = emissions.estimate_background(tile, emission, ratios)
     return _Solution(ratios, emission, *background, straight, gray)
@@ -187,6 +206,7 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Esti
     still = flags[Status.NO_BACKGROUND_MOTION]
     undefined = still | flags[Status.GRAY]
     unidentified = undefined | emission.constant
+    ratio_variance = ratios.variance + (emission.level.ratio * emission.level.std) ** 2
     result = Estimate(
         object_temperature=emission.temperature,
         object_temperature_std=emission.temperature_std,
@@ -195,7 +215,7 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Esti
         emissivity=emission.emissivity,
         emissivity_std=np.sqrt(emission.emissivity_variance),
         reflection_ratio=np.where(still, np.nan, ratios.ratio),
-        reflection_ratio_std=np.where(still, np.nan, np.sqrt(ratios.variance)),
+        reflection_ratio_std=np.where(still, np.nan, np.sqrt(ratio_variance)),
         status=status_bits(flags),
     )
     no_background = unidentified | flags[Status.NONPHYSICAL_EMISSIVITY]
@@ -234,8 +254,7 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     still |= ~ratios.pooled & (ratios.scatter[0, 0] <= 0)
     still |= ~np.isfinite(ratios.inverse_energy)
     # Ratios of 1, where eq. 5 is singular, are not excluded.
-    epsilon = ratios.inverse_energy * ratios.null_variance
-    singular = epsilon > 1.0 / chi2.isf(reflection_ratio.CHANCE, others)
+    singular = emission.epsilon_variance > 1.0 / chi2.isf(reflection_ratio.CHANCE, others)
     gray = ~still & (singular | solution.gray)
     defined = ~still & ~gray & ~emission.constant
     nonphysical = defined & np.any((emission.emissivity <= 0) | (emission.emissivity >= 1), axis=0)

@@ -1,0 +1,166 @@
+r"""Samples that are no measurement by their values: clipped at a level, or repeated.
+
+A camera that saturates heaps samples on one value, the highest or the lowest of a pixel, wherever
+that lies; one that freezes repeats its values. Whole counts do both by chance. How often follows
+from the noise s and the step q of the counts: a sample takes any one value at most with probability
+
+.. math:: c = q / (\sqrt{2 \pi} s)
+
+so that k repeats in a row have a probability of :math:`c^k`, and of the samples within 2 s of an
+end, where the density does not grow, at most q / 2 s lie on the last value. With s below 1.25 q
+nothing can be told, and nothing is.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import ndtri
+from scipy.stats import binom
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+MINIMUM_FRAMES: Final = 16
+"""Fewest samples from which the noise of a pixel is estimated."""
+
+# Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
+_QUIET: Final = 0.8
+# Mean magnitude of that share of a standard normal distribution.
+_QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
+# About as many pixels tell the noise and the step of the counts.
+_PIXELS: Final = 32
+# The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
+_MARGIN: Final = 1.25
+# Probability of a value above which counts are too coarse to be judged.
+_COARSE: Final = 0.4
+# A pixel, or a frame, is taken for spoilt by chance once in so many.
+_FALSE_ALARM: Final = 1e-5
+FEWEST: Final = 3
+"""Fewest samples on one value, and repeats in a row, that are taken for more than chance."""
+
+# Width [noise] of the end of a pixel's values.
+_END: Final = 2.0
+
+
+def noise(signal: npt.NDArray[Any]) -> Array:
+    """
+    Noise (pixel ...) of signals (time, pixel ...), which may hold NaN; NaN of too few frames.
+
+    The mean magnitude of the smaller four fifths of the second differences: neither object nor
+    walkers enter.
+    """
+    valid = np.isfinite(signal)
+    frames = valid.sum(axis=0)
+    if not valid.all():
+        # The samples of each pixel that are no measurement go behind the others.
+        order = np.argsort(~valid, axis=0, kind="stable")
+        signal = np.take_along_axis(np.where(valid, signal, np.inf), order, axis=0)
+    with np.errstate(invalid="ignore"):
+        second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
+    quiet = np.maximum((_QUIET * (frames - 2)).astype(np.intp), 1)
+    if valid.all() and len(second) > quiet.max(initial=0):
+        second.partition(int(quiet.flat[0]), axis=0)
+    else:
+        second.sort(axis=0)
+    used = np.arange(len(second)).reshape(-1, *np.ones(frames.ndim, dtype=int)) < quiet
+    level = second.sum(axis=0, dtype=np.float64, where=used) / quiet / (_QUIET_MEAN * np.sqrt(1.5))
+    return np.where(frames < MINIMUM_FRAMES, np.nan, level)
+
+
+@dataclass(frozen=True)
+class Grain:
+    """Noise [count] of a band, and the probability that a sample takes some one value."""
+
+    noise: float
+    chance: float  # 1 if the counts are too coarse to tell
+
+
+def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grain:
+    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit."""
+    every = slice(None, None, max(1, counts.shape[1] // _PIXELS))
+    some = np.where(valid[:, every], counts[:, every].astype(np.float64), np.nan)
+    if len(some) < MINIMUM_FRAMES:
+        return Grain(stated, 1.0)
+    level, change = noise(some), np.abs(np.diff(some, axis=0))
+    step = np.min(change, axis=0, initial=np.inf, where=change > 0)
+    known = (level > 0) & np.isfinite(step)
+    if not known.any():
+        return Grain(stated, 1.0)
+    std = min(stated, float(np.median(level[known])))
+    chance = _MARGIN * float(np.median(step[known])) / (np.sqrt(2.0 * np.pi) * std)
+    return Grain(std, chance if chance < _COARSE else 1.0)
+
+
+def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain) -> Mask:
+    """Pixels (pixel) of counts (time, pixel) of which the highest or lowest value is a heap."""
+    result = np.zeros(counts.shape[1], dtype=bool)
+    if band.chance < 1.0:
+        for highest in (False, True):
+            end, number = end_of(counts, valid, highest=highest)
+            (pixels,) = np.nonzero((number >= FEWEST) & (number < valid.sum(axis=0)))
+            near = near_end(counts[:, pixels], valid[:, pixels], end[pixels], band)
+            result[pixels] |= is_heap(number[pixels], near, band)
+    return result
+
+
+def end_of(
+    counts: npt.NDArray[Any], valid: Mask, *, highest: bool
+) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
+    """Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there."""
+    if highest:
+        end = counts.max(axis=0, where=valid, initial=counts.min(initial=0))
+    else:
+        end = counts.min(axis=0, where=valid, initial=counts.max(initial=0))
+    return end, np.count_nonzero((counts == end) & valid, axis=0)
+
+
+def near_end(
+    counts: npt.NDArray[Any], valid: Mask, end: npt.NDArray[Any], band: Grain
+) -> npt.NDArray[np.intp]:
+    """Number (pixel) of samples of counts (time, pixel) about an end, within some noise."""
+    apart = np.abs(counts.astype(np.float64) - end)
+    return np.asarray(np.count_nonzero((apart < _END * band.noise) & valid, axis=0))
+
+
+def is_heap(number: npt.ArrayLike, near: npt.ArrayLike, band: Grain) -> Mask:
+    """Return where samples at an end, out of those near it, are more than noise puts there."""
+    share = min(1.0, np.sqrt(2.0 * np.pi) * band.chance / _END)
+    # The first sample makes the end.
+    return np.asarray(binom.sf(np.asarray(number) - 2, np.asarray(near) - 1, share) < _FALSE_ALARM)
+
+
+def repeated(counts: npt.NDArray[Any], valid: Mask) -> Mask:
+    """Samples (time - 1, pixel) of counts (time, pixel) that repeat the one before."""
+    return np.asarray((counts[1:] == counts[:-1]) & valid[1:] & valid[:-1])
+
+
+def frozen(same: Mask, chance: float) -> Mask:
+    """Pixels (pixel) of which more `repeated` samples follow one another than noise makes."""
+    length = _needed(len(same) + 1, chance)
+    if length > len(same):
+        return np.zeros(same.shape[1], dtype=bool)
+    run, reach = same, 1
+    while reach < length:
+        shift = min(reach, length - reach)
+        run = run[:-shift] & run[shift:]
+        reach += shift
+    return np.asarray(run.any(axis=0))
+
+
+def copies(same: Mask, chance: float, valid: Mask) -> Mask:
+    """Frames (time) in which all changing pixels repeat, and more of them than noise makes."""
+    moving = ~same.all(axis=0)
+    both = valid[1:] & valid[:-1] & moving
+    number = np.count_nonzero(both, axis=1)
+    copied = ~np.any(both & ~same, axis=1) & (number >= _needed(len(valid), chance))
+    return np.concatenate([[False], copied])
+
+
+def _needed(frames: int, chance: float) -> int:
+    """Fewest repeats together that noise does not make in so many frames."""
+    if chance == 1.0:
+        return np.iinfo(np.int32).max
+    tiny = np.finfo(np.float64).tiny
+    return max(FEWEST, int(np.ceil(np.log(_FALSE_ALARM / frames) / np.log(max(chance, tiny)))))
