@@ -21,11 +21,7 @@ import numpy.typing as npt
 import xarray as xr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
-<<<<<<< HEAD
-from dbthermal._text import read_text
-=======
 from dbthermal import _text as texts
->>>>>>> main
 from dbthermal.store._integrity import (
     AS_WRITTEN,
     MARK,
@@ -217,48 +213,13 @@ def read_numbers(path: str | Path) -> dict[str, Number]:
     not finite, or it differs from what was written. A file without a checksum, of dbthermal 0.1.0,
     is read with a warning.
     """
-<<<<<<< HEAD
-    try:
-        content = json.loads(
-            read_text(path),
-            parse_constant=_finite,
-            parse_float=_finite,
-            object_pairs_hook=_without_repetition,
-        )
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"Invalid file '{path}': {error}") from error
-=======
     content = texts.parse_json(texts.read_text(path), str(path))
->>>>>>> main
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
         raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
     if content.keys() <= {"numbers", "provenance"}:
         warn_unchecked(path, stacklevel=2)
     elif content.pop("sha256", None) != _digest(content):
         raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
-<<<<<<< HEAD
-    try:
-        return {name: _number(name, value) for name, value in content["numbers"].items()}
-    except TypeError as error:
-        raise ValueError(f"Invalid file '{path}': {error}") from error
-
-
-def _finite(text: str) -> float:
-    """Finite number of JSON."""
-    if not math.isfinite(number := float(text)):
-        raise ValueError(f"Invalid number {text}. Must be finite.")
-    return number
-
-
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Mapping of JSON in which no name is twice."""
-    content: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in content:
-            raise ValueError(f"Repeated name {name!r}. Must occur once.")
-        content[name] = value
-    return content
-=======
     for name, value in content["numbers"].items():
         if not isinstance(value, bool | int | float | str):
             raise ValueError(
@@ -266,7 +227,6 @@ def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
                 "number, a string or a boolean."
             )
     return dict(content["numbers"])
->>>>>>> main
 
 
 def _digest(content: Mapping[str, Any]) -> str:
