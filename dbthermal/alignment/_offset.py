@@ -259,14 +259,16 @@ def sample(corrected: xr.Dataset) -> Array:
     step = max(1, int(np.sqrt(pixels / _PIXELS)), fitting)
     part = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
     counts = part["counts"].values.astype(np.float64)
+    counts[~schema.measured(counts)] = np.nan
     counts = counts.reshape(*counts.shape[:2], -1)
     usable = np.ones(counts.shape[2], dtype=bool)
     if "status" in part:
         usable &= (part["status"].values.reshape(-1) & _UNUSABLE) == 0
     for movie in counts:
         absent = clocks.missing(movie)
-        movie[absent] = np.nan
-        usable &= np.all(np.isfinite(movie[~absent]), axis=0) & (np.ptp(movie[~absent], axis=0) > 0)
+        movie[absent], here = np.nan, movie[~absent]
+        changes = here.max(axis=0, initial=-np.inf) > here.min(axis=0, initial=np.inf)
+        usable &= np.all(np.isfinite(here), axis=0) & changes
     if usable.sum() < _GROUPS:
         raise ValueError(
             f"Invalid capture of {usable.sum()} usable pixels. Must be at least {_GROUPS} that are "
