@@ -196,8 +196,8 @@ def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
         step = float(np.median(np.diff(movie["time"].values))) if finite.size > 1 else np.nan
         raise ValueError(
             f"Invalid band '{movie['band'].item()}' of {finite.sum()} frames that are not NaN. "
-            f"Must have at least {fewest}, to judge a pixel by changes within {_REACH_SECONDS} s of "
-            f"a 'time' in steps of {step:.3g} s."
+            f"Must have at least {fewest}, to judge a pixel by changes within "
+            f"{_REACH_SECONDS} s of a 'time' in steps of {step:.3g} s."
         )
     return np.flatnonzero(finite)
 
