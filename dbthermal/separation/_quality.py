@@ -8,6 +8,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _samples as samples
+from dbthermal import schema
 from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
@@ -50,7 +51,7 @@ def read(part: xr.Dataset, fewest: int = 1, noise: Array | None = None) -> tuple
     """
     raw = part["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1).astype(np.float64)
-    valid = np.all(np.isfinite(counts), axis=0)
+    valid = np.all(schema.measured(counts), axis=0)
     if "mask" in part:
         valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
     counts[:, ~valid] = 0.0
@@ -62,8 +63,9 @@ def read(part: xr.Dataset, fewest: int = 1, noise: Array | None = None) -> tuple
     counts[:, ~valid] = 0.0
     frames = valid.sum(axis=0)
     invalid = frames < max(fewest, MOST_MISSING * len(valid))
-    highest = counts.max(axis=1, where=valid, initial=-np.inf)
-    lowest = counts.min(axis=1, where=valid, initial=np.inf)
+    used = True if valid.all() else valid  # numpy's reductions are slower with a mask
+    highest = counts.max(axis=1, where=used, initial=-np.inf)
+    lowest = counts.min(axis=1, where=used, initial=np.inf)
     constant = np.any(highest == lowest, axis=0) & ~invalid
     status = status_bits(
         {

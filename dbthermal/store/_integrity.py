@@ -70,7 +70,7 @@ class CheckedStore(SummedStore):
         self._compare(GROUP, content)
         try:
             self.attrs: dict[str, Any] = json.loads(content or b"")["attributes"]
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"Invalid {self._named(GROUP)}. Must be a zarr group.") from error
         self.closed = bool(self.attrs.get("closed", True))
         if MARK.keys() & self.attrs.keys() and not self._sums:
