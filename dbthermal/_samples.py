@@ -82,13 +82,24 @@ class Grain:
 
 
 def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grain:
-    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit."""
+    """
+    Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
+
+    Samples at a heap, and frames in which no pixel changes, say nothing of the noise.
+    """
     every = slice(None, None, max(1, counts.shape[1] // _PIXELS))
     some = np.where(valid[:, every], counts[:, every].astype(np.float64), np.nan)
+    changing = np.any(some[1:] != some[:-1], axis=1)  # true for NaN
+    if some.shape[1] >= _PIXELS:
+        some = some[np.concatenate([[True], changing])]
     if len(some) < MINIMUM_FRAMES:
         return Grain(stated, 1.0)
-    level, change = noise(some), np.abs(np.diff(some, axis=0))
+    change = np.abs(np.diff(some, axis=0))
     step = np.min(change, axis=0, initial=np.inf, where=change > 0)
+    for reduced in (np.fmin.reduce(some, axis=0), np.fmax.reduce(some, axis=0)):
+        at_end = some == reduced
+        some[at_end & (np.count_nonzero(at_end, axis=0) >= FEWEST)] = np.nan
+    level = noise(some)
     known = (level > 0) & np.isfinite(step)
     if not known.any():
         return Grain(stated, 1.0)
