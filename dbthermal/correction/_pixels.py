@@ -193,9 +193,11 @@ def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     for rows in _blocks(movie):
         finite |= np.isfinite(movie.isel(y=rows).values).any(axis=(1, 2))
     if finite.sum() < fewest:
+        step = float(np.median(np.diff(movie["time"].values))) if finite.size > 1 else np.nan
         raise ValueError(
             f"Invalid band '{movie['band'].item()}' of {finite.sum()} frames that are not NaN. "
-            f"Must have at least {fewest}, to judge a pixel."
+            f"Must have at least {fewest}, to judge a pixel by changes within "
+            f"{_REACH_SECONDS} s of a 'time' in steps of {step:.3g} s."
         )
     return np.flatnonzero(finite)
 

@@ -29,6 +29,9 @@ Window = tuple[slice, slice]
 PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
+SAMPLES: Final = 2**19
+"""Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
+
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
 
@@ -246,7 +249,8 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     """Read a block of rows and cut it into tiles; with the material of each pixel of the image."""
     block = inputs.capture.isel(y=rows).load()
     method, bands, width = inputs.method, inputs.bands, block.sizes["x"]
-    size = getattr(inputs.settings, "batch", PIXELS)
+    fitting = max(1, min(PIXELS, SAMPLES // block.sizes["time"]))
+    size = getattr(inputs.settings, "batch", fitting)
     size = block.sizes["y"] * width if method.whole_image else size
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
