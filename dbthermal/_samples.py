@@ -29,8 +29,9 @@ MINIMUM_FRAMES: Final = 16
 _QUIET: Final = 0.8
 # Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
-# About as many pixels tell the noise and the step of the counts.
-_PIXELS: Final = 32
+PIXELS: Final = 16
+"""About as many pixels tell the noise and the step of the counts."""
+
 # The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
 _MARGIN: Final = 1.25
 # Probability of a value above which counts are too coarse to be judged.
@@ -51,21 +52,25 @@ def noise(signal: npt.NDArray[Any]) -> Array:
     The mean magnitude of the smaller four fifths of the second differences: neither object nor
     walkers enter.
     """
-    valid = np.isfinite(signal)
-    frames = valid.sum(axis=0)
-    if not valid.all():
+    frames = np.isfinite(signal).sum(axis=0)
+    whole = bool(np.all(frames == len(signal)))
+    if not whole:
         # The samples of each pixel that are no measurement go behind the others.
-        order = np.argsort(~valid, axis=0, kind="stable")
-        signal = np.take_along_axis(np.where(valid, signal, np.inf), order, axis=0)
+        order = np.argsort(~np.isfinite(signal), axis=0, kind="stable")
+        signal = np.take_along_axis(signal, order, axis=0)
     with np.errstate(invalid="ignore"):
         second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
     quiet = np.maximum((_QUIET * (frames - 2)).astype(np.intp), 1)
-    if valid.all() and len(second) > quiet.max(initial=0):
-        second.partition(int(quiet.flat[0]), axis=0)
+    if whole and len(second) > 1:
+        number = int(quiet.flat[0])
+        second.partition(number, axis=0)
+        total = second[:number].sum(axis=0, dtype=np.float64)
     else:
+        second[~np.isfinite(second)] = np.inf
         second.sort(axis=0)
-    used = np.arange(len(second)).reshape(-1, *np.ones(frames.ndim, dtype=int)) < quiet
-    level = second.sum(axis=0, dtype=np.float64, where=used) / quiet / (_QUIET_MEAN * np.sqrt(1.5))
+        used = np.arange(len(second)).reshape(-1, *np.ones(frames.ndim, dtype=int)) < quiet
+        total = second.sum(axis=0, dtype=np.float64, where=used)
+    level = total / quiet / (_QUIET_MEAN * np.sqrt(1.5))
     return np.where(frames < MINIMUM_FRAMES, np.nan, level)
 
 
@@ -78,13 +83,24 @@ class Grain:
 
 
 def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grain:
-    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit."""
-    every = slice(None, None, max(1, counts.shape[1] // _PIXELS))
+    """
+    Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
+
+    Samples at a heap, and frames in which no pixel changes, say nothing of the noise.
+    """
+    every = slice(None, None, max(1, counts.shape[1] // PIXELS))
     some = np.where(valid[:, every], counts[:, every].astype(np.float64), np.nan)
+    changing = np.any(some[1:] != some[:-1], axis=1)  # true for NaN
+    if some.shape[1] >= PIXELS:
+        some = some[np.concatenate([[True], changing])]
     if len(some) < MINIMUM_FRAMES:
         return Grain(stated, 1.0)
-    level, change = noise(some), np.abs(np.diff(some, axis=0))
+    change = np.abs(np.diff(some, axis=0))
     step = np.min(change, axis=0, initial=np.inf, where=change > 0)
+    for reduced in (np.fmin.reduce(some, axis=0), np.fmax.reduce(some, axis=0)):
+        at_end = some == reduced
+        some[at_end & (np.count_nonzero(at_end, axis=0) >= FEWEST)] = np.nan
+    level = noise(some)
     known = (level > 0) & np.isfinite(step)
     if not known.any():
         return Grain(stated, 1.0)
@@ -99,7 +115,8 @@ def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain) -> Mask:
     if band.chance < 1.0:
         for highest in (False, True):
             end, number = end_of(counts, valid, highest=highest)
-            (pixels,) = np.nonzero((number >= FEWEST) & (number < valid.sum(axis=0)))
+            (pixels,) = np.nonzero(number >= FEWEST)
+            pixels = pixels[number[pixels] < valid[:, pixels].sum(axis=0)]
             near = near_end(counts[:, pixels], valid[:, pixels], end[pixels], band)
             result[pixels] |= is_heap(number[pixels], near, band)
     return result
@@ -109,11 +126,19 @@ def end_of(
     counts: npt.NDArray[Any], valid: Mask, *, highest: bool
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
     """Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there."""
-    if highest:
+    whole = valid.all()
+    if whole:
+        end = counts.max(axis=0) if highest else counts.min(axis=0)
+    elif highest:
         end = counts.max(axis=0, where=valid, initial=counts.min(initial=0))
     else:
         end = counts.min(axis=0, where=valid, initial=counts.max(initial=0))
-    return end, np.count_nonzero((counts == end) & valid, axis=0)
+    there = counts == end
+    if not whole:
+        there &= valid
+    # A product of matrices adds up several times faster than a sum over the first axis.
+    number = np.ones(len(there), dtype=np.float32) @ there.astype(np.float32)
+    return end, number.astype(np.intp)
 
 
 def near_end(
@@ -152,9 +177,8 @@ def frozen(same: Mask, chance: float) -> Mask:
 def copies(same: Mask, chance: float, valid: Mask) -> Mask:
     """Frames (time) in which all changing pixels repeat, and more of them than noise makes."""
     moving = ~same.all(axis=0)
-    both = valid[1:] & valid[:-1] & moving
-    number = np.count_nonzero(both, axis=1)
-    copied = ~np.any(both & ~same, axis=1) & (number >= _needed(len(valid), chance))
+    both = moving if valid.all() else valid[1:] & valid[:-1] & moving
+    copied = np.all(same | ~both, axis=1) & (both.sum(axis=-1) >= _needed(len(valid), chance))
     return np.concatenate([[False], copied])
 
 

@@ -1,22 +1,33 @@
-"""Text from elsewhere: files, numbers and YAML, read strictly, or refused with line and rule.
+"""Text from elsewhere: files, numbers, tables and YAML, read strictly, or refused by line and rule.
 
 Whatever a reader opens was written by others. `read_text` opens regular files of a limited size,
-`number` takes decimal numbers alone, `parse_yaml` takes mappings that mean the same in YAML 1.1 and
-1.2. Nothing is guessed, and of two equal keys neither wins.
+`number` takes decimal numbers alone, `table_rows` and `numbers` whole tables, `parse_yaml` mappings
+that mean the same in YAML 1.1 and 1.2. Nothing is guessed, and of two equal keys neither wins.
 """
 
+import csv
+import json
 import math
 import os
 import re
 import stat
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+Row = tuple[int, list[str]]
+"""Row of a table and its line in the file, from 1."""
 
 TEXT_LIMIT: Final = 2**26
 """Largest table that is read [byte]; the largest of the public libraries has 0.7 MB."""
 
-YAML_LIMIT: Final = 2**22
+YAML_LIMIT: Final = 2**20
 """Largest YAML file that is read [byte]."""
 
 SHOWN: Final = 60
@@ -25,6 +36,7 @@ SHOWN: Final = 60
 _DEPTH: Final = 50  # of nested lists and mappings in YAML
 _LARGEST: Final = 2**53  # up to here whole numbers are exact also as float
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
+_DIGITS: Final = re.compile(r"[0-9eE.+ -]*")
 _DECIMAL: Final = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _CONSTANTS: Final = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
@@ -102,6 +114,85 @@ def number(text: str, place: str) -> float:
             "decimal point."
         )
     return value
+
+
+def table_rows(text: str, source: str, *, comment: str | None = None) -> list[Row]:
+    """
+    Rows of comma-separated values, each in one line; lines that begin with `comment` are left out.
+
+    ValueError if the last line has no end, as where a file was cut, or quotes are not closed.
+    """
+    rows: list[Row] = []
+    for number_, line in enumerate(whole_lines(text, source), 1):
+        if comment is None or not line.startswith(comment):
+            try:
+                rows.extend((number_, row) for row in csv.reader([line], strict=True))
+            except csv.Error as error:
+                place = at(source, number_)
+                raise ValueError(f"{place}: Must be comma-separated values: {error}.") from error
+    return rows
+
+
+def whole_lines(text: str, source: str) -> list[str]:
+    """Lines of a text; ValueError if the last one has no end."""
+    *lines, rest = text.split("\n")
+    if rest:
+        place = at(source, len(lines) + 1)
+        raise ValueError(f"{place}: Truncated line {shown(rest)}. Must end with a line end.")
+    return lines
+
+
+def numbers(rows: Sequence[Row], width: int, source: str) -> NDArray[np.float64]:
+    """Values (row, column) of rows that must all be `width` numbers; see `number`."""
+    if not rows:
+        raise ValueError(f"Empty table in '{source}'. Must hold at least one row.")
+    for line, row in rows:
+        if len(row) != width:
+            place = at(source, line)
+            raise ValueError(f"{place}: Invalid row {shown(row)}. Must be {width} numbers.")
+    texts = [row for _, row in rows]
+    if _DIGITS.fullmatch(" ".join(chain.from_iterable(texts))):
+        with suppress(ValueError):
+            values = np.array(texts, dtype=np.float64)
+            if np.isfinite(values).all():
+                return values
+    return np.array(  # slowly, to name the first that is none
+        [
+            [number(text, at(source, line, column)) for column, text in enumerate(row, 1)]
+            for line, row in rows
+        ]
+    )
+
+
+def parse_json(text: str, source: str) -> Any:
+    """Content of JSON; ValueError by place if a key repeats or a number is not finite."""
+
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        content: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in content:
+                raise ValueError(f"{source}: Repeated key {shown(key)}. Must be listed once.")
+            content[key] = value
+        return content
+
+    def finite(digits: str) -> float:
+        value = float(digits)
+        if not math.isfinite(value):
+            raise ValueError(f"{source}: Invalid number {digits[:SHOWN]}. Must be finite.")
+        return value
+
+    def whole(digits: str) -> int:
+        finite(digits)  # a whole number of thousands of digits is none
+        return int(digits)
+
+    hooks: Any = {"parse_float": finite, "parse_int": whole, "parse_constant": finite}
+    try:
+        return json.loads(text, object_pairs_hook=once, **hooks)
+    except json.JSONDecodeError as error:
+        place = at(source, error.lineno, error.colno)
+        raise ValueError(f"{place}: Must be JSON: {error.msg}.") from error
+    except RecursionError as error:
+        raise ValueError(f"{source}: Invalid nesting. Must be less deep.") from error
 
 
 def read_yaml(path: str | Path) -> dict[Any, Any]:

@@ -6,7 +6,6 @@ bands and the filter to set beside the camera's own band (`rank_filters`), by th
 supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334, and by the noise.
 """
 
-import csv
 from collections.abc import Iterable, Mapping
 from importlib import resources
 from typing import Final
@@ -15,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _text as texts
 from dbthermal import mixing, planck, schema
 from dbthermal.bands import FILTERS, Band, get
 
@@ -153,14 +153,18 @@ def embedded_table() -> xr.Dataset:
     >>> embedded_table().emissivity.sel(material="plate window glass", band="9.5").item()
     0.718
     """
-    text = resources.files("dbthermal").joinpath(_TABLE).read_text(encoding="utf-8")
-    rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
-    values = np.array([[float(row[name]) for name in FILTERS] for row in rows])
+    with resources.as_file(resources.files("dbthermal").joinpath(_TABLE)) as path:
+        rows = texts.table_rows(texts.read_text(path), _TABLE, comment="#")
+    (_, titles), *rows = rows
+    names = ["material", "library", "source"]
+    if titles != [*names, *FILTERS, "coverage_8_14"]:
+        raise ValueError(f"Invalid columns {titles} of '{_TABLE}'. Must be those of the filters.")
+    values = texts.numbers([(line, row[3:]) for line, row in rows], len(FILTERS) + 1, _TABLE)
     # The four filters end at 12.35 um: every spectrum of the table covers them whole.
-    coverage = np.ones_like(values)
-    coverage[:, list(FILTERS).index(CAMERA_BAND)] = [float(row["coverage_8_14"]) for row in rows]
-    table = _dataset([row["material"] for row in rows], list(FILTERS), values, coverage)
-    notes = {name: ("material", [row[name] for row in rows]) for name in ("library", "source")}
+    coverage = np.ones_like(values[:, :-1])
+    coverage[:, list(FILTERS).index(CAMERA_BAND)] = values[:, -1]
+    table = _dataset([row[0] for _, row in rows], list(FILTERS), values[:, :-1], coverage)
+    notes = {name: ("material", [row[i] for _, row in rows]) for i, name in enumerate(names) if i}
     return table.assign_coords(notes).assign_attrs(temperature=300.0)
 
 
@@ -447,6 +451,8 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
     names = [str(name) for name in values["band"].values]
     if beside not in names or len(names) < 2:
         raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
+    if np.any(np.isinf(values)):
+        raise ValueError("Invalid emissivity of the table: infinite. Must be finite, or NaN.")
     std = _noise_of(noise, names)
     others = [name for name in names if name != beside]
     camera, filtered = values.sel(band=beside).values[:, np.newaxis], values.sel(band=others).values

@@ -129,7 +129,10 @@ def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
             f"Invalid {maps.name}: {invalid} of {chosen.size} values that count are not finite. "
             "Must be finite; the mask says which count."
         )
-    return np.asarray(chosen - chosen.mean(axis=-1, keepdims=True), dtype=np.float64)
+    chosen = chosen.astype(np.float64)
+    # The correlation has no unit: in that of the largest value no square overflows.
+    chosen /= max(float(np.abs(chosen).max()), np.finfo(np.float64).tiny)
+    return np.asarray(chosen - chosen.mean(axis=-1, keepdims=True))
 
 
 def _labelled(result: xr.DataArray, name: str, units: str, long_name: str) -> xr.DataArray:

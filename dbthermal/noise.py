@@ -14,6 +14,7 @@ from scipy.special import ndtri
 from scipy.stats import chi2
 
 from dbthermal import _smooth as smooth
+from dbthermal import schema
 
 __all__ = ["MINIMUM_FRAMES", "estimate", "estimate_bands", "second_difference"]
 
@@ -45,8 +46,10 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     Second difference in time of signals (time, pixel), in which white noise keeps its variance.
 
     Each sample less the line through its two neighbours (time - 2, pixel), over the root of the sum
-    of the squared weights; times [s] need not be even.
+    of the squared weights; times [s] need not be even. ValueError for an infinite sample.
     """
+    if np.any(np.isinf(signal)):
+        raise ValueError("Invalid signal: infinite. Must be finite, or NaN.")
     time = np.asarray(time, dtype=np.float64)
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
     line = before * signal[:-2] + (1.0 - before) * signal[2:]
@@ -85,7 +88,8 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     Raises
     ------
     ValueError
-        If there are fewer than `MINIMUM_FRAMES` frames, no pixel, or a noise comes out as zero.
+        If there are fewer than `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or
+        a noise comes out as zero.
 
     Examples
     --------
@@ -105,6 +109,10 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
         raise ValueError(
             f"Invalid capture of {frames} frames and {pixels} usable pixels to estimate a noise "
             f"from. Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise."
+        )
+    if not all(np.all(schema.measured(signal)) for signal in (first, second)):
+        raise ValueError(
+            f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
         )
     functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]

@@ -101,7 +101,7 @@ class Curve:
         """Temperature [K] of a blackbody of given counts; NaN at and below the offset."""
         excess = np.asarray(counts, dtype=np.float64) - self.offset
         ratio = np.full_like(excess, np.nan)
-        np.divide(self.amplitude, excess, out=ratio, where=excess > 0)
+        np.divide(self.amplitude, excess, out=ratio, where=(excess > 0) & np.isfinite(excess))
         scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(ratio)
         return np.asarray((scale - self.shift) / self.wavelength)
 

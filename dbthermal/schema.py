@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntFlag
 from types import MappingProxyType
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "EMISSIVITY_LIMITS",
     "EXPOSURE_TIME",
     "FRAME_FLAGS",
+    "LARGEST",
     "NOISE",
     "OPTIONAL",
     "SEGMENT",
@@ -34,6 +36,7 @@ __all__ = [
     "check_corrected",
     "check_variable",
     "has_flag",
+    "measured",
     "nomenclature",
     "status_attrs",
 ]
@@ -179,6 +182,9 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
 )
 """Stage -> variable that it may hold -> its definition."""
 
+LARGEST: Final = 1e9
+"""Magnitude from which a number of counts or kelvin is no measurement of any detector."""
+
 EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
 """A spectral emissivity outside is no measurement, but a wrong unit or a damaged file [1].
 
@@ -282,6 +288,11 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
         raise ValueError(f"Unknown flag '{unknown[0]}'. Must be one of {meanings}.")
     mask = sum({int(masks[name]) for name in names})
     return flags.copy(data=(flags.values & flags.dtype.type(mask)) != 0).drop_attrs()
+
+
+def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
+    """Mask of the samples that are numbers below `LARGEST` in magnitude: not NaN, not infinite."""
+    return np.abs(values) < LARGEST
 
 
 def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:

@@ -113,3 +113,37 @@ def test_project_files_are_plain_yaml() -> None:
     root = Path(__file__).parents[1]
     files = [*(root / "params").rglob("*.yaml"), root / "data_manifest.yaml"]
     assert all(read_yaml(path) for path in files)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": 1,\n "a": 2}', "f.json: Repeated key 'a'. Must be listed once"),
+        ('{"a": NaN}', "f.json: Invalid number NaN. Must be finite"),
+        ('{"a": 1e999}', "f.json: Invalid number 1e999. Must be finite"),
+        ('{"a": ' + "9" * 5000 + "}", "f.json: Invalid number 9999"),
+        ('{"a": 1,\n', "f.json, line 2, column 1: Must be JSON"),
+        ("[" * 100_000, "f.json: Invalid nesting. Must be less deep"),
+    ],
+)
+def test_json_is_refused_by_place(text: str, message: str) -> None:
+    """Repeated keys, numbers that are not finite and text that is no JSON name the file."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        texts.parse_json(text, "f.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n3", "f.csv, line 3: Truncated line '3'. Must end with a line end"),
+        ('a,b\n1,"2\n', "f.csv, line 2: Must be comma-separated values"),
+        ("a,b\n1,2,3\n", "f.csv, line 2: Invalid row ['1', '2', '3']. Must be 2 numbers"),
+        ("a,b\n\n", "f.csv, line 2: Invalid row [].* Must be 2 numbers".replace(".*", ".")),
+        ("a,b\n1,2\n1,2_0\n", "f.csv, line 3, column 2: Invalid number '2_0'. Must be finite"),
+        ("a,b\n", "Empty table in 'f.csv'. Must hold at least one row"),
+    ],
+)
+def test_tables_are_refused_by_place(text: str, message: str) -> None:
+    """Rows that are cut, short or no numbers are named by line and column."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        texts.numbers(texts.table_rows(text, "f.csv")[1:], 2, "f.csv")

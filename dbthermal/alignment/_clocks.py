@@ -20,6 +20,8 @@ _GAP: Final = 1.5
 # Largest relative deviation of a time step from the median of an even clock [1].
 _EVEN: Final = 0.05
 _MINIMUM_FRAMES: Final = 2
+# Fewest frames in a row, of a recording that pauses.
+_ROW: Final = 64
 PAUSE: Final = 20
 """Length from which a gap in a camera's frames is a pause of the recording [frame period]."""
 
@@ -184,6 +186,28 @@ def even_times(stamps: Array, reach: int) -> Array:
     nearest = np.unique(np.rint((stamps[np.isfinite(stamps)] - start) / step))
     slots = np.unique(nearest[:, np.newaxis] + np.arange(-reach, reach + 1.0))
     return np.asarray(start + step * slots[(slots >= 0) & (slots * step < stop - start)])
+
+
+def require_steady(stamps: Array, bands: list[str]) -> None:
+    """
+    Refuse exposure times (band, time) [s] in which a camera has no frame period.
+
+    As of frames that arrive in bursts: of half of the steps it must be the period within 50 %, and
+    half of the frames must lie between pauses in rows of `_ROW` at least.
+    """
+    for band, row in zip(bands, stamps, strict=True):
+        times, period = row[np.isfinite(row)], frame_period(row)
+        steps = np.diff(times)
+        even = np.mean(np.abs(steps - period) <= 0.5 * period)
+        rows = np.diff(np.flatnonzero(np.r_[True, steps > PAUSE * period, True]))
+        share = rows[rows >= min(_ROW, times.size)].sum() / times.size
+        if even < 0.5 or share < 0.5:
+            raise ValueError(
+                f"Invalid exposure times of band '{band}': {100 * even:.0f} % of the steps are the "
+                f"median {period:.3g} s within half of it, and {100 * share:.0f} % of the frames "
+                f"lie in rows of {_ROW} without a pause of {PAUSE} such steps. Must be half each: "
+                "times of exposure, not of arrival in bursts; or give the offset."
+            )
 
 
 def pauses(times: Array) -> Array:

@@ -34,6 +34,8 @@ Mask = npt.NDArray[np.bool_]
 
 # Pixels, at most, of which a capture is judged; a full frame would say it no better.
 _PIXELS: Final = 16384
+# Samples of a band, at most: of a long capture fewer pixels.
+_SAMPLES: Final = 2**25
 SEARCH: Final = 5
 """Largest lag that is searched by default, either way [frame]."""
 
@@ -122,7 +124,8 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
         If the band is missing, the search does not fit the capture's length, there are fewer than
         16 usable pixels, nothing moves in both bands, their covariance is greatest at an end of the
         search, the bands share less than half of their frames, the offset is not known within 0.1
-        frame, or the clock of a band was set while it ran.
+        frame, the clock of a band was set while it ran, or its times are no exposure times, as of
+        frames that arrive in bursts.
 
     Notes
     -----
@@ -150,6 +153,7 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     place = _check(corrected, band, search)
     pair = corrected.isel(band=[0, place])
     signals, stamps = sample(pair), clocks.exposure_times(pair)
+    clocks.require_steady(stamps, [str(name) for name in pair["band"].values])
     require_one_clock(pair, signals, stamps, search)
     return _offset(pair, signals, stamps, search)
 
@@ -250,17 +254,21 @@ def sample(corrected: xr.Dataset) -> Array:
     Usable is a pixel that is not flagged as dead, saturated or invalid, changes in every band, and
     is finite in every frame that is not missing.
     """
-    step = max(1, int(np.sqrt(corrected.sizes["y"] * corrected.sizes["x"] / _PIXELS)))
+    pixels = corrected.sizes["y"] * corrected.sizes["x"]
+    fitting = int(np.ceil(np.sqrt(pixels * corrected.sizes["time"] / _SAMPLES)))
+    step = max(1, int(np.sqrt(pixels / _PIXELS)), fitting)
     part = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
     counts = part["counts"].values.astype(np.float64)
+    counts[~schema.measured(counts)] = np.nan
     counts = counts.reshape(*counts.shape[:2], -1)
     usable = np.ones(counts.shape[2], dtype=bool)
     if "status" in part:
         usable &= (part["status"].values.reshape(-1) & _UNUSABLE) == 0
     for movie in counts:
         absent = clocks.missing(movie)
-        movie[absent] = np.nan
-        usable &= np.all(np.isfinite(movie[~absent]), axis=0) & (np.ptp(movie[~absent], axis=0) > 0)
+        movie[absent], here = np.nan, movie[~absent]
+        changes = here.max(axis=0, initial=-np.inf) > here.min(axis=0, initial=np.inf)
+        usable &= np.all(np.isfinite(here), axis=0) & changes
     if usable.sum() < _GROUPS:
         raise ValueError(
             f"Invalid capture of {usable.sum()} usable pixels. Must be at least {_GROUPS} that are "

@@ -115,7 +115,7 @@ def align(
     times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
     aligned, factors = np.empty(counts.shape, dtype=np.float32), np.ones(len(names))
     for band, row in enumerate(stamps):
-        movie = np.asarray(counts.isel(band=band).values, dtype=np.float32)
+        movie = _single(counts.isel(band=band))
         absent = clocks.missing(movie)
         if absent.any():
             movie = np.where(absent[:, np.newaxis, np.newaxis], np.float32(np.nan), movie)
@@ -220,9 +220,21 @@ def _noise(signals: Array, stamps: Array) -> Array:
         here = present(frames) & np.isfinite(times)
         signal = frames[here]
         rough = noises.second_difference(signal, times[here])
-        scatter = MAD * np.median(np.abs(rough), axis=0)
-        levels.append((np.median(scatter), np.median(scatter / signal.std(axis=0))))
+        if not rough.size:  # too few frames to tell
+            levels.append((0.0, 0.0))
+            continue
+        scatter, change = MAD * np.median(np.abs(rough), axis=0), signal.std(axis=0)
+        relative = np.divide(scatter, change, out=np.zeros_like(change), where=change > 0)
+        levels.append((np.median(scatter), np.median(relative)))
     return np.array(levels).T
+
+
+def _single(movie: xr.DataArray) -> Movie:
+    """Counts in single precision, NaN where they are infinite or beyond it."""
+    counts = movie.values
+    if counts.dtype.itemsize > np.dtype(np.float32).itemsize or np.isinf(counts).any():
+        counts = np.where(schema.measured(counts), counts, np.nan)
+    return np.asarray(counts, dtype=np.float32)
 
 
 def _registered(corrected: xr.Dataset, matrices: Array) -> xr.Dataset:
@@ -230,7 +242,7 @@ def _registered(corrected: xr.Dataset, matrices: Array) -> xr.Dataset:
     counts = corrected["counts"]
     views = np.empty(counts.shape, dtype=np.float32)
     for band, matrix in enumerate(matrices):
-        movie = counts.isel(band=band).values
+        movie = _single(counts.isel(band=band))
         views[band] = movie if np.array_equal(matrix, np.eye(3)) else warp(movie, matrix)
     result = corrected.assign(counts=counts.copy(data=views))
     if "status" in corrected:

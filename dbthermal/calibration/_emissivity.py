@@ -367,8 +367,10 @@ def _readings(
     """Corrected object temperature (measurement) [K], and the two deviations of a reading [K]."""
     schema.check(measured, stage)
     for name, variable in measured.data_vars.items():
-        if not np.all(np.isfinite(variable.values)):
-            raise ValueError(f"Invalid {name}: NaN or infinite. Must be finite.")
+        if not np.all(schema.measured(variable.values)):
+            raise ValueError(
+                f"Invalid {name}: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
+            )
     stds = planck.require_positive("reading_std [K]", reading_std)
     return bias.corrected(measured["object_temperature"].values.astype(np.float64)), stds
 

@@ -168,8 +168,11 @@ def _check_blackbody(counts: xr.DataArray) -> None:
             f"Must be at least {MINIMUM_TEMPERATURES}."
         )
     for name, row in zip(counts["band"].values, counts.values, strict=True):
-        if not np.all(np.isfinite(row)):
-            raise ValueError(f"Invalid counts in band '{name}': NaN or infinite. Must be finite.")
+        if not np.all(schema.measured(row)):
+            raise ValueError(
+                f"Invalid counts in band '{name}': NaN or infinite, or beyond {schema.LARGEST:g}. "
+                "Must be finite."
+            )
 
 
 def _check_growth(band: str, temperature: Array, counts: Array, std: float) -> None:

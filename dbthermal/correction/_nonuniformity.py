@@ -220,7 +220,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
         )
     flat = laid_on(flat, correction, "the flat image", "the correction")
     good = ~correction["bad"].values
-    if not np.all(np.isfinite(flat.values[good])):
+    if not np.all(schema.measured(flat.values[good])):
         raise ValueError("Invalid flat image: a good pixel is not finite. Must be finite.")
     seen = correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
     level = np.mean(seen, axis=(1, 2), where=good, keepdims=True)
@@ -382,6 +382,8 @@ def _least_squares(frames: Array, level: Array) -> tuple[Array, Array, Mask]:
 
 def _inliers(values: Array, good: Mask, threshold: float) -> Mask:
     """Values [count] within `threshold` robust standard deviations of the good ones' median."""
+    if not good.any():
+        return good
     centre = np.median(values[good])
     scale = MAD * np.median(np.abs(values[good] - centre))
     return np.asarray(np.abs(values - centre) <= threshold * max(scale, _ROUNDING))
@@ -405,6 +407,6 @@ def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
     maps = correction[["gain", "offset", "bad"]]
     for name in ("gain", "offset"):
-        if not np.all(np.isfinite(maps[name])):
+        if not np.all(schema.measured(maps[name])):
             raise ValueError(f"Invalid {name} of the correction: not finite. Must be finite.")
     return maps.drop_vars(["y", "x"], errors="ignore")

@@ -172,7 +172,7 @@ def _repeats(movie: xr.DataArray, measured: xr.DataArray) -> tuple[Mask, Mask]:
     moving = ends[0, 0] < ends[1, 0]
     for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
         clipped |= moving & samples.is_heap(number, near, grain)
-        level = moving & (end == sign * np.max(sign * end[moving], initial=-np.inf))
+        level = end == sign * np.max(sign * end[moving], initial=-np.inf)
         first = level.sum() - 1  # one sample of each makes its end
         clipped |= level & samples.is_heap(
             number[level].sum() - first, near[level].sum() - first, grain
@@ -193,11 +193,19 @@ def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     for rows in _blocks(movie):
         finite |= np.isfinite(movie.isel(y=rows).values).any(axis=(1, 2))
     if finite.sum() < fewest:
+        step = float(np.median(np.diff(movie["time"].values))) if finite.size > 1 else np.nan
         raise ValueError(
             f"Invalid band '{movie['band'].item()}' of {finite.sum()} frames that are not NaN. "
-            f"Must have at least {fewest}, to judge a pixel."
+            f"Must have at least {fewest}, to judge a pixel by changes within "
+            f"{_REACH_SECONDS} s of a 'time' in steps of {step:.3g} s."
         )
     return np.flatnonzero(finite)
+
+
+def _samples(movie: xr.DataArray, rows: slice) -> Single:
+    """Counts of some rows, NaN where they are no measurement."""
+    counts = movie.isel(y=rows).values
+    return np.where(schema.measured(counts), counts, np.nan).astype(np.float32)
 
 
 def _blocks(movie: xr.DataArray) -> list[slice]:
@@ -211,7 +219,7 @@ def _noise(movie: xr.DataArray) -> Array:
     """Noise (y, x) [count] of each pixel; NaN of too few frames."""
     level = np.empty((movie.sizes["y"], movie.sizes["x"]))
     for rows in _blocks(movie):
-        level[rows] = samples.noise(movie.isel(y=rows).values.astype(np.float32))
+        level[rows] = samples.noise(_samples(movie, rows))
     return level
 
 
@@ -233,7 +241,7 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
     for rows in _blocks(movie):
         # A row more on each side: the neighbours.
         top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
-        changes = _changes(movie.isel(y=slice(top, bottom)).values.astype(np.float32), stepped)
+        changes = _changes(_samples(movie, slice(top, bottom)), stepped)
         here = slice(rows.start - top, rows.stop - top)
         for sign in (1.0, -1.0):
             change, seen = (np.float32(sign) * part for part in changes)

@@ -7,9 +7,8 @@ calibration of the library's spectrometers and are kept as they are. An emissivi
 `schema.EMISSIVITY_LIMITS` is no measurement, but a wrong unit or a damaged file, and is refused.
 """
 
-import csv
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -18,6 +17,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from dbthermal import _text as texts
 from dbthermal import schema
 
 Floats = NDArray[np.float64]
@@ -88,29 +88,34 @@ def ecostress(path: str | Path) -> xr.Dataset:
     >>> lines += ["8.0 4.0", "9.5 25.0", "14.0 10.0"]  # wavelength [um], reflectance [%]
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder, "glass.spectrum.txt")
-    ...     size = path.write_text("\n".join(lines))
+    ...     size = path.write_text("\n".join([*lines, ""]))
     ...     ecostress(path).emissivity.values.tolist()
     [0.96, 0.75, 0.9]
     """
     path = Path(path)
-    lines = path.read_text(encoding="latin-1").split("\n")
+    lines = texts.whole_lines(texts.read_text(path, encoding="latin-1"), path.name)
     blank = next((i for i, line in enumerate(lines) if not line.strip()), len(lines))
     header = _header(lines[:blank], path)
-    rows = [line.split() for line in lines[blank:] if line.strip()]
-    wavelength, reflectance = _columns(rows, 2, path)
+    rows = [(i, line.split()) for i, line in enumerate(lines, 1) if i > blank and line.strip()]
+    wavelength, reflectance = texts.numbers(rows, 2, path.name).T
     _check_extent(header, wavelength, path)
     notes = {note: header.get(key, "") for note, key in NOTES.items()}
-    return _spectrum(wavelength, 1 - reflectance / 100, notes, path)
+    places = [line for line, _ in rows]
+    return _spectrum(wavelength, 1 - reflectance / 100, notes, path, places)
 
 
-def slum(path: str | Path) -> dict[str, xr.Dataset]:
+def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> dict[str, xr.Dataset]:
     r"""
     Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
 
     Parameters
     ----------
     path : str or Path
-        File with a column ``wavelength`` [micrometre] and one of emissivity [1] per sample.
+        File with a column ``wavelength`` [micrometre], in steps that change little from one to the
+        next, and one of emissivity [1] per sample.
+    reach : tuple of float
+        Wavelengths that the table must reach [micrometre], so that a file that was cut is refused;
+        by default those of the library.
 
     Returns
     -------
@@ -122,7 +127,8 @@ def slum(path: str | Path) -> dict[str, xr.Dataset]:
     FileNotFoundError
         If the file does not exist.
     ValueError
-        If the columns are not these, a row is short, or a value is refused as by `ecostress`.
+        If the columns are not these, a row is short, missing or added, the last line has no end,
+        the table does not reach so far, or a value is refused as by `ecostress`.
 
     References
     ----------
@@ -147,15 +153,18 @@ def slum(path: str | Path) -> dict[str, xr.Dataset]:
         raise ValueError(
             f"Invalid columns {titles} in '{path.name}'. Must be 'wavelength' and distinct codes."
         )
-    wavelength, *samples = _columns(rows, len(titles), path)
+    wavelength, *samples = texts.numbers(rows, len(titles), path.name).T
+    lines = [line for line, _ in rows]
     notes = {"type": "manmade", "measurement": "emissivity"}
-    return {
-        code: _spectrum(wavelength, sample, notes | {"name": code, "sample_no": code}, path)
+    spectra = {
+        code: _spectrum(wavelength, sample, notes | {"name": code, "sample_no": code}, path, lines)
         for code, sample in zip(codes, samples, strict=True)
     }
+    _check_reach(wavelength, reach, path, lines)
+    return spectra
 
 
-def ucsb(path: str | Path) -> xr.Dataset:
+def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
     r"""
     Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
 
@@ -163,7 +172,9 @@ def ucsb(path: str | Path) -> xr.Dataset:
     ----------
     path : str or Path
         File with columns ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>``
-        emissivity [1].
+        emissivity [1], in steps as for `slum`.
+    reach : tuple of float
+        Wavelengths that the table must reach [micrometre], as for `slum`.
 
     Returns
     -------
@@ -175,8 +186,8 @@ def ucsb(path: str | Path) -> xr.Dataset:
     FileNotFoundError
         If the file does not exist.
     ValueError
-        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or a
-        value is refused as by `ecostress`.
+        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or the
+        table or a value is refused as by `slum`.
 
     Examples
     --------
@@ -185,27 +196,38 @@ def ucsb(path: str | Path) -> xr.Dataset:
     >>> with TemporaryDirectory() as folder:
     ...     path = Path(folder, "water.csv")
     ...     size = path.write_text("x1,x2,y_water\n8.0,1250.0,0.985\n12.5,800.0,0.981\n")
-    ...     ucsb(path).emissivity.values.tolist()
+    ...     ucsb(path, reach=(8.0, 12.5)).emissivity.values.tolist()
     [0.985, 0.981]
     """
     path = Path(path)
     titles, rows = _table(path)
     if titles[:2] != ["x1", "x2"] or not re.fullmatch("y_.+", ",".join(titles[2:])):
         raise ValueError(f"Invalid columns {titles} in '{path.name}'. Must be x1, x2, y_<name>.")
-    wavelength, wavenumber, emissivity = _columns(rows, 3, path)
-    wrong = np.abs(wavelength * wavenumber / 1e4 - 1) > 1e-3
+    wavelength, wavenumber, emissivity = texts.numbers(rows, 3, path.name).T
+    lines = [line for line, _ in rows]
+    wrong = ~(np.abs(wavelength * wavenumber / 1e4 - 1) <= 1e-3)
     if wrong.any():
         raise ValueError(
-            f"Invalid wavenumber {wavenumber[wrong][0]} 1/cm at {wavelength[wrong][0]} micrometres "
-            f"in '{path.name}'. Their product must be 10000."
+            f"{texts.at(path.name, lines[int(np.argmax(wrong))])}: Invalid wavenumber "
+            f"{wavenumber[wrong][0]} 1/cm at {wavelength[wrong][0]} micrometres. "
+            "Their product must be 10000."
         )
     notes = {"name": titles[2].removeprefix("y_"), "measurement": "emissivity"}
-    return _spectrum(wavelength, emissivity, notes, path)
+    spectrum = _spectrum(wavelength, emissivity, notes, path, lines)
+    _check_reach(wavelength, reach, path, lines)
+    return spectrum
 
 
 def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
-    pairs = (line.partition(":") for line in lines)
-    header = {key.strip(): " ".join(text.split()) for key, _, text in pairs}
+    header: dict[str, str] = {}
+    for number, line in enumerate(lines, 1):
+        key, colon, text = line.partition(":")
+        if not colon or key.strip() in header:
+            raise ValueError(
+                f"{texts.at(path.name, number)}: Invalid header {texts.shown(line)}. Must be a key "
+                "that is listed once, a colon and a text."
+            )
+        header[key.strip()] = " ".join(text.split())
     for key, rule in _HEADER_RULES.items():
         if not re.search(rule, header.get(key, ""), re.IGNORECASE):
             raise ValueError(
@@ -223,34 +245,49 @@ def _check_extent(header: Mapping[str, str], wavelength: Floats, path: Path) -> 
     }
     for key, value in actual.items():
         declared = header.get(key, "")
-        if not re.fullmatch(r"[0-9.]+", declared) or abs(float(declared) - value) > 1e-3:
+        if not abs(texts.number(declared, f"{path.name}, {key}") - value) <= 1e-3:
             raise ValueError(
                 f"Truncated or altered '{path.name}': {key} is {value:g}, declared '{declared}'. "
                 "Must be equal."
             )
 
 
-def _table(path: Path) -> tuple[list[str], list[list[str]]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        titles, *rows = [*csv.reader(file)] or [[""]]
+def _table(path: Path) -> tuple[list[str], list[texts.Row]]:
+    """Titles and rows of a table; the titles are empty if the file is."""
+    (_, titles), *rows = texts.table_rows(texts.read_text(path), path.name) or [(1, [""])]
     return titles, rows
 
 
-def _columns(rows: Sequence[Sequence[str]], width: int, path: Path) -> Iterator[Floats]:
-    """Yield the columns of rows that must all be `width` numbers."""
-    for row in rows:
-        if len(row) != width:
-            raise ValueError(f"Invalid row {list(row)} in '{path.name}'. Must be {width} numbers.")
-    if not rows:
-        raise ValueError(f"Empty table in '{path.name}'. Must hold at least one row.")
-    try:
-        yield from np.array(rows, dtype=np.float64).T
-    except ValueError as error:
-        raise ValueError(f"Invalid value in '{path.name}': {error}. Must be numbers.") from error
+def _check_reach(
+    wavelength: Floats, reach: tuple[float, float], path: Path, lines: Sequence[int]
+) -> None:
+    """Raise ValueError if rows are missing, at the ends or between two others."""
+    ends = float(wavelength.min()), float(wavelength.max())
+    if ends[0] > reach[0] or ends[1] < reach[1]:
+        raise ValueError(
+            f"Truncated '{path.name}': wavelengths from {ends[0]:g} to {ends[1]:g} micrometres. "
+            f"Must reach from {reach[0]:g} to {reach[1]:g}, or as far as you say by reach=."
+        )
+    steps = np.abs(np.diff(1 / wavelength))
+    if steps.size < 3:
+        return
+    # A missing row makes a step twice as long as those beside it, whatever the grid.
+    beside = np.maximum(np.r_[steps[1], steps[:-1]], np.r_[steps[1:], steps[-2]])
+    uneven = steps > 1.6 * beside
+    if uneven.any():
+        raise ValueError(
+            f"{texts.at(path.name, lines[int(np.argmax(uneven)) + 1])}: Uneven step to "
+            f"{wavelength[1:][uneven][0]:g} micrometres, longer than those beside it. Must follow "
+            "the row before: rows are missing."
+        )
 
 
 def _spectrum(
-    wavelength: Floats, emissivity: Floats, notes: Mapping[str, str], path: Path
+    wavelength: Floats,
+    emissivity: Floats,
+    notes: Mapping[str, str],
+    path: Path,
+    lines: Sequence[int],
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
     name, (low, high) = f"'{notes['name']}' of '{path.name}'", schema.EMISSIVITY_LIMITS
@@ -261,15 +298,18 @@ def _spectrum(
         wrong = ~((values >= least) & (values <= most))
         if wrong.any():
             raise ValueError(
-                f"Invalid {quantity} {values[wrong][0]:g} in {name}. Must lie in [{least}, {most}]."
+                f"{texts.at(path.name, lines[int(np.argmax(wrong))])}: Invalid {quantity} "
+                f"{values[wrong][0]:g} in {name}. Must lie in [{least}, {most}]."
             )
-    if wavelength[0] > wavelength[-1]:
-        wavelength, emissivity = wavelength[::-1], emissivity[::-1]
-    if np.any(still := np.diff(wavelength, append=np.inf) <= 0):
+    falling = wavelength[0] > wavelength[-1]
+    if np.any(still := np.diff(-wavelength if falling else wavelength) <= 0):
         raise ValueError(
-            f"Unordered wavelength in {name}: {wavelength[still][0]:g} micrometres is followed by "
-            "one not beyond it. Must increase or decrease strictly."
+            f"{texts.at(path.name, lines[int(np.argmax(still))])}: Unordered wavelength in {name}: "
+            f"{wavelength[:-1][still][0]:g} micrometres is followed by one not beyond it. Must "
+            "increase or decrease strictly."
         )
+    if falling:
+        wavelength, emissivity = wavelength[::-1], emissivity[::-1]
     unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))
     attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": path.name}
     variable = schema.STAGES["spectrum"]["emissivity"]

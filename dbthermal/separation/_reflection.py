@@ -185,8 +185,10 @@ def _check(signal: xr.DataArray, mask: xr.DataArray | None, correlated: float) -
         )
     if not 0 < correlated < 1:
         raise ValueError(f"Invalid correlation {correlated}. Must lie in (0, 1).")
-    if not np.all(np.isfinite(signal.values)):
-        raise ValueError("Invalid signal: NaN or infinite. Must be finite.")
+    if not np.all(schema.measured(signal.values)):
+        raise ValueError(
+            f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
+        )
     if mask is None:
         return np.ones(signal.sizes["y"] * signal.sizes["x"], dtype=bool)
     if mask.dims != ("y", "x"):

@@ -70,7 +70,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     corrected : Dataset
         `counts` (band, time, y, x) [count], `time` [s], and optionally `status` (y, x) and
         `segment` (time), as `correction.correct_capture` gives them: a camera's raw counts must be
-        corrected first. Samples that are NaN are left out. May be lazy, as from
+        corrected first. Samples that are NaN are left out, and frames that repeat the one before in
+        a band. May be lazy, as from
         `store.open_dataset`: it is read a few rows at a time, and never whole. "subspace" takes two
         bands or more, and at least 32 frames; the other methods two bands.
     response : Dataset
@@ -117,7 +118,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     Raises
     ------
     TypeError
-        If an argument is of the wrong type, or the settings are those of another method.
+        If an argument is of the wrong type, the counts are whole numbers, which are raw, or the
+        settings are those of another method.
     ValueError
         If a dim, unit, band, coordinate, method or emissivity is not as described, the capture is
         too short for the method, or its `time` is that of arrival or of a clock that was set:

@@ -29,6 +29,9 @@ Window = tuple[slice, slice]
 PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
+SAMPLES: Final = 2**19
+"""Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
+
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
 
@@ -246,17 +249,20 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     """Read a block of rows and cut it into tiles; with the material of each pixel of the image."""
     block = inputs.capture.isel(y=rows).load()
     method, bands, width = inputs.method, inputs.bands, block.sizes["x"]
-    size = getattr(inputs.settings, "batch", PIXELS)
+    fitting = max(1, min(PIXELS, SAMPLES // block.sizes["time"]))
+    size = getattr(inputs.settings, "batch", fitting)
     size = block.sizes["y"] * width if method.whole_image else size
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
     curves = tuple(inputs.curves[band] for band in bands)
-    noise = inputs.noise * [curve.reference_slope for curve in inputs.curves]
+    slopes = np.array([curve.reference_slope for curve in inputs.curves])
+    grains = None
     for window in windows(rows, width, size):
         rng, places = generator(inputs.seed, window), numbers(window, width)
         local = slice(window[0].start - rows.start, window[0].stop - rows.start)
+        grains = grains or quality.grains(block, inputs.noise * slopes)
         counts, valid, status = quality.read(
-            block.isel(y=local, x=window[1]), method.minimum_frames, noise
+            block.isel(y=local, x=window[1]), method.minimum_frames, grains
         )
         counts, usable = quality.bridge(counts, valid, time)
         if method.whole_image or method.every_frame:

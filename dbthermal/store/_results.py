@@ -14,13 +14,14 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from zarr.codecs import Crc32cCodec, ZstdCodec
 
+from dbthermal import _text as texts
 from dbthermal.store._integrity import (
     AS_WRITTEN,
     MARK,
@@ -120,13 +121,27 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     Parameters
     ----------
     path : str or Path
-        Folder ``*.zarr`` (FileNotFoundError if it does not exist).
+        Folder ``*.zarr``.
 
     Returns
     -------
     Dataset
         Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
         fixed-length kind.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        With file, array and store, if a file of it is not as it was written, or missing, or
+        foreign; also when values are read, if a chunk is not. Of a recording that was cut short
+        only what is valid counts.
+
+    Warns
+    -----
+    UserWarning
+        If the store has no checksums, as of dbthermal 0.1.0, so that damage cannot be seen.
 
     Examples
     --------
@@ -208,24 +223,24 @@ def read_numbers(path: str | Path) -> dict[str, Number]:
     """
     Read a file of `save_numbers`: name to value.
 
-    ValueError if it is not such a file, or differs from what was written. A file without a
-    checksum, of dbthermal 0.1.0, is read with a warning.
+    ValueError, with file and line, if it is not such a file, a name is listed twice, a number is
+    not finite, or it differs from what was written. A file without a checksum, of dbthermal 0.1.0,
+    is read with a warning.
     """
-
-    def refuse(constant: str) -> NoReturn:
-        raise ValueError(f"Invalid number {constant} in '{path}'. Must be finite.")
-
-    try:
-        content = json.loads(Path(path).read_bytes(), parse_constant=refuse)
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"Invalid file '{path}': {error}. Must be JSON.") from error
+    content = texts.parse_json(texts.read_text(path), str(path))
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
         raise ValueError(f"No 'numbers' in '{path}'. Must be a file that save_numbers wrote.")
     if content.keys() <= {"numbers", "provenance"}:
         warn_unchecked(path, stacklevel=2)
     elif content.pop("sha256", None) != _digest(content):
         raise ValueError(f"Damaged file '{path}'. {AS_WRITTEN}")
-    return {name: _number(name, value) for name, value in content["numbers"].items()}
+    for name, value in content["numbers"].items():
+        if not isinstance(value, bool | int | float | str):
+            raise ValueError(
+                f"Invalid {texts.shown(name)} = {texts.shown(value)} in '{path}'. Must be a "
+                "number, a string or a boolean."
+            )
+    return dict(content["numbers"])
 
 
 def _digest(content: Mapping[str, Any]) -> str:

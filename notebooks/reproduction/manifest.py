@@ -190,8 +190,13 @@ def provenance(collection: str) -> dict[str, str]:
 def main() -> int:
     """Fetch or verify all collections, a line on each; exit status 1 if any is incomplete."""
     pooch.get_logger().setLevel("WARNING")  # one line a collection, not one a file
+    try:
+        collections = load().collections
+    except (OSError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 1
     status = 0
-    for name, listed in load().collections.items():
+    for name, listed in collections.items():
         try:
             number = len(fetch_collection(name))
         except (OSError, ValueError) as error:

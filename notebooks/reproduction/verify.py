@@ -94,7 +94,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--run", default="full", help="folder below results/")
     parser.add_argument("--record", action="store_true", help="keep the numbers as the reference")
     options = parser.parse_args(arguments)
-    numbers, path = read_run(options.run), reference_path()
+    try:
+        numbers, path = read_run(options.run), reference_path()
+    except (OSError, RuntimeError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 1
     reference = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if options.record:
         record(numbers, reference)

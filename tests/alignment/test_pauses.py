@@ -129,3 +129,21 @@ def test_lost_frames_are_no_clock_that_is_set(lost: int) -> None:
     capture = filmed(np.stack([EVEN, gap]))
     assert alignment.time_offset(capture) == pytest.approx(0.0, abs=0.01)
     assert max(alignment.align(capture).attrs["frames_lost"]) <= lost + 1
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        np.arange(FRAMES) // 8 * 0.8 + np.arange(FRAMES) % 8 * 1e-4,
+        np.arange(FRAMES) // 32 * 3.2 + np.arange(FRAMES) % 32 * 1e-3,
+        np.cumsum(np.random.default_rng(1).exponential(0.1, FRAMES)),
+        np.expm1(np.arange(FRAMES) / 40.0),
+    ],
+    ids=["bursts of 8", "bursts of 32", "at random", "slower and slower"],
+)
+def test_times_of_arrival_have_no_frame_period(times: Floats) -> None:
+    """An offset in frames of a clock that has no frame period is refused by band."""
+    even = np.stack([EVEN, EVEN])
+    capture = filmed(np.stack([times, times]), even + np.array([[0.0], [0.05]]))
+    with pytest.raises(ValueError, match=r"Invalid exposure times of band '8-14': .* in bursts"):
+        alignment.time_offset(capture)

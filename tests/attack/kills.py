@@ -70,7 +70,10 @@ def _saved(rng: Rng, folder: Path) -> Attack:
         if kind == "numbers.json":
             value = store.read_numbers(target)["rmse_K"]
             return wrong(f"{value}", where=value not in (0.21, 0.42))
-        opened = store.open_dataset(target).load()
+        try:
+            opened = store.open_dataset(target).load()
+        except ValueError as error:
+            return Verdict("rejected", f"the result does not open: {error}")
         before = store.open_dataset(source).load()
         counts = opened["counts"].values
         whole = np.array_equal(counts, before["counts"]) or np.array_equal(counts, _later())
@@ -109,22 +112,26 @@ def _recorded(folder: Path, what: str, status: int) -> Verdict:
         return wrong(f"{len(places)} recordings, ended by {what} with status {status}")
     if not places:
         return Verdict("refused")
-    opened = store.open_dataset(places[0]).load()
+    try:
+        opened = store.open_dataset(places[0]).load()
+    except ValueError as error:
+        # Ended with an error before its first frame, it has lost nothing.
+        empty = status > 0 and not list(places[0].glob("counts/c/*"))
+        return Verdict("refused" if empty else "rejected", f"does not open: {error}")
     frames = list(opened.attrs["frames_written"].values())
     spoilt = [False] * len(frames)
     for band, number in enumerate(frames):
         part = opened.isel(band=band, time=slice(0, min(number, opened.sizes["time"])))
         leaps = np.diff(part["sequence"].values.astype(int))
-        empty = (part["counts"] == 0).all(["y", "x"])
-        spoilt[band] = bool(empty.any()) or bool((leaps < 1).any())
+        black = (part["counts"] == 0).all(["y", "x"])
+        spoilt[band] = bool(black.any()) or bool((leaps < 1).any())
     if any(spoilt):
         return wrong(f"zeros, or frames out of order: {spoilt}")
     attrs = opened.attrs
-    if attrs["complete"] and (status != 0 or min(frames) < _FRAMES):
-        return wrong(f"'complete' with {frames} frames, status {status}")
     unclosed = what in ("SIGTERM", "SIGHUP") and not attrs["closed"] and max(frames) > 0
-    if unclosed:
-        return wrong(f"not closed after {what}, status {status}")
+    early = attrs["complete"] and (status != 0 or min(frames) < _FRAMES)
+    if unclosed or early:
+        return wrong(f"closed {attrs['closed']}, {frames} frames, {what}, status {status}")
     return RIGHT if attrs["complete"] else Verdict("flagged")
 
 

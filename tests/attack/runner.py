@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from attack import arrays, files, kills, media, stages
+from attack import arrays, files, kills, media, stages, steps
 from attack.oracle import BAD, GOOD, LIMIT, SECONDS, Attack, Outcome, carry_out
 
 Make = Callable[[np.random.Generator], Attack]
@@ -33,6 +33,7 @@ CLASSES: Final[Mapping[str, tuple[Make, int]]] = {
     "fit_response": (stages.response_fits, 8),
     "band_table": (stages.tables, 3),
     "plan": (stages.plans, 3),
+    "steps": (steps.steps, 8),
     "metrics": (stages.measures, 3),
     "bits": (files.bits, 8),
     "chunks": (files.chunks, 5),

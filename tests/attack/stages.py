@@ -488,7 +488,8 @@ def measures(rng: Rng) -> Attack:
     changed = changes.get(kind, lambda: other)()
     first = rng.random() < 0.5
     function = metrics.correlation if first else metrics.relative_error_celsius
-    fine = kind in ("good", "constant") or (first and kind == "unit")
+    # The one takes maps of any unit, the other dims of any name.
+    fine = kind in ("good", "constant", "unit" if first else "dims")
     return Attack(
         f"{function.__name__}: {kind}",
         lambda: function(changed, truth),

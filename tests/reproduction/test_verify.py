@@ -54,8 +54,10 @@ def test_other_kind_of_run_has_no_reference(project: Path) -> None:
     assert verify.main([]) == 1
 
 
-def test_run_without_numbers_is_an_error(project: Path) -> None:
-    """A run without numbers raises a FileNotFoundError."""
+@pytest.mark.usefixtures("project")
+def test_run_without_numbers_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    """A run without numbers is an error, and the command says so."""
     with pytest.raises(FileNotFoundError, match="Missing numbers of run 'smoke'"):
-        verify.main(["--run", "smoke"])
-    assert project.exists()
+        verify.read_run("smoke")
+    assert verify.main(["--run", "smoke"]) == 1
+    assert "Missing numbers of run 'smoke'" in capsys.readouterr().err

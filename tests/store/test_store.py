@@ -173,11 +173,25 @@ def test_numbers_are_scalars(tmp_path: Path) -> None:
         store.save_numbers({"rmse_K": [1]}, tmp_path / "a.json", RECORD)  # type: ignore[dict-item]
 
 
-@pytest.mark.parametrize("text", ['{"numbers": {"rmse_K": NaN}}', "{}", "[1]", "{"])
+@pytest.mark.filterwarnings("ignore:No checksums")
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"numbers": {"rmse_K": NaN}}',
+        '{"numbers": {"rmse_K": 1e999}}',
+        '{"numbers": {"rmse_K": 0.1, "rmse_K": 0.2}}',
+        '{"numbers": {"rmse_K": null}}',
+        '{"numbers": {"\x00": 1}}',
+        "{}",
+        "[1]",
+        "{",
+        "[" * 100_000,
+    ],
+)
 def test_damaged_numbers_are_refused(text: str, tmp_path: Path) -> None:
-    """A truncated, invalid or foreign file of numbers raises an error."""
+    """A truncated, invalid or foreign file of numbers raises an error with its name."""
     (tmp_path / "a.json").write_text(text)
-    with pytest.raises(ValueError, match=r"(NaN in|No 'numbers' in|Invalid file) '.*a\.json'"):
+    with pytest.raises(ValueError, match=r"a\.json('|:|, line 1).* Must "):
         store.read_numbers(tmp_path / "a.json")
 
 
@@ -186,16 +200,17 @@ def test_no_flipped_bit_passes_as_a_number(tmp_path: Path) -> None:
     numbers: dict[str, store.Number] = {"rmse_K": 0.21, "frames": 350, "method": "subspace"}
     store.save_numbers(numbers, tmp_path / "a.json", RECORD)
     whole, refused = (tmp_path / "a.json").read_bytes(), 0
-    for bit in range(8 * len(whole)):
+    bits = range(0, 8 * len(whole), 13)
+    for bit in bits:
         content = bytearray(whole)
         content[bit // 8] ^= 1 << bit % 8
         (tmp_path / "a.json").write_bytes(content)
         try:
             assert store.read_numbers(tmp_path / "a.json") == numbers, bit
         except ValueError as error:
-            assert "a.json'" in str(error)  # noqa: PT017
+            assert "a.json" in str(error)  # noqa: PT017
             refused += 1
-    assert refused > 0.98 * 8 * len(whole)
+    assert refused > 0.97 * len(bits)
 
 
 def test_numbers_without_a_checksum_are_read_with_a_warning(tmp_path: Path) -> None:

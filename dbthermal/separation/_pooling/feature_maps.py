@@ -15,6 +15,7 @@ import xarray as xr
 from scipy import ndimage
 
 from dbthermal import response as responses
+from dbthermal import schema
 from dbthermal.noise import MAD
 
 Array = npt.NDArray[np.float64]
@@ -50,6 +51,7 @@ def mean_signals(
         for top in range(0, shape[1], _ROWS):
             rows = slice(top, top + _ROWS)
             part = counts.isel(band=band, y=rows).astype(np.float64)
+            part = part.where(schema.measured(part))
             means[index, rows] = curve.linearise(part.mean("time").values)
             frames[index, rows] = part.count("time").values
     # var(mean) = s_m^2 / N, and var(pattern) = var(z_m - z_r from pixel to pixel) - both of these
@@ -65,6 +67,7 @@ def mean_signals(
 def signal_change(corrected: xr.Dataset, response: xr.Dataset, band: int) -> Array:
     """Mean signal (y, x) [K] of a band in the last third of the frames, less that in the first."""
     counts = corrected["counts"].isel(band=band)
+    counts = counts.where(schema.measured(counts))
     curve = responses.curve(response, str(corrected["band"].values[band]))
     third = max(counts.sizes["time"] // 3, 1)
     first, last = (
