@@ -111,8 +111,8 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
     Parameters
     ----------
     path : str or Path
-        File with a column ``wavelength`` [micrometre] and one of emissivity [1] per sample, at even
-        steps of wavenumber.
+        File with a column ``wavelength`` [micrometre], in steps that change little from one to the
+        next, and one of emissivity [1] per sample.
     reach : tuple of float
         Wavelengths that the table must reach [micrometre], so that a file that was cut is refused;
         by default those of the library.
@@ -172,7 +172,7 @@ def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.
     ----------
     path : str or Path
         File with columns ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>``
-        emissivity [1], at even steps of wavenumber.
+        emissivity [1], in steps as for `slum`.
     reach : tuple of float
         Wavelengths that the table must reach [micrometre], as for `slum`.
 
@@ -261,20 +261,24 @@ def _table(path: Path) -> tuple[list[str], list[texts.Row]]:
 def _check_reach(
     wavelength: Floats, reach: tuple[float, float], path: Path, lines: Sequence[int]
 ) -> None:
-    """Raise ValueError if rows are missing, at the ends or between two even steps."""
+    """Raise ValueError if rows are missing, at the ends or between two others."""
     ends = float(wavelength.min()), float(wavelength.max())
     if ends[0] > reach[0] or ends[1] < reach[1]:
         raise ValueError(
             f"Truncated '{path.name}': wavelengths from {ends[0]:g} to {ends[1]:g} micrometres. "
-            f"Must reach from {reach[0]:g} to {reach[1]:g}."
+            f"Must reach from {reach[0]:g} to {reach[1]:g}, or as far as you say by reach=."
         )
     steps = np.abs(np.diff(1 / wavelength))
-    uneven = steps > 1.5 * np.median(steps)
+    if steps.size < 3:
+        return
+    # A missing row makes a step twice as long as those beside it, whatever the grid.
+    beside = np.maximum(np.r_[steps[1], steps[:-1]], np.r_[steps[1:], steps[-2]])
+    uneven = steps > 1.6 * beside
     if uneven.any():
         raise ValueError(
             f"{texts.at(path.name, lines[int(np.argmax(uneven)) + 1])}: Uneven step to "
-            f"{wavelength[1:][uneven][0]:g} micrometres. Must be even in wavenumber: rows are "
-            "missing before it."
+            f"{wavelength[1:][uneven][0]:g} micrometres, longer than those beside it. Must follow "
+            "the row before: rows are missing."
         )
 
 

@@ -34,11 +34,11 @@ Additional Information: none
 @cache
 def _whole(kind: str) -> tuple[bytes, ...]:
     """Files of a library: a look-alike, and some of the public ones where they are."""
-    wavelength = np.linspace(6, 16, 41)
+    wavelength = 1e4 / np.linspace(2850, 670, 110)  # 3.5 to 14.9 um, in even steps as in FTIR
     values = 0.85 + 0.1 * np.sin(wavelength)
     rows = list(zip(wavelength, values, strict=True))
     if kind == "ecostress":
-        ends = {"first": 6.0, "last": 16.0, "number": 41}
+        ends = {"first": wavelength[0], "last": wavelength[-1], "number": len(wavelength)}
         text = _HEADER.format(**ends) + "".join(f"{w:.4f} {100 - 100 * v:.4f}\n" for w, v in rows)
         pattern = "ecostress/*.txt"
     elif kind == "slum":
@@ -76,8 +76,8 @@ def spectra(rng: Rng) -> Attack:
             where=not same,
         )
 
-    # Neither library says how many rows there are.
-    endless = "cut" in what and kind != "ecostress"
+    # The public file of this library may end at 3.3 or 3.7 um, and does not say so.
+    endless = "cut" in what and kind == "ucsb"
     limit = "no number of rows in the file" if endless else ""
     return Attack(f"{kind}: {what}", lambda: read(path), judge, (path.name,), limit=limit)
 

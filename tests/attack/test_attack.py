@@ -16,7 +16,6 @@ SHORT, LONG = 300, 6000
 
 UNMENDED: dict[str, str] = {
     "steps": "units, text, complex numbers in three steps",
-    "spectra": "bad UTF-8",
 }
 """Class with inputs that still end badly -> why; none that does not is in it."""
 

@@ -66,7 +66,9 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def make(*goals: str) -> subprocess.CompletedProcess[str]:
     """Run make to its end."""
-    return subprocess.run(["make", *goals], capture_output=True, text=True, check=False, timeout=60)
+    return subprocess.run(
+        ["make", *goals], capture_output=True, text=True, check=False, timeout=120
+    )
 
 
 @pytest.fixture
@@ -87,7 +89,7 @@ def started() -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
 
 def wait_for(path: Path) -> None:
     """Wait until a file is there."""
-    end = time.monotonic() + 30
+    end = time.monotonic() + 60
     while not path.exists():
         assert time.monotonic() < end, path
         time.sleep(0.01)
@@ -146,7 +148,7 @@ def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment:
         process.send_signal(signal.SIGKILL if victim == "make" else signal.SIGTERM)
     else:
         os.killpg(process.pid, signal.SIGINT if victim == "ctrl-c" else signal.SIGKILL)
-    assert process.wait(30) != 0
+    assert process.wait(60) != 0
     (checkout / "hold").unlink()
     assert not (checkout / TARGET).exists()
     again = make(TARGET)
