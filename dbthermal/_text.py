@@ -11,7 +11,6 @@ import math
 import os
 import re
 import stat
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -28,7 +27,7 @@ Row = tuple[int, list[str]]
 TEXT_LIMIT: Final = 2**26
 """Largest table that is read [byte]; the largest of the public libraries has 0.7 MB."""
 
-YAML_LIMIT: Final = 2**22
+YAML_LIMIT: Final = 2**20
 """Largest YAML file that is read [byte]."""
 
 SHOWN: Final = 60
@@ -169,11 +168,11 @@ def parse_json(text: str, source: str) -> Any:
     """Content of JSON; ValueError by place if a key repeats or a number is not finite."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        content = dict(pairs)
-        if len(content) < len(pairs):
-            repeated = [key for key, count in Counter(key for key, _ in pairs).items() if count > 1]
-            key = shown(repeated[0])
-            raise ValueError(f"{source}: Repeated key {key}. Must be listed once.")
+        content: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in content:
+                raise ValueError(f"{source}: Repeated key {shown(key)}. Must be listed once.")
+            content[key] = value
         return content
 
     def finite(digits: str) -> float:

@@ -451,6 +451,8 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
     names = [str(name) for name in values["band"].values]
     if beside not in names or len(names) < 2:
         raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
+    if np.any(np.isinf(values)):
+        raise ValueError("Invalid emissivity of the table: infinite. Must be finite, or NaN.")
     std = _noise_of(noise, names)
     others = [name for name in names if name != beside]
     camera, filtered = values.sel(band=beside).values[:, np.newaxis], values.sel(band=others).values

@@ -130,7 +130,8 @@ def condition_number(emissivity: npt.ArrayLike) -> Array:
     Returns
     -------
     ndarray, shape (...)
-        Ratio of the largest to the smallest singular value, 1 at best.
+        Ratio of the largest to the smallest singular value, 1 at best; NaN of an unknown
+        emissivity.
 
     Examples
     --------
@@ -139,9 +140,12 @@ def condition_number(emissivity: npt.ArrayLike) -> Array:
     >>> condition_number([[0.86, 0.72], [0.90, 0.90]]).round(1).tolist()
     [9.6, inf]
     """
-    singular = np.linalg.svd(matrix(emissivity), compute_uv=False)
+    emissivity = np.asarray(emissivity, dtype=np.float64)
+    known = np.all(np.isfinite(emissivity), axis=-1)
+    filled = np.where(known[..., np.newaxis], emissivity, 0.5)
+    singular = np.linalg.svd(matrix(filled), compute_uv=False)
     largest, smallest = singular[..., 0], singular[..., -1]
     infinite = np.full_like(largest, np.inf)
     regular = smallest > 4 * np.finfo(np.float64).eps * largest
     np.divide(largest, smallest, out=infinite, where=regular)
-    return infinite
+    return np.where(known, infinite, np.nan)

@@ -13,7 +13,10 @@ from dbthermal import (
     alignment,
     calibration,
     correction,
+    emissivity,
+    limits,
     metrics,
+    mixing,
     noise,
     response,
     separation,
@@ -171,3 +174,18 @@ def test_odd_counts_warn_of_nothing(name: str, call: str) -> None:
     except ValueError as error:
         message = str(error)
     assert "Must" in message
+
+
+def test_odd_emissivities_and_truths_warn_of_nothing() -> None:
+    """An unknown emissivity has no condition number; infinite ones and truths raise an error."""
+    unknown, glass = mixing.condition_number([[0.86, np.nan], [0.86, 0.72]])
+    assert np.isnan(unknown)
+    assert glass == mixing.condition_number([0.86, 0.72])
+    table = emissivity.embedded_table()
+    noises = emissivity.filter_noise(0.03, [str(name) for name in table["band"].values])
+    with pytest.raises(ValueError, match="Invalid emissivity of the table: infinite"):
+        emissivity.rank_filters(table.assign(emissivity=table["emissivity"] + np.inf), noises)
+    for name in ("object_temperature", "background_temperature"):
+        endless = SCENE.assign({name: SCENE[name].where(SCENE["time"] > 1.0, np.inf)})
+        with pytest.raises(ValueError, match=f"Invalid {name} of the scene: not finite"):
+            limits.bounds(endless, CAMERA)

@@ -205,6 +205,9 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
     temperature, background, emissivity = (
         scene[name].values.astype(np.float64).reshape(scene[name].shape[0], -1) for name in names
     )
+    for name, values in zip(names[:2], (temperature, background), strict=True):
+        if not np.all(schema.measured(values)):
+            raise ValueError(f"Invalid {name} of the scene: not finite. Must be in kelvin.")
     if len(emissivity) < 2:
         raise ValueError("Invalid scene of one band. Must have at least two.")
     bad = ~((emissivity > 0) & (emissivity < 1))

@@ -117,7 +117,10 @@ def made_beside(path: Path, folder: Path) -> Iterator[Path]:
 
     It is made in `folder`, on the same file system; what a kill leaves there is hidden.
     """
-    with TemporaryDirectory(prefix=f".{path.name}-", dir=folder) as place:
+    # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
+    with TemporaryDirectory(
+        prefix=f".{path.name}-", dir=folder, ignore_cleanup_errors=True
+    ) as place:
         part = Path(place) / path.name
         yield part
         tree_to_disk([part], part)

@@ -30,6 +30,8 @@ GROUP: Final = "zarr.json"  # file of a zarr group's attributes
 SUMS: Final = "checksums.sfv"
 MARK: Final = MappingProxyType({"checksums": f"CRC-32 of every file, in {SUMS}"})
 """Attribute of every store with checksums, so that their loss is seen."""
+GROWING: Final = MappingProxyType({"checksums": f"{MARK['checksums']}, and of earlier states"})
+"""The same of a recording that is not closed; a result made of it has `MARK`, whatever it says."""
 
 
 class SummedStore(LocalStore):
@@ -72,8 +74,9 @@ class CheckedStore(SummedStore):
             self.attrs: dict[str, Any] = json.loads(content or b"")["attributes"]
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"Invalid {self._named(GROUP)}. Must be a zarr group.") from error
-        self.closed = bool(self.attrs.get("closed", True))
-        if MARK.keys() & self.attrs.keys() and not self._sums:
+        mark = {name: self.attrs[name] for name in MARK if name in self.attrs}
+        self.closed = mark != GROWING if mark else bool(self.attrs.get("closed", True))
+        if mark and not self._sums:
             raise ValueError(f"Missing {self._named(SUMS)}. {AS_WRITTEN}")
         if self._sums:
             self._check_files()
@@ -175,6 +178,8 @@ def valid_part(attrs: Mapping[str, Any]) -> dict[str, int]:
 def add_sums(root: Path, contents: Mapping[str, Content]) -> Path:
     """Append the checksums of files by relative name; path of the file of checksums."""
     lines = [f"{key} {zlib.crc32(content):08x}\n" for key, content in contents.items()]
+    if (root / GROUP).exists() and not (root / SUMS).exists():
+        raise FileNotFoundError(f"No file '{SUMS}' in '{os.path.realpath(root)}' any more.")
     with (root / SUMS).open("ab") as stream:  # in one piece, for several threads may append
         stream.write("".join(lines).encode())
     return root / SUMS

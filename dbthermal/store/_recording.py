@@ -31,6 +31,7 @@ from dbthermal.store._durable import (
 )
 from dbthermal.store._integrity import (
     GROUP,
+    GROWING,
     MARK,
     SUMS,
     SummedStore,
@@ -95,7 +96,7 @@ class Recording:
             raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
         self.frames, self.rows = dict.fromkeys(bands, 0), 0
         self._attrs = json.loads(
-            json.dumps({**MARK, **attrs, "complete": False, "closed": False}, allow_nan=False)
+            json.dumps({**GROWING, **attrs, "complete": False, "closed": False}, allow_nan=False)
         )
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
         whole = {**sizes, "band": len(bands), "time": chunk}
@@ -203,7 +204,7 @@ class Recording:
                 f"No file '{lost[0]}' in the recording '{self.place()}' any more, of {len(lost)} "
                 "that were deleted. Must stay while it is written to."
             )
-        self.commit(complete=complete, closed=True, **attrs)
+        self.commit(complete=complete, closed=True, **MARK, **attrs)
         replace(self.root / SUMS, last_sums(self.root), self._part(SUMS))
         self.path, self._closed = self.place(), True
         self._folder.close()

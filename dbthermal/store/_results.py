@@ -121,13 +121,27 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     Parameters
     ----------
     path : str or Path
-        Folder ``*.zarr`` (FileNotFoundError if it does not exist).
+        Folder ``*.zarr``.
 
     Returns
     -------
     Dataset
         Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
         fixed-length kind.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        With file, array and store, if a file of it is not as it was written, or missing, or
+        foreign; also when values are read, if a chunk is not. Of a recording that was cut short
+        only what is valid counts.
+
+    Warns
+    -----
+    UserWarning
+        If the store has no checksums, as of dbthermal 0.1.0, so that damage cannot be seen.
 
     Examples
     --------

@@ -245,3 +245,22 @@ def test_recording_is_read_while_it_grows(tmp_path: Path) -> None:
     recording.append_log({"log_time": np.array([9.0]), "log_value": np.array([9.0])})
     recording.close()
     assert opened["log_value"].values.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_result_of_a_recording_cut_short_is_whole(stores: dict[str, Path], tmp_path: Path) -> None:
+    """What was computed from a recording cut short has all its frames, and all its chunks."""
+    opened = store.open_dataset(stores["cut short"])
+    finer = opened[["counts"]].isel(time=[0, 0, 1, 1, 2, 2, 3, 3]).assign_coords(scene="pot")
+    store.save(finer, tmp_path / "a.zarr", {})
+    assert store.open_dataset(tmp_path / "a.zarr").sizes["time"] == 8
+    chunks(tmp_path / "a.zarr")[-1].unlink()
+    with pytest.raises(ValueError, match="Missing file"):
+        store.open_dataset(tmp_path / "a.zarr")
+
+
+def test_recording_without_its_checksums_ends(tmp_path: Path) -> None:
+    """Without the file of checksums nothing more is recorded that could not be opened."""
+    recording = record(tmp_path / "a.zarr", close=False)
+    (tmp_path / "a.zarr" / "checksums.sfv").unlink()
+    with pytest.raises(FileNotFoundError, match=r"No file 'checksums.sfv' in '.*a\.zarr' any more"):
+        recording.append_log({"log_time": np.array([9.0]), "log_value": np.array([9.0])})

@@ -38,7 +38,8 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     FileNotFoundError
         If the folder does not exist.
     ValueError
-        If a band has fewer than two frames with a time.
+        If a band has fewer than two frames with a time, or a file of the recording is not as it
+        was written; see `dbthermal.store.open_dataset`.
 
     Examples
     --------
