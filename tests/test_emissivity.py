@@ -188,9 +188,10 @@ def test_condition_number_of_glass() -> None:
 def test_condition_number_closed_form(first: float, second: float) -> None:
     """The ratio of singular values follows from the Frobenius norm and the determinant."""
     assume(abs(first - second) > 1e-4)
-    norm = first**2 + (1 - first) ** 2 + second**2 + (1 - second) ** 2
-    half = norm / (2 * abs(first - second))
-    expected = half + np.sqrt(half**2 - 1)
+    # norm / (2 det) less 1, of norm = the sum of squares, written without a difference of like numbers
+    low, high = sorted((first, second))
+    excess = ((1 - high) ** 2 + low**2) / (high - low)
+    expected = 1 + excess + np.sqrt(excess * (excess + 2))
     result = float(emissivity.condition_numbers(table(m=[first, second]))[0, 0, 1])
     assert result == pytest.approx(expected, rel=1e-9)
 
