@@ -81,7 +81,7 @@ def moments(tmp_path: Path, every: int) -> range:
     return range(begun + 1, operations_of(lambda: write(tmp_path / "b.zarr")), every)
 
 
-@pytest.mark.parametrize("every", [500, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [500, pytest.param(41, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("move", MOVES)
 def test_moved_at_any_operation_it_goes_on(
     tmp_path: Path, move: Callable[[Path], Path], every: int
@@ -133,7 +133,7 @@ def array_replaced(path: Path) -> None:
 LOSSES = (deleted, carried_off, array_moved, array_replaced)
 
 
-@pytest.mark.parametrize("every", [500, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [500, pytest.param(41, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("lose", LOSSES)
 def test_without_a_part_it_ends(tmp_path: Path, lose: Callable[[Path], None], every: int) -> None:
     """Without its folder, or an array's, a recording ends with its name, and makes no other."""
