@@ -152,7 +152,7 @@ results/full/%.ipynb: notebooks/%.ipynb params/%.yaml $(sources) results/inputs.
 	$(execute) full $* -f params/$*.yaml
 
 results/smoke/%.ipynb: notebooks/%.ipynb $(sources) results/inputs.txt .venv/installed
-	$(execute) smoke $*
+	$(execute) smoke $* --check
 
 # The same notebooks on what the emulated rig recorded: full values in results/rig, small ones in results/chain.
 results/rig/%.ipynb: notebooks/%.ipynb params/%.yaml params/recorded/%.yaml results/full/00_acquisition.ipynb

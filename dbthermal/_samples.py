@@ -29,8 +29,9 @@ MINIMUM_FRAMES: Final = 16
 _QUIET: Final = 0.8
 # Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
-# About as many pixels tell the noise and the step of the counts.
-_PIXELS: Final = 16
+PIXELS: Final = 16
+"""About as many pixels tell the noise and the step of the counts."""
+
 # The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
 _MARGIN: Final = 1.25
 # Probability of a value above which counts are too coarse to be judged.
@@ -82,13 +83,24 @@ class Grain:
 
 
 def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grain:
-    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit."""
-    every = slice(None, None, max(1, counts.shape[1] // _PIXELS))
+    """
+    Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
+
+    Samples at a heap, and frames in which no pixel changes, say nothing of the noise.
+    """
+    every = slice(None, None, max(1, counts.shape[1] // PIXELS))
     some = np.where(valid[:, every], counts[:, every].astype(np.float64), np.nan)
+    changing = np.any(some[1:] != some[:-1], axis=1)  # true for NaN
+    if some.shape[1] >= PIXELS:
+        some = some[np.concatenate([[True], changing])]
     if len(some) < MINIMUM_FRAMES:
         return Grain(stated, 1.0)
-    level, change = noise(some), np.abs(np.diff(some, axis=0))
+    change = np.abs(np.diff(some, axis=0))
     step = np.min(change, axis=0, initial=np.inf, where=change > 0)
+    for reduced in (np.fmin.reduce(some, axis=0), np.fmax.reduce(some, axis=0)):
+        at_end = some == reduced
+        some[at_end & (np.count_nonzero(at_end, axis=0) >= FEWEST)] = np.nan
+    level = noise(some)
     known = (level > 0) & np.isfinite(step)
     if not known.any():
         return Grain(stated, 1.0)

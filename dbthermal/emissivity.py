@@ -470,9 +470,7 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
 
 def _noise_of(noise: xr.DataArray, names: list[str]) -> Array:
     """Noise [K] of the named bands."""
-    if noise.dims != ("band",) or noise.attrs.get("units", "K") != "K":
-        raise ValueError(
-            f"Invalid noise {noise.dims} [{noise.attrs.get('units')}]. Must be (band,) [K]."
-        )
+    if schema.check_numbers(noise, "the noise", "K").dims != ("band",):
+        raise ValueError(f"Invalid dims {noise.dims} of the noise. Must be ('band',).")
     places = schema.band_positions(noise, names, "the noise")
     return planck.require_positive("noise [K]", noise.values[places])

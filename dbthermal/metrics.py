@@ -10,6 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
 
+from dbthermal import schema
 from dbthermal._coordinates import laid_on
 
 __all__ = ["correlation", "relative_error_celsius"]
@@ -53,6 +54,9 @@ def correlation(
     >>> round(float(correlation(emissivity, 290.0 + 10.0 * emissivity)), 6)
     1.0
     """
+    for values, label in ((first, "the first map"), (second, "the second map")):
+        if not {"y", "x"} <= {*schema.check_numbers(values, label).dims}:
+            raise ValueError(f"Invalid dims {values.dims} of {label}. Must hold y and x.")
     first, second = xr.broadcast(first, laid_on(second, first, "the second map", "the first"))
     left, right = (_centred(values, mask) for values in (first, second))
     norm = np.linalg.norm(left, axis=-1) * np.linalg.norm(right, axis=-1)
@@ -95,9 +99,8 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     >>> round(float(relative_error_celsius(truth + 0.5, truth)), 6)  # [percent]
     2.0
     """
-    for values in (estimate, truth):
-        if values.attrs.get("units", "K") != "K":
-            raise ValueError(f"Invalid units '{values.attrs['units']}'. Must be 'K'.")
+    schema.check_numbers(estimate, "the estimate", "K")
+    schema.check_numbers(truth, "the truth", "K")
     bad = ~(truth.values > zero_Celsius)
     if np.any(bad):
         raise ValueError(
@@ -112,8 +115,6 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
 
 def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
     """Deviations from the mean of each map over the mask, (..., pixel)."""
-    if not {"y", "x"} <= {*maps.dims}:
-        raise ValueError(f"Invalid dims {maps.dims} of the maps. Must hold y and x.")
     maps = maps.transpose(..., "y", "x")
     chosen = maps.values.reshape(*maps.shape[:-2], -1)
     if mask is not None:

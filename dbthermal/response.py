@@ -315,6 +315,9 @@ def apparent_temperature(
     >>> apparent_temperature(response, blackbody).sel(band="9.5").values.round(2)
     array([293.15, 313.15])
     """
+    schema.check_numbers(counts, "the counts", "count")
+    if counts.dims[:1] != ("band",):
+        raise ValueError(f"Invalid dims {counts.dims} of the counts. Must begin with 'band'.")
     names = [str(name) for name in counts["band"].values]
     values = [
         curve(response, name, kind).inverse(part)

@@ -34,6 +34,7 @@ __all__ = [
     "band_positions",
     "check",
     "check_corrected",
+    "check_numbers",
     "check_variable",
     "has_flag",
     "measured",
@@ -361,16 +362,26 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
     if array.size == 0:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
-    if array.dtype.kind not in "fui":
-        raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be a real number.")
-    units = array.attrs.get("units", variable.units)
-    if units != variable.units:
-        raise ValueError(f"Invalid units '{units}' of {label}. Must be '{variable.units}'.")
+    check_numbers(array, label, variable.units)
     for dim in array.dims:
         if dim == "band":
             _check_bands(array, label)
         elif dim in COORDINATES:
             _check_coordinate(array, str(dim), label)
+
+
+def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
+    """Check that an array holds real numbers, of a unit if it states one, and return it as it is.
+
+    Raises TypeError for another type or dtype, ValueError for another unit; the label names it.
+    """
+    if not isinstance(array, xr.DataArray):
+        raise TypeError(f"Invalid {label} of type {type(array).__name__}. Must be a DataArray.")
+    if array.dtype.kind not in "fui":
+        raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be a real number.")
+    if units is not None and array.attrs.get("units", units) != units:
+        raise ValueError(f"Invalid units '{array.attrs['units']}' of {label}. Must be '{units}'.")
+    return array
 
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:

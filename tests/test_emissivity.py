@@ -252,7 +252,7 @@ def test_choice_weighs_condition_against_noise() -> None:
         (["8-14"], [0.03], "K", "Missing band '9.5' in the noise"),
         (["8-14", "9.5"], [0.03, 0.0], "K", "Invalid noise [K] 0.0"),
         (["8-14", "9.5"], [0.03, np.nan], "K", "Invalid noise [K] nan"),
-        (["8-14", "9.5"], [3.0, 3.0], "count", "Invalid noise ('band',) [count]"),
+        (["8-14", "9.5"], [3.0, 3.0], "count", "Invalid units 'count' of the noise"),
     ],
 )
 def test_bad_noise(bands: list[str], values: list[float], units: str, message: str) -> None:

@@ -62,7 +62,10 @@ def test_relative_error_is_of_degrees_celsius() -> None:
 
 @pytest.mark.parametrize(
     ("temperature", "units", "message"),
-    [(273.15, "K", "true temperature 273.15 K"), (50.0, "degC", "units 'degC'. Must be 'K'")],
+    [
+        (273.15, "K", "true temperature 273.15 K"),
+        (50.0, "degC", "units 'degC' of the estimate. Must be 'K'"),
+    ],
 )
 def test_relative_error_needs_kelvin_above_zero(
     temperature: float, units: str, message: str

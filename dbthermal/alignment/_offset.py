@@ -216,7 +216,9 @@ def _estimate(shared: _Pair, search: int, names: list[str], label: str) -> float
     lag = _peak(_covariances(shared, search, names), label)
     # Whole frames first: smooth functions over the same scene take the same out of both bands.
     covariances = _covariances(shared.shifted(lag), 1, names)
-    delays = [lag + _delay(part) for part in (covariances, *_leave_one_out(covariances))]
+    both = lag + np.array([_delays(part) for part in (covariances, *_leave_one_out(covariances))])
+    # The pair of frames that it lies best between in all pixels, for the groups as well.
+    delays = both[:, np.argmin(np.abs(both[0] - lag - np.array([-0.5, 0.5])))]
     # Jackknife over n groups: var = (n - 1) mean (d_i - mean d)^2.
     std = np.sqrt((_GROUPS - 1) * np.var(delays[1:]))
     if not std <= _PRECISION:
@@ -383,8 +385,8 @@ def _leave_one_out(covariances: _Covariances) -> list[_Covariances]:
     ]
 
 
-def _delay(covariances: _Covariances) -> float:
-    """Offset [frame] within a frame of lag 0, from the pair of frames it lies best between."""
+def _delays(covariances: _Covariances) -> Array:
+    """Offset [frame] near lag 0 if it lies between the frames -1 and 0, and between 0 and 1."""
     cross, (near, far) = covariances.cross.sum(axis=0), covariances.auto.sum(axis=0)
     delays = []
     for lag in (-1, 0):
@@ -392,5 +394,5 @@ def _delay(covariances: _Covariances) -> float:
         place = int(np.argmax(covariances.lags == lag))
         before, after = cross[place - 1], cross[place + 2]
         share = 0.5 - 0.5 * (before - after) / (near - far) * (near + far) / (before + after)
-        delays.append((abs(float(share) - 0.5), lag + float(share)))
-    return min(delays)[1]
+        delays.append(lag + float(share))
+    return np.array(delays)

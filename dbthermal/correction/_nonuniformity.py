@@ -214,6 +214,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     schema.check(correction, "correction")
     if "bad" not in correction:
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
+    schema.check_numbers(flat, "the flat image", "count")
     if flat.dims != ("band", "y", "x") or "band" not in flat.coords:
         raise ValueError(
             f"Invalid dims {flat.dims} of the flat image. Must be (band, y, x), bands by name."

@@ -172,7 +172,7 @@ def _repeats(movie: xr.DataArray, measured: xr.DataArray) -> tuple[Mask, Mask]:
     moving = ends[0, 0] < ends[1, 0]
     for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
         clipped |= moving & samples.is_heap(number, near, grain)
-        level = moving & (end == sign * np.max(sign * end[moving], initial=-np.inf))
+        level = end == sign * np.max(sign * end[moving], initial=-np.inf)
         first = level.sum() - 1  # one sample of each makes its end
         clipped |= level & samples.is_heap(
             number[level].sum() - first, near[level].sum() - first, grain

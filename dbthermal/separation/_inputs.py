@@ -267,14 +267,11 @@ def _known_emissivity(
 
 def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str) -> Array:
     """Values (band, y, x) of an array (band) or (band, y, x), in the capture's order of bands."""
-    if not isinstance(array, xr.DataArray):
-        raise TypeError(f"Invalid {name} of type {type(array).__name__}. Must be a DataArray.")
+    schema.check_numbers(array, name, "1")
     if array.dims not in (("band",), ("band", "y", "x")):
         raise ValueError(
             f"Invalid dims {array.dims} of {name}. Must be ('band',) or ('band', 'y', 'x')."
         )
-    if array.attrs.get("units", "1") != "1":
-        raise ValueError(f"Invalid units '{array.attrs['units']}' of {name}. Must be '1'.")
     values = laid_on(array, corrected, name, "the capture").values.astype(np.float64)
     shape = tuple(corrected.sizes[dim] for dim in ("band", "y", "x"))
     return np.broadcast_to(values.reshape(shape[0], *values.shape[1:] or (1, 1)), shape)

@@ -38,7 +38,21 @@ def unusable(status: Bits) -> Mask:
     return np.asarray((status & _UNUSABLE) != 0)
 
 
-def read(part: xr.Dataset, fewest: int = 1, noise: Array | None = None) -> tuple[Array, Mask, Bits]:
+def grains(part: xr.Dataset, noise: Array | None = None) -> list[samples.Grain]:
+    """Grain of each band of a part of the capture; with the noise (band) [count], if known."""
+    step = max(1, int(np.sqrt(part.sizes["y"] * part.sizes["x"] / samples.PIXELS)))
+    counts = part["counts"].values[:, :, ::step, ::step]
+    flat = counts.reshape(*counts.shape[:2], -1)
+    limits = np.full(len(flat), np.inf) if noise is None else noise
+    return [
+        samples.grain(band, np.isfinite(band), float(limit))
+        for band, limit in zip(flat, limits, strict=True)
+    ]
+
+
+def read(
+    part: xr.Dataset, fewest: int = 1, known: list[samples.Grain] | None = None
+) -> tuple[Array, Mask, Bits]:
     """
     Read the samples of a part of the capture, and judge its pixels.
 
@@ -46,8 +60,8 @@ def read(part: xr.Dataset, fewest: int = 1, noise: Array | None = None) -> tuple
     pixels; the samples that are valid in all bands (time, pixel), by their values and by the
     variable `mask`, in frames that repeat none (`_samples.copies`); and the status (pixel). A pixel
     with fewer valid frames than `fewest`, or than `MOST_MISSING` of all, cannot be solved; see
-    `bridge` for pixels that lack a few. The noise (band) [count], if known, tells better what
-    repeats by chance.
+    `bridge` for pixels that lack a few. The `grains` of a larger part, if known, tell what repeats
+    by chance.
     """
     raw = part["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1).astype(np.float64)
@@ -55,10 +69,9 @@ def read(part: xr.Dataset, fewest: int = 1, noise: Array | None = None) -> tuple
     if "mask" in part:
         valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
     counts[:, ~valid] = 0.0
-    limits = np.full(len(counts), np.inf) if noise is None else noise
-    grains = [samples.grain(band, valid, limit) for band, limit in zip(counts, limits, strict=True)]
-    saturated = [samples.heaped(band, valid, it) for band, it in zip(counts, grains, strict=True)]
-    frozen, copied = _frozen(counts, valid, [it.chance for it in grains])
+    known = grains(part) if known is None else known
+    saturated = [samples.heaped(band, valid, it) for band, it in zip(counts, known, strict=True)]
+    frozen, copied = _frozen(counts, valid, [it.chance for it in known])
     valid &= ~copied[:, np.newaxis]
     counts[:, ~valid] = 0.0
     frames = valid.sum(axis=0)

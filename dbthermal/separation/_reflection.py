@@ -60,11 +60,17 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     >>> bool(1.2 < (change.max("time") - change.min("time")).median() < 1.8)  # 1.4 K and noise
     True
     """
+    schema.check_numbers(apparent, "the apparent temperature", "K")
+    if not isinstance(result, xr.Dataset):
+        raise TypeError(f"Invalid result of type {type(result).__name__}. Must be a Dataset.")
     if str(apparent["band"].values[0]) != str(result["band"].values[0]):
         raise ValueError(
             f"Invalid first band '{apparent['band'].values[0]}'. "
             f"Must be '{result['band'].values[0]}', as in the result."
         )
+    for name in ("background_temperature", "emissivity"):
+        units = schema.STAGES["separated"][name].units
+        schema.check_numbers(result[name], f"'{name}' of the result", units)
     first = apparent.isel(band=0, drop=True)
     first = laid_on(first, result, "the apparent temperature", "the result")
     background = result["background_temperature"]

@@ -255,12 +255,14 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
     curves = tuple(inputs.curves[band] for band in bands)
-    noise = inputs.noise * [curve.reference_slope for curve in inputs.curves]
+    slopes = np.array([curve.reference_slope for curve in inputs.curves])
+    grains = None
     for window in windows(rows, width, size):
         rng, places = generator(inputs.seed, window), numbers(window, width)
         local = slice(window[0].start - rows.start, window[0].stop - rows.start)
+        grains = grains or quality.grains(block, inputs.noise * slopes)
         counts, valid, status = quality.read(
-            block.isel(y=local, x=window[1]), method.minimum_frames, noise
+            block.isel(y=local, x=window[1]), method.minimum_frames, grains
         )
         counts, usable = quality.bridge(counts, valid, time)
         if method.whole_image or method.every_frame:

@@ -1,19 +1,21 @@
 """Execute a notebook: its result has its name only when it is whole, and on the disk.
 
 `python -m reproduction.execute RUN STEM -f FILE.yaml -p NAME TEXT` runs ``notebooks/STEM.ipynb``
-with small values, those of the files over them, and those texts over both. The executed notebook is
-``results/RUN/STEM.ipynb`` and stands for all that the notebook wrote. Until its end it is a hidden
-file beside that (see `paths.unfinished`), whatever ends the process. What an earlier run left goes
-first. A notebook that fails is kept in ``results/failed/RUN``, to be read, and nothing else of it.
+with small values, those of the files over them, and those texts over both. With ``--check`` nbval
+runs it as a test, with small values. The executed or checked notebook is ``results/RUN/STEM.ipynb``
+and stands for all that the notebook wrote. Until its end it is a hidden file beside that (see
+`paths.unfinished`), whatever ends the process. What an earlier run left goes first. A notebook that
+fails is kept in ``results/failed/RUN``, to be read, and nothing else of it.
 """
 
 import argparse
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -36,12 +38,49 @@ class Kernel(AsyncKernelManager):
         await super().start_kernel(*arguments, **options)
 
 
-def execute(run: str, stem: str, values: Mapping[str, Any]) -> Path:
+def run_papermill(stem: str, part: Path, values: Mapping[str, Any]) -> None:
+    """Execute a notebook; raises what papermill raises, RuntimeError if a cell was not reached."""
+    papermill.execute_notebook(
+        paths.notebook(stem),
+        part,
+        parameters=values,
+        kernel_name="python3",
+        kernel_manager_class=Kernel,
+        progress_bar=False,
+        cwd=paths.root() / "notebooks",
+    )
+    _check_complete(part)
+
+
+def run_nbval(stem: str, part: Path, values: Mapping[str, Any]) -> None:
+    """Run a notebook as a test, as it is stored; RuntimeError with a failing cell's report."""
+    if values:
+        raise ValueError(f"Invalid parameters {[*values]} of '{stem}'. Must be none in a check.")
+    shutil.copyfile(paths.notebook(stem), part)
+    command = ["pytest", "--quiet", "--no-header", "-p", "no:cacheprovider", "--nbval-lax"]
+    report = subprocess.run(
+        [sys.executable, "-m", *command, str(paths.notebook(stem))],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=paths.root(),
+        pass_fds=(int(os.environ[locked.HELD]),),
+    )
+    if report.returncode:
+        raise RuntimeError(f"The notebook fails as a test.\n{report.stdout}{report.stderr}")
+
+
+def execute(
+    run: str,
+    stem: str,
+    values: Mapping[str, Any],
+    runner: Callable[[str, Path, Mapping[str, Any]], None] = run_papermill,
+) -> Path:
     """
     Path of the executed notebook, when it and all that it wrote are whole and on the disk.
 
-    It is as old as its start, so that whatever changed while it ran is newer. Raises what papermill
-    raises for a cell that fails, and a RuntimeError if a cell was not reached.
+    It is as old as its start, so that whatever changed while it ran is newer. Raises what the
+    runner raises for a cell that fails.
     """
     part, start = paths.unfinished(run, stem), time.time()
     path = part.with_name(f"{stem}.ipynb")
@@ -54,16 +93,7 @@ def execute(run: str, stem: str, values: Mapping[str, Any]) -> Path:
     failed.unlink(missing_ok=True)
     _remove(part)
     try:
-        papermill.execute_notebook(
-            paths.notebook(stem),
-            part,
-            parameters=values,
-            kernel_name="python3",
-            kernel_manager_class=Kernel,
-            progress_bar=False,
-            cwd=paths.root() / "notebooks",
-        )
-        _check_complete(part)
+        runner(stem, part, values)
     except BaseException:
         _remove(part)
         failed.parent.mkdir(parents=True, exist_ok=True)
@@ -125,16 +155,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("stem", help="name of the notebook, such as 03_simulation")
     parser.add_argument("-f", dest="files", action="append", default=[], type=Path, metavar="FILE")
     parser.add_argument("-p", dest="texts", action="append", default=[], nargs=2, metavar="TEXT")
+    parser.add_argument("--check", action="store_true", help="run it as a test, with small values")
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, _stop)
     try:
         _lock(f"reproduction.execute {options.run} {options.stem}")
         manifest.mirror()
         texts = [*options.texts, ["results", options.run]]
-        if "results" not in parameters.defaults(options.stem):
+        if options.check or "results" not in parameters.defaults(options.stem):
             texts.pop()
         values = parameters.read(options.stem, options.files, texts)
-        path = execute(options.run, options.stem, values)
+        runner = run_nbval if options.check else run_papermill
+        path = execute(options.run, options.stem, values, runner)
     except KeyboardInterrupt:
         return 128 + signal.SIGINT
     except (OSError, RuntimeError, ValueError, papermill.PapermillException) as error:

@@ -222,3 +222,20 @@ def test_parameters_are_refused_before_the_notebook_runs(
     assert execute.main(["full", "03_tiny", "-f", "a.yaml"]) == 1
     assert "full/03_tiny: Unknown parameter 'frmaes' in 'a.yaml'" in capsys.readouterr().err
     assert (folder / "03_tiny.ipynb").is_file()
+
+
+@pytest.mark.slow
+def test_a_check_that_fails_leaves_nothing_whole(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The notebook is checked as it is stored, and the report names the cell that failed."""
+    path = project / "notebooks/03_tiny.ipynb"
+    notebook = nbformat.read(path, 4)
+    notebook.cells[1].source = "assert frames == 4"
+    nbformat.write(notebook, path)
+    with (project / "held").open("w") as file:
+        monkeypatch.setenv(locked.HELD, str(file.fileno()))
+        with pytest.raises(RuntimeError, match="AssertionError"):
+            execute.execute("smoke", "03_tiny", {}, execute.run_nbval)
+    assert [path.name for path in (project / "results/smoke").iterdir()] == []
+    assert (project / "results/failed/smoke/03_tiny.ipynb").exists()

@@ -217,8 +217,8 @@ def test_a_capture_of_nothing_can_be_pooled() -> None:
     [
         (np.zeros((1, 20), int), TypeError, "Invalid pool of type ndarray"),
         (labels(np.zeros(20)), TypeError, "Invalid dtype float64 of the pool"),
-        (labels(one(19)), ValueError, r"Invalid pool {'y': 1, 'x': 19}"),
-        (labels(one(20)).transpose("x", "y"), ValueError, "Invalid pool"),
+        (labels(one(19)), ValueError, "Invalid size 19 of 'x' of the pool"),
+        (labels(one(20)).transpose("x", "y"), ValueError, r"Invalid dims \('x', 'y'\) of the pool"),
     ],
 )
 def test_bad_labels_are_a_clear_error(pool: Any, error: type[Exception], message: str) -> None:

@@ -124,7 +124,8 @@ def flags_of_whole_counts(noise: float, seeds: range) -> int:
         gain, offset = 1.0 + 0.02 * rng.standard_normal(320), 40.0 * rng.standard_normal(320)
         counts = (raw * gain + offset).astype(np.float32)[:, :, np.newaxis]
         capture = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)})
-        status = quality.read(capture, 1, None if seed % 2 else np.array([noise, noise]))[2]
+        known = quality.grains(capture, np.array([noise, noise])) if seed % 2 else None
+        status = quality.read(capture, 1, known)[2]
         number += int(np.count_nonzero(status & np.uint32(Status.SATURATED | Status.FROZEN_FRAMES)))
     return number
 

@@ -296,11 +296,8 @@ def estimate_background(
     of_first = first_noise**2 - 1.0 / ((ratios.ratio / noise) ** 2).sum(axis=0)
     slope = (emission.noise_variance + emission.drift_variance) / (1.0 - first) ** 2
     variance = 1.0 / (total * curvature) + object_share**2 * emission.smooth_variance
-    variance += through * (
-        through * (ratios.null_variance * ratios.inverse_energy) - contrast * covariance
-    )
+    variance += through * (through * emission.epsilon_variance - contrast * covariance)
     variance += contrast**2 * (of_first * ratios.inverse_energy + slope)
-    variance += (through * emission.level.epsilon * emission.level.std) ** 2
     return background, np.asarray(variance)
 
 

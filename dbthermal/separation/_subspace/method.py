@@ -35,7 +35,9 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
              \left[ \frac{z_m - e_m u_m(x)}{1 - e_m} - u_m(y) \right]^2 \qquad (9)
 
    Where it changes by many kelvins its signals are no longer proportional: the part that bends
-   them apart (11) is taken out, and steps 1 to 4 are done again, on the exact model.
+   them apart (11) is taken out, and steps 1 to 4 are done again, on the exact model. It is known
+   as well as the background's mean temperature, whose error the ratios carry. Near a gray body,
+   whose ratios it makes alone, it is not known at all: such ratios are flagged.
 5. Where the residual is not noise, one jump of the object is looked for (`residuals`), and taken
    into the subspace.
 
@@ -81,7 +83,7 @@ _BEND: Final = 0.2
 # Times that it is taken out at most: it changes with the background that it is computed of.
 _BENDS: Final = 2
 # Background temperatures at which a gray body's ratios are computed, over the calibrated range.
-_TEMPERATURES: Final = 17
+_TEMPERATURES: Final = 9
 
 Record = TypeVar("Record", Estimate, Survey)
 

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 from scipy.stats import chi2, norm
 
 from dbthermal import _smooth as smooth
@@ -177,11 +177,15 @@ def may_be_gray(ratios: ReflectionRatio, noise: Array, slopes: Array) -> Mask:
     # The part of g / s orthogonal to v, as in `null_combination`; its variance is sigma^2.
     off = gray[..., np.newaxis] - (gray @ unit)[:, np.newaxis] * unit
     start, step = off[:-1], np.diff(off, axis=0)
-    length = np.maximum((step**2).sum(axis=1), np.finfo(np.float64).tiny)
-    share = np.clip(-(start * step).sum(axis=1) / length, 0.0, 1.0)
-    nearest = ((start + share[:, np.newaxis] * step) ** 2).sum(axis=1)
-    chance = chdtrc(len(noise) - 1, nearest / ratios.inverse_energy).mean(axis=0)
-    return np.asarray(chance > _GRAY_CHANCE)
+    length = np.maximum(np.einsum("tbp,tbp->tp", step, step), np.finfo(np.float64).tiny)
+    share = np.clip(-np.einsum("tbp,tbp->tp", start, step) / length, 0.0, 1.0)
+    between = start + share[:, np.newaxis] * step
+    nearest = np.einsum("tbp,tbp->tp", between, between) / ratios.inverse_energy
+    freedom = len(noise) - 1
+    # The mean is no larger than the largest chance: few pixels need it.
+    gray = nearest.min(axis=0) < chdtri(freedom, _GRAY_CHANCE)
+    gray[gray] = chdtrc(freedom, nearest[:, gray]).mean(axis=0) > _GRAY_CHANCE
+    return np.asarray(gray)
 
 
 def choose_order(null_energy: Array, frames: int) -> Whole:
