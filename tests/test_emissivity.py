@@ -188,7 +188,7 @@ def test_condition_number_of_glass() -> None:
 def test_condition_number_closed_form(first: float, second: float) -> None:
     """The ratio of singular values follows from the Frobenius norm and the determinant."""
     assume(abs(first - second) > 1e-4)
-    # norm / (2 det) less 1, of norm = the sum of squares, written without a difference of like numbers
+    # Norm^2 / (2 det) less 1, without a difference of like numbers.
     low, high = sorted((first, second))
     excess = ((1 - high) ** 2 + low**2) / (high - low)
     expected = 1 + excess + np.sqrt(excess * (excess + 2))
