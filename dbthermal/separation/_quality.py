@@ -42,7 +42,7 @@ def unusable(status: Bits) -> Mask:
 
 
 def rounding_std(capture: xr.Dataset) -> Array:
-    """Standard deviation (band) [count] of rounding to a step: step / sqrt(12), 0 of fine counts."""
+    """Standard deviation (band) [count] of rounding to a step: step / sqrt(12), or 0."""
     some = _some(capture)
     counts = np.where(schema.measured(some), some, np.nan).astype(np.float64)
     if counts.shape[1] < samples.MINIMUM_FRAMES:
