@@ -8,6 +8,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _samples as samples
+from dbthermal import noise as noises
 from dbthermal import schema
 from dbthermal.schema import Status
 
@@ -45,7 +46,7 @@ def rounding_std(capture: xr.Dataset) -> Array:
     """Standard deviation (band) [count] of rounding to a step: step / sqrt(12), or 0."""
     some = _some(capture)
     counts = np.where(schema.measured(some), some, np.nan).astype(np.float64)
-    if counts.shape[1] < samples.MINIMUM_FRAMES:
+    if counts.shape[1] < noises.MINIMUM_FRAMES:
         return np.zeros(len(counts))
     change = np.abs(np.diff(counts, axis=1))
     step = np.min(change, axis=1, initial=np.inf, where=change > 0, keepdims=True)
