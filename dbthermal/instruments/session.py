@@ -34,7 +34,6 @@ environment variable ``DBTHERMAL_USBTC08``.
 
 import errno
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import field
 from pathlib import Path
@@ -87,6 +86,10 @@ def _printable(text: str) -> str:
     return text
 
 
+def _of_scheme(*schemes: str) -> AfterValidator:
+    return AfterValidator(lambda url: addresses.parse(url, schemes) and url)
+
+
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(strict=True, ge=200.0, le=2000.0)]  # no degrees Celsius [K]
 Pixels = Annotated[int, Field(strict=True, ge=2, le=8192)]
@@ -102,16 +105,8 @@ DeviceName = Literal["filter_wheel", "thermocouples"]
 class Device:
     """Addresses of one device, such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``."""
 
-    simulated: str
-    hardware: str
-
-    @field_validator("simulated", "hardware")
-    @classmethod
-    def _check_scheme(cls, url: str, info: ValidationInfo) -> str:
-        emulated = ("sim", "pty")
-        is_simulated = info.field_name == "simulated"
-        addresses.parse(url, emulated if is_simulated else addresses.RULES.keys() - {*emulated})
-        return url
+    simulated: Annotated[str, _of_scheme("sim", "pty")]
+    hardware: Annotated[str, _of_scheme("v4l2", "serial", "tc08")]
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -162,14 +157,10 @@ class Camera:
 class Blackbody:
     """Temperatures of a calibration, and the rule by which each counts as reached."""
 
-    # In their order [K].
-    temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
-    stability: Annotated[Positive, Field(le=10.0)] = (
-        0.05  # largest range of the readings in the window [K]
-    )
-    window: Annotated[Positive, Field(le=3600.0)] = (
-        30.0  # how long the readings must stay within it [s]
-    )
+    temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]  # [K]
+    # Largest range of the readings in the window [K], and how long they must stay within it [s].
+    stability: Annotated[Positive, Field(le=10.0)] = 0.05
+    window: Annotated[Positive, Field(le=3600.0)] = 30.0
     # Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
     # by half a kelvin or so each, and the recordings keep the reading.
     tolerance: Annotated[Positive, Field(le=50.0)] = 1.5
@@ -246,7 +237,7 @@ class Session:
         rows, columns = self.telemetry_rows, self.shape[1]
         for band, camera in self.cameras.items():
             allowed = camera_kind(camera.kind).telemetry_rows
-            _check_one_of(f"telemetry_rows of band '{band}', a {camera.kind},", [rows], allowed)
+            _check_one_of(f"telemetry_rows of band '{band}', a {camera.kind},", rows, allowed)
         if rows and rows * columns < telemetry.WORDS:
             rule = f"Must have {telemetry.WORDS // rows} columns for the telemetry"
             raise ValueError(f"Invalid shape {list(self.shape)}. {rule}")
@@ -279,7 +270,8 @@ class Session:
         behind = [band for band in self.bands if band in self.filters.values()]
         if self.filters and len(behind) != 1:
             raise ValueError(f"Invalid cameras {behind} behind the wheel. Must be exactly one")
-        _check_one_of("filter of the sweep", self.sweep, tuple(self.filters.values()))
+        for band in self.sweep:
+            _check_one_of("filter of the sweep", band, self.filters.values())
         _check_unique("filter of the sweep", self.sweep)
         if self.sweep and self.blackbody is None:
             raise ValueError(f"Invalid sweep {list(self.sweep)}. Must have a blackbody")
@@ -398,16 +390,14 @@ def _check_schemes(name: str, device: Device) -> None:
         )
 
 
-def _check_one_of(name: str, values: Iterable[Any], allowed: Iterable[Any]) -> None:
-    for value in values:
-        if value not in (allowed := list(allowed)):
-            raise ValueError(f"Invalid {name} {value!r}. Must be one of {allowed}")
+def _check_one_of(name: str, value: Any, allowed: Iterable[Any]) -> None:
+    if value not in (allowed := list(allowed)):
+        raise ValueError(f"Invalid {name} {value!r}. Must be one of {allowed}")
 
 
 def _check_unique(name: str, values: Iterable[Any]) -> None:
-    for value, count in Counter(values).items():
-        if count > 1:
-            raise ValueError(f"Repeated {name} '{value}'. Must be listed once")
+    for value in texts.repeated(values):
+        raise ValueError(f"Repeated {name} '{value}'. Must be listed once")
 
 
 def _message(error: Any) -> str:
