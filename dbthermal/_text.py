@@ -251,11 +251,11 @@ class _Document:
         import yaml  # noqa: PLC0415
 
         self.events, self.source, self.yaml = events, source, yaml
-        self.resolver = yaml.resolver.Resolver()
+        self.resolver: Any = yaml.resolver.Resolver()
 
     def content(self) -> Any:
         """Value of the document; None without one."""
-        values = []
+        values: list[Any] = []
         for event in self.events:
             if isinstance(event, self.yaml.DocumentStartEvent):
                 if values:
