@@ -16,14 +16,12 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtri
-from scipy.stats import binom
+from scipy.special import bdtrc, ndtri
+
+from dbthermal.noise import MINIMUM_FRAMES
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-
-MINIMUM_FRAMES: Final = 16
-"""Fewest samples from which the noise of a pixel is estimated."""
 
 # Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
 _QUIET: Final = 0.8
@@ -52,24 +50,16 @@ def noise(signal: npt.NDArray[Any]) -> Array:
     The mean magnitude of the smaller four fifths of the second differences: neither object nor
     walkers enter.
     """
-    frames = np.isfinite(signal).sum(axis=0)
-    whole = bool(np.all(frames == len(signal)))
-    if not whole:
-        # The samples of each pixel that are no measurement go behind the others.
-        order = np.argsort(~np.isfinite(signal), axis=0, kind="stable")
+    valid = np.isfinite(signal)
+    frames = valid.sum(axis=0)
+    if not valid.all():  # the samples of each pixel that are no measurement go behind the others
+        order = np.argsort(~valid, axis=0, kind="stable")
         signal = np.take_along_axis(signal, order, axis=0)
-    with np.errstate(invalid="ignore"):
-        second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
+    second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
+    second.sort(axis=0)  # NaN last
     quiet = np.maximum((_QUIET * (frames - 2)).astype(np.intp), 1)
-    if whole and len(second) > 1:
-        number = int(quiet.flat[0])
-        second.partition(number, axis=0)
-        total = second[:number].sum(axis=0, dtype=np.float64)
-    else:
-        second[~np.isfinite(second)] = np.inf
-        second.sort(axis=0)
-        used = np.arange(len(second)).reshape(-1, *np.ones(frames.ndim, dtype=int)) < quiet
-        total = second.sum(axis=0, dtype=np.float64, where=used)
+    used = np.arange(len(second)).reshape(-1, *(1,) * quiet.ndim) < quiet
+    total = second.sum(axis=0, dtype=np.float64, where=used)
     level = total / quiet / (_QUIET_MEAN * np.sqrt(1.5))
     return np.where(frames < MINIMUM_FRAMES, np.nan, level)
 
@@ -152,8 +142,10 @@ def near_end(
 def is_heap(number: npt.ArrayLike, near: npt.ArrayLike, band: Grain) -> Mask:
     """Return where samples at an end, out of those near it, are more than noise puts there."""
     share = min(1.0, np.sqrt(2.0 * np.pi) * band.chance / _END)
-    # The first sample makes the end.
-    return np.asarray(binom.sf(np.asarray(number) - 2, np.asarray(near) - 1, share) < _FALSE_ALARM)
+    # The first sample makes the end; bdtrc is the tail of the binomial distribution.
+    return np.asarray(
+        bdtrc(np.asarray(number) - 2, np.asarray(near, dtype=np.intp) - 1, share) < _FALSE_ALARM
+    )
 
 
 def repeated(counts: npt.NDArray[Any], valid: Mask) -> Mask:

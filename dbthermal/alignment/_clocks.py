@@ -161,8 +161,9 @@ def missing(frames: npt.NDArray[Any]) -> Mask:
 
 
 def frame_period(stamps: Array) -> float:
-    """Median step [s] between the frames of one camera."""
-    return float(np.median(np.diff(stamps[np.isfinite(stamps)])))
+    """Median step [s] from one frame of a camera to the next; stamps (time) may be NaN."""
+    (recorded,) = np.nonzero(np.isfinite(stamps))
+    return float(np.median(np.diff(stamps[recorded]) / np.diff(recorded)))
 
 
 def even_times(stamps: Array, reach: int) -> Array:
@@ -229,7 +230,7 @@ def interpolation(stamps: Array, present: Mask, wanted: Array) -> Interpolation:
             f"Invalid capture of {usable.size} valid frames. Must be at least {_MINIMUM_FRAMES}: "
             "the others are NaN or copies of the frame before."
         )
-    times, step = stamps[usable], frame_period(stamps[usable])
+    times, step = stamps[usable], frame_period(np.where(present, stamps, np.nan))
     right = np.clip(np.searchsorted(times, wanted), 1, usable.size - 1)
     width = times[right] - times[right - 1]
     weight = (wanted - times[right - 1]) / width

@@ -200,19 +200,13 @@ def _try(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
         return np.nan
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
     """Offset of two bands [s], of signals (band, time, pixel) [count] at stamps (band, time)."""
     names = [str(name) for name in pair["band"].values]
     label = f"of band '{names[1]}' against '{names[0]}'"
     # Frames of the one side of a pause never meet those of the other, at any lag.
-    reach = search + 3
-    shared = _on_one_clock(signals, stamps, clocks.segments(pair), reach)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return _estimate(shared, search, names, label)
-
-
-def _estimate(shared: _Pair, search: int, names: list[str], label: str) -> float:
-    """Offset [s] of bands on one clock, from the lag of their largest covariance."""
+    shared = _on_one_clock(signals, stamps, clocks.segments(pair), search + 3)
     lag = _peak(_covariances(shared, search, names), label)
     # Whole frames first: smooth functions over the same scene take the same out of both bands.
     covariances = _covariances(shared.shifted(lag), 1, names)

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter, median_filter
 
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment._resampling import TRANSFORM
+from dbthermal.alignment._resampling import TRANSFORM, positions
 
 Array = npt.NDArray[np.float64]
 
@@ -24,6 +24,8 @@ _MEDIAN_WINDOW: Final = 3
 # Steps, and relative change of the correlation, at which the maximisation stops.
 _STEPS, _TOLERANCE = 200, 1e-7
 _LEAST_CORRELATION: Final = 0.5
+# Share of the first view that the other must show: the last rows of two views correlate by chance.
+_LEAST_OVERLAP: Final = 0.5
 
 
 def register(
@@ -62,7 +64,7 @@ def register(
         If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
         If the model is unknown, the image is smaller than 16 pixels either way, a mean is not
-        finite, or the correlation of two views is below 0.5.
+        finite, the correlation of two views is below 0.5, or they share less than half the image.
 
     References
     ----------
@@ -139,6 +141,14 @@ def _transform(first: Array, other: Array, model: str, band: str) -> Array:
             f"Invalid view in band '{band}': its correlation with the first is {correlation:.2f}. "
             f"Must be at least {_LEAST_CORRELATION}; they do not show the same, or lie too far "
             "apart."
+        )
+    y, x = positions(matrix, first.shape)
+    rows, columns = first.shape
+    shared = np.mean((y > -0.5) & (y < rows - 0.5) & (x > -0.5) & (x < columns - 0.5))
+    if not shared >= _LEAST_OVERLAP:
+        raise ValueError(
+            f"Invalid view in band '{band}': it shares {shared:.0%} of the image with the first. "
+            f"Must be at least {_LEAST_OVERLAP:.0%}."
         )
     return matrix
 

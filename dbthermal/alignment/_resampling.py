@@ -232,9 +232,7 @@ def _noise(signals: Array, stamps: Array) -> Array:
 def _single(movie: xr.DataArray) -> Movie:
     """Counts in single precision, NaN where they are infinite or beyond it."""
     counts = movie.values
-    if counts.dtype.itemsize > np.dtype(np.float32).itemsize or np.isinf(counts).any():
-        counts = np.where(schema.measured(counts), counts, np.nan)
-    return np.asarray(counts, dtype=np.float32)
+    return np.where(schema.measured(counts), counts, np.nan).astype(np.float32, copy=False)
 
 
 def _registered(corrected: xr.Dataset, matrices: Array) -> xr.Dataset:

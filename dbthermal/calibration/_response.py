@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from dbthermal import bands, planck, schema
 from dbthermal import response as responses
+from dbthermal.response import Curve
 
 Array = npt.NDArray[np.float64]
 
@@ -124,10 +125,10 @@ def fit_response(
         reading = np.hypot(std, np.sqrt(_ROUNDING) if np.all(row == np.rint(row)) else 0.0)
         _check_growth(name, temperature, row, float(np.hypot(reading, temperature_std * line[0])))
         curve = _fit_band(name, temperature, row)
-        slope = np.max(np.diff(_values(curve, temperature)) / np.diff(temperature))
+        slope = np.max(np.diff(curve.counts(temperature)) / np.diff(temperature))
         error = float(np.hypot(reading, temperature_std * slope))
-        _check_residuals(name, temperature, row, curve, error)
-        rows.append([*curve, *line])
+        _check_residuals(curve, temperature, row, error)
+        rows.append([curve.amplitude, curve.wavelength, curve.shift, curve.offset, *line])
     parameters = [*responses.COEFFICIENTS, "linear_slope", "linear_intercept"]
     stage = schema.STAGES["response"]
     variables: dict[str, xr.DataArray] = {
@@ -188,16 +189,14 @@ def _check_growth(band: str, temperature: Array, counts: Array, std: float) -> N
         )
 
 
-def _check_residuals(
-    band: str, temperature: Array, counts: Array, coefficients: Array, std: float
-) -> None:
+def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float) -> None:
     """
     Refuse counts farther from their Planck curve than errors of a standard deviation explain.
 
     The nearest curve of any shape is no farther from the counts than the nearest one of the true
     shape, whose two linear parameters leave a chi-square of n - 2 degrees of freedom.
     """
-    off = counts - _values(coefficients, temperature)
+    band, off = curve.band, counts - curve.counts(temperature)
     if np.sum(off**2) <= std**2 * chi2.isf(_FALSE_ALARM, counts.size - 2):
         return
     explained = f"noise and blackbody explain {std:.3g} count"
@@ -205,7 +204,7 @@ def _check_residuals(
     for place in range(counts.size):
         rest = np.arange(counts.size) != place
         others = _fit_band(band, temperature[rest], counts[rest])
-        beside = counts - _values(others, temperature)
+        beside = counts - others.counts(temperature)
         if np.sum(beside[rest] ** 2) <= std**2 * chi2.isf(_FALSE_ALARM, counts.size - 3):
             fitting.append((place, beside[place]))
     if len(fitting) == 1:
@@ -224,13 +223,6 @@ def _check_residuals(
     )
 
 
-def _values(coefficients: Array, temperature: Array) -> Array:
-    """Counts of the Sakuma-Hattori curve of some `COEFFICIENTS`."""
-    amplitude, wavelength, shift, offset = coefficients
-    exponent = planck.SECOND_RADIATION_CONSTANT / (wavelength * temperature + shift)
-    return np.asarray(amplitude / np.expm1(exponent) + offset)
-
-
 def _wavelengths(band: str) -> tuple[float, float]:
     """Least and greatest mean wavelength [m] of a response in a band, by its name."""
     known = bands.FILTERS.get(band)
@@ -239,8 +231,8 @@ def _wavelengths(band: str) -> tuple[float, float]:
     return known.lower / _WAVELENGTH_MARGIN, known.upper * _WAVELENGTH_MARGIN
 
 
-def _fit_band(band: str, temperature: Array, counts: Array) -> Array:
-    """Amplitude, effective wavelength, shift and offset of one band, as in `COEFFICIENTS`."""
+def _fit_band(band: str, temperature: Array, counts: Array) -> Curve:
+    """Curve of least squares of one band."""
     middle = 0.5 * (temperature[0] + temperature[-1])
     span = counts[-1] - counts[0]
 
@@ -268,7 +260,8 @@ def _fit_band(band: str, temperature: Array, counts: Array) -> Array:
     amplitude, offset = linear_part(fit.x)[0]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle
     shift = _SHAPE_UNIT * fit.x[0] * (1.0 - fit.x[1])
-    return np.array([amplitude, wavelength, shift, offset])
+    range_ = (temperature[0], temperature[-1])
+    return Curve(band, amplitude, wavelength, shift, offset, middle, *range_)
 
 
 def _noise(noise: xr.DataArray, names: list[str]) -> Array:
@@ -279,10 +272,8 @@ def _noise(noise: xr.DataArray, names: list[str]) -> Array:
         raise ValueError(f"Invalid dims {noise.dims} of the noise. Must be ('band',).")
     if noise.attrs.get("units", "count") != "count":
         raise ValueError(f"Invalid units '{noise.attrs['units']}' of the noise. Must be 'count'.")
-    values = noise.values[schema.band_positions(noise, names, "the noise")].astype(np.float64)
-    if not np.all(np.isfinite(values) & (values > 0)):
-        raise ValueError(f"Invalid noise {values} count. Must be finite and positive.")
-    return np.asarray(values)
+    places = schema.band_positions(noise, names, "the noise")
+    return planck.require_positive("noise [count]", noise.values[places])
 
 
 def _with_noise(response: xr.Dataset, noise: Array) -> xr.Dataset:

@@ -14,7 +14,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from dbthermal import _samples as samples
 from dbthermal import schema
 from dbthermal.correction._nonuniformity import OUTLIER
-from dbthermal.noise import MAD
+from dbthermal.noise import MAD, MINIMUM_FRAMES
 from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
@@ -102,15 +102,17 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     reach = _reach(counts["time"].values.astype(np.float64))
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
-        frames = _frames(movie, max(samples.MINIMUM_FRAMES, 2 * reach + 3))
+        frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
         part = np.zeros(frames.size) if segment is None else segment[frames]
         movie, stepped = movie.isel(time=frames), np.diff(part) != 0
-        level = _noise(movie)
+        level = np.empty(image)
+        for rows in _blocks(movie):
+            level[rows] = samples.noise(_samples(movie, rows))
         known = np.isfinite(level)
         if not known.any():
             raise ValueError(
                 f"Invalid band '{movie['band'].item()}': no pixel has "
-                f"{samples.MINIMUM_FRAMES} samples that are not NaN. Must have them, to be judged."
+                f"{MINIMUM_FRAMES} samples that are not NaN. Must have them, to be judged."
             )
         unjudged |= ~known
         usual = np.where(known, level, np.median(level[known]))
@@ -182,7 +184,7 @@ def _repeats(movie: xr.DataArray, measured: xr.DataArray) -> tuple[Mask, Mask]:
 
 def _reach(time: Array) -> int:
     """Frames by which neighbours may show a change earlier or later."""
-    if time.size < samples.MINIMUM_FRAMES:
+    if time.size < MINIMUM_FRAMES:
         return _REACH_FRAMES
     return max(_REACH_FRAMES, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
 
@@ -213,14 +215,6 @@ def _blocks(movie: xr.DataArray) -> list[slice]:
     height = movie.sizes["y"]
     rows = max(1, _BLOCK // (movie.sizes["time"] * movie.sizes["x"]))
     return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
-
-
-def _noise(movie: xr.DataArray) -> Array:
-    """Noise (y, x) [count] of each pixel; NaN of too few frames."""
-    level = np.empty((movie.sizes["y"], movie.sizes["x"]))
-    for rows in _blocks(movie):
-        level[rows] = samples.noise(_samples(movie, rows))
-    return level
 
 
 def _outliers(level: Array, usual: Array, threshold: float) -> Mask:

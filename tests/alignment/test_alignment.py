@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal import alignment, separation, simulation
+from dbthermal.alignment import _clocks as clocks
 from dbthermal.simulation import Background, Rig, drop_frames, expose, repeat_frames
 
 RIG = Rig()
@@ -422,3 +423,13 @@ def test_nothing_is_left_on_the_clocks_before(scene: xr.Dataset) -> None:
     offset = xr.DataArray([0.0, 20.0], dims="band", coords={"band": capture["band"]})
     with pytest.raises(ValueError, match="Invalid unit 'ms' of the offset"):
         alignment.align(capture, offset=offset.assign_attrs(units="ms"))
+
+
+def test_frames_beside_lost_ones_are_not_bridged() -> None:
+    """The frame period is that of the slots: with most stamps lost, no pause counts as a step."""
+    time = np.arange(400) / 10.0
+    stamps = np.where(np.random.default_rng(1).random(time.size) < 0.95, np.nan, time)
+    assert clocks.frame_period(stamps) == pytest.approx(0.1)
+    known = np.isfinite(stamps)
+    between = clocks.interpolation(stamps, np.ones(time.size, dtype=bool), time + 0.03)
+    assert not between.valid[~(known & np.roll(known, -1))].any()

@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import alignment, schema, separation, simulation
+from dbthermal.alignment import _registration as registration
 from dbthermal.alignment import _resampling as resampling
 from dbthermal.simulation import Rig
 
@@ -141,6 +142,15 @@ def parallax(pixels: float, rng: np.random.Generator) -> tuple[xr.Dataset, xr.Da
     both = (("band", "time", "y", "x"), np.stack(seen), {"units": "K"})
     apart = scene.assign(background_temperature=both)
     return scene, simulation.observe(apart, RIG.response(), rng)
+
+
+def test_views_that_share_little_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The edges of two views correlate by chance: what keeps only these is no transform."""
+    apart = np.eye(3)
+    apart[0, 2] = 0.6 * SHAPE[1]
+    monkeypatch.setattr(registration, "_maximise", lambda *_: (apart, 0.99))
+    with pytest.raises(ValueError, match=r"band '9\.5': it shares 40% of the image"):
+        alignment.register(views(np.eye(3)))
 
 
 def test_what_parallax_costs() -> None:
