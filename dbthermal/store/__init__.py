@@ -6,7 +6,7 @@ chunks and survives a kill or a power loss; a `HeldFolder` is found wherever it 
 package opens or writes zarr.
 """
 
-from dbthermal.store._durable import HeldFolder
+from dbthermal.store._durable import HeldFolder, to_disk
 from dbthermal.store._provenance import checksum, provenance
 from dbthermal.store._recording import Recording
 from dbthermal.store._results import (
@@ -33,6 +33,7 @@ __all__ = [
     "save_numbers",
     "save_text",
     "save_video",
+    "to_disk",
 ]
 
 

@@ -132,7 +132,8 @@ def to_disk(paths: Iterable[Path]) -> None:
     """
     Wait until files and folders are on the disk, and not only in its cache.
 
-    All are synced at the same time, for a file system then writes its journal once.
+    All are synced at the same time, for a file system then writes its journal once. What is in a
+    folder is not synced with it. OSError, FileNotFoundError among them, if one cannot be.
     """
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(_to_disk, paths))

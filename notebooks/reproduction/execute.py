@@ -24,7 +24,8 @@ import nbformat
 import papermill
 from jupyter_client.manager import AsyncKernelManager
 
-from reproduction import locked, manifest, parameters, paths
+from dbthermal import store
+from reproduction import locked, parameters, paths
 
 
 class Kernel(AsyncKernelManager):
@@ -89,28 +90,25 @@ def execute(
     if path.exists():  # from here on no name says that it is whole
         path.replace(part)
     part.touch()
-    _sync(part, part.parent)
+    store.to_disk([part, part.parent])
     failed.unlink(missing_ok=True)
-    _remove(part)
+    _remove(part, stem)
     try:
         runner(stem, part, values)
     except BaseException:
-        _remove(part)
+        _remove(part, stem)
         failed.parent.mkdir(parents=True, exist_ok=True)
         part.replace(failed)
         raise
-    for result in part.parent.glob(f"{stem}*"):
-        _sync(result, *result.rglob("*"))
     os.utime(part, (start, start))
-    _sync(part)
+    store.to_disk([part, *part.parent.glob(f"{stem}*"), *part.parent.glob(f"{stem}*/**/*")])
     part.replace(path)
-    _sync(path.parent)
+    store.to_disk([path.parent])
     return path
 
 
-def _remove(part: Path) -> None:
+def _remove(part: Path, stem: str) -> None:
     """Remove what a notebook wrote, but not the unfinished notebook itself."""
-    stem = part.name.removeprefix(".").removesuffix(".part.ipynb")
     for result in [*part.parent.glob(f"{stem}*"), *part.parent.glob(f".{stem}*")]:
         if result.is_dir() and not result.is_symlink():
             shutil.rmtree(result)
@@ -124,16 +122,6 @@ def _check_complete(path: Path) -> None:
     for number, cell in enumerate(notebook.cells):
         if cell.cell_type == "code" and cell.source.strip() and cell.execution_count is None:
             raise RuntimeError(f"Unfinished notebook '{path}': cell {number} did not run.")
-
-
-def _sync(*places: Path) -> None:
-    """Bring files and folders to the disk."""
-    for place in places:
-        file = os.open(place, os.O_RDONLY)
-        try:
-            os.fsync(file)
-        finally:
-            os.close(file)
 
 
 def _lock(task: str) -> None:
@@ -160,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, _stop)
     try:
         _lock(f"reproduction.execute {options.run} {options.stem}")
-        manifest.mirror()
+        locked.mirror()
         texts = [*options.texts, ["results", options.run]]
         if options.check or "results" not in parameters.defaults(options.stem):
             texts.pop()

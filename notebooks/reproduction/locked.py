@@ -30,8 +30,8 @@ HELD: Final = "DBTHERMAL_LOCK"
 LOCKED: Final = "DBTHERMAL_LOCKED"
 """Variable with the folder that is locked, which tells the Makefile that it is."""
 
-MIRROR: Final = "DBTHERMAL_MIRROR"
-"""Variable with the absolute path of the folder that DBTHERMAL_DATA names."""
+MIRROR: Final = "DBTHERMAL_DATA"
+"""Variable that names the folder with a copy of the outside files."""
 
 _PATIENCE: Final = 3.0  # the kernels of a make that was killed notice it within a second [s]
 _POLL: Final = 0.2  # [s]
@@ -88,18 +88,23 @@ def end_with_parent(end: Callable[[], object]) -> None:
 
 def settings() -> dict[str, str]:
     """Environment for make: JOBS, and DBTHERMAL_DATA as an absolute path, both checked."""
-    environment = dict(os.environ)
-    if not re.fullmatch("[1-9][0-9]{0,3}", jobs := environment.get("JOBS", "1")):
+    if not re.fullmatch("[1-9][0-9]{0,3}", jobs := os.environ.get("JOBS", "1")):
         raise ValueError(f"Invalid JOBS {jobs!r}. Must be a whole number of 1 or more.")
-    if os.pathsep in os.getcwd():  # noqa: PTH109 - as text
+    if os.pathsep in (folder := str(Path.cwd())):
         rule = f"Must hold no '{os.pathsep}', which ends a path in PYTHONPATH."
-        raise ValueError(f"Invalid folder {os.getcwd()!r} of the checkout. {rule}")  # noqa: PTH109
-    if mirror := environment.get("DBTHERMAL_DATA", "").strip():
-        if not Path(mirror).is_dir():
-            raise ValueError(f"Invalid DBTHERMAL_DATA {mirror!r}. Must name a folder.")
-        mirror = str(Path(mirror).absolute())
+        raise ValueError(f"Invalid folder {folder!r} of the checkout. {rule}")
+    copies = str(mirror() or "")
     # The second name is for the Makefile: what was said to make itself goes over the environment.
-    return environment | {"DBTHERMAL_DATA": mirror, MIRROR: mirror}
+    return {**os.environ, MIRROR: copies, "DBTHERMAL_MIRROR": copies}
+
+
+def mirror() -> Path | None:
+    """Folder that DBTHERMAL_DATA names, None if it is unset or empty."""
+    if not (folder := os.environ.get(MIRROR, "").strip()):
+        return None
+    if not Path(folder).is_dir():
+        raise ValueError(f"Invalid {MIRROR} {folder!r}. Must name a folder.")
+    return Path(folder).absolute()
 
 
 def main(make: str) -> int:

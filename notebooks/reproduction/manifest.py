@@ -9,7 +9,6 @@ just been compared.
 """
 
 import hashlib
-import os
 import re
 import sys
 import time
@@ -21,19 +20,44 @@ from urllib.parse import quote, urljoin, urlsplit
 
 import pooch
 import requests
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from dbthermal import readers
-from reproduction import paths
-
-MIRROR: Final = "DBTHERMAL_DATA"
-"""Variable that names the folder with a copy of the files."""
+from reproduction import locked, paths
 
 _CONNECTIONS: Final = 8
 _RETRIES: Final = 3
-_REDIRECTS: Final = 5
 _TIMEOUT: Final = 30.0  # without a byte [s]
 _SLOWEST: Final = 10_000  # of a whole download, beside one `_TIMEOUT` [byte/s]
+
+
+def _matching(label: str, pattern: str, rule: str) -> AfterValidator:
+    """Validator whose error names what a text is, the text, and the rule."""
+
+    def check(value: Any) -> Any:
+        if not re.fullmatch(pattern, str(value)):
+            raise ValueError(f"Invalid {label} {value!r}. Must {rule}.")
+        return value
+
+    return AfterValidator(check)
+
+
+_FILE: Final = _matching(
+    "file name",
+    "[A-Za-z0-9_][A-Za-z0-9 _.-]{0,199}",
+    "be letters, digits, '_', '.', '-' and spaces, none of the last three first: it names no "
+    "folder",
+)
+_SHA256: Final = _matching("sha256", "[0-9a-f]{64}", "be 64 lower-case digits")
+_SIZE: Final = _matching("size", "[1-9][0-9]*", "be > 0 bytes")
+_ORIGIN: Final = _matching(
+    "origin", r"https?://[^?#@\\\x00-\x1f]+/", "begin with https:// and end in '/'"
+)
+_COLLECTION: Final = _matching(
+    "collection",
+    "[a-z][a-z0-9_]{0,49}",
+    "be lower-case letters, digits and '_', a letter first: it names a folder in 'data'",
+)
 
 
 class File(BaseModel):
@@ -41,35 +65,11 @@ class File(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    name: str
-    sha256: str
-    bytes: int
+    name: Annotated[str, _FILE]
+    sha256: Annotated[str, _SHA256]
+    bytes: Annotated[int, _SIZE]
     covers_8_14um: bool = True  # False for a spectrum that ends short of 14 um
     thermal_duplicate_of: str | None = None  # file with the same values in the thermal infrared
-
-    @field_validator("name")
-    @classmethod
-    def _check_name(cls, name: str) -> str:
-        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9 _.-]{0,199}", name):
-            raise ValueError(
-                f"Invalid file name {name!r}. Must be letters, digits, '_', '.', '-' and spaces, "
-                "none of the last three first: it names no folder."
-            )
-        return name
-
-    @field_validator("sha256")
-    @classmethod
-    def _check_sha256(cls, sha256: str) -> str:
-        if not re.fullmatch("[0-9a-f]{64}", sha256):
-            raise ValueError(f"Invalid sha256 '{sha256}'. Must be 64 lower-case digits.")
-        return sha256
-
-    @field_validator("bytes")
-    @classmethod
-    def _check_bytes(cls, size: int) -> int:
-        if size <= 0:
-            raise ValueError(f"Invalid size {size}. Must be > 0 bytes.")
-        return size
 
 
 def _by_name(entries: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -85,19 +85,12 @@ class Collection(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     title: str
-    origin: str
+    origin: Annotated[str, _ORIGIN]
     citation: tuple[str, ...]
     terms: str
     used_by: tuple[str, ...]
     note: str
     files: Annotated[dict[str, File], BeforeValidator(_by_name)]
-
-    @field_validator("origin")
-    @classmethod
-    def _check_origin(cls, origin: str) -> str:
-        if not re.fullmatch(r"https?://[^?#@\\\x00-\x1f]+/", origin):
-            raise ValueError(f"Invalid origin {origin!r}. Must begin with https:// and end in '/'.")
-        return origin
 
     def url(self, name: str) -> str:
         """Address of a file, with spaces and the like quoted."""
@@ -115,18 +108,7 @@ class Manifest(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    collections: Mapping[str, Collection]
-
-    @field_validator("collections")
-    @classmethod
-    def _check_collections(cls, collections: Mapping[str, Collection]) -> Mapping[str, Collection]:
-        for name in collections:
-            if not re.fullmatch("[a-z][a-z0-9_]{0,49}", name):
-                raise ValueError(
-                    f"Invalid collection {name!r}. Must be lower-case letters, digits and '_', a "
-                    "letter first: it names a folder in 'data'."
-                )
-        return collections
+    collections: Mapping[Annotated[str, _COLLECTION], Collection]
 
     def __getitem__(self, name: str) -> Collection:
         """Collection by name; ValueError if it is not listed."""
@@ -158,7 +140,7 @@ def local(collection: str) -> dict[str, Path]:
         raise FileNotFoundError(
             f"Missing {len(missing)} of {len(files)} files of '{collection}' in '{folder}', the "
             f"first is '{missing[0]}'. Must all be there: fetch them with 'make data', or name "
-            f"a folder that holds them in {MIRROR}."
+            f"a folder that holds them in {locked.MIRROR}."
         )
     return {name: _verified(folder / name, file) for name, file in files.items()}
 
@@ -209,20 +191,12 @@ def main() -> int:
 
 
 def _folder(collection: str) -> Path:
-    return (mirror() or paths.data()) / collection
-
-
-def mirror() -> Path | None:
-    """Folder that DBTHERMAL_DATA names, None if it is unset or empty."""
-    folder = os.environ.get(MIRROR)
-    if folder and not Path(folder).is_dir():
-        raise ValueError(f"Invalid {MIRROR} '{folder}'. Must name a folder.")
-    return Path(folder) if folder else None
+    return (locked.mirror() or paths.data()) / collection
 
 
 def _fetch(listed: Collection, file: File, folder: Path) -> Path:
     path = folder / file.name
-    if mirror() is None and not path.is_file():
+    if locked.mirror() is None and not path.is_file():
         source = pooch.create(
             folder,
             base_url=listed.origin,
@@ -239,7 +213,17 @@ def _download(file: File) -> Callable[[str, str, object], None]:
 
     def download(url: str, path: str, _: object) -> None:
         end, size = time.monotonic() + _TIMEOUT + file.bytes / _SLOWEST, 0
-        with _answer(url) as response, Path(path).open("wb") as output:
+        with (
+            requests.get(
+                url,
+                stream=True,
+                timeout=_TIMEOUT,
+                headers={"Accept-Encoding": "identity"},
+                hooks={"response": _check_redirect},
+            ) as response,
+            Path(path).open("wb") as output,
+        ):
+            response.raise_for_status()
             while part := response.raw.read1(2**16, decode_content=False):
                 size += output.write(part)
                 if size > file.bytes:
@@ -254,31 +238,23 @@ def _download(file: File) -> Callable[[str, str, object], None]:
     return download
 
 
-def _answer(url: str) -> requests.Response:
-    """Answer of a server, after redirects of which none leaves the scheme, unless for https."""
-    for _ in range(_REDIRECTS + 1):
-        response = requests.get(
-            url,
-            stream=True,
-            timeout=_TIMEOUT,
-            allow_redirects=False,
-            headers={"Accept-Encoding": "identity"},
-        )
-        if not response.is_redirect:
-            response.raise_for_status()
-            return response
+def _check_redirect(response: requests.Response, **_: object) -> None:
+    """OSError if a redirect leaves the scheme, unless for https; its body is not read."""
+    if response.is_redirect:
         response.close()
-        following = urljoin(url, response.headers["location"])
-        if urlsplit(following).scheme not in {urlsplit(url).scheme, "https"}:
-            raise OSError(f"Invalid redirect of '{url}' to '{following}'. Must stay at its scheme.")
-        url = following
-    raise OSError(f"Invalid redirects to '{url}'. Must be at most {_REDIRECTS}.")
+        following = urljoin(response.url, response.headers["location"])
+        if urlsplit(following).scheme not in {urlsplit(response.url).scheme, "https"}:
+            raise OSError(
+                f"Invalid redirect of '{response.url}' to '{following}'. Must stay at its scheme."
+            )
 
 
 def _verified(path: Path, file: File) -> Path:
     """Path of a file that exists and has the listed checksum."""
     if not path.is_file():
-        raise FileNotFoundError(f"Missing file '{path}'. Must be in the folder {MIRROR} names.")
+        raise FileNotFoundError(
+            f"Missing file '{path}'. Must be in the folder {locked.MIRROR} names."
+        )
     with path.open("rb") as content:
         sha256 = hashlib.file_digest(content, "sha256").hexdigest()
     if sha256 != file.sha256:

@@ -4,7 +4,6 @@ Papermill injects whatever it gets, under any name. Here a value is refused unle
 name, and a default of its kind.
 """
 
-import ast
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -17,13 +16,13 @@ from reproduction import paths
 INJECTED: Final = "# Parameters\n"
 """First line of the cell that papermill injects."""
 
-_KINDS: Final = {
-    "true or false": bool,
-    "a whole number": int,
-    "a number": int | float,
-    "text": str,
-    "a list": list,
-    "a mapping": dict,
+_KINDS: Final[Mapping[type, str]] = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    list: "a list",
+    dict: "a mapping",
 }
 
 
@@ -37,9 +36,7 @@ def defaults(stem: str) -> dict[str, Any]:
     ]
     if len(cells) != 1:
         raise ValueError(f"Invalid notebook '{path}'. Must have one cell tagged 'parameters'.")
-    values: dict[str, Any] = {}
-    exec("".join(cells[0]), {"__builtins__": {}}, values)
-    return values
+    return _assigned("".join(cells[0]))
 
 
 def read(stem: str, files: Iterable[Path], texts: Iterable[tuple[str, str]] = ()) -> dict[str, Any]:
@@ -79,53 +76,50 @@ def check(values: Mapping[str, Any], small: Mapping[str, Any], source: str) -> N
             raise ValueError(
                 f"Unknown parameter '{name}' in {source}. Must be one of {sorted(small)}."
             )
-        _check_kind(f"parameter '{name}' in {source}", value, small[name])
-        if (
-            isinstance(value, dict)
-            and _is_record(small[name])
-            and value.keys() != small[name].keys()
-        ):
-            rule = f"Must have the names {[*small[name]]}."
-            raise ValueError(f"Invalid names {[*value]} of parameter '{name}' in {source}. {rule}")
-        if type(small[name]) is int and small[name] >= 0 and value < 0:
+        place, known = f"parameter '{name}' in {source}", small[name]
+        _check_kind(place, value, known, whole=type(known) is int)
+        if type(known) is int and known >= 0 > value:
             raise ValueError(f"Invalid parameter '{name}' = {value} in {source}. Must be >= 0.")
+        if isinstance(value, dict) and len(_kinds(known)) > 1 and value.keys() != known.keys():
+            rule = f"Must have the names {[*known]}."
+            raise ValueError(f"Invalid names {[*value]} of {place}. {rule}")
 
 
 def injected(namespace: Mapping[str, Any]) -> dict[str, Any]:
     """Values that papermill put into a notebook's namespace, by its `globals()`."""
     cells = [cell for cell in namespace.get("In", ()) if cell.startswith(INJECTED)]
-    lines = [line for cell in cells for line in ast.parse(cell).body]
-    targets = [target for line in lines if isinstance(line, ast.Assign) for target in line.targets]
-    return {name.id: namespace[name.id] for name in targets if isinstance(name, ast.Name)}
+    return {name: namespace[name] for name in _assigned("\n".join(cells))}
 
 
-def _check_kind(place: str, value: Any, small: Any, *, whole: bool = True) -> None:
-    """Raise a ValueError if a value is of another kind than a small one, or not finite within."""
+def _assigned(cell: str) -> dict[str, Any]:
+    """Names that a cell assigns, with their values; papermill writes ``float("nan")``."""
+    values: dict[str, Any] = {}
+    exec(cell, {"__builtins__": {"float": float}}, values)
+    return values
+
+
+def _check_kind(place: str, value: Any, known: Any, *, whole: bool = False) -> None:
+    """Raise a ValueError if a value is of another kind than the known one, or not finite within."""
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"Invalid {place}: {value}. Must be finite.")
-    if small is not None:
-        kind = _kind(small, whole=whole)
-        is_bool = isinstance(value, bool)
-        if not isinstance(value, _KINDS[kind]) or is_bool != (kind == "true or false"):
-            raise ValueError(f"Invalid {place}: {value!r}. Must be {kind}, as {small!r} is.")
+    kind = _kind(known, whole=whole)
+    if known is not None and _kind(value, whole=whole) != kind:
+        raise ValueError(f"Invalid {place}: {value!r}. Must be {kind}, as {known!r} is.")
     if isinstance(value, dict):
         for name, part in value.items():
-            known = small.get(name) if isinstance(small, dict) else None
-            _check_kind(f"'{name}' of {place}", part, known, whole=False)
+            _check_kind(f"'{name}' of {place}", part, (known or {}).get(name))
     elif isinstance(value, list):
-        parts = small if isinstance(small, list) else []
-        one = parts[0] if len({_kind(part, whole=False) for part in parts}) == 1 else None
+        one = known[0] if known and len(_kinds(known)) == 1 else None
         for number, part in enumerate(value):
-            _check_kind(f"entry {number} of {place}", part, one, whole=False)
+            _check_kind(f"entry {number} of {place}", part, one)
 
 
-def _is_record(small: Mapping[str, Any]) -> bool:
-    return len({_kind(value, whole=False) for value in small.values()}) > 1
+def _kinds(known: Any) -> set[str]:
+    """Kinds within a list or a mapping."""
+    parts = known.values() if isinstance(known, dict) else known or ()
+    return {_kind(part) for part in parts}
 
 
-def _kind(value: Any, *, whole: bool) -> str:
-    """Kind of a small value, in words; beside others, in lists and mappings, a number is any."""
-    if value is None:
-        return "nothing"
-    kind = next(kind for kind, types in _KINDS.items() if isinstance(value, types))
-    return "a number" if kind == "a whole number" and not whole else kind
+def _kind(value: Any, *, whole: bool = False) -> str:
+    """Kind of a value, in words; beside others, in lists and mappings, a number is any."""
+    return _KINDS.get(float if type(value) is int and not whole else type(value), "nothing")

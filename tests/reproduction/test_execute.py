@@ -8,6 +8,7 @@ import nbformat
 import papermill
 import pytest
 
+from dbthermal import store
 from reproduction import execute, locked, parameters, paths
 from reproduction.run import Run
 
@@ -82,7 +83,7 @@ def test_results_are_on_the_disk_before_the_name_is(
     synced: list[tuple[Path, bool]] = []
     named = folder / "03_tiny.ipynb"
     monkeypatch.setattr(
-        execute, "_sync", lambda *places: synced.extend((place, named.exists()) for place in places)
+        store, "to_disk", lambda places: synced.extend((place, named.exists()) for place in places)
     )
     execute.execute("full", "03_tiny", {})
     for name in ("03_tiny.json", ".03_tiny.part.ipynb"):

@@ -13,7 +13,7 @@ from urllib.parse import quote, unquote
 
 import pytest
 
-from reproduction import manifest
+from reproduction import locked, manifest
 
 CONTENT = {"one.txt": b"first", "two.txt": b"second"}
 
@@ -36,7 +36,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     root.mkdir()
     list_files(root, "http://127.0.0.1:9/")
     monkeypatch.chdir(root)
-    monkeypatch.delenv(manifest.MIRROR, raising=False)
+    monkeypatch.delenv(locked.MIRROR, raising=False)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     monkeypatch.setattr(manifest, "_RETRIES", 0)
     return root
@@ -50,7 +50,7 @@ def copies(tmp_path: Path, project: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     folder.mkdir(parents=True)
     for name, content in CONTENT.items():
         (folder / name).write_bytes(content)
-    monkeypatch.setenv(manifest.MIRROR, str(folder.parent))
+    monkeypatch.setenv(locked.MIRROR, str(folder.parent))
     return folder
 
 
@@ -75,20 +75,18 @@ class Quiet(SimpleHTTPRequestHandler):
     """Serve files without a line for each; the names of some say what is wrong with them."""
 
     def do_GET(self) -> None:
-        """Send a file, an endless one, one that trickles, or lead elsewhere."""
+        """Send a file, an endless one, one that trickles, or lead elsewhere with an endless one."""
         if not (found := re.search("/(endless|slow|to-(.*)).txt$", self.path)):
             super().do_GET()
-        elif found[2]:
-            self.send_response(302)
-            self.send_header("Location", unquote(found[2]).replace(" ", "/"))
-            self.end_headers()
         else:
-            self.send_response(200)
+            self.send_response(302 if found[2] else 200)
+            if found[2]:
+                self.send_header("Location", unquote(found[2]).replace(" ", "/"))
             self.end_headers()
             with contextlib.suppress(OSError):
                 while True:
-                    self.wfile.write(b"x" * (2**16 if found[1] == "endless" else 1))
-                    time.sleep(0 if found[1] == "endless" else 0.02)
+                    self.wfile.write(b"x" * (1 if found[1] == "slow" else 2**16))
+                    time.sleep(0.02 if found[1] == "slow" else 0)
 
     def log_message(self, *_: object) -> None:
         """Print no line."""
@@ -180,7 +178,7 @@ def test_mirror_without_a_file(copies: Path, project: Path) -> None:
 
 def test_mirror_that_is_no_folder(copies: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mirror that is not a folder raises an error."""
-    monkeypatch.setenv(manifest.MIRROR, str(copies / "absent"))
+    monkeypatch.setenv(locked.MIRROR, str(copies / "absent"))
     with pytest.raises(ValueError, match=r"Invalid DBTHERMAL_DATA '.*absent'\. Must name a folder"):
         manifest.available("notes")
 

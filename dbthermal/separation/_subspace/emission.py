@@ -170,7 +170,8 @@ def _level_std(tile: Tile, ratios: ReflectionRatio, fit: _Fit, variance: Array) 
     reflected = (tile.signals[0] - fit.emitted).mean(axis=0)
     std = np.abs(reflected) * np.sqrt(variance) / (1.0 - fit.emissivity) ** 2
     # A uniform distribution of width d has the variance d^2 / 12.
-    return ratios.ratio * rates * np.fmin(std, (curve.highest - curve.lowest) / np.sqrt(12.0))
+    std = np.fmin(std, (curve.highest - curve.lowest) / np.sqrt(12.0))
+    return np.asarray(ratios.ratio * rates * std)
 
 
 def _fieller(sensitivity: Array, epsilon: Array) -> Array:
