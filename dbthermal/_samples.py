@@ -67,7 +67,7 @@ def noise(signal: npt.NDArray[Any]) -> Array:
 
 
 def some_pixels(counts: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return counts (band, time, pixel) of a few pixels, evenly spaced, out of (band, time, y, x)."""
+    """Counts (band, time, pixel) of a few pixels, evenly spaced, out of (band, time, y, x)."""
     step = max(1, int(np.sqrt(counts.shape[2] * counts.shape[3] / PIXELS)))
     return counts[:, :, ::step, ::step].reshape(*counts.shape[:2], -1)
 
