@@ -1,14 +1,13 @@
 """Data quality: which samples of a capture are valid, and which pixels cannot be used."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _samples as samples
-from dbthermal import noise as noises
 from dbthermal import schema
 from dbthermal.schema import Status
 
@@ -27,9 +26,6 @@ MOST_BRIDGED: Final = 0.15
 
 # Frames from which fewer pixels are sampled, of as many samples together.
 _LONG: Final = 2048
-# Distance from a multiple of the step at which a change of counts is none.
-_OFF_MULTIPLE: Final = 0.01
-
 _UNUSABLE: Final = np.uint32(Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
 
 
@@ -44,29 +40,9 @@ def unusable(status: Bits) -> Mask:
     return np.asarray((status & _UNUSABLE) != 0)
 
 
-def rounding_std(capture: xr.Dataset) -> Array:
-    """Standard deviation (band) [count] of rounding to a step: step / sqrt(12), or 0."""
-    some = _some(capture)
-    counts = np.where(schema.measured(some), some, np.nan).astype(np.float64)
-    if counts.shape[1] < noises.MINIMUM_FRAMES:
-        return np.zeros(len(counts))
-    change = np.abs(np.diff(counts, axis=1))
-    step = np.min(change, axis=1, initial=np.inf, where=change > 0, keepdims=True)
-    off = np.abs(change / step - np.rint(change / step))
-    rounded = np.isfinite(step[:, 0]) & ~np.any(off > _OFF_MULTIPLE, axis=1)  # (band, pixel)
-    return np.asarray(np.median(np.where(rounded, step[:, 0], 0.0), axis=1) / np.sqrt(12.0))
-
-
-def _some(part: xr.Dataset) -> npt.NDArray[Any]:
-    """Counts (band, time, pixel) [count] of a few pixels, evenly spaced over the image."""
-    step = max(1, int(np.sqrt(part.sizes["y"] * part.sizes["x"] / samples.PIXELS)))
-    counts = part["counts"][:, :, ::step, ::step].values  # of a lazy capture these pixels alone
-    return np.asarray(counts.reshape(*counts.shape[:2], -1))
-
-
 def grains(part: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grain]:
     """Grain of each band of a part of the capture; with the noise (band) [count], if known."""
-    flat = _some(part)
+    flat = samples.some_pixels(part["counts"])
     limits = np.broadcast_to(noise, len(flat)).tolist()
     bands = zip(flat, limits, strict=True)
     return [samples.grain(band, np.isfinite(band), limit) for band, limit in bands]
