@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _samples as samples
 from dbthermal import noise as noises
 from dbthermal import planck, schema
 from dbthermal import response as responses
@@ -199,7 +200,11 @@ def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Ar
     if "noise" in response:
         slopes = np.array([curve.reference_slope for curve in curves])
         known = np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
-        return known * _noise_factor(capture)
+        # Counts rounded to steps wider than the noise were rounded after that was measured, or by
+        # others: an error of its own, uniform in a step.
+        rounding = samples.rounding_std(samples.some_pixels(capture["counts"].values)) / slopes
+        wide = np.sqrt(12.0) * rounding > known
+        return np.asarray(np.hypot(known, np.where(wide, rounding, 0.0)) * _noise_factor(capture))
     counts, frames = quality.sample(capture, _few(capture, _NOISE_PIXELS))
     signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
     return noises.estimate_bands(signals, capture["time"].values[frames])

@@ -40,9 +40,7 @@ def unusable(status: Bits) -> Mask:
 
 def grains(part: xr.Dataset, noise: Array | None = None) -> list[samples.Grain]:
     """Grain of each band of a part of the capture; with the noise (band) [count], if known."""
-    step = max(1, int(np.sqrt(part.sizes["y"] * part.sizes["x"] / samples.PIXELS)))
-    counts = part["counts"].values[:, :, ::step, ::step]
-    flat = counts.reshape(*counts.shape[:2], -1)
+    flat = samples.some_pixels(part["counts"].values)
     limits = np.full(len(flat), np.inf) if noise is None else noise
     return [
         samples.grain(band, np.isfinite(band), float(limit))
