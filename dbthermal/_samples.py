@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import xarray as xr
 from scipy.special import bdtrc, ndtri
 
 from dbthermal.noise import MINIMUM_FRAMES
@@ -39,6 +40,8 @@ _FALSE_ALARM: Final = 1e-5
 FEWEST: Final = 3
 """Fewest samples on one value, and repeats in a row, that are taken for more than chance."""
 
+# Distance from a multiple of the step at which a change of counts is none.
+_OFF_MULTIPLE: Final = 0.01
 # Width [noise] of the end of a pixel's values.
 _END: Final = 2.0
 
@@ -62,6 +65,29 @@ def noise(signal: npt.NDArray[Any]) -> Array:
     total = second.sum(axis=0, dtype=np.float64, where=used)
     level = total / quiet / (_QUIET_MEAN * np.sqrt(1.5))
     return np.where(frames < MINIMUM_FRAMES, np.nan, level)
+
+
+def some_pixels(counts: xr.DataArray) -> npt.NDArray[Any]:
+    """Read counts (band, time, pixel) of a few pixels, evenly spaced, of (band, time, y, x)."""
+    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / PIXELS)))
+    some = counts[:, :, ::step, ::step].values  # of a lazy capture no more than these
+    return np.asarray(some.reshape(*some.shape[:2], -1))
+
+
+def rounding_std(counts: npt.NDArray[Any]) -> Array:
+    """
+    Standard deviation (band) [count] of rounding, step / sqrt(12), of counts (band, time, pixel).
+
+    0 where the changes of most pixels are no multiples of a step.
+    """
+    if counts.shape[1] < MINIMUM_FRAMES:
+        return np.zeros(len(counts))
+    counts = np.where(np.isfinite(counts), counts, np.nan).astype(np.float64)
+    change = np.abs(np.diff(counts, axis=1))
+    step = np.min(change, axis=1, initial=np.inf, where=change > 0, keepdims=True)
+    off = np.abs(change / step - np.rint(change / step))
+    rounded = np.isfinite(step[:, 0]) & ~np.any(off > _OFF_MULTIPLE, axis=1)  # (band, pixel)
+    return np.asarray(np.median(np.where(rounded, step[:, 0], 0.0), axis=1) / np.sqrt(12.0))
 
 
 @dataclass(frozen=True)

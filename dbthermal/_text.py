@@ -11,10 +11,11 @@ import math
 import os
 import re
 import stat
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from itertools import chain
+from functools import partial
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -44,51 +45,42 @@ _CONSTANTS: Final = {
     **dict.fromkeys(("false", "False", "FALSE"), False),
 }
 # Numbers that YAML 1.1 and 1.2 read alike: 012, 1e3 and 1_000 are not among them.
-_WHOLE: Final = re.compile(r"[-+]?(0|[1-9][0-9]*)")
+_WHOLE: Final = re.compile(r"[-+]?(0|[1-9][0-9]{,15})")
 _REAL: Final = re.compile(r"([-+]?(0|[1-9][0-9]*)\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?")
 
 
 def regular_file(path: str | Path, limit: int) -> Path:
-    """Return the path of a regular file of at most `limit` bytes; ValueError if it is another.
-
-    A folder, a pipe or a device is refused without being opened. OSError if there is none.
-    """
+    """Path of a regular file of at most `limit` bytes; others are refused without being opened."""
     path = Path(path)
     state = path.stat()
     if not stat.S_ISREG(state.st_mode):
         kind = "folder" if stat.S_ISDIR(state.st_mode) else "pipe, socket or device"
         raise ValueError(f"Invalid file '{path}', a {kind}. Must be a regular file.")
-    if state.st_size > limit:
-        raise ValueError(
-            f"Invalid size {state.st_size} bytes of '{path}'. Must be at most {limit}."
-        )
+    if (size := state.st_size) > limit:
+        raise ValueError(f"Invalid size {size} bytes of '{path}'. Must be at most {limit}.")
     return path
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", limit: int = TEXT_LIMIT) -> str:
-    """
-    Text of a regular file, with line ends as newlines and without a byte-order mark.
+    """Text of a `regular_file`, with line ends as newlines and without a byte-order mark.
 
-    ValueError names the file, the line and the rule if the file is a folder, a pipe or a device,
-    larger than `limit` [byte], not of the encoding, or holds a control character such as NUL.
-    OSError if it cannot be opened.
+    ValueError by file and line where it is not of the encoding, or holds a control character.
     """
-    with regular_file(path, limit).open("rb") as file:
-        content = file.read(limit)
+    content = regular_file(path, limit).read_bytes()
     try:
         text = content.decode(encoding).removeprefix("\ufeff")
     except UnicodeDecodeError as error:
-        place = _place(os.fspath(path), content[: error.start].decode("latin-1"))
+        place = _after(os.fspath(path), content[: error.start].decode("latin-1"))
         byte = f"0x{content[error.start]:02x}"
         raise ValueError(f"{place}: Invalid byte {byte}. Must be text in {encoding}.") from error
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if found := _CONTROL.search(text):
-        place = _place(os.fspath(path), text[: found.start()])
+        place = _after(os.fspath(path), text[: found.start()])
         raise ValueError(f"{place}: Invalid control character {found.group()!r}. Must be text.")
     return text
 
 
-def _place(source: str, before: str) -> str:
+def _after(source: str, before: str) -> str:
     """Place of the character that follows a piece of text."""
     return at(source, before.count("\n") + 1, len(before) - before.rfind("\n"))
 
@@ -104,32 +96,34 @@ def shown(value: object) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} characters)"
 
 
+def repeated(values: Iterable[Any]) -> list[Any]:
+    """Values that occur more than once, in their order."""
+    return [value for value, count in Counter(values).items() if count > 1]
+
+
 def number(text: str, place: str) -> float:
     """Finite number written in decimal digits; ValueError with its `place` if it is not one."""
     text = text.strip(" \t")
     value = float(text) if _DECIMAL.fullmatch(text) else math.nan
     if not math.isfinite(value):
-        raise ValueError(
-            f"{place}: Invalid number {shown(text)}. Must be finite, and written in digits with a "
-            "decimal point."
-        )
+        rule = "Must be finite, and written in digits with a decimal point"
+        raise ValueError(f"{place}: Invalid number {shown(text)}. {rule}.")
     return value
 
 
 def table_rows(text: str, source: str, *, comment: str | None = None) -> list[Row]:
-    """
-    Rows of comma-separated values, each in one line; lines that begin with `comment` are left out.
+    """Rows of comma-separated values, each in one line; lines that begin with `comment` left out.
 
     ValueError if the last line has no end, as where a file was cut, or quotes are not closed.
     """
     rows: list[Row] = []
-    for number_, line in enumerate(whole_lines(text, source), 1):
+    for i, line in enumerate(whole_lines(text, source), 1):
         if comment is None or not line.startswith(comment):
             try:
-                rows.extend((number_, row) for row in csv.reader([line], strict=True))
+                rows.extend((i, row) for row in csv.reader([line], strict=True))
             except csv.Error as error:
-                place = at(source, number_)
-                raise ValueError(f"{place}: Must be comma-separated values: {error}.") from error
+                rule = "Must be comma-separated values"
+                raise ValueError(f"{at(source, i)}: {rule}: {error}.") from error
     return rows
 
 
@@ -137,8 +131,8 @@ def whole_lines(text: str, source: str) -> list[str]:
     """Lines of a text; ValueError if the last one has no end."""
     *lines, rest = text.split("\n")
     if rest:
-        place = at(source, len(lines) + 1)
-        raise ValueError(f"{place}: Truncated line {shown(rest)}. Must end with a line end.")
+        message = f"Truncated line {shown(rest)}. Must end with a line end."
+        raise ValueError(f"{at(source, len(lines) + 1)}: {message}")
     return lines
 
 
@@ -168,23 +162,15 @@ def parse_json(text: str, source: str) -> Any:
     """Content of JSON; ValueError by place if a key repeats or a number is not finite."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        content: dict[str, Any] = {}
-        for key, value in pairs:
-            if key in content:
-                raise ValueError(f"{source}: Repeated key {shown(key)}. Must be listed once.")
-            content[key] = value
-        return content
-
-    def finite(digits: str) -> float:
-        value = float(digits)
-        if not math.isfinite(value):
-            raise ValueError(f"{source}: Invalid number {digits[:SHOWN]}. Must be finite.")
-        return value
+        for key in repeated(key for key, _ in pairs):
+            raise ValueError(f"{source}: Repeated key {shown(key)}. Must be listed once.")
+        return dict(pairs)
 
     def whole(digits: str) -> int:
-        finite(digits)  # a whole number of thousands of digits is none
+        number(digits, source)  # a whole number of thousands of digits is none
         return int(digits)
 
+    finite = partial(number, place=source)
     hooks: Any = {"parse_float": finite, "parse_int": whole, "parse_constant": finite}
     try:
         return json.loads(text, object_pairs_hook=once, **hooks)
@@ -245,101 +231,76 @@ def parse_yaml(text: str, source: str) -> dict[Any, Any]:
     import yaml  # noqa: PLC0415 - of the extra `instruments`; most of the package does without
 
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C ten times as fast
-    builder = _Builder(source, yaml.resolver.Resolver())
     try:
-        for event in yaml.parse(text, loader):
-            builder.take(event)
+        content = _Document(yaml.parse(text, loader), source).content()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = at(source, mark.line + 1, mark.column + 1) if mark else source
         raise ValueError(f"{place}: Must be YAML: {error.problem}.") from error
     except (yaml.YAMLError, UnicodeError) as error:
         raise ValueError(f"{source}: Must be YAML: {' '.join(str(error).split())}.") from error
-    if not isinstance(builder.content, dict):
-        raise ValueError(f"{source}: Invalid content {shown(builder.content)}. Must be a mapping.")
-    return builder.content
+    if not isinstance(content, dict):
+        raise ValueError(f"{source}: Invalid content {shown(content)}. Must be a mapping.")
+    return content
 
 
-class _Builder:
-    """Content of a YAML document, built event by event, so that depth and aliases cost nothing."""
+class _Document:
+    """YAML document, read from the events of its parser, so that depth and aliases cost nothing."""
 
-    def __init__(self, source: str, resolver: Any) -> None:
-        self.source, self.resolver = source, resolver
-        self.content: Any = None
-        self._documents = 0
-        self._open: list[_Open] = []  # outermost first
+    def __init__(self, events: Iterator[Any], source: str) -> None:
+        import yaml  # noqa: PLC0415
 
-    def take(self, event: Any) -> None:
-        """Take in one event of the parser."""
-        kind = type(event).__name__.removesuffix("Event")
-        if getattr(event, "anchor", None) is not None:
-            self._refuse(event, f"anchor or alias '{event.anchor}'", "Must be written out")
-        if getattr(event, "tag", None) not in {None, "!"}:
-            self._refuse(event, f"tag '{event.tag}'", "Must be left out")
-        if kind == "DocumentStart":
-            self._documents += 1
-            if self._documents > 1:
-                self._refuse(event, "second document", "Must be one")
-        elif kind == "Scalar":
-            self._put(self._scalar(event) if event.implicit[0] else event.value, event)
-        elif kind in {"MappingStart", "SequenceStart"}:
-            if len(self._open) >= _DEPTH:
-                self._refuse(event, f"nesting deeper than {_DEPTH}", "Must be less deep")
-            value: Any = {} if kind == "MappingStart" else []
-            self._put(value, event)
-            self._open.append(_Open(value))
-        elif kind in {"MappingEnd", "SequenceEnd"}:
-            self._open.pop()
+        self.events, self.source, self.yaml = events, source, yaml
+        self.resolver: Any = yaml.resolver.Resolver()
 
-    def _put(self, value: Any, event: Any) -> None:
-        """Put a value where the document stands: key, value of a key, entry of a list."""
-        if not self._open:
-            self.content = value
-            return
-        open_ = self._open[-1]
-        if isinstance(open_.value, list):
-            open_.value.append(value)
-        elif open_.key is None:
-            open_.key = self._key(value, open_.names, event)
-        else:
-            open_.value[open_.key], open_.key = value, None
+    def content(self) -> Any:
+        """Value of the document; None without one."""
+        values: list[Any] = []
+        for event in self.events:
+            if isinstance(event, self.yaml.DocumentStartEvent):
+                if values:
+                    self._refuse(event, "Invalid second document. Must be one")
+                values.append(self._value(next(self.events), 0))
+        return values[0] if values else None
 
-    def _key(self, key: Any, names: set[str], event: Any) -> Any:
-        if isinstance(key, bool) or not isinstance(key, str | int | float):
-            self._refuse(event, f"key {shown(key)}", "Must be text or a number")
-        if str(key) in names:
-            raise ValueError(f"{self._at(event)}: Repeated key {shown(key)}. Must be listed once.")
-        names.add(str(key))
-        return key
+    def _value(self, event: Any, depth: int) -> Any:
+        """Value that begins with an event; takes the events up to its end."""
+        if event.anchor is not None:
+            self._refuse(event, f"Invalid anchor or alias '{event.anchor}'. Must be written out")
+        if event.tag not in {None, "!"}:
+            self._refuse(event, f"Invalid tag '{event.tag}'. Must be left out")
+        if isinstance(event, self.yaml.ScalarEvent):
+            return self._plain(event) if event.implicit[0] else event.value
+        if depth >= _DEPTH:
+            self._refuse(event, f"Invalid nesting deeper than {_DEPTH}. Must be less deep")
+        inside = takewhile(lambda e: not isinstance(e, self.yaml.CollectionEndEvent), self.events)
+        if isinstance(event, self.yaml.SequenceStartEvent):
+            return [self._value(entry, depth + 1) for entry in inside]
+        pairs: dict[str, tuple[Any, Any]] = {}  # by the key as text: 1 and "1" are the same
+        for entry in inside:
+            key = self._value(entry, depth + 1)
+            if isinstance(key, bool) or not isinstance(key, str | int | float):
+                self._refuse(entry, f"Invalid key {shown(key)}. Must be text or a number")
+            if str(key) in pairs:
+                self._refuse(entry, f"Repeated key {shown(key)}. Must be listed once")
+            pairs[str(key)] = key, self._value(next(self.events), depth + 1)
+        return dict(pairs.values())
 
-    def _scalar(self, event: Any) -> Any:
+    def _plain(self, event: Any) -> Any:
         """Value of a plain scalar, if all versions of YAML read it alike."""
-        from yaml import ScalarNode  # noqa: PLC0415
-
         text = event.value
         if text in _CONSTANTS:
             return _CONSTANTS[text]
-        if _WHOLE.fullmatch(text) and len(text) < 18 and abs(int(text)) <= _LARGEST:
+        if _WHOLE.fullmatch(text) and abs(int(text)) <= _LARGEST:
             return int(text)
         if _REAL.fullmatch(text) and math.isfinite(float(text)):
             return float(text)
-        is_text = self.resolver.resolve(ScalarNode, text, (True, False)).endswith(":str")
-        if not is_text or _DECIMAL.fullmatch(text) or re.fullmatch("0o[0-7]+", text):
+        tag = self.resolver.resolve(self.yaml.ScalarNode, text, (True, False))
+        if not tag.endswith(":str") or _DECIMAL.fullmatch(text) or re.fullmatch("0o[0-7]+", text):
             rule = "Must be a finite decimal number, true, false, or in quotes if it is text"
-            self._refuse(event, f"value {text[:SHOWN]}", rule)
+            self._refuse(event, f"Invalid value {text[:SHOWN]}. {rule}")
         return text
 
-    def _at(self, event: Any) -> str:
-        return at(self.source, event.start_mark.line + 1, event.start_mark.column + 1)
-
-    def _refuse(self, event: Any, what: str, rule: str) -> NoReturn:
-        raise ValueError(f"{self._at(event)}: Invalid {what}. {rule}.")
-
-
-@dataclass
-class _Open:
-    """List or mapping that is not complete, and of a mapping its keys, and the key in hand."""
-
-    value: Any
-    names: set[str] = field(default_factory=set)
-    key: Any = None
+    def _refuse(self, event: Any, message: str) -> NoReturn:
+        place = at(self.source, event.start_mark.line + 1, event.start_mark.column + 1)
+        raise ValueError(f"{place}: {message}.")

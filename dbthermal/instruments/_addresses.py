@@ -50,7 +50,7 @@ def parse(url: str, schemes: Iterable[str] = tuple(RULES)) -> Address:
         raise ValueError(f"Invalid address {texts.shown(url)}. Must be {forms}.")
     parts = {name: text or "" for name, text in found.groupdict().items()}
     pairs = [pair.split("=") for pair in parts.get("options", "").split("&") if pair]
-    if len({name for name, _ in pairs}) < len(pairs):
+    if texts.repeated(name for name, _ in pairs):
         raise ValueError(f"Repeated option in address '{url}'. Must be listed once.")
     target = parts["target"] or parts.get("windows", "")
     return Address(scheme, target, parts.get("name", ""), dict(pairs))

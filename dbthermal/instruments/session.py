@@ -34,7 +34,6 @@ environment variable ``DBTHERMAL_USBTC08``.
 
 import errno
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import field
 from pathlib import Path
@@ -48,16 +47,14 @@ from pydantic import (
     StrictBool,
     TypeAdapter,
     ValidationError,
-    ValidationInfo,
     field_validator,
-    model_validator,
 )
 from pydantic.dataclasses import dataclass
 
 from dbthermal import _text as texts
 from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments import filterwheel, telemetry
-from dbthermal.instruments.camera import FFC_READING, FPA_READING, KINDS, camera_kind
+from dbthermal.instruments.camera import FFC_READING, FPA_READING, camera_kind
 
 __all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
 
@@ -87,6 +84,14 @@ def _printable(text: str) -> str:
     return text
 
 
+def _of_scheme(*schemes: str) -> AfterValidator:
+    def checked(url: str) -> str:
+        addresses.parse(url, schemes)
+        return url
+
+    return AfterValidator(checked)
+
+
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(strict=True, ge=200.0, le=2000.0)]  # no degrees Celsius [K]
 Pixels = Annotated[int, Field(strict=True, ge=2, le=8192)]
@@ -102,84 +107,67 @@ DeviceName = Literal["filter_wheel", "thermocouples"]
 class Device:
     """Addresses of one device, such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``."""
 
-    simulated: str
-    hardware: str
+    simulated: Annotated[str, _of_scheme("sim", "pty")]
+    hardware: Annotated[str, _of_scheme("v4l2", "serial", "tc08")]
 
-    @field_validator("simulated", "hardware")
-    @classmethod
-    def _check_scheme(cls, url: str, info: ValidationInfo) -> str:
-        emulated = ("sim", "pty")
-        is_simulated = info.field_name == "simulated"
-        addresses.parse(url, emulated if is_simulated else addresses.RULES.keys() - {*emulated})
-        return url
+
+def _check_schemes(name: str, device: Device) -> Device:
+    """Raise ValueError unless the addresses are of the schemes of a device of this name."""
+    simulated, hardware = _SCHEMES[name]
+    url = addresses.parse(device.simulated, simulated)
+    addresses.parse(device.hardware, (hardware,))
+    emulator = {"filter_wheel": "apt", "thermocouples": "tc08"}.get(name, url.target)
+    if url.scheme == "sim" and (url.target != emulator or (emulator == "tc08" and url.name)):
+        rule = f"Must be sim://{emulator}"
+        raise ValueError(f"Invalid address '{device.simulated}' of {name}. {rule}")
+    return device
+
+
+def _of_device(name: str) -> AfterValidator:
+    return AfterValidator(lambda device: _check_schemes(name, device))
 
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
     """One camera: addresses of its frames and of its command port, if any, and its kind."""
 
-    video: Device
-    control: Device | None = None
-    # One of `dbthermal.instruments.camera.KINDS`, and that of its simulated address.
-    kind: Annotated[str, Field(validate_default=True)] = "boson"
+    video: Annotated[Device, _of_device("video")]
+    control: Annotated[Device, _of_device("control")] | None = None
+    kind: str = "boson"  # of `dbthermal.instruments.camera.KINDS`, that of its simulated address
 
-    @field_validator("video", "control")
-    @classmethod
-    def _check_addresses(cls, device: Device | None, info: ValidationInfo) -> Device | None:
-        if device is not None:
-            _check_schemes(str(info.field_name), device)
-        return device
-
-    @field_validator("kind")
-    @classmethod
-    def _check_kind(cls, kind: str, info: ValidationInfo) -> str:
-        if kind not in KINDS:
-            raise ValueError(f"Must be one of {sorted(KINDS)}")
-        video: Device | None = info.data.get("video")
-        if video is not None and not video.simulated.startswith(f"sim://{kind}/"):
+    def __post_init__(self) -> None:
+        kind, simulated = camera_kind(self.kind), self.video.simulated
+        if not simulated.startswith(f"sim://{self.kind}/"):
             raise ValueError(
-                f"Must be the kind in its simulated address '{video.simulated}': that of a {kind} "
-                f"is sim://{kind}/<name>"
+                f"Invalid kind '{self.kind}'. Must be the kind in its simulated address "
+                f"'{simulated}': that of a {self.kind} is sim://{self.kind}/<name>"
             )
-        return kind
-
-    @model_validator(mode="after")
-    def _check_control(self) -> Self:
         if self.control is None:
-            return self
-        if camera_kind(self.kind).open_control is None:
+            return
+        if kind.open_control is None:
             raise ValueError(f"Invalid control of kind '{self.kind}', which has none")
-        url, video = (addresses.parse(device.simulated) for device in (self.control, self.video))
+        url, video = addresses.parse(self.control.simulated), addresses.parse(simulated)
         if url.scheme == "sim" and url[:3] != video[:3]:
-            raise ValueError(
-                f"Invalid control '{self.control.simulated}' of '{self.video.simulated}'. "
-                "Must be the same camera"
-            )
-        return self
+            rule = "Must be the same camera"
+            raise ValueError(f"Invalid control '{self.control.simulated}' of '{simulated}'. {rule}")
 
 
 @dataclass(frozen=True, config=_CHECKED)
 class Blackbody:
     """Temperatures of a calibration, and the rule by which each counts as reached."""
 
-    # In their order [K].
-    temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
-    stability: Annotated[Positive, Field(le=10.0)] = (
-        0.05  # largest range of the readings in the window [K]
-    )
-    window: Annotated[Positive, Field(le=3600.0)] = (
-        30.0  # how long the readings must stay within it [s]
-    )
+    temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]  # [K]
+    # Largest range of the readings in the window [K], and how long they must stay within it [s].
+    stability: Annotated[Positive, Field(le=10.0)] = 0.05
+    window: Annotated[Positive, Field(le=3600.0)] = 30.0
     # Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
     # by half a kelvin or so each, and the recordings keep the reading.
     tolerance: Annotated[Positive, Field(le=50.0)] = 1.5
     timeout: Annotated[Positive, Field(le=1e5)] = 1800.0  # longest wait for it [s]
 
-    @model_validator(mode="after")
-    def _check_window(self) -> Self:
+    def __post_init__(self) -> None:
         if self.window >= self.timeout:
             raise ValueError(f"Invalid window {self.window} s. Must be below the timeout")
-        return self
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -227,8 +215,14 @@ class Session:
     thermocouples: dict[Channel, Label] = field(default_factory=dict)  # channel to measured object
     blackbody: Blackbody | None = None
 
-    @model_validator(mode="after")
-    def _check_protocol(self) -> Self:
+    def __post_init__(self) -> None:
+        self._check_protocol()
+        self._check_frames()
+        self._check_addresses()
+        self._check_thermocouples()
+        self._check_wheel()
+
+    def _check_protocol(self) -> None:
         if (self.protocol == "scene") != (self.blackbody is None):
             rule = "no blackbody" if self.protocol == "scene" else "a blackbody"
             raise ValueError(f"Invalid session of protocol '{self.protocol}'. Must have {rule}")
@@ -239,51 +233,43 @@ class Session:
             raise ValueError(f"Invalid thermocouples {dict(self.thermocouples)}. {rule}")
         if self.duration * self.frame_rate < 1:
             raise ValueError(f"Invalid duration {self.duration} s. Must be one frame at least")
-        return self
 
-    @model_validator(mode="after")
-    def _check_frames(self) -> Self:
+    def _check_frames(self) -> None:
         rows, columns = self.telemetry_rows, self.shape[1]
         for band, camera in self.cameras.items():
             allowed = camera_kind(camera.kind).telemetry_rows
-            _check_one_of(f"telemetry_rows of band '{band}', a {camera.kind},", [rows], allowed)
+            _check_one_of(f"telemetry_rows of band '{band}', a {camera.kind},", rows, allowed)
         if rows and rows * columns < telemetry.WORDS:
             rule = f"Must have {telemetry.WORDS // rows} columns for the telemetry"
             raise ValueError(f"Invalid shape {list(self.shape)}. {rule}")
-        return self
 
-    @model_validator(mode="after")
-    def _check_addresses(self) -> Self:
+    def _check_addresses(self) -> None:
         for name, device in self.devices.items():
             _check_schemes(name, device)
         if not self.simulated:  # emulated cameras are told apart by their world
             pairs = [(camera.video, camera.control) for camera in self.cameras.values()]
             listed = [device for pair in pairs for device in pair if device is not None]
             _check_unique("address", [one.hardware for one in (*listed, *self.devices.values())])
-        return self
 
-    @model_validator(mode="after")
-    def _check_thermocouples(self) -> Self:
+    def _check_thermocouples(self) -> None:
         # The readings of a recording have one name each: of the cameras and the wheel, too.
         names = [*self.thermocouples.values(), "filter_wheel", "thermocouples"]
         for band in dict.fromkeys((*self.bands, *self.filters.values())):
             names += [band, FPA_READING + band, FFC_READING + band]
         _check_unique("thermocouple", names)
         self._require("thermocouples", self.thermocouples)
-        return self
 
-    @model_validator(mode="after")
-    def _check_wheel(self) -> Self:
+    def _check_wheel(self) -> None:
         _check_unique("filter", self.filters.values())
         self._require("filter_wheel", self.filters)
         behind = [band for band in self.bands if band in self.filters.values()]
         if self.filters and len(behind) != 1:
             raise ValueError(f"Invalid cameras {behind} behind the wheel. Must be exactly one")
-        _check_one_of("filter of the sweep", self.sweep, tuple(self.filters.values()))
+        for band in self.sweep:
+            _check_one_of("filter of the sweep", band, self.filters.values())
         _check_unique("filter of the sweep", self.sweep)
         if self.sweep and self.blackbody is None:
             raise ValueError(f"Invalid sweep {list(self.sweep)}. Must have a blackbody")
-        return self
 
     def _require(self, device: DeviceName, entries: Mapping[int, str]) -> None:
         if entries and device not in self.devices:
@@ -386,28 +372,14 @@ class Session:
         return session
 
 
-def _check_schemes(name: str, device: Device) -> None:
-    """Raise ValueError unless the addresses are of the schemes of such a device."""
-    simulated, hardware = _SCHEMES[name]
-    url = addresses.parse(device.simulated, simulated)
-    addresses.parse(device.hardware, (hardware,))
-    emulator = {"filter_wheel": "apt", "thermocouples": "tc08"}.get(name, url.target)
-    if url.scheme == "sim" and (url.target != emulator or (emulator == "tc08" and url.name)):
-        raise ValueError(
-            f"Invalid address '{device.simulated}' of {name}. Must be sim://{emulator}"
-        )
-
-
-def _check_one_of(name: str, values: Iterable[Any], allowed: Iterable[Any]) -> None:
-    for value in values:
-        if value not in (allowed := list(allowed)):
-            raise ValueError(f"Invalid {name} {value!r}. Must be one of {allowed}")
+def _check_one_of(name: str, value: Any, allowed: Iterable[Any]) -> None:
+    if value not in (allowed := list(allowed)):
+        raise ValueError(f"Invalid {name} {value!r}. Must be one of {allowed}")
 
 
 def _check_unique(name: str, values: Iterable[Any]) -> None:
-    for value, count in Counter(values).items():
-        if count > 1:
-            raise ValueError(f"Repeated {name} '{value}'. Must be listed once")
+    for value in texts.repeated(values):
+        raise ValueError(f"Repeated {name} '{value}'. Must be listed once")
 
 
 def _message(error: Any) -> str:
@@ -419,7 +391,9 @@ def _message(error: Any) -> str:
         return f"Unknown key '{place}'. Must be one of those in dbthermal.instruments.session."
     rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"]).rstrip(".")
     rule = re.sub(r"a (valid dictionary|dictionary or an instance of \w+)", "a mapping", rule)
-    if re.match("(Invalid|Missing|Repeated) ", rule):  # of more than one key, or of an address
+    if re.match(
+        "(Invalid|Missing|Repeated|Unknown) ", rule
+    ):  # of more than one key, or of an address
         return f"{place}: {rule}." if place else f"{rule}."
     rule = rule if rule.startswith("Must ") else f"Must {rule}"
     return f"Invalid {place} {texts.shown(error['input'])}. {rule}."

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dbthermal import _text as texts
-from dbthermal import schema
 
 MEMORY: Final = 2.0**30
 """Largest memory that a video may take, by default [byte]."""
@@ -33,10 +32,10 @@ _CONTAINERS: Final = {
 
 
 class Film(NamedTuple):
-    """Frames of a video as packed colours (time, y, x), red highest, and their coordinates."""
+    """Frames of a video as packed colours (time, y, x), red highest, and their times [s]."""
 
     codes: NDArray[np.uint32]
-    coords: dict[str, Any]
+    times: NDArray[np.float64]
 
 
 def decode(path: Path, width: int | None, memory: float, sha256: str | None) -> Film:
@@ -59,9 +58,8 @@ def decode(path: Path, width: int | None, memory: float, sha256: str | None) -> 
         ) as container:
             return _frames(container, options, width, memory, path)
     except av.FFmpegError as error:
-        raise ValueError(
-            f"Damaged video '{path.name}': '{error}'. Must decode to its end."
-        ) from error
+        message = f"Damaged video '{path.name}': '{error}'. Must decode to its end."
+        raise ValueError(message) from error
 
 
 def _refuse_to_open(url: str, *_: Any) -> NoReturn:
@@ -79,18 +77,17 @@ def _frames(
     container: Any, options: dict[str, str], width: int | None, memory: float, path: Path
 ) -> Film:
     """Decode all packets, once their number and the frames' size are known and allowed."""
-    if len(container.streams.video) != 1 or container.streams.video[0].codec_context is None:
-        number = len(container.streams.video)
-        raise ValueError(f"Invalid {number} video streams in '{path.name}'. Must be a known one.")
-    stream = container.streams.video[0]
+    if len(streams := container.streams.video) != 1 or streams[0].codec_context is None:
+        rule = "Must be a known one"
+        raise ValueError(f"Invalid {len(streams)} video streams in '{path.name}'. {rule}.")
+    stream = streams[0]
     packets = [*container.demux(stream)]  # the last is empty: it asks for the frames still held
     number = sum(packet.size > 0 for packet in packets)
     height, columns = stream.codec_context.height, stream.codec_context.width
     _check_size(number, stream.frames, (height, columns), memory, path)
     if width is not None and not 0 < width <= columns:
-        raise ValueError(
-            f"Invalid width {width} for '{path.name}'. Must be from 1 to {columns} pixels."
-        )
+        rule = f"Must be from 1 to {columns} pixels"
+        raise ValueError(f"Invalid width {width} for '{path.name}'. {rule}.")
     codes = np.empty((number, height, width or columns), dtype=np.uint32)
     times: list[float | None] = []
     stream.codec_context.options = options
@@ -105,15 +102,12 @@ def _frames(
         codes[len(times)] = rgb @ np.array([2**16, 2**8, 1], dtype=np.uint32)
         times.append(frame.time)
     if not times or len(times) != number:
-        raise ValueError(
-            f"Truncated video '{path.name}': {len(times)} frames decoded, {number} present. "
-            "Must be equal."
-        )
+        _refuse_truncated(path, f"{len(times)} frames decoded, {number} present")
     seconds = np.array(times, dtype=np.float64)  # None becomes NaN
     if not np.all(np.diff(seconds, prepend=seconds[0] - 1) > 0):
         raise ValueError(f"Unordered timestamps in '{path.name}'. Must increase strictly.")
-    _check_duration(container, stream, seconds, path)
-    return Film(codes, _coords(seconds, codes.shape[1:]))
+    _check_duration(container, seconds, path)
+    return Film(codes, seconds - seconds[0])
 
 
 def _check_size(
@@ -121,12 +115,8 @@ def _check_size(
 ) -> None:
     """Raise ValueError if frames are missing, or all of them need more memory than is allowed."""
     if number != (declared or number):
-        raise ValueError(
-            f"Truncated video '{path.name}': {number} frames present, {declared} declared. "
-            "Must be equal."
-        )
-    needed = number * shape[0] * shape[1] * PIXEL
-    if needed > memory:
+        _refuse_truncated(path, f"{number} frames present, {declared} declared")
+    if (needed := number * shape[0] * shape[1] * PIXEL) > memory:
         raise ValueError(
             f"Invalid size of '{path.name}': {number} frames of {shape[0]} x {shape[1]} pixels "
             f"take {needed:.3g} bytes. Must be at most memory={memory:.3g}."
@@ -139,21 +129,17 @@ def _undamaged(packets: Sequence[Any], path: Path) -> Iterator[Any]:
     for packet in packets:
         frames = packet.decode()
         if packet.is_corrupt or any(frame.is_corrupt for frame in frames):
-            raise ValueError(
-                f"Damaged video '{path.name}': frame {count} or a later one is marked corrupt. "
-                "Must decode without damage."
-            )
+            what = f"frame {count} or a later one is marked corrupt"
+            raise ValueError(f"Damaged video '{path.name}': {what}. Must decode without damage.")
         yield from frames
         count += len(frames)
 
 
-def _check_duration(container: Any, stream: Any, seconds: NDArray[Any], path: Path) -> None:
+def _check_duration(container: Any, seconds: NDArray[Any], path: Path) -> None:
     """Compare the length of the play with the declared one, to half a frame."""
-    declared = []
-    if stream.duration is not None:
-        declared.append(float(stream.duration * stream.time_base))
-    if container.duration is not None:
-        declared.append(container.duration / 1e6)  # FFmpeg counts microseconds
+    stream = container.streams.video[0]
+    lengths = (stream.duration, stream.time_base), (container.duration, 1e-6)
+    declared = [float(length * unit) for length, unit in lengths if length is not None]
     if not declared and not stream.frames:
         raise ValueError(f"Unknown length of '{path.name}'. Must declare its frames or its time.")
     rate = stream.guessed_rate or np.inf  # [Hz]; without it, any declared time is wrong
@@ -161,14 +147,8 @@ def _check_duration(container: Any, stream: Any, seconds: NDArray[Any], path: Pa
     length = seconds[-1] - seconds[0] + interval
     for value in declared:
         if abs(value - length) > interval / 2:
-            raise ValueError(
-                f"Truncated video '{path.name}': {length:g} s of frames, {value:g} s declared. "
-                "Must be equal."
-            )
+            _refuse_truncated(path, f"{length:g} s of frames, {value:g} s declared")
 
 
-def _coords(seconds: NDArray[Any], shape: tuple[int, ...]) -> dict[str, Any]:
-    time = ("time", seconds - seconds[0], schema.COORDINATES["time"].attrs)
-    pixels = {dim: (dim, np.arange(size)) for dim, size in zip("yx", shape, strict=True)}
-    attrs = {"units": "1", "long_name": "pixel"}
-    return {"time": time} | {dim: (*pixel, attrs) for dim, pixel in pixels.items()}
+def _refuse_truncated(path: Path, lengths: str) -> NoReturn:
+    raise ValueError(f"Truncated video '{path.name}': {lengths}. Must be equal.")

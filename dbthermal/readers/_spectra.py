@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -100,8 +100,7 @@ def ecostress(path: str | Path) -> xr.Dataset:
     wavelength, reflectance = texts.numbers(rows, 2, path.name).T
     _check_extent(header, wavelength, path)
     notes = {note: header.get(key, "") for note, key in NOTES.items()}
-    places = [line for line, _ in rows]
-    return _spectrum(wavelength, 1 - reflectance / 100, notes, path, places)
+    return _spectrum(wavelength, 1 - reflectance / 100, notes, _File(path.name, rows))
 
 
 def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> dict[str, xr.Dataset]:
@@ -154,14 +153,11 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
             f"Invalid columns {titles} in '{path.name}'. Must be 'wavelength' and distinct codes."
         )
     wavelength, *samples = texts.numbers(rows, len(titles), path.name).T
-    lines = [line for line, _ in rows]
-    notes = {"type": "manmade", "measurement": "emissivity"}
-    spectra = {
-        code: _spectrum(wavelength, sample, notes | {"name": code, "sample_no": code}, path, lines)
+    notes, file = {"type": "manmade", "measurement": "emissivity"}, _File(path.name, rows, reach)
+    return {
+        code: _spectrum(wavelength, sample, notes | {"name": code, "sample_no": code}, file)
         for code, sample in zip(codes, samples, strict=True)
     }
-    _check_reach(wavelength, reach, path, lines)
-    return spectra
 
 
 def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
@@ -204,18 +200,24 @@ def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.
     if titles[:2] != ["x1", "x2"] or not re.fullmatch("y_.+", ",".join(titles[2:])):
         raise ValueError(f"Invalid columns {titles} in '{path.name}'. Must be x1, x2, y_<name>.")
     wavelength, wavenumber, emissivity = texts.numbers(rows, 3, path.name).T
-    lines = [line for line, _ in rows]
-    wrong = ~(np.abs(wavelength * wavenumber / 1e4 - 1) <= 1e-3)
-    if wrong.any():
-        raise ValueError(
-            f"{texts.at(path.name, lines[int(np.argmax(wrong))])}: Invalid wavenumber "
-            f"{wavenumber[wrong][0]} 1/cm at {wavelength[wrong][0]} micrometres. "
-            "Their product must be 10000."
-        )
+    file = _File(path.name, rows, reach)
+    for i in np.flatnonzero(~(np.abs(wavelength * wavenumber / 1e4 - 1) <= 1e-3)):
+        message = f"Invalid wavenumber {wavenumber[i]} 1/cm at {wavelength[i]} micrometres"
+        raise ValueError(f"{file.at(i)}: {message}. Their product must be 10000.")
     notes = {"name": titles[2].removeprefix("y_"), "measurement": "emissivity"}
-    spectrum = _spectrum(wavelength, emissivity, notes, path, lines)
-    _check_reach(wavelength, reach, path, lines)
-    return spectrum
+    return _spectrum(wavelength, emissivity, notes, file)
+
+
+class _File(NamedTuple):
+    """Name and rows of a table, and the wavelengths that it must reach [micrometre]."""
+
+    name: str
+    rows: Sequence[texts.Row]
+    reach: tuple[float, float] | None = None
+
+    def at(self, index: np.integer[Any]) -> str:
+        """Place of a row in the file."""
+        return texts.at(self.name, self.rows[int(index)][0])
 
 
 def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
@@ -223,16 +225,13 @@ def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
     for number, line in enumerate(lines, 1):
         key, colon, text = line.partition(":")
         if not colon or key.strip() in header:
-            raise ValueError(
-                f"{texts.at(path.name, number)}: Invalid header {texts.shown(line)}. Must be a key "
-                "that is listed once, a colon and a text."
-            )
+            rule = "Must be a key that is listed once, a colon and a text"
+            place = texts.at(path.name, number)
+            raise ValueError(f"{place}: Invalid header {texts.shown(line)}. {rule}.")
         header[key.strip()] = " ".join(text.split())
     for key, rule in _HEADER_RULES.items():
-        if not re.search(rule, header.get(key, ""), re.IGNORECASE):
-            raise ValueError(
-                f"Invalid {key} '{header.get(key, '')}' in '{path.name}'. Must match '{rule}'."
-            )
+        if not re.search(rule, text := header.get(key, ""), re.IGNORECASE):
+            raise ValueError(f"Invalid {key} '{text}' in '{path.name}'. Must match '{rule}'.")
     return header
 
 
@@ -258,60 +257,47 @@ def _table(path: Path) -> tuple[list[str], list[texts.Row]]:
     return titles, rows
 
 
-def _check_reach(
-    wavelength: Floats, reach: tuple[float, float], path: Path, lines: Sequence[int]
-) -> None:
+def _check_reach(wavelength: Floats, reach: tuple[float, float], file: _File) -> None:
     """Raise ValueError if rows are missing, at the ends or between two others."""
-    ends = float(wavelength.min()), float(wavelength.max())
-    if ends[0] > reach[0] or ends[1] < reach[1]:
+    (low, high), (least, most) = (wavelength.min(), wavelength.max()), reach
+    if low > least or high < most:
         raise ValueError(
-            f"Truncated '{path.name}': wavelengths from {ends[0]:g} to {ends[1]:g} micrometres. "
-            f"Must reach from {reach[0]:g} to {reach[1]:g}, or as far as you say by reach=."
+            f"Truncated '{file.name}': wavelengths from {low:g} to {high:g} micrometres. "
+            f"Must reach from {least:g} to {most:g}, or as far as you say by reach=."
         )
     steps = np.abs(np.diff(1 / wavelength))
     if steps.size < 3:
         return
     # A missing row makes a step twice as long as those beside it, whatever the grid.
     beside = np.maximum(np.r_[steps[1], steps[:-1]], np.r_[steps[1:], steps[-2]])
-    uneven = steps > 1.6 * beside
-    if uneven.any():
-        raise ValueError(
-            f"{texts.at(path.name, lines[int(np.argmax(uneven)) + 1])}: Uneven step to "
-            f"{wavelength[1:][uneven][0]:g} micrometres, longer than those beside it. Must follow "
-            "the row before: rows are missing."
-        )
+    for i in np.flatnonzero(steps > 1.6 * beside) + 1:
+        step = f"Uneven step to {wavelength[i]:g} micrometres, longer than those beside it"
+        raise ValueError(f"{file.at(i)}: {step}. Must follow the row before: rows are missing.")
 
 
 def _spectrum(
-    wavelength: Floats,
-    emissivity: Floats,
-    notes: Mapping[str, str],
-    path: Path,
-    lines: Sequence[int],
+    wavelength: Floats, emissivity: Floats, notes: Mapping[str, str], file: _File
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
-    name, (low, high) = f"'{notes['name']}' of '{path.name}'", schema.EMISSIVITY_LIMITS
+    name, (low, high) = f"'{notes['name']}' of '{file.name}'", schema.EMISSIVITY_LIMITS
     for quantity, values, least, most in (
         ("wavelength", wavelength, 1e-3, 1e3),
         ("emissivity", emissivity, low, high),
     ):
-        wrong = ~((values >= least) & (values <= most))
-        if wrong.any():
-            raise ValueError(
-                f"{texts.at(path.name, lines[int(np.argmax(wrong))])}: Invalid {quantity} "
-                f"{values[wrong][0]:g} in {name}. Must lie in [{least}, {most}]."
-            )
+        for i in np.flatnonzero(~((values >= least) & (values <= most))):
+            message = f"Invalid {quantity} {values[i]:g} in {name}"
+            raise ValueError(f"{file.at(i)}: {message}. Must lie in [{least}, {most}].")
     falling = wavelength[0] > wavelength[-1]
-    if np.any(still := np.diff(-wavelength if falling else wavelength) <= 0):
-        raise ValueError(
-            f"{texts.at(path.name, lines[int(np.argmax(still))])}: Unordered wavelength in {name}: "
-            f"{wavelength[:-1][still][0]:g} micrometres is followed by one not beyond it. Must "
-            "increase or decrease strictly."
-        )
+    for i in np.flatnonzero(np.diff(-wavelength if falling else wavelength) <= 0):
+        message = f"{wavelength[i]:g} micrometres is followed by one not beyond it"
+        rule = "Must increase or decrease strictly"
+        raise ValueError(f"{file.at(i)}: Unordered wavelength in {name}: {message}. {rule}.")
+    if file.reach is not None:
+        _check_reach(wavelength, file.reach, file)
     if falling:
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
     unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))
-    attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": path.name}
+    attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
     variable = schema.STAGES["spectrum"]["emissivity"]
     coordinate = schema.COORDINATES["wavelength"]
     return xr.Dataset(

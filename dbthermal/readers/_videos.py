@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from dbthermal import schema
 from dbthermal.readers._decoding import MEMORY, Film, decode
 
 Floats = NDArray[np.float64]
@@ -210,7 +211,11 @@ def _distinct(film: Film) -> _Video:
     colours = np.stack([distinct >> 16, distinct >> 8 & 255, distinct & 255], axis=1).astype(
         np.float64
     )
-    return _Video(colours, count / count.sum(), codes, film.coords)
+    coords = {"time": ("time", film.times, schema.COORDINATES["time"].attrs)} | {
+        dim: (dim, np.arange(size), {"units": "1", "long_name": "pixel"})
+        for dim, size in zip("yx", codes.shape[1:], strict=True)
+    }
+    return _Video(colours, count / count.sum(), codes, coords)
 
 
 def _palette(name: str) -> Floats:

@@ -311,7 +311,7 @@ def shapes(rng: Rng) -> Attack:
     names = () if what == "tiny" else ("counts|dims|band|time|frame|Dataset|status|segment",)
     # What is left of the truth, where the capture was cut.
     sizes = made.capture.sizes
-    time, y, x = (slice(0, sizes.get(dim, 0)) for dim in ("time", "y", "x"))
+    time, y, x = (slice(0, max(1, sizes.get(dim, 64))) for dim in ("time", "y", "x"))
     made.warm, made.emissivity = made.warm[time, y, x], made.emissivity[:, y, x]
     method = any_method(rng) if len(made.bands) == 2 else "subspace"
     return solving(f"shape: {what}", made, None, method, *names, good=what == "tiny")

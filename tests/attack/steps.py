@@ -17,11 +17,17 @@ from dbthermal import calibration, correction, emissivity, limits, response, sep
 
 @dataclass(frozen=True)
 class Step:
-    """A call, its arguments, and those that must lie on the same coordinates as another one."""
+    """
+    A call, and its arguments.
+
+    Those in `windowed` must lie on the same coordinates as another one; of those in `partly` a
+    sample may stay unused.
+    """
 
     call: Callable[..., Any]
     arguments: Mapping[str, Any]
     windowed: tuple[str, ...] = ()
+    partly: tuple[str, ...] = ()
 
 
 _USED: Final = ["background_temperature", "emissivity", "status"]
@@ -95,6 +101,7 @@ def _steps() -> Mapping[str, Step]:
             separation.reflected_change,
             {"apparent": apparent, "result": result[_USED]},
             ("result",),
+            ("apparent",),  # used where the object is constant
         ),
         "bounds": Step(limits.bounds, {"scene": truth, "response": curves}),
         "condition_numbers": Step(emissivity.condition_numbers, {"table": table}),
@@ -136,6 +143,8 @@ def _demanded(step: Step, argument: str, what: str) -> bool:
         return argument in step.windowed
     if what == "of other bands":
         return sum("band" in getattr(one, "dims", ()) for one in step.arguments.values()) > 1
+    if what == "NaN" and argument in step.partly:
+        return False
     if what == "of another unit":
         return "units" in str(_first(step.arguments[argument]).attrs)
     return what in _DIFFERENT

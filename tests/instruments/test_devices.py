@@ -220,7 +220,7 @@ VIDEO, CONTROL = (f'{key}: {{simulated: "sim://boson/wide"' for key in ("video",
         ((VIDEO, VIDEO.replace("wide", "tele")), "of 'sim://boson/tele'. Must be the same camera"),
         (
             (VIDEO, VIDEO.replace("boson", "y16")),
-            r"cameras\.8-14\.kind 'boson'\. Must be the kind in its simulated address 'sim://y16/wide'",
+            r"cameras\.8-14: Invalid kind 'boson'\. Must be the kind in its simulated address 'sim://y16/wide'",
         ),
         (
             (VIDEO, VIDEO.replace("wide", "wide?ffc=120")),

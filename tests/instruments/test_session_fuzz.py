@@ -116,7 +116,11 @@ def test_many_mutants_are_refused_in_words() -> None:
         ("window: 3", "window: 20", "blackbody: Invalid window 20.0 s. Must be below the timeout"),
         ("[[17, 33]]", "[[0, 0]]", "wheel: Invalid addresses ((0, 0),). Must be pairs of [17, 33"),
         ("velocity: 50.0, h", "speed: 50.0, h", "Unknown key 'wheel.speed'"),
-        ("velocity: 50.0, h", 'velocity: "50", h', "Invalid wheel.velocity '50'. Must be a number"),
+        (
+            "velocity: 50.0, h",
+            'velocity: "50", h',
+            "Invalid wheel.velocity '50'. Must be a number",
+        ),
         ("wheel: {velocity", "wheel: {filters: {1: a}, velocity", "Unknown key 'wheel.filters'"),
         ('"tc08:"', '"tc08:///tmp/x.so"', "Invalid address 'tc08:///tmp/x.so'. Must be"),
         ("serial:///dev/ttyUSB0", "tc08:", "Invalid address 'tc08:'. Must be serial:///dev/"),

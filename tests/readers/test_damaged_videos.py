@@ -69,7 +69,7 @@ def outcomes(path: Path, number: int) -> Counter[str]:
             counts["refused"] += 1
         else:
             same = np.array_equal(found.codes, whole.codes)
-            same &= np.array_equal(found.coords["time"][1], whole.coords["time"][1])
+            same &= np.array_equal(found.times, whole.times)
             counts["same" if same else f"different, {kind}"] += 1
     return counts
 

@@ -61,6 +61,21 @@ def test_calibrated_noise_is_the_bound(glass: Glass) -> None:
     assert not result["status"].any()
 
 
+@pytest.mark.parametrize("step", [64.0, 1e-3])
+def test_rounding_is_in_the_deviations(glass: Glass, step: float) -> None:
+    """Counts in steps far wider than the noise err by step / sqrt(12) more, and say so."""
+    scene, capture, response = glass
+    whole = step * (capture["counts"] / step).round()
+    coarse = capture.assign(counts=whole.where(whole["band"] == "9.5", capture["counts"]))
+    known = emissivity_of(0.86, 0.72)
+    result = separation.solve(coarse, response, "calibrated", emissivity=known)
+    scores = (result["object_temperature"] - scene["object_temperature"]) / result[
+        "object_temperature_std"
+    ]
+    print(f"steps of {step} counts: scores of standard deviation {float(scores.std()):.3f}")
+    assert float(scores.std()) == pytest.approx(1.0, abs=0.05)
+
+
 def test_unlabelled_emissivity_goes_by_position(glass: Glass) -> None:
     """An emissivity without band names is taken in the capture's order, as xarray aligns it."""
     _, capture, response = glass

@@ -7,13 +7,13 @@ pylablib 1.4.5, ``Thorlabs/kinesis.py`` (scales and units of speed); instrumentk
 units, and addresses). Facts alone, no code.
 """
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from types import MappingProxyType
 from typing import Final
 
+from dbthermal import _text as texts
 from dbthermal.instruments import apt
 
 POSITIONS: Final = 6  # slots of the wheel, numbered from 1
@@ -155,9 +155,8 @@ class Settings:
     def __post_init__(self) -> None:
         for position in self.filters:
             BSC20X.target(position)
-        repeated = [name for name, count in Counter(self.filters.values()).items() if count > 1]
-        if repeated:
-            raise ValueError(f"Repeated filter '{repeated[0]}'. Each must have a name of its own.")
+        for name in texts.repeated(self.filters.values()):
+            raise ValueError(f"Repeated filter '{name}'. Each must have a name of its own.")
         for name, (least, most) in _LIMITS.items():
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
