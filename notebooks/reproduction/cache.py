@@ -1,7 +1,8 @@
 """Cache of long experiments: `kept(experiment, folder)(...)` computes each result once.
 
 A result is read back only if arguments, source code and package versions are those that it was
-computed with. It is one file, its SHA-256 first; if that fails the result is computed again.
+computed with. It is one file, with its name and a checksum; if one of the two is wrong, the result
+is computed again.
 """
 
 import hashlib
@@ -12,6 +13,7 @@ import pickle
 import platform
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from importlib.metadata import distributions
 from pathlib import Path
@@ -25,7 +27,6 @@ import dbthermal
 
 Experiment = Callable[..., xr.Dataset]
 
-_DIGEST: Final = 32  # length of a SHA-256 [byte]
 _LOGGER: Final = logging.getLogger(__name__)
 
 
@@ -56,25 +57,19 @@ def _result(experiment: Experiment, folder: Path, *args: Any, **options: Any) ->
     inputs = inspect.signature(experiment).bind(*args, **options)
     inputs.apply_defaults()
     path = folder / f"{joblib.hash(inputs.arguments)}.pkl"
+    result: xr.Dataset
     if path.exists():
-        content = path.read_bytes()
-        packed = content[_DIGEST:]
-        if _digest(path, packed) == content[:_DIGEST]:
-            result: xr.Dataset = pickle.loads(zlib.decompress(packed))
-            return result
+        with suppress(zlib.error):  # which compares its checksum
+            name, result = pickle.loads(zlib.decompress(path.read_bytes()))
+            if name == path.name:
+                return result
         _LOGGER.warning("Damaged result '%s'. It is computed again.", path)
     result = experiment(*args, **options)
-    packed = zlib.compress(pickle.dumps(result))
     folder.mkdir(parents=True, exist_ok=True)
     with NamedTemporaryFile(dir=folder, prefix=".", delete=False) as part:
-        part.write(_digest(path, packed) + packed)
+        part.write(zlib.compress(pickle.dumps((path.name, result))))
     Path(part.name).replace(path)
     return result
-
-
-def _digest(path: Path, packed: bytes) -> bytes:
-    """SHA-256 of a result and its name, which another's file does not have."""
-    return hashlib.sha256(path.name.encode() + packed).digest()
 
 
 def gridded(results: Sequence[xr.Dataset], coords: Mapping[str, Sequence[Any]]) -> xr.Dataset:

@@ -17,8 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 import nbformat
 import papermill
@@ -40,7 +39,7 @@ class Kernel(AsyncKernelManager):
 
 
 def run_papermill(stem: str, part: Path, values: Mapping[str, Any]) -> None:
-    """Execute a notebook; raises what papermill raises, RuntimeError if a cell was not reached."""
+    """Execute a notebook; raises what papermill raises, RuntimeError if a cell did not run."""
     papermill.execute_notebook(
         paths.notebook(stem),
         part,
@@ -50,7 +49,9 @@ def run_papermill(stem: str, part: Path, values: Mapping[str, Any]) -> None:
         progress_bar=False,
         cwd=paths.root() / "notebooks",
     )
-    _check_complete(part)
+    for number, cell in enumerate(nbformat.read(part, nbformat.NO_CONVERT).cells):
+        if cell.cell_type == "code" and cell.source.strip() and cell.execution_count is None:
+            raise RuntimeError(f"Unfinished notebook '{part}': cell {number} did not run.")
 
 
 def run_nbval(stem: str, part: Path, values: Mapping[str, Any]) -> None:
@@ -116,26 +117,6 @@ def _remove(part: Path, stem: str) -> None:
             result.unlink()
 
 
-def _check_complete(path: Path) -> None:
-    """Raise a RuntimeError if a cell did not run, as after one that ends the kernel."""
-    notebook = nbformat.read(path, nbformat.NO_CONVERT)
-    for number, cell in enumerate(notebook.cells):
-        if cell.cell_type == "code" and cell.source.strip() and cell.execution_count is None:
-            raise RuntimeError(f"Unfinished notebook '{path}': cell {number} did not run.")
-
-
-def _lock(task: str) -> None:
-    """Be beneath the lock of make, and end with it; without make, take the lock."""
-    if locked.held(root := paths.root()):
-        locked.end_with_parent(lambda: os.kill(os.getpid(), signal.SIGKILL))
-    else:
-        os.environ[locked.HELD] = str(locked.lock(root, task))
-
-
-def _stop(number: int, _: FrameType | None) -> NoReturn:
-    raise SystemExit(128 + number)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Execute a notebook; exit status 1 if its parameters are refused, or it fails."""
     parser = argparse.ArgumentParser(prog="python -m reproduction.execute", description=__doc__)
@@ -145,9 +126,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-p", dest="texts", action="append", default=[], nargs=2, metavar="TEXT")
     parser.add_argument("--check", action="store_true", help="run it as a test, with small values")
     options = parser.parse_args(arguments)
-    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
-        _lock(f"reproduction.execute {options.run} {options.stem}")
+        if os.environ.get(locked.LOCKED) == str(root := paths.root()):
+            locked.end_with_parent(lambda: os.kill(os.getpid(), signal.SIGKILL))
+        else:
+            task = f"reproduction.execute {options.run} {options.stem}"
+            os.environ[locked.HELD] = str(locked.lock(root, task))
         locked.mirror()
         texts = [*options.texts, ["results", options.run]]
         if options.check or "results" not in parameters.defaults(options.stem):

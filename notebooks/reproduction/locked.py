@@ -63,15 +63,9 @@ def _locked(file: int) -> bool:
     except BlockingIOError:
         return False
     except OSError as error:
-        raise RuntimeError(
-            f"No lock on '{LOCK}': {error}. Must be on a file system with locks."
-        ) from error
+        rule = "Must be on a file system with locks."
+        raise RuntimeError(f"No lock on '{LOCK}': {error}. {rule}") from error
     return True
-
-
-def held(folder: Path) -> bool:
-    """Whether this process runs beneath a make that holds the lock of a folder."""
-    return os.environ.get(LOCKED) == str(folder)
 
 
 def end_with_parent(end: Callable[[], object]) -> None:

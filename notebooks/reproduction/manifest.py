@@ -8,7 +8,6 @@ limited time, and from no other scheme. Every path from this module is of a file
 just been compared.
 """
 
-import hashlib
 import re
 import sys
 import time
@@ -22,7 +21,7 @@ import pooch
 import requests
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
 
-from dbthermal import readers
+from dbthermal import readers, store
 from reproduction import locked, paths
 
 _CONNECTIONS: Final = 8
@@ -42,32 +41,22 @@ def _matching(label: str, pattern: str, rule: str) -> AfterValidator:
     return AfterValidator(check)
 
 
-_FILE: Final = _matching(
-    "file name",
-    "[A-Za-z0-9_][A-Za-z0-9 _.-]{0,199}",
-    "be letters, digits, '_', '.', '-' and spaces, none of the last three first: it names no "
-    "folder",
-)
-_SHA256: Final = _matching("sha256", "[0-9a-f]{64}", "be 64 lower-case digits")
-_SIZE: Final = _matching("size", "[1-9][0-9]*", "be > 0 bytes")
-_ORIGIN: Final = _matching(
-    "origin", r"https?://[^?#@\\\x00-\x1f]+/", "begin with https:// and end in '/'"
-)
-_COLLECTION: Final = _matching(
-    "collection",
-    "[a-z][a-z0-9_]{0,49}",
-    "be lower-case letters, digits and '_', a letter first: it names a folder in 'data'",
-)
-
-
 class File(BaseModel):
     """Outside file: name at its origin and in its folder, checksum, and size [byte]."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    name: Annotated[str, _FILE]
-    sha256: Annotated[str, _SHA256]
-    bytes: Annotated[int, _SIZE]
+    name: Annotated[
+        str,
+        _matching(
+            "file name",
+            "[A-Za-z0-9_][A-Za-z0-9 _.-]{0,199}",
+            "be letters, digits, '_', '.', '-' and spaces, none of the last three first: it names "
+            "no folder",
+        ),
+    ]
+    sha256: Annotated[str, _matching("sha256", "[0-9a-f]{64}", "be 64 lower-case digits")]
+    bytes: Annotated[int, _matching("size", "[1-9][0-9]*", "be > 0 bytes")]
     covers_8_14um: bool = True  # False for a spectrum that ends short of 14 um
     thermal_duplicate_of: str | None = None  # file with the same values in the thermal infrared
 
@@ -85,7 +74,10 @@ class Collection(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     title: str
-    origin: Annotated[str, _ORIGIN]
+    origin: Annotated[
+        str,
+        _matching("origin", r"https?://[^?#@\\\x00-\x1f]+/", "begin with https:// and end in '/'"),
+    ]
     citation: tuple[str, ...]
     terms: str
     used_by: tuple[str, ...]
@@ -108,7 +100,17 @@ class Manifest(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    collections: Mapping[Annotated[str, _COLLECTION], Collection]
+    collections: Mapping[
+        Annotated[
+            str,
+            _matching(
+                "collection",
+                "[a-z][a-z0-9_]{0,49}",
+                "be lower-case letters, digits and '_', a letter first: it names a folder",
+            ),
+        ],
+        Collection,
+    ]
 
     def __getitem__(self, name: str) -> Collection:
         """Collection by name; ValueError if it is not listed."""
@@ -255,9 +257,7 @@ def _verified(path: Path, file: File) -> Path:
         raise FileNotFoundError(
             f"Missing file '{path}'. Must be in the folder {locked.MIRROR} names."
         )
-    with path.open("rb") as content:
-        sha256 = hashlib.file_digest(content, "sha256").hexdigest()
-    if sha256 != file.sha256:
+    if (sha256 := store.checksum(path)) != file.sha256:
         raise ValueError(
             f"Wrong checksum of '{path}': {sha256}. Must be {file.sha256}; remove the file and "
             "fetch it again."
