@@ -50,6 +50,7 @@ def parse(url: str, schemes: Iterable[str] = tuple(RULES)) -> Address:
         raise ValueError(f"Invalid address {texts.shown(url)}. Must be {forms}.")
     parts = {name: text or "" for name, text in found.groupdict().items()}
     pairs = [pair.split("=") for pair in parts.get("options", "").split("&") if pair]
-    if texts.repeated(name for name, _ in pairs):
-        raise ValueError(f"Repeated option in address '{url}'. Must be listed once.")
+    named = ["name"] if parts.get("name") else []
+    for option in texts.repeated([*named, *(option for option, _ in pairs)]):
+        raise ValueError(f"Repeated option '{option}' in address '{url}'. Must be listed once.")
     return Address(scheme, parts["target"], parts.get("name", ""), dict(pairs))
