@@ -50,23 +50,19 @@ def laid_on(
 
 
 def _require_same(here: npt.NDArray[Any], there: npt.NDArray[Any], label: str, of: str) -> None:
-    differ = np.flatnonzero(_differ(here, there))
-    if differ.size:
-        first = differ[0]
+    """ValueError where two coordinates differ: numbers beyond rounding, all else as text."""
+    if {here.dtype.kind, there.dtype.kind} <= set("iuf"):
+        left, right = here.astype(np.float64), there.astype(np.float64)
+        floats = [np.finfo(part.dtype).eps for part in (here, there) if part.dtype.kind == "f"]
+        tolerance = _ROUNDING * max(floats, default=0.0) * np.abs(right).max(initial=0.0)
+        if right.size > 1:
+            tolerance += _STEP * np.abs(np.diff(right)).min()
+        same = np.abs(left - right) <= tolerance
+    else:
+        same = here.astype(str) == there.astype(str)
+    if not same.all():
+        first = int(np.argmin(same))
         raise ValueError(
             f"Invalid {label}: {here[first]} at position {first}, where that of {of} is "
             f"{there[first]}. Must be the same."
         )
-
-
-def _differ(here: npt.NDArray[Any], there: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """Positions at which two coordinates differ: numbers beyond rounding, all else as text."""
-    if not {here.dtype.kind, there.dtype.kind} <= set("iuf"):
-        return np.asarray(here.astype(str) != there.astype(str))
-    left, right = here.astype(np.float64), there.astype(np.float64)
-    floats = [part for part in (here, there) if part.dtype.kind == "f"]
-    rounding = _ROUNDING * max([float(np.finfo(part.dtype).eps) for part in floats], default=0.0)
-    steps = np.abs(np.diff(right))
-    tolerance = rounding * np.abs(right).max(initial=0.0)
-    tolerance += _STEP * steps.min() if steps.size else 0.0
-    return np.asarray(~(np.abs(left - right) <= tolerance))

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import xarray as xr
 from scipy.special import bdtrc, ndtri
 
 from dbthermal.noise import MINIMUM_FRAMES
@@ -66,10 +67,11 @@ def noise(signal: npt.NDArray[Any]) -> Array:
     return np.where(frames < MINIMUM_FRAMES, np.nan, level)
 
 
-def some_pixels(counts: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Counts (band, time, pixel) of a few pixels, evenly spaced, out of (band, time, y, x)."""
-    step = max(1, int(np.sqrt(counts.shape[2] * counts.shape[3] / PIXELS)))
-    return counts[:, :, ::step, ::step].reshape(*counts.shape[:2], -1)
+def some_pixels(counts: xr.DataArray) -> npt.NDArray[Any]:
+    """Read counts (band, time, pixel) of a few pixels, evenly spaced, of (band, time, y, x)."""
+    step = max(1, int(np.sqrt(counts.sizes["y"] * counts.sizes["x"] / PIXELS)))
+    some = counts[:, :, ::step, ::step].values  # of a lazy capture no more than these
+    return np.asarray(some.reshape(*some.shape[:2], -1))
 
 
 def rounding_std(counts: npt.NDArray[Any]) -> Array:

@@ -119,7 +119,7 @@ def fit_response(
     temperature = counts["temperature"].values.astype(np.float64)
     values = counts.values.astype(np.float64)
     noises = np.zeros(len(names)) if noise is None else _noise(noise, names)
-    rows = []
+    curves, rows = [], []
     for name, row, std in zip(names, values, noises, strict=True):
         line = np.polynomial.Polynomial.fit(temperature, row, 1).convert().coef[::-1]
         reading = np.hypot(std, np.sqrt(_ROUNDING) if np.all(row == np.rint(row)) else 0.0)
@@ -128,6 +128,7 @@ def fit_response(
         slope = np.max(np.diff(curve.counts(temperature)) / np.diff(temperature))
         error = float(np.hypot(reading, temperature_std * slope))
         _check_residuals(curve, temperature, row, error)
+        curves.append(curve)
         rows.append([curve.amplitude, curve.wavelength, curve.shift, curve.offset, *line])
     parameters = [*responses.COEFFICIENTS, "linear_slope", "linear_intercept"]
     stage = schema.STAGES["response"]
@@ -136,7 +137,7 @@ def fit_response(
         for index, name in enumerate(parameters)
     }
     scalars = {
-        "reference_temperature": temperature[np.argmin(np.abs(temperature - AMBIENT))],
+        "reference_temperature": curves[0].reference,
         "temperature_min": temperature[0],
         "temperature_max": temperature[-1],
     }
@@ -150,7 +151,13 @@ def fit_response(
             [responses.curve(result, band, kind).counts(temperature) for band in names]
         )
         result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
-    return result if noise is None else _with_noise(result, noises)
+    if noise is None:
+        return result
+    netd = noises / np.array([curve.reference_slope for curve in curves])
+    return result.assign(
+        noise=("band", noises, {"units": "count", "long_name": "noise of one pixel and frame"}),
+        netd=("band", netd, {"units": "K", "long_name": "NETD"}),
+    )
 
 
 def _check_blackbody(counts: xr.DataArray) -> None:
@@ -260,27 +267,15 @@ def _fit_band(band: str, temperature: Array, counts: Array) -> Curve:
     amplitude, offset = linear_part(fit.x)[0]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle
     shift = _SHAPE_UNIT * fit.x[0] * (1.0 - fit.x[1])
+    reference = temperature[np.argmin(np.abs(temperature - AMBIENT))]
     range_ = (temperature[0], temperature[-1])
-    return Curve(band, amplitude, wavelength, shift, offset, middle, *range_)
+    return Curve(band, amplitude, wavelength, shift, offset, reference, *range_)
 
 
 def _noise(noise: xr.DataArray, names: list[str]) -> Array:
     """Noise (band) [count] of the named bands, checked."""
     if not isinstance(noise, xr.DataArray):
         raise TypeError(f"Invalid noise of type {type(noise).__name__}. Must be a DataArray.")
-    if noise.dims != ("band",):
-        raise ValueError(f"Invalid dims {noise.dims} of the noise. Must be ('band',).")
-    if noise.attrs.get("units", "count") != "count":
-        raise ValueError(f"Invalid units '{noise.attrs['units']}' of the noise. Must be 'count'.")
+    schema.check_variable(noise, schema.NOISE, "the noise")
     places = schema.band_positions(noise, names, "the noise")
     return planck.require_positive("noise [count]", noise.values[places])
-
-
-def _with_noise(response: xr.Dataset, noise: Array) -> xr.Dataset:
-    """Add noise (band) and NETD (noise over slope at the reference temperature)."""
-    names = [str(name) for name in response["band"].values]
-    slopes = np.array([responses.curve(response, name).reference_slope for name in names])
-    return response.assign(
-        noise=("band", noise, {"units": "count", "long_name": "noise of one pixel and frame"}),
-        netd=("band", noise / slopes, {"units": "K", "long_name": "NETD"}),
-    )

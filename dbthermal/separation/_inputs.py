@@ -23,8 +23,6 @@ Labels = npt.NDArray[np.intp]
 # Pixels from which the noise is estimated where the response has none, and a clock is judged.
 _NOISE_PIXELS: Final = 4096
 _CLOCK_PIXELS: Final = 256
-# Frames from which fewer pixels are read, of as many samples together.
-_LONG: Final = 2048
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor")
@@ -202,18 +200,12 @@ def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Ar
         known = np.asarray(responses.noise(response, [curve.band for curve in curves]) / slopes)
         # Counts rounded to steps wider than the noise were rounded after that was measured, or by
         # others: an error of its own, uniform in a step.
-        rounding = samples.rounding_std(samples.some_pixels(capture["counts"].values)) / slopes
+        rounding = samples.rounding_std(samples.some_pixels(capture["counts"])) / slopes
         wide = np.sqrt(12.0) * rounding > known
         return np.asarray(np.hypot(known, np.where(wide, rounding, 0.0)) * _noise_factor(capture))
-    counts, frames = quality.sample(capture, _few(capture, _NOISE_PIXELS))
+    counts, frames = quality.sample(capture, _NOISE_PIXELS)
     signals = [curve.linearise(part) for curve, part in zip(curves, counts, strict=True)]
     return noises.estimate_bands(signals, capture["time"].values[frames])
-
-
-def _few(capture: xr.Dataset, pixels: int) -> int:
-    """Pixels of a sample, fewer in a long capture; `sample` may read four times as many."""
-    frames = capture.sizes["time"]
-    return pixels if frames <= _LONG else max(1, pixels * _LONG // (4 * frames))
 
 
 def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise: Array) -> None:
@@ -223,7 +215,7 @@ def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise
     off = np.abs(time - even).max() * (time.size - 1)
     if method.check_clock is None or off <= _NEARLY_EVEN * (time[-1] - time[0]):
         return
-    counts, frames = quality.sample(capture, _few(capture, _CLOCK_PIXELS))
+    counts, frames = quality.sample(capture, _CLOCK_PIXELS)
     if frames.sum() < method.minimum_frames:
         return
     order = np.argsort(noise, kind="stable")

@@ -24,6 +24,8 @@ LONGEST_GAP: Final = 2
 MOST_BRIDGED: Final = 0.15
 """Share of the frames from which a pixel lacks too many to be bridged."""
 
+# Frames from which fewer pixels are sampled, of as many samples together.
+_LONG: Final = 2048
 _UNUSABLE: Final = np.uint32(Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
 
 
@@ -38,14 +40,12 @@ def unusable(status: Bits) -> Mask:
     return np.asarray((status & _UNUSABLE) != 0)
 
 
-def grains(part: xr.Dataset, noise: Array | None = None) -> list[samples.Grain]:
+def grains(part: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grain]:
     """Grain of each band of a part of the capture; with the noise (band) [count], if known."""
-    flat = samples.some_pixels(part["counts"].values)
-    limits = np.full(len(flat), np.inf) if noise is None else noise
-    return [
-        samples.grain(band, np.isfinite(band), float(limit))
-        for band, limit in zip(flat, limits, strict=True)
-    ]
+    flat = samples.some_pixels(part["counts"])
+    limits = np.broadcast_to(noise, len(flat)).tolist()
+    bands = zip(flat, limits, strict=True)
+    return [samples.grain(band, np.isfinite(band), limit) for band, limit in bands]
 
 
 def read(
@@ -159,11 +159,14 @@ def common_frames(
 
 def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
     """
-    Read about so many good pixels, evenly spaced over the image.
+    Read about so many good pixels, evenly spaced over the image; fewer of a long capture.
 
     Returns the counts (band, time, pixel) [count] of pixels without any bit but that of frozen
     frames, at the frames that most of them have, and these frames (time).
     """
+    length = corrected.sizes["time"]
+    if length > _LONG:  # the step is rounded down: up to four times as many pixels are read
+        pixels = max(1, pixels * _LONG // (4 * length))
     step = max(1, int(np.sqrt(corrected.sizes["y"] * corrected.sizes["x"] / pixels)))
     every = slice(None, None, step)
     counts, valid, status = read(corrected.isel(y=every, x=every))

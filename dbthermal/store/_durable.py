@@ -51,18 +51,13 @@ class HeldFolder:
         """Path at which the folder lies now: FileNotFoundError if it was deleted."""
         paths = (self._path, Path(os.path.realpath(self._link)))
         for path in paths:
-            if self.has(path):
-                return path
+            with suppress(OSError):
+                if os.path.samestat(os.fstat(self._descriptor), path.stat()):
+                    return path
         raise FileNotFoundError(
             f"No folder '{paths[0]}' any more: it was deleted, replaced or taken to another disk. "
             "Must stay while it is written to."
         )
-
-    def has(self, path: Path) -> bool:
-        """True if a path leads to the held folder."""
-        with suppress(OSError):
-            return os.path.samestat(os.fstat(self._descriptor), path.stat())
-        return False
 
 
 class DurableStore(SummedStore):
@@ -111,15 +106,15 @@ def replace(path: Path, content: bytes, part: Path, before: Iterable[Path] = ())
 
 
 @contextmanager
-def made_beside(path: Path, folder: Path) -> Iterator[Path]:
+def made_beside(path: Path) -> Iterator[Path]:
     """
     Yield the path of a folder to make, and move it to `path` when it is complete and on the disk.
 
-    It is made in `folder`, on the same file system; what a kill leaves there is hidden.
+    It is made beside it; what a kill leaves there is hidden.
     """
     # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
     with TemporaryDirectory(
-        prefix=f".{path.name}-", dir=folder, ignore_cleanup_errors=True
+        prefix=f".{path.name}-", dir=path.parent, ignore_cleanup_errors=True
     ) as place:
         part = Path(place) / path.name
         yield part

@@ -27,6 +27,7 @@ from zarr.storage import LocalStore
 Content = bytes | memoryview
 
 GROUP: Final = "zarr.json"  # file of a zarr group's attributes
+TIME: Final = "time"  # array that a recording gets when it is closed
 SUMS: Final = "checksums.sfv"
 MARK: Final = MappingProxyType({"checksums": f"CRC-32 of every file, in {SUMS}"})
 """Attribute of every store with checksums, so that their loss is seen."""
@@ -58,7 +59,7 @@ class CheckedStore(SummedStore):
     Zarr store in a folder, to be read: all that differs from what was written is a ValueError.
 
     `attrs` are the attributes of the store; a recording that is not `closed` has to have its valid
-    part alone. A store without checksums, of dbthermal 0.1.0, opens with a warning.
+    part alone, without `time`. A store without checksums, of dbthermal 0.1.0, opens with a warning.
     """
 
     def __init__(self, root: Path | str, *, read_only: bool = True) -> None:  # noqa: ARG002 - zarr's
@@ -97,16 +98,15 @@ class CheckedStore(SummedStore):
             return content
         return super().get_sync(key, prototype=prototype, byte_range=byte_range)
 
-    async def get(
-        self,
-        key: str,
-        prototype: BufferPrototype | None = None,
-        byte_range: ByteRequest | None = None,
-    ) -> Buffer | None:
+    async def get(self, key: str, *args: Any, **options: Any) -> Buffer | None:
         """Read a file; see `get_sync`."""
-        return await asyncio.to_thread(
-            self.get_sync, key, prototype=prototype, byte_range=byte_range
-        )
+        return await asyncio.to_thread(self.get_sync, key, *args, **options)
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        """Names in a group's folder; the time of a recording is whole when that is closed."""
+        async for name in super().list_dir(prefix):
+            if self.closed or name != TIME:
+                yield name
 
     def _compare(self, key: str, content: Content | None) -> None:
         """ValueError unless a file is as it was written, or absent as it was."""
@@ -134,7 +134,7 @@ class CheckedStore(SummedStore):
     def _valid_files(self) -> Iterator[str]:
         """Metadata of all arrays, and the chunks in the valid part of a recording that grows."""
         ends = valid_part(self.attrs)
-        for key in [key for key in self._sums if Path(key).name == GROUP]:
+        for key in {key for key in self._sums if Path(key).name == GROUP} - {f"{TIME}/{GROUP}"}:
             yield key
             content = self._content(key)
             self._compare(key, content)
@@ -217,6 +217,5 @@ def _is_listed(sums: Mapping[str, str], key: str, content: Content | None) -> bo
 def _files(root: Path) -> Iterator[str]:
     """Relative names of all files but that of the checksums."""
     for folder, _, names in os.walk(root):
-        place = Path(folder).relative_to(root).as_posix()
-        start = "" if place == "." else f"{place}/"
-        yield from (f"{start}{name}" for name in names if start or name != SUMS)
+        place = Path(folder).relative_to(root)
+        yield from (key for name in names if (key := (place / name).as_posix()) != SUMS)

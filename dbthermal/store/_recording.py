@@ -11,10 +11,10 @@ or moved, the recording goes on in it, and nothing is written to what now has it
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import wraps
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -34,35 +34,17 @@ from dbthermal.store._integrity import (
     GROWING,
     MARK,
     SUMS,
+    TIME,
     SummedStore,
-    add_sums,
     last_sums,
     missing_files,
 )
 
 Values = npt.NDArray[Any]
-Method = TypeVar("Method", bound=Callable[..., Any])
 
 _NO_NODES: Final = "band"  # folder of an array, in which zarr seeks no nodes: for unfinished files
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
 _COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec())
-
-
-def _in_held_folder(method: Method) -> Method:
-    """Let a method raise what is missing of the folder, and errors with paths in it."""
-
-    @wraps(method)
-    def held(recording: "Recording", *inputs: Any, **more: Any) -> Any:
-        recording.place()
-        try:
-            return method(recording, *inputs, **more)
-        except OSError as error:
-            recording.place()
-            if isinstance(error.filename, str):
-                error.filename = os.path.realpath(error.filename)
-            raise
-
-    return cast("Method", held)
 
 
 class Recording:
@@ -100,21 +82,17 @@ class Recording:
         )
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
         whole = {**sizes, "band": len(bands), "time": chunk}
-        with made_beside(self.path, self.path.absolute().parent) as part:
+        with made_beside(self.path.absolute()) as part:
             part.mkdir()
             group = zarr.open_group(
                 SummedStore(part), mode="w-", zarr_format=3, attributes=self._attrs
             )
             for name, variable in variables.items():
                 _create(group, name, variable, whole, (fills or {}).get(name))
-            names = group.create_array(
-                "band",
-                shape=(len(bands),),
-                dtype=str,
-                compressors=_COMPRESSORS,
-                dimension_names=("band",),
+            names = np.array(bands, dtype=np.dtypes.StringDType())
+            group.create_array(
+                "band", data=names, compressors=_COMPRESSORS, dimension_names=("band",)
             )
-            names[:] = np.array(bands, dtype=np.dtypes.StringDType())
             self._folder = HeldFolder(part, self.path)
         self.root = self._folder.root
         self._store = DurableStore(self.root)
@@ -138,47 +116,58 @@ class Recording:
                 )
         return place
 
-    @_in_held_folder
+    @contextmanager
+    def _held(self) -> Iterator[None]:
+        """Raise what is missing of the folder, and errors with paths in it."""
+        self.place()
+        try:
+            yield
+        except OSError as error:
+            self.place()
+            if isinstance(error.filename, str):
+                error.filename = os.path.realpath(error.filename)
+            raise
+
     def append(self, band: str, block: Mapping[str, Values]) -> None:
         """
         Write a chunk of frames of one band behind its others; valid with the next `commit`.
 
         `block` holds every variable of frames, (frame, ...): a whole chunk, or at last less.
         """
-        place, start = list(self.frames).index(band), self.frames[band]
-        stop = start + len(next(iter(block.values())))
-        for name, values in block.items():
-            _grow(self._arrays[name], 1, stop)
-            self._arrays[name][place, start:stop] = values
-        self._to_disk(block, [Path("c", str(place), str(start // self.chunk))])
-        self.frames[band] = stop
+        with self._held():
+            place, start = list(self.frames).index(band), self.frames[band]
+            stop = start + len(next(iter(block.values())))
+            for name, values in block.items():
+                _grow(self._arrays[name], 1, stop)
+                self._arrays[name][place, start:stop] = values
+            self._to_disk(block, [Path("c", str(place), str(start // self.chunk))])
+            self.frames[band] = stop
 
-    @_in_held_folder
     def append_log(self, columns: Mapping[str, Values]) -> None:
         """Write rows of the log, every variable (row,); valid with the next `commit`."""
-        start, end = self.rows, self.rows + len(next(iter(columns.values())))
-        for name, values in columns.items():
-            _grow(self._arrays[name], 0, end)
-            self._arrays[name][start:end] = values
-        chunks = range(start // _LOG_CHUNK, (end - 1) // _LOG_CHUNK + 1)
-        self._to_disk(columns, [Path("c", str(number)) for number in chunks])
-        self.rows = end
+        with self._held():
+            start, end = self.rows, self.rows + len(next(iter(columns.values())))
+            for name, values in columns.items():
+                _grow(self._arrays[name], 0, end)
+                self._arrays[name][start:end] = values
+            chunks = range(start // _LOG_CHUNK, (end - 1) // _LOG_CHUNK + 1)
+            self._to_disk(columns, [Path("c", str(number)) for number in chunks])
+            self.rows = end
 
-    @_in_held_folder
     def read(self, name: str, band: str) -> Values:
         """Values (frame, ...) of a band, as many as the longest band has frames."""
-        place, frames = list(self.frames).index(band), max(self.frames.values())
-        return np.asarray(self._arrays[name][place, :frames])
+        with self._held():
+            place, frames = list(self.frames).index(band), max(self.frames.values())
+            return np.asarray(self._arrays[name][place, :frames])
 
-    @_in_held_folder
     def commit(self, **attrs: Any) -> None:
         """Declare valid, in one step, all that was appended, and set attributes (JSON)."""
-        self._attrs.update(attrs, frames_written=dict(self.frames), log_written=self.rows)
-        content = {"zarr_format": 3, "node_type": "group", "attributes": self._attrs}
-        text = json.dumps(content, allow_nan=False)
-        self._store.replace(GROUP, text.encode(), self._part(GROUP))
+        with self._held():
+            self._attrs.update(attrs, frames_written=dict(self.frames), log_written=self.rows)
+            content = {"zarr_format": 3, "node_type": "group", "attributes": self._attrs}
+            text = json.dumps(content, allow_nan=False)
+            self._store.replace(GROUP, text.encode(), self._part(GROUP))
 
-    @_in_held_folder
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
         """
         Bring all bands to one number of frames, with `time` [s] as coordinate; set attributes.
@@ -188,26 +177,36 @@ class Recording:
         """
         if self._closed:
             return
-        self.commit()
-        frames = max(self.frames.values())
-        for place, recorded in enumerate(self.frames.values()):
-            if 0 < recorded < frames:
-                self._repeat_last(place, recorded, frames)
-        for array in self._arrays.values():
-            shape = {"time": frames, "log": self.rows}
-            sizes = zip(_dims(array), array.shape, strict=True)
-            array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
-        if time is not None:
-            self._create_time(time)
-        if lost := missing_files(self.root):
-            raise FileNotFoundError(
-                f"No file '{lost[0]}' in the recording '{self.place()}' any more, of {len(lost)} "
-                "that were deleted. Must stay while it is written to."
-            )
-        self.commit(complete=complete, closed=True, **MARK, **attrs)
-        replace(self.root / SUMS, last_sums(self.root), self._part(SUMS))
-        self.path, self._closed = self.place(), True
-        self._folder.close()
+        with self._held():
+            self.commit()
+            frames = max(self.frames.values())
+            for place, recorded in enumerate(self.frames.values()):
+                if 0 < recorded < frames:
+                    self._repeat_last(place, recorded, frames)
+            for array in self._arrays.values():
+                shape = {"time": frames, "log": self.rows}
+                sizes = zip(_dims(array), array.shape, strict=True)
+                array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
+            if time is not None:
+                zarr.create_array(
+                    self._store,
+                    name=TIME,
+                    data=time.astype(np.float64),
+                    compressors=_COMPRESSORS,
+                    dimension_names=("time",),
+                    attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
+                    config={"write_empty_chunks": True},
+                )
+                self._to_disk([TIME], [Path()])
+            if lost := missing_files(self.root):
+                raise FileNotFoundError(
+                    f"No file '{lost[0]}' in the recording '{self.place()}' any more, of "
+                    f"{len(lost)} that were deleted. Must stay while it is written to."
+                )
+            self.commit(complete=complete, closed=True, **MARK, **attrs)
+            replace(self.root / SUMS, last_sums(self.root), self._part(SUMS))
+            self.path, self._closed = self.place(), True
+            self._folder.close()
 
     def _repeat_last(self, place: int, recorded: int, frames: int) -> None:
         """Fill a band up to a number of frames with copies of its last one, chunk by chunk."""
@@ -221,21 +220,6 @@ class Recording:
             counts[place, start:stop] = np.broadcast_to(last, (stop - start, *last.shape))
             self._to_disk(["counts"], [Path("c", str(place), str(number))])
             start = stop
-
-    def _create_time(self, time: Values) -> None:
-        with made_beside(self.root / "time", self.root / _NO_NODES) as part:
-            zarr.create_array(
-                part,
-                data=time.astype(np.float64),
-                compressors=_COMPRESSORS,
-                dimension_names=("time",),
-                attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
-                config={"write_empty_chunks": True},
-            )
-        # Its metadata last: lines that are cut short are then not those of an array.
-        files = sorted(path for path in (self.root / "time").rglob("*") if path.is_file())
-        names = [path.relative_to(self.root).as_posix() for path in files]
-        add_sums(self.root, {name: (self.root / name).read_bytes() for name in names})
 
     def _part(self, name: str) -> Path:
         return self.root / _NO_NODES / f".{name}.part"

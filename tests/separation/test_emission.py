@@ -93,7 +93,7 @@ def test_standard_deviations_are_those_of_the_scatter() -> None:
     found = replace(found, drift_variance=np.zeros(1500))
     background, variance = emission.estimate_background(tile, found, ratios)
     of_emissivity = emission._emissivity_variance(
-        found.emissivity[0], found.noise_variance, ratios, np.array(tile.noise), found.level
+        found.emissivity[0], found.noise_variance, ratios, np.array(tile.noise), found.level_std
     )
     pairs = {
         "object": (found.temperature, found.temperature_std**2),

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from zarr.core.buffer import Buffer
+from zarr.storage import LocalStore
 
 from dbthermal import store
 from dbthermal.schema import Variable
@@ -245,6 +247,27 @@ def test_recording_is_read_while_it_grows(tmp_path: Path) -> None:
     recording.append_log({"log_time": np.array([9.0]), "log_value": np.array([9.0])})
     recording.close()
     assert opened["log_value"].values.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("stop", ["time/zarr.json", "time/c/0"])
+@pytest.mark.parametrize("late", [False, True])
+def test_recording_killed_while_its_time_is_written_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: str, *, late: bool
+) -> None:
+    """Until a recording is closed, what is there of its time is passed over."""
+    recording = record(tmp_path / "a.zarr", close=False)
+    write = LocalStore.set_sync
+
+    def killed(self: LocalStore, key: str, value: Buffer) -> None:
+        if late or key != stop:
+            write(self, key, value)
+        if key == stop:
+            raise OSError("killed")
+
+    monkeypatch.setattr(LocalStore, "set_sync", killed)
+    with pytest.raises(OSError, match="killed"):
+        recording.close(time=np.arange(6) / 60)
+    assert store.open_dataset(tmp_path / "a.zarr").load().sizes["time"] == 5
 
 
 def test_result_of_a_recording_cut_short_is_whole(stores: dict[str, Path], tmp_path: Path) -> None:

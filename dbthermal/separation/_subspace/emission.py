@@ -2,7 +2,7 @@ r"""Object temperature, emissivities and background of one tile, given the refle
 
 Steps 2 to 4 of `method`, whose numbers of equations are used here. The error of the ratios enters
 the object through one number, the error :math:`\epsilon` of :math:`w \cdot \kappa`, of variance
-:math:`\sigma^2` times the null variance, and that of `_level`.
+:math:`\sigma^2` times the null variance, and that of `_level_std`.
 
 The emissivity is the slope of the first band's signal against the object's own (eq. 7). A part of
 the background that changes as the object does, :math:`y = \ldots + c \, u_1(x)`, changes the slope
@@ -52,20 +52,11 @@ class Emission:
     emissivity: Array  # (band, pixel) [1]
     emissivity_variance: Array  # (band, pixel) [1]
     epsilon_variance: Array  # of epsilon (pixel) [1]
-    level: "Level"  # errors that the background's level makes
+    level_std: Array  # of the ratios, through the background's level (band, pixel) [1]
     noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
     drift_variance: Array  # of e_1, from the background's slow part (pixel) [1]
     constant: Mask  # the object changes too little for its emissivity (pixel)
     restless: Mask  # the background hardly rests (pixel)
-
-
-@dataclass(frozen=True)
-class Level:
-    """Errors of the ratios through the background's mean temperature, the bend's argument."""
-
-    std: Array  # of that temperature (pixel) [K]
-    ratio: Array  # change of the ratios with it (band, pixel) [1/K]
-    epsilon: Array  # change of epsilon with it (pixel) [1/K]
 
 
 def estimate(
@@ -91,8 +82,9 @@ def estimate(
         known = ratios.pooled & np.isfinite(tile.material.emissivity)
         noise_variance = np.where(known, tile.material.noise_variance, noise_variance)
         drifting = np.where(known, tile.material.drift_variance, drifting)
-    level = _level(tile, ratios, fit, noise_variance + walk)
-    epsilon = ratios.inverse_energy * ratios.null_variance + (level.epsilon * level.std) ** 2
+    level_std = _level_std(tile, ratios, fit, noise_variance + walk)
+    by_level = (ratios.null_weights * level_std).sum(axis=0)
+    epsilon = ratios.inverse_energy * ratios.null_variance + by_level**2
     # Residual of the line in a frame of rest: s_1^2 + e_1^2 var x.
     expected = noise[0] ** 2 + first**2 * (sensitivity**2 * epsilon + smooth_variance + omitted)
     emissivity = 1.0 - ratios.ratio * (1.0 - first)
@@ -103,10 +95,10 @@ def estimate(
         smooth_variance=smooth_variance,
         emissivity=emissivity,
         emissivity_variance=_emissivity_variance(
-            emissivity[0], noise_variance + drifting, ratios, noise, level
+            emissivity[0], noise_variance + drifting, ratios, noise, level_std
         ),
         epsilon_variance=epsilon,
-        level=level,
+        level_std=level_std,
         noise_variance=noise_variance,
         drift_variance=drifting,
         constant=fit.constant,
@@ -160,16 +152,16 @@ def _plain_slope(abscissa: Array, ordinate: Array) -> Array:
     return np.asarray(np.einsum("tp,tp->p", centred, ordinate) / energy)
 
 
-def _level(tile: Tile, ratios: ReflectionRatio, fit: _Fit, variance: Array) -> Level:
+def _level_std(tile: Tile, ratios: ReflectionRatio, fit: _Fit, variance: Array) -> Array:
     r"""
-    Errors of the ratios through the background's mean temperature, with the variance of e_1.
+    Signed standard deviation (band, pixel) [1] of the ratios through the background's level.
 
     Rapid changes have the ratios :math:`\kappa_m u_m'(y) / u_1'(y)`, and y is known as well as e_1,
 
     .. math:: \delta \kappa_m = \kappa_m \, \delta y \, \mathrm{d} \ln (u_m' / u_1') / \mathrm{d} y,
               \quad \delta y = (u_1(y) - u_1(x)) \, \delta e_1 / (1 - e_1)
 
-    in the mean over time; or as a temperature that may be any in the calibrated range.
+    in the mean over time, with the `variance` of e_1; or as any temperature that is calibrated.
     """
     curve = tile.curves[0]
     around = tile.reference + np.array([-0.5, 0.5])  # [K]
@@ -177,13 +169,9 @@ def _level(tile: Tile, ratios: ReflectionRatio, fit: _Fit, variance: Array) -> L
     rates = np.diff(slopes - slopes[0], axis=1)
     reflected = (tile.signals[0] - fit.emitted).mean(axis=0)
     std = np.abs(reflected) * np.sqrt(variance) / (1.0 - fit.emissivity) ** 2
-    change = ratios.ratio * rates
     # A uniform distribution of width d has the variance d^2 / 12.
-    return Level(
-        std=np.fmin(std, (curve.highest - curve.lowest) / np.sqrt(12.0)),
-        ratio=change,
-        epsilon=(ratios.null_weights * change).sum(axis=0),
-    )
+    std = np.fmin(std, (curve.highest - curve.lowest) / np.sqrt(12.0))
+    return np.asarray(ratios.ratio * rates * std)
 
 
 def _fieller(sensitivity: Array, epsilon: Array) -> Array:
@@ -197,7 +185,7 @@ def _fieller(sensitivity: Array, epsilon: Array) -> Array:
 
 
 def _emissivity_variance(
-    first: Array, slope_variance: Array, ratios: ReflectionRatio, noise: Array, level: Level
+    first: Array, slope_variance: Array, ratios: ReflectionRatio, noise: Array, level_std: Array
 ) -> Array:
     r"""
     Variance of the emissivities (band, pixel) [1], from the ratios and from the slope (eq. 8).
@@ -214,8 +202,8 @@ def _emissivity_variance(
     through = (ratio * first * reflectivity) ** 2 * ratios.null_variance
     through += 2.0 * ratio * first * reflectivity**2 * covariance
     direct = reflectivity**2 * ratios.variance
-    # Through the background's level y: -(1 - e_1) (kappa_m e_1 deps/dy + dkappa_m/dy).
-    by_level = reflectivity * (ratio * first * level.epsilon + level.ratio) * level.std
+    # Through the background's level: -(1 - e_1) (kappa_m e_1 deps + dkappa_m).
+    by_level = reflectivity * (ratio * first * (weights * level_std).sum(axis=0) + level_std)
     noisy = through * ratios.inverse_energy + direct
     return np.asarray(ratio**2 * slope_variance + noisy + by_level**2)
 

@@ -160,12 +160,8 @@ def _exact(
         bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
         if not np.any(bent):
             break
-        part, removed, places, least = (
-            part.select_pixels(bent),
-            bend[..., bent],
-            places[bent],
-            _BEND,
-        )
+        part, removed, places = part.select_pixels(bent), bend[..., bent], places[bent]
+        least = _BEND
         signals = part.signals.copy()
         signals[1:] -= removed
         straight = replace(part, signals=signals)
@@ -186,19 +182,16 @@ def _steps(
 
     The bend of a gray body is not known: whether it is one is told from signals as they are.
     """
-    noise, slopes = np.array(tile.noise), _slopes(tile)
+    noise = np.array(tile.noise)
     ratios = reflection_ratio.estimate(straight.signals, functions, noise, tile.material)
     if gray is None:
+        curve = tile.curves[0]
+        temperature = np.linspace(curve.lowest, curve.highest, _TEMPERATURES)
+        slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
         gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
     emission = emissions.estimate(straight, functions, ratios, settings.background_drift)
     background = emissions.estimate_background(tile, emission, ratios)
     return _Solution(ratios, emission, *background, straight, gray)
-
-
-def _slopes(tile: Tile) -> Array:
-    """Slopes of the responses (temperature, band) [1] over the calibrated range."""
-    temperature = np.linspace(tile.curves[0].lowest, tile.curves[0].highest, _TEMPERATURES)
-    return np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
 
 
 def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Estimate:
@@ -208,7 +201,7 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Esti
     still = flags[Status.NO_BACKGROUND_MOTION]
     undefined = still | flags[Status.GRAY]
     unidentified = undefined | emission.constant
-    ratio_variance = ratios.variance + (emission.level.ratio * emission.level.std) ** 2
+    ratio_variance = ratios.variance + emission.level_std**2
     result = Estimate(
         object_temperature=emission.temperature,
         object_temperature_std=emission.temperature_std,
