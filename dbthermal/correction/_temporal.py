@@ -163,9 +163,9 @@ def _noise_amplification(ratio: Array) -> Array:
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:
     """Good pixels (y, x) of the reference patch."""
-    if not isinstance(reference, xr.DataArray) or reference.dtype != bool:
-        kind = f"dtype {getattr(reference, 'dtype', type(reference).__name__)}"
-        raise TypeError(f"Invalid {kind} of the reference. Must be a DataArray of bool.")
+    dtype = getattr(reference, "dtype", type(reference).__name__)
+    if dtype != bool:
+        raise TypeError(f"Invalid dtype {dtype} of the reference. Must be bool.")
     if reference.dims != ("y", "x"):
         raise ValueError(f"Invalid dims {reference.dims} of the reference. Must be ('y', 'x').")
     good = laid_on(reference, corrected, "the reference", "the capture").values.copy()
