@@ -159,8 +159,9 @@ def _noise_amplification(ratio: Array) -> Array:
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:
     """Good pixels (y, x) of the reference patch."""
-    if reference.dtype != bool:
-        raise TypeError(f"Invalid dtype {reference.dtype} of the reference. Must be bool.")
+    dtype = getattr(reference, "dtype", type(reference).__name__)
+    if str(dtype) != "bool":
+        raise TypeError(f"Invalid dtype {dtype} of the reference. Must be bool.")
     if reference.dims != ("y", "x"):
         raise ValueError(f"Invalid dims {reference.dims} of the reference. Must be ('y', 'x').")
     good = laid_on(reference, corrected, "the reference", "the capture").values.copy()

@@ -391,9 +391,8 @@ def _message(error: Any) -> str:
         return f"Unknown key '{place}'. Must be one of those in dbthermal.instruments.session."
     rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"]).rstrip(".")
     rule = re.sub(r"a (valid dictionary|dictionary or an instance of \w+)", "a mapping", rule)
-    if re.match(
-        "(Invalid|Missing|Repeated|Unknown) ", rule
-    ):  # of more than one key, or of an address
+    # A rule of more than one key, or of an address, names its value by itself.
+    if re.match("(Invalid|Missing|Repeated|Unknown) ", rule):
         return f"{place}: {rule}." if place else f"{rule}."
     rule = rule if rule.startswith("Must ") else f"Must {rule}"
     return f"Invalid {place} {texts.shown(error['input'])}. {rule}."
