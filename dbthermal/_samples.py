@@ -142,16 +142,14 @@ def end_of(
     counts: npt.NDArray[Any], valid: Mask, *, highest: bool
 ) -> tuple[npt.NDArray[Any], npt.NDArray[np.intp]]:
     """Highest or lowest value (pixel) of counts (time, pixel), and the number of samples there."""
-    whole = valid.all()
-    if whole:
+    used = True if valid.all() else valid  # numpy's reductions are slower with a mask
+    if used is True:
         end = counts.max(axis=0) if highest else counts.min(axis=0)
     elif highest:
         end = counts.max(axis=0, where=valid, initial=counts.min(initial=0))
     else:
         end = counts.min(axis=0, where=valid, initial=counts.max(initial=0))
-    there = counts == end
-    if not whole:
-        there &= valid
+    there = (counts == end) & used
     # A product of matrices adds up several times faster than a sum over the first axis.
     number = np.ones(len(there), dtype=np.float32) @ there.astype(np.float32)
     return end, number.astype(np.intp)

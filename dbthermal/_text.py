@@ -39,11 +39,6 @@ _LARGEST: Final = 2**53  # up to here whole numbers are exact also as float
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 _DIGITS: Final = re.compile(r"[0-9eE.+ -]*")
 _DECIMAL: Final = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
-_CONSTANTS: Final = {
-    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
-    **dict.fromkeys(("true", "True", "TRUE"), True),
-    **dict.fromkeys(("false", "False", "FALSE"), False),
-}
 # Numbers that YAML 1.1 and 1.2 read alike: 012, 1e3 and 1_000 are not among them.
 _WHOLE: Final = re.compile(r"[-+]?(0|[1-9][0-9]{,15})")
 _REAL: Final = re.compile(r"([-+]?(0|[1-9][0-9]*)\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?")
@@ -219,15 +214,7 @@ def read_yaml(path: str | Path) -> dict[Any, Any]:
 
 
 def parse_yaml(text: str, source: str) -> dict[Any, Any]:
-    """
-    Mapping in a text, as `read_yaml` has it of a file; `source` is its name in messages.
-
-    Examples
-    --------
-    >>> parse_yaml("{duration: 1, duration: 2}", "session")
-    Traceback (most recent call last):
-    ValueError: session, line 1, column 15: Repeated key 'duration'. Must be listed once.
-    """
+    """Mapping in a text, as `read_yaml` has it of a file; `source` is its name in messages."""
     import yaml  # noqa: PLC0415 - of the extra `instruments`; most of the package does without
 
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C ten times as fast
@@ -289,14 +276,16 @@ class _Document:
     def _plain(self, event: Any) -> Any:
         """Value of a plain scalar, if all versions of YAML read it alike."""
         text = event.value
-        if text in _CONSTANTS:
-            return _CONSTANTS[text]
-        if _WHOLE.fullmatch(text) and abs(int(text)) <= _LARGEST:
+        tag = self.resolver.resolve(self.yaml.ScalarNode, text, (True, False)).split(":")[-1]
+        if tag == "null":
+            return None
+        if tag == "bool" and text.lower() in {"true", "false"}:
+            return text.lower() == "true"
+        if tag == "int" and _WHOLE.fullmatch(text) and abs(int(text)) <= _LARGEST:
             return int(text)
-        if _REAL.fullmatch(text) and math.isfinite(float(text)):
+        if tag == "float" and _REAL.fullmatch(text) and math.isfinite(float(text)):
             return float(text)
-        tag = self.resolver.resolve(self.yaml.ScalarNode, text, (True, False))
-        if not tag.endswith(":str") or _DECIMAL.fullmatch(text) or re.fullmatch("0o[0-7]+", text):
+        if tag != "str" or _DECIMAL.fullmatch(text) or re.fullmatch("0o[0-7]+", text):
             rule = "Must be a finite decimal number, true, false, or in quotes if it is text"
             self._refuse(event, f"Invalid value {text[:SHOWN]}. {rule}")
         return text

@@ -293,6 +293,8 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
 
 def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
     """Mask of the samples that are numbers below `LARGEST` in magnitude: not NaN, not infinite."""
+    if values.dtype == np.float16:  # `LARGEST` is none, and all of its numbers are smaller
+        return np.isfinite(values)
     return np.abs(values) < LARGEST
 
 

@@ -210,7 +210,7 @@ def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> flo
     lag = _peak(_covariances(shared, search, names), label)
     # Whole frames first: smooth functions over the same scene take the same out of both bands.
     covariances = _covariances(shared.shifted(lag), 1, names)
-    both = lag + np.array([_delays(part) for part in (covariances, *_leave_one_out(covariances))])
+    both = lag + _delays(covariances)
     # The pair of frames that it lies best between in all pixels, for the groups as well.
     delays = both[:, np.argmin(np.abs(both[0] - lag - np.array([-0.5, 0.5])))]
     # Jackknife over n groups: var = (n - 1) mean (d_i - mean d)^2.
@@ -370,23 +370,19 @@ def _peak(covariances: _Covariances, label: str) -> int:
     return int(covariances.lags[peak])
 
 
-def _leave_one_out(covariances: _Covariances) -> list[_Covariances]:
-    """Covariances without each group of pixels in turn, for the jackknife."""
-    keep = [np.arange(_GROUPS) != group for group in range(_GROUPS)]
-    return [
-        _Covariances(covariances.lags, covariances.cross[one], covariances.auto[one])
-        for one in keep
-    ]
-
-
 def _delays(covariances: _Covariances) -> Array:
-    """Offset [frame] near lag 0 if it lies between the frames -1 and 0, and between 0 and 1."""
-    cross, (near, far) = covariances.cross.sum(axis=0), covariances.auto.sum(axis=0)
+    """
+    Offset [frame] near lag 0 if it lies between the frames -1 and 0, and between 0 and 1, columns.
+
+    In rows: of all groups of pixels, and without each of them in turn, for the jackknife.
+    """
+    kept = np.vstack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)])
+    cross, (near, far) = kept @ covariances.cross, (kept @ covariances.auto).T
     delays = []
     for lag in (-1, 0):
         # C_-1 -+ C_2 = (h0 -+ h1)(R1 -+ R2) of the frames m - 1 and m + 2: delta = h1 / (h0 + h1).
         place = int(np.argmax(covariances.lags == lag))
-        before, after = cross[place - 1], cross[place + 2]
+        before, after = cross[:, place - 1], cross[:, place + 2]
         share = 0.5 - 0.5 * (before - after) / (near - far) * (near + far) / (before + after)
-        delays.append(lag + float(share))
-    return np.array(delays)
+        delays.append(lag + share)
+    return np.stack(delays, axis=1)

@@ -127,9 +127,7 @@ def align(
         factors[band] = np.sqrt(np.mean((1.0 - shares) ** 2 + shares**2)) if shares.size else 1.0
     lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
     result = _assembled(corrected, aligned, times)
-    attrs = schema.NOISE_FACTOR.attrs
-    factor = xr.DataArray(factors, coords={"band": counts["band"]}, dims="band", attrs=attrs)
-    result = result.assign(noise_factor=factor)
+    result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
     return result.assign_attrs(
         clock=names[reference],
         time_offset=offsets.tolist(),

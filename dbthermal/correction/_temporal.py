@@ -49,19 +49,15 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
         raise ValueError("Invalid dataset: the lag was undone before. Must be as the pixels lag.")
     if counts.sizes["time"] < 2:
         raise ValueError("Invalid capture of 1 frame. Must have at least 2, for a lag.")
-    if counts.dtype.kind != "f":
-        raise TypeError(f"Invalid dtype {counts.dtype} of the counts. Must be floating, for NaN.")
     old, new = lag_coefficients(time_constant, counts)
     signal = np.full_like(counts.values, np.nan)
     for band in range(counts.sizes["band"]):
-        before: Array | float = np.nan
-        for frame, image in enumerate(counts.isel(band=band).values):
-            now = np.where(schema.measured(image), image, np.nan)
-            if frame:
-                # z_n = I_n + (I_n - I_n-1) a / (1 - a): small where the lag is.
-                gain = old[band, frame - 1] / new[band, frame - 1]
-                signal[band, frame] = now + (now - before) * gain
-            before = now
+        movie = counts.isel(band=band).values
+        movie = np.where(schema.measured(movie), movie, np.nan)
+        for frame in range(1, len(movie)):
+            # z_n = I_n + (I_n - I_n-1) a / (1 - a): a correction that is small where the lag is.
+            gain = old[band, frame - 1] / new[band, frame - 1]
+            signal[band, frame] = movie[frame] + (movie[frame] - movie[frame - 1]) * gain
     middle = np.median(np.diff(counts["time"].values.astype(np.float64)))
     constants = _time_constants(time_constant, counts)
     return corrected.assign(counts=(counts.dims, signal, counts.attrs)).assign_attrs(
@@ -163,8 +159,9 @@ def _noise_amplification(ratio: Array) -> Array:
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:
     """Good pixels (y, x) of the reference patch."""
-    if reference.dtype != bool:
-        raise TypeError(f"Invalid dtype {reference.dtype} of the reference. Must be bool.")
+    dtype = getattr(reference, "dtype", type(reference).__name__)
+    if str(dtype) != "bool":
+        raise TypeError(f"Invalid dtype {dtype} of the reference. Must be bool.")
     if reference.dims != ("y", "x"):
         raise ValueError(f"Invalid dims {reference.dims} of the reference. Must be ('y', 'x').")
     good = laid_on(reference, corrected, "the reference", "the capture").values.copy()

@@ -10,15 +10,15 @@ from typing import Final, NamedTuple
 
 from dbthermal import _text as texts
 
-_NODE = r"(?P<target>/dev/(?!\S*\.\.)[^\s?#\\]+)"
+_NODE = r"/dev/(?!\S*\.\.)[^\s?#\\]+"
 _WORD = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 _OPTION = r"[a-z]+=[^\s=&?#]+"
 
 RULES: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {
-        "v4l2": ("v4l2:///dev/<node>", f"v4l2://{_NODE}"),
-        "serial": ("serial:///dev/<port>", f"serial://({_NODE}|(?P<windows>COM[0-9]+))"),
-        "pty": ("pty:///dev/<terminal>", f"pty://{_NODE}"),
+        "v4l2": ("v4l2:///dev/<node>", f"v4l2://(?P<target>{_NODE})"),
+        "serial": ("serial:///dev/<port>", f"serial://(?P<target>{_NODE}|COM[0-9]+)"),
+        "pty": ("pty:///dev/<terminal>", f"pty://(?P<target>{_NODE})"),
         "tc08": ("tc08:", "tc08:(?P<target>)"),
         "sim": (
             "sim://<emulator>/<name>?<option>=<value>",
@@ -50,7 +50,7 @@ def parse(url: str, schemes: Iterable[str] = tuple(RULES)) -> Address:
         raise ValueError(f"Invalid address {texts.shown(url)}. Must be {forms}.")
     parts = {name: text or "" for name, text in found.groupdict().items()}
     pairs = [pair.split("=") for pair in parts.get("options", "").split("&") if pair]
-    if texts.repeated(name for name, _ in pairs):
-        raise ValueError(f"Repeated option in address '{url}'. Must be listed once.")
-    target = parts["target"] or parts.get("windows", "")
-    return Address(scheme, target, parts.get("name", ""), dict(pairs))
+    named = ["name"] if parts.get("name") else []
+    for option in texts.repeated([*named, *(option for option, _ in pairs)]):
+        raise ValueError(f"Repeated option '{option}' in address '{url}'. Must be listed once.")
+    return Address(scheme, parts["target"], parts.get("name", ""), dict(pairs))

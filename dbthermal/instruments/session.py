@@ -34,8 +34,9 @@ environment variable ``DBTHERMAL_USBTC08``.
 
 import errno
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, Self
@@ -78,25 +79,26 @@ _SCHEMES: Final[Mapping[str, tuple[tuple[str, ...], str]]] = MappingProxyType(
 """Schemes of a device's simulated address, and of that of the hardware."""
 
 
-def _printable(text: str) -> str:
-    if not text.isprintable() or text != text.strip():
-        raise ValueError("Must be printable, without space at its ends")
-    return text
+def _by(check: Callable[[Any], object]) -> AfterValidator:
+    """Validator of a value that a check lets pass."""
 
-
-def _of_scheme(*schemes: str) -> AfterValidator:
-    def checked(url: str) -> str:
-        addresses.parse(url, schemes)
-        return url
+    def checked(value: Any) -> Any:
+        check(value)
+        return value
 
     return AfterValidator(checked)
+
+
+def _check_printable(text: str) -> None:
+    if not text.isprintable() or text != text.strip():
+        raise ValueError("Must be printable, without space at its ends")
 
 
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 Temperature = Annotated[float, Field(strict=True, ge=200.0, le=2000.0)]  # no degrees Celsius [K]
 Pixels = Annotated[int, Field(strict=True, ge=2, le=8192)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=64)]
-Label = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
+Label = Annotated[str, Field(min_length=1, max_length=64), _by(_check_printable)]
 Slot = Annotated[int, Field(strict=True, ge=1, le=6)]
 Channel = Annotated[int, Field(strict=True, ge=1, le=8)]
 Byte = Annotated[int, Field(strict=True, ge=0, le=255)]
@@ -107,11 +109,11 @@ DeviceName = Literal["filter_wheel", "thermocouples"]
 class Device:
     """Addresses of one device, such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``."""
 
-    simulated: Annotated[str, _of_scheme("sim", "pty")]
-    hardware: Annotated[str, _of_scheme("v4l2", "serial", "tc08")]
+    simulated: Annotated[str, _by(partial(addresses.parse, schemes=("sim", "pty")))]
+    hardware: Annotated[str, _by(partial(addresses.parse, schemes=("v4l2", "serial", "tc08")))]
 
 
-def _check_schemes(name: str, device: Device) -> Device:
+def _check_schemes(name: str, device: Device) -> None:
     """Raise ValueError unless the addresses are of the schemes of a device of this name."""
     simulated, hardware = _SCHEMES[name]
     url = addresses.parse(device.simulated, simulated)
@@ -120,28 +122,22 @@ def _check_schemes(name: str, device: Device) -> Device:
     if url.scheme == "sim" and (url.target != emulator or (emulator == "tc08" and url.name)):
         rule = f"Must be sim://{emulator}"
         raise ValueError(f"Invalid address '{device.simulated}' of {name}. {rule}")
-    return device
-
-
-def _of_device(name: str) -> AfterValidator:
-    return AfterValidator(lambda device: _check_schemes(name, device))
 
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
     """One camera: addresses of its frames and of its command port, if any, and its kind."""
 
-    video: Annotated[Device, _of_device("video")]
-    control: Annotated[Device, _of_device("control")] | None = None
+    video: Annotated[Device, _by(partial(_check_schemes, "video"))]
+    control: Annotated[Device, _by(partial(_check_schemes, "control"))] | None = None
     kind: str = "boson"  # of `dbthermal.instruments.camera.KINDS`, that of its simulated address
 
     def __post_init__(self) -> None:
         kind, simulated = camera_kind(self.kind), self.video.simulated
         if not simulated.startswith(f"sim://{self.kind}/"):
-            raise ValueError(
-                f"Invalid kind '{self.kind}'. Must be the kind in its simulated address "
-                f"'{simulated}': that of a {self.kind} is sim://{self.kind}/<name>"
-            )
+            rule = f"Must be the kind in its simulated address '{simulated}'"
+            form = f"that of a {self.kind} is sim://{self.kind}/<name>"
+            raise ValueError(f"Invalid kind '{self.kind}'. {rule}: {form}")
         if self.control is None:
             return
         if kind.open_control is None:
@@ -347,10 +343,9 @@ class Session:
                 message = f"Missing file of key 'rig' of session '{path}'. Must be copied with it"
                 raise FileNotFoundError(errno.ENOENT, message, str(rig))
             shared = texts.read_yaml(rig)
-            if twice := [key for key in content if key in shared]:
-                raise ValueError(
-                    f"{path}: Repeated key of session and rig '{twice[0]}'. Must be listed once."
-                )
+            for key in texts.repeated([*content, *shared]):
+                name = f"key of session and rig '{key}'"
+                raise ValueError(f"{path}: Repeated {name}. Must be listed once.")
             files = dict.fromkeys(shared, str(rig))
             content = {**shared, **content}
         changed = {**content, **(changes or {})}
@@ -391,9 +386,8 @@ def _message(error: Any) -> str:
         return f"Unknown key '{place}'. Must be one of those in dbthermal.instruments.session."
     rule = re.sub(r"^(Value error, |\w+ should )", "", error["msg"]).rstrip(".")
     rule = re.sub(r"a (valid dictionary|dictionary or an instance of \w+)", "a mapping", rule)
-    if re.match(
-        "(Invalid|Missing|Repeated|Unknown) ", rule
-    ):  # of more than one key, or of an address
+    # A rule of more than one key, or of an address, names its value by itself.
+    if re.match("(Invalid|Missing|Repeated|Unknown) ", rule):
         return f"{place}: {rule}." if place else f"{rule}."
     rule = rule if rule.startswith("Must ") else f"Must {rule}"
     return f"Invalid {place} {texts.shown(error['input'])}. {rule}."

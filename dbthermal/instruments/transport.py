@@ -207,12 +207,9 @@ def _open_emulated(
 ) -> SerialTransport:
     """Start the emulator that an address names, and open its end of the line."""
     if address.target not in EMULATORS:
-        raise ValueError(
-            f"Invalid address '{url}'. Must be one of {sorted(EMULATORS)} after sim://."
-        )
+        rule = f"Must be one of {sorted(EMULATORS)} after sim://"
+        raise ValueError(f"Invalid address '{url}'. {rule}.")
     options = {**address.options, **({"name": address.name} if address.name else {})}
-    if address.name and "name" in address.options:
-        raise ValueError(f"Repeated option 'name' in address '{url}'. Must be listed once.")
     emulated = importlib.import_module(EMULATORS[address.target]).start(options, world)
     try:
         port = _open_port(emulated.path, baudrate=baudrate, rtscts=rtscts)

@@ -106,8 +106,7 @@ def palette_video(
     video = _distinct(decode(path, None, memory, sha256))
     position, _, distance = _nearest(video.colours, colours)
     residual = float(np.sqrt(np.average(distance**2, weights=video.share)))
-    _check_fit(path, palette, residual, _PALETTE_LIMIT)
-    attrs = _attrs(path, palette, residual)
+    attrs = _attrs(path, palette, residual, _PALETTE_LIMIT)
     return xr.DataArray(position[video.index], video.coords, attrs=attrs, name="movie")
 
 
@@ -171,10 +170,10 @@ def masked_palette_video(
     coloured = np.ptp(video.colours, axis=1) > _COLOURED
     if not coloured.any():
         raise ValueError(f"No coloured pixel in '{path.name}'. Must show an object in a palette.")
-    residual = _median(distance[coloured], video.share[coloured])
-    _check_fit(path, palette, residual, _MASKED_LIMIT)
+    share = video.share[coloured]
+    residual = np.quantile(distance[coloured], 0.5, weights=share, method="inverted_cdf")
     valid = from_palette < np.linalg.norm(_ycc(video.colours)[:, 1:], axis=1)
-    dims, attrs = tuple(video.coords), _attrs(path, palette, residual)
+    dims, attrs = tuple(video.coords), _attrs(path, palette, float(residual), _MASKED_LIMIT)
     mask_attrs = {"units": "1", "long_name": "nearer to the palette than to gray"}
     return xr.Dataset(
         {
@@ -208,9 +207,7 @@ def _distinct(film: Film) -> _Video:
     for frame in codes:
         frame[...] = place[frame]
         count += np.bincount(frame.ravel(), minlength=distinct.size)
-    colours = np.stack([distinct >> 16, distinct >> 8 & 255, distinct & 255], axis=1).astype(
-        np.float64
-    )
+    colours = (distinct[:, np.newaxis] >> np.array([16, 8, 0]) & 255).astype(np.float64)
     coords = {"time": ("time", film.times, schema.COORDINATES["time"].attrs)} | {
         dim: (dim, np.arange(size), {"units": "1", "long_name": "pixel"})
         for dim, size in zip("yx", codes.shape[1:], strict=True)
@@ -242,21 +239,13 @@ def _nearest(colours: Floats, palette: Floats) -> tuple[NDArray[np.float32], Flo
     return position, distance, np.linalg.norm(colours - palette[nearest], axis=1)
 
 
-def _median(values: Floats, weights: Floats) -> float:
-    order = np.argsort(values)
-    share = np.cumsum(weights[order]) / weights.sum()
-    return float(values[order][np.searchsorted(share, 0.5)])
-
-
-def _check_fit(path: Path, palette: str, residual: float, limit: float) -> None:
+def _attrs(path: Path, palette: str, residual: float, limit: float) -> dict[str, Any]:
+    """Attributes of positions; ValueError if the pixels are not of the palette."""
     if residual > limit:
         raise ValueError(
             f"Palette '{palette}' does not fit '{path.name}': its pixels are {residual:.1f} from "
             f"it. Must be at most {limit:g} (0-255 per channel)."
         )
-
-
-def _attrs(path: Path, palette: str, residual: float) -> dict[str, Any]:
     return {
         "units": "1",
         "long_name": f"position in the palette {palette}",

@@ -61,6 +61,8 @@ def test_drift_refuses_nonsense() -> None:
         undo_drift(capture, patch()[:, :5])
     with pytest.raises(TypeError, match="Invalid dtype int64 of the reference"):
         undo_drift(capture, patch().astype(int))
+    with pytest.raises(TypeError, match="Invalid dtype dict of the reference"):
+        undo_drift(capture, {})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="Invalid order 1 of the drift"):
         undo_drift(capture, patch(), order=1)
     with pytest.raises(ValueError, match="the drift was undone before"):

@@ -128,7 +128,7 @@ def test_a_pseudo_terminal_has_no_rts(line: SerialTransport) -> None:
         ("sim://boson?colour=red", "Unknown option 'colour'"),
         ("sim://boson?sn", r"or sim://<emulator>/<name>\?<option>=<value>"),
         ("sim://boson?sn=", "Invalid address 'sim://boson.sn='"),
-        ("sim://boson?sn=1&sn=2", "Repeated option in address .* Must be listed once"),
+        ("sim://boson?sn=1&sn=2", "Repeated option 'sn' in address .* Must be listed once"),
         ("sim://boson/a?name=b", "Repeated option 'name' in address .* Must be listed once"),
         ("sim://boson#wide", "Invalid address 'sim://boson#wide'"),
         ("sim://boson?sn=abc", r"Invalid option sn=abc .* \(int\) in 0 to 4294967295"),

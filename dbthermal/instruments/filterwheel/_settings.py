@@ -162,9 +162,8 @@ class Settings:
             if value is not None and not least <= value <= most:
                 raise ValueError(f"Invalid {name} {value}. Must lie in [{least}, {most}].")
         if not self.addresses or not {*chain(*self.addresses)} <= apt.CONTROLLERS:
-            raise ValueError(
-                f"Invalid addresses {self.addresses}. Must be pairs of {sorted(apt.CONTROLLERS)}."
-            )
+            rule = f"Must be pairs of {sorted(apt.CONTROLLERS)}"
+            raise ValueError(f"Invalid addresses {self.addresses}. {rule}.")
         for name, allowed in _HOME.items():
             value = getattr(self, name)
             if value is not None and value not in allowed:
