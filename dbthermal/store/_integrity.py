@@ -98,9 +98,10 @@ class CheckedStore(SummedStore):
             return content
         return super().get_sync(key, prototype=prototype, byte_range=byte_range)
 
-    async def get(self, key: str, *args: Any, **options: Any) -> Buffer | None:
+    async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Buffer | None:
         """Read a file; see `get_sync`."""
-        return await asyncio.to_thread(self.get_sync, key, *args, **options)
+        options = {"prototype": prototype, "byte_range": byte_range}
+        return await asyncio.to_thread(self.get_sync, key, **options)
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
         """Names in a group's folder; the time of a recording is whole when that is closed."""
