@@ -17,12 +17,15 @@ from reproduction import locked
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOK = """\
+import os
 import time
 from pathlib import Path
 
 from reproduction.run import Run
 
 run = Run("01_tiny", globals())
+with Path("../kernels").open("a") as file:
+    file.write(f"{os.getpid()}\\n")
 run.finish({"number": number})
 while Path("../hold").exists():
     time.sleep(0.02)
@@ -158,11 +161,13 @@ def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment:
 
 
 def kernels(root: Path) -> list[int]:
-    """Process numbers of the kernels that run in a checkout."""
-    command = ["ps", "-axww", "-o", "pid=,command="]
-    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    of_checkout = f"ipykernel_launcher -f {root}"
-    return [int(line.split()[0]) for line in listed.splitlines() if of_checkout in line]
+    """Process numbers of the kernels of a checkout that still run."""
+    states = {}
+    for number in (root / "kernels").read_text().split():
+        command = ["ps", "-o", "stat=", "-p", number]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        states[int(number)] = done.stdout.strip()
+    return [number for number, state in states.items() if state and not state.startswith("Z")]
 
 
 def test_names_are_no_programs(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
