@@ -11,6 +11,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
+import dbthermal
+import reproduction
+
 GOOD: Final = ("right", "refused", "flagged")
 """Right within the stated deviations; refused by an error that names the thing; all flagged."""
 
@@ -27,7 +30,17 @@ MEGABYTES: Final = 500
 
 _REFUSALS: Final = (ValueError, TypeError, OSError)
 # Of the libraries, those that name what does not fit: a model's field, a coordinate.
-_OURS: Final = re.compile(r"/(dbthermal|reproduction|pydantic|xarray/structure/alignment)")
+_OURS: Final = re.compile(
+    "|".join(
+        [
+            *(
+                re.escape(f"{Path(str(room.__file__)).parent}/")
+                for room in (dbthermal, reproduction)
+            ),
+            "/pydantic/|/xarray/structure/alignment",
+        ]
+    )
+)
 _WORK: Final = ("right", "refused", "flagged", "silent")
 
 
