@@ -1,5 +1,7 @@
 """The filter wheel: its places, its settings, and the emulated wheel in memory and on a line."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 from device_benches import FILTERS, QUICK, WheelBench
 from loopback import Loop
@@ -219,3 +221,13 @@ def test_the_largest_number_of_a_controller() -> None:
     """The largest serial number has room in the emulator's answer."""
     device = EmulatedApt(World(), serial_number=2**32 - 1)
     assert len(device.info.pack()) == 84
+
+
+def test_several_threads_may_ask() -> None:
+    """A recorder that reads the status in its own thread takes no other thread's reply."""
+    with (
+        FilterWheel.from_url("sim://apt", SETTINGS) as wheel,
+        ThreadPoolExecutor(max_workers=4) as pool,
+    ):
+        asked = [pool.submit(wheel.status) for _ in range(200)]
+        assert len({status.result().position for status in asked}) == 1

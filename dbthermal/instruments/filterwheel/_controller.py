@@ -9,6 +9,7 @@ address is searched for, the model is checked, and each setting is read back.
 """
 
 import logging
+import threading
 import time as system_time
 from collections.abc import Callable
 from dataclasses import replace
@@ -74,6 +75,8 @@ class Controller:
         self._settings = settings
         self._clock = clock
         self._identity: tuple[apt.Info, Scale] | None = None
+        # A recorder asks for the position in a thread of its own, while others turn the wheel.
+        self._line = threading.Lock()
         self._events: list[apt.Message] = []
         self._notices: list[apt.Notice] = []
 
@@ -251,13 +254,14 @@ class Controller:
         request are not its reply. A reply that comes after its limit may be taken for that of the
         repetition, and is then older than it seems, but replies never change their order.
         """
-        for _ in range(attempts):
-            self._collect()
-            self._transport.write(request)
-            message = self._wait(reply, source, channel)
-            if message is not None:
-                return message
-            self._decoder.discard()  # half a message whose rest did not come in time
+        with self._line:
+            for _ in range(attempts):
+                self._collect()
+                self._transport.write(request)
+                message = self._wait(reply, source, channel)
+                if message is not None:
+                    return message
+                self._decoder.discard()  # half a message whose rest did not come in time
         raise NoReplyError(
             f"No answer {reply.name} from address 0x{source:02X} in "
             f"{self._settings.reply_timeout} s. "
@@ -309,7 +313,8 @@ class Controller:
 
     def _forget_events(self) -> None:
         """Forget the ends of earlier motions, and raise the errors that were reported."""
-        self._collect()
+        with self._line:
+            self._collect()
         self._events.clear()
         self.raise_notice()
 
