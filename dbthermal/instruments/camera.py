@@ -19,6 +19,8 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal import _text as texts
+
 __all__ = [
     "DAMAGED",
     "FEWEST_COPIES",
@@ -290,7 +292,9 @@ class CameraKind:
 def camera_kind(name: str) -> CameraKind:
     """Import the kind of camera of this name; ValueError if it is not one of `KINDS`."""
     if name not in KINDS:
-        raise ValueError(f"Unknown kind of camera '{name}'. Must be one of {sorted(KINDS)}.")
+        raise ValueError(
+            f"Unknown kind of camera {texts.shown(name)}. Must be one of {sorted(KINDS)}."
+        )
     kind: CameraKind = importlib.import_module(KINDS[name]).KIND
     return kind
 
