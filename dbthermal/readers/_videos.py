@@ -247,8 +247,8 @@ def _nearest(colours: Floats, palette: Floats) -> tuple[NDArray[np.float32], Flo
     return position, distance, np.linalg.norm(colours - palette[nearest], axis=1)
 
 
-def _rms(distance: Floats) -> np.floating[Any]:
-    return np.sqrt(np.mean(distance**2))
+def _rms(distance: Floats) -> float:
+    return float(np.sqrt(np.mean(distance**2)))
 
 
 def _fits(
@@ -256,7 +256,7 @@ def _fits(
     palette: str,
     colours: Floats,
     share: Floats,
-    average: Callable[[Floats], np.floating[Any]],
+    average: Callable[[Floats], Any],
 ) -> str:
     """Average distance of a sample of pixels from each palette; ValueError if another is nearer."""
     summed = np.cumsum(share)
