@@ -253,7 +253,8 @@ def test_noise_factor_is_that_of_the_interpolation() -> None:
 def test_noise_factor_of_a_warp() -> None:
     """Interpolation over pixels lessens noise and residual pattern of the warped band alone."""
     capture = still(level=0.0, count=100, noise=1.0).assign(pattern_std=("band", [3.0, 3.0]))
-    matrices = np.stack([np.eye(3), [[1, 0, 0.5], [0, 1, 0.25], [0, 0, 1]]])
+    matrices = np.stack([np.eye(3)] * 2)
+    matrices[1, :2, 2] = 0.5, 0.25  # [pixel]
     transform = xr.DataArray(
         matrices, dims=("band", "row", "column"), coords={"band": capture["band"]}
     )
