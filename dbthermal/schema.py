@@ -113,6 +113,10 @@ STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
     {
         "capture": {"counts": _of("band time y x", "count", "raw signal", "uint16")},
         "corrected": {"counts": _of("band time y x", "count", "corrected signal", "float32")},
+        "reflection_shift": {
+            **_with_std("shift", "axis y x", "pixel", "shift of what is reflected"),
+            "known": _of("y x", "1", "texture tells the shift", "bool"),
+        },
         "separated": {
             **_with_std("object_temperature", "time y x", "K", "object temperature"),
             **_with_std("background_temperature", "time y x", "K", "background temperature"),
@@ -371,7 +375,10 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
     if array.size == 0:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
-    check_numbers(array, label, variable.units)
+    if variable.dtype != "bool":
+        check_numbers(array, label, variable.units)
+    elif array.dtype != bool:
+        raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
     for dim in array.dims:
         if dim == "band":
             _check_bands(array, label)
