@@ -72,7 +72,8 @@ def align(
         Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
         exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
         `status` is that of all the pixels that it may be made of; `noise_factor` (band) [1], by how
-        much interpolation lessens the noise, which `separation.solve` takes into account.
+        much interpolation in time and over pixels lessens the noise, root mean square, which
+        `separation.solve` takes into account; `pattern_std`, lessened over pixels.
         Attributes: `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band),
         `pauses` (times of the frames before and after each gap of more than 20 frame periods, in
         turn) [s], `transform` (the matrices, row by row). `exposure_time` and other variables over
@@ -101,7 +102,9 @@ def align(
     """
     names = [str(name) for name in schema.check_corrected(corrected)["band"].values]
     matrices = None if transform is None else _matrices(transform, names)
+    shares = np.ones(len(names))
     if matrices is not None:
+        shares = _warp_factors(matrices, corrected["counts"].shape[2:])
         # Registered first: a moving reflection passes an unregistered view earlier or later.
         corrected = _registered(corrected, matrices)
     counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
@@ -123,11 +126,14 @@ def align(
         plan = replace(plan, valid=plan.valid & (plan.labels(segment) == segment))
         plan.apply(movie, aligned[band], _largest(noise[band], movie))
         # (1 - w) I + w I' of two frames with independent noises, root mean square over time.
-        shares = plan.weight[plan.valid]
-        factors[band] = np.sqrt(np.mean((1.0 - shares) ** 2 + shares**2)) if shares.size else 1.0
+        weight = plan.weight[plan.valid]
+        factors[band] = np.sqrt(np.mean((1.0 - weight) ** 2 + weight**2)) if weight.size else 1.0
     lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
     result = _assembled(corrected, aligned, times)
-    result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
+    result = result.assign(noise_factor=("band", factors * shares, schema.NOISE_FACTOR.attrs))
+    if "pattern_std" in result:
+        result["pattern_std"] = result["pattern_std"] * shares
+        result["pattern_std"].attrs.update(schema.PATTERN_STD.attrs)
     return result.assign_attrs(
         clock=names[reference],
         time_offset=offsets.tolist(),
@@ -149,6 +155,14 @@ def warp(frames: npt.NDArray[Any], matrix: Array) -> Movie:
         map_coordinates(frame, places, output=out, order=1, mode="nearest")
         out[~inside] = np.nan
     return result
+
+
+def _warp_factors(matrices: Array, shape: tuple[int, ...]) -> Array:
+    """Deviation (band) [1] of independent pixels after the warp over that before it."""
+    weights = [positions(matrix, shape) % 1.0 for matrix in matrices]
+    # Bilinear: of each axis the weights 1 - w and w; the root of their mean square over the image.
+    squares = [np.prod((1.0 - weight) ** 2 + weight**2, axis=0) for weight in weights]
+    return np.sqrt([np.mean(square) for square in squares])
 
 
 def positions(matrix: Array, shape: tuple[int, ...]) -> Array:

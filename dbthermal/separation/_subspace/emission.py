@@ -357,6 +357,37 @@ def estimate_background(
     return background, np.asarray(variance)
 
 
+def pattern_variances(
+    tile: Tile, emission: Emission, ratios: ReflectionRatio, background: Array
+) -> tuple[Array | float, Array | float]:
+    r"""
+    Variances (time, pixel) [K^2] of object and background from a residual fixed pattern.
+
+    An offset :math:`\delta_m` of each band, constant in time, is no slope and no rapid change: the
+    emissivities are free of it. With the weights g of the bands in the background,
+
+    .. math:: \delta x = \frac{1}{h'} \sum w_m \delta_m, \quad
+              u' \delta y = \sum g_m \frac{\delta_m - e_m u_m' \delta x}{1 - e_m}
+    """
+    if tile.pattern is None:
+        return 0.0, 0.0
+    emitted = [
+        share * curve.slope(emission.temperature)
+        for share, curve in zip(emission.emissivity, tile.curves, strict=True)
+    ]
+    steepness, slope = _weighted(emitted, ratios.null_weights), tile.curves[0].slope(background)
+    reflectivity = 1.0 - emission.emissivity
+    precision = (reflectivity / np.array(tile.noise)[:, np.newaxis]) ** 2
+    direct = precision / precision.sum(axis=0) / reflectivity
+    through = _weighted(emitted, direct)
+    of_object = of_background = np.zeros(1)
+    for std, weight, share in zip(tile.pattern, ratios.null_weights, direct, strict=True):
+        part = weight / steepness
+        of_object = of_object + (std * part) ** 2
+        of_background = of_background + (std * (share - through * part) / slope) ** 2
+    return of_object, of_background
+
+
 def bend(tile: Tile, emission: Emission, background: Array) -> Array:
     r"""
     Part of the reflections (band - 1, time, pixel) [K] that the responses bend apart (eq. 11).
