@@ -29,7 +29,7 @@ class _Rows(BackendArray):
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Values:
         kind = indexing.IndexingSupport.OUTER
-        return indexing.explicit_indexing_adapter(key, self.shape, kind, self._read)
+        return np.asarray(indexing.explicit_indexing_adapter(key, self.shape, kind, self._read))
 
     def _read(self, key: tuple[Any, ...]) -> Values:
         """Values at a number, slice or array of places along each dim."""
