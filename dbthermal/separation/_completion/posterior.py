@@ -337,7 +337,7 @@ def _all_bands(tile: Tile, signal: Array) -> tuple[Array, Array]:
 def through(sensitivity: Array, covariance: Array) -> Array:
     """Variance (time, pixel) through parameters, d^T C d."""
     total = np.einsum("itp,ijp,jtp->tp", sensitivity, covariance, sensitivity, optimize=True)
-    return np.maximum(total, 0.0)
+    return np.asarray(np.maximum(total, 0.0))
 
 
 def fluctuation(tile: Tile, static: Moments, means: Bins, valid: Mask, expected: float) -> Array:
