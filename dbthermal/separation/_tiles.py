@@ -96,6 +96,7 @@ class Tile:
     noise: tuple[float, ...]  # standard deviation of each band's signal at the reference [K]
     shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
     rng: np.random.Generator  # the tile's own source of random starts
+    pattern: tuple[float, ...] | None = None  # residual fixed pattern of each band [K]
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
     emissivity: Array | None = None  # known beforehand (band, pixel) [1]
@@ -286,6 +287,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             noise=tuple(float(inputs.noise[band]) for band in bands),
             shape=(local.stop - local.start, window[1].stop - window[1].start),
             rng=rng,
+            pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
             segment=segment,
             material=None if material is None else material.select_pixels(places),
             emissivity=emissivity,
