@@ -82,7 +82,7 @@ def test_reflection_of_a_scaled_picture() -> None:
     both = found["reflection"].values, reflection
     rapid = [part[:, 20:, :30].reshape(FRAMES, -1) for part in both]
     rapid = [part - functions @ (functions.T @ part) for part in rapid]
-    agreement = float(np.corrcoef(*(part.ravel() for part in rapid))[0, 1])
+    agreement = float(np.corrcoef(rapid[0].ravel(), rapid[1].ravel())[0, 1])
     print(f"ratio {found.attrs['pooled_ratio']:.2f}, correlation {agreement:.2f}")
     assert found.attrs["pooled_ratio"] == pytest.approx(RATIO, rel=0.1)
     assert agreement > 0.8
