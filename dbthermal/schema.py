@@ -256,6 +256,10 @@ class Status(Flags):
     OBJECT_JUMP = 1 << 13, "one step of the object, taken into its curve; the values hold"
     BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
     ROLES_MAY_BE_SWAPPED = 1 << 15, "mean emissivity below 1/2: object and background exchanged"
+    COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity of the same material"
+    COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity of a library, or stated"
+    COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background of surroundings"
+    COMPLETED_FRAMES = 1 << 19, "completed, not measured: some frames of the temperatures"
 
 
 def status_attrs() -> dict[str, object]:
