@@ -110,6 +110,10 @@ STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
     {
         "capture": {"counts": _of("band time y x", "count", "raw signal", "uint16")},
         "corrected": {"counts": _of("band time y x", "count", "corrected signal", "float32")},
+        "reflection_shift": {
+            **_with_std("shift", "axis y x", "pixel", "shift of what is reflected"),
+            "known": _of("y x", "1", "texture tells the shift", "bool"),
+        },
         "separated": {
             **_with_std("object_temperature", "time y x", "K", "object temperature"),
             **_with_std("background_temperature", "time y x", "K", "background temperature"),
@@ -245,6 +249,7 @@ class Status(Flags):
     OBJECT_JUMP = 1 << 13, "one step of the object, taken into its curve; the values hold"
     BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
     ROLES_MAY_BE_SWAPPED = 1 << 15, "mean emissivity below 1/2: object and background exchanged"
+    NO_REFLECTION_PAIR = 1 << 16, "the second camera does not see this reflection: nothing is known"
 
 
 def status_attrs() -> dict[str, object]:
@@ -364,7 +369,10 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
     if array.size == 0:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
-    check_numbers(array, label, variable.units)
+    if variable.dtype != "bool":
+        check_numbers(array, label, variable.units)
+    elif array.dtype != bool:
+        raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
     for dim in array.dims:
         if dim == "band":
             _check_bands(array, label)
