@@ -8,8 +8,8 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import map_coordinates
 
+from dbthermal import _rows, schema
 from dbthermal import noise as noises
-from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
 from dbthermal.noise import MAD
@@ -34,6 +34,7 @@ def align(
     offset: float | xr.DataArray | None = None,
     transform: xr.DataArray | None = None,
     clock: str | None = None,
+    lazy: bool = False,
 ) -> xr.Dataset:
     """
     Resample all bands onto one clock, and onto the first band's grid.
@@ -65,6 +66,9 @@ def align(
         outside a view are NaN.
     clock : str, optional
         Band whose samples are not touched in time.
+    lazy : bool
+        Compute the counts when they are read, some rows at a time and each time anew, as
+        `correction.correct_capture` does: the capture may be lazy, too.
 
     Returns
     -------
@@ -72,7 +76,8 @@ def align(
         Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
         exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
         `status` is that of all the pixels that it may be made of; `noise_factor` (band) [1], by how
-        much interpolation lessens the noise, which `separation.solve` takes into account.
+        much interpolation in time and over pixels lessens the noise, root mean square, which
+        `separation.solve` takes into account; `pattern_std`, lessened over pixels.
         Attributes: `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band),
         `pauses` (times of the frames before and after each gap of more than 20 frame periods, in
         turn) [s], `transform` (the matrices, row by row). `exposure_time` and other variables over
@@ -101,9 +106,12 @@ def align(
     """
     names = [str(name) for name in schema.check_corrected(corrected)["band"].values]
     matrices = None if transform is None else _matrices(transform, names)
+    views = corrected["counts"]
+    shares = np.ones(len(names))
     if matrices is not None:
+        shares = _warp_factors(matrices, corrected["counts"].shape[2:])
         # Registered first: a moving reflection passes an unregistered view earlier or later.
-        corrected = _registered(corrected, matrices)
+        corrected = _registered(corrected, matrices, lazy=lazy)
     counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     signals = sample(corrected)
@@ -113,42 +121,69 @@ def align(
     noise, relative = _noise(signals, stamps)
     reference = int(np.argmax(relative)) if clock is None else _place(clock, names)
     times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
-    aligned, factors = np.empty(counts.shape, dtype=np.float32), np.ones(len(names))
-    for band, row in enumerate(stamps):
-        movie = _single(counts.isel(band=band))
-        absent = clocks.missing(movie)
-        if absent.any():
-            movie = np.where(absent[:, np.newaxis, np.newaxis], np.float32(np.nan), movie)
+    plans, factors, missing = [], np.ones(len(names)), _missing(views)
+    for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times).within(segment)
-        plan = replace(plan, valid=plan.valid & (plan.labels(segment) == segment))
-        plan.apply(movie, aligned[band], _largest(noise[band], movie))
+        plans.append(replace(plan, valid=plan.valid & (plan.labels(segment) == segment)))
         # (1 - w) I + w I' of two frames with independent noises, root mean square over time.
-        shares = plan.weight[plan.valid]
-        factors[band] = np.sqrt(np.mean((1.0 - shares) ** 2 + shares**2)) if shares.size else 1.0
-    lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
-    result = _assembled(corrected, aligned, times)
-    result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
+        weight = plans[band].weight[plans[band].valid]
+        factors[band] = np.sqrt(np.mean((1.0 - weight) ** 2 + weight**2)) if weight.size else 1.0
+
+    def aligned(rows: slice) -> Movie:
+        """Counts of some rows at the times of the reference."""
+        movies = counts.isel(y=rows)
+        result = np.empty(movies.shape, dtype=np.float32)
+        for band, plan in enumerate(plans):
+            movie = _single(movies.isel(band=band).values)
+            if missing[band].any():
+                movie = np.where(
+                    missing[band][:, np.newaxis, np.newaxis], np.float32(np.nan), movie
+                )
+            plan.apply(movie, result[band], _largest(noise[band], movie))
+        return result
+
+    lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
+    movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
+    result = _assembled(corrected, movie, times)
+    result = result.assign(noise_factor=("band", factors * shares, schema.NOISE_FACTOR.attrs))
+    if "pattern_std" in result:
+        result["pattern_std"] = result["pattern_std"] * shares
+        result["pattern_std"].attrs.update(schema.PATTERN_STD.attrs)
     return result.assign_attrs(
         clock=names[reference],
         time_offset=offsets.tolist(),
-        frames_lost=lost.tolist(),
+        frames_lost=lost,
         pauses=clocks.pauses(times).ravel().tolist(),
         **({} if matrices is None else {"transform": matrices.ravel().tolist()}),
     )
 
 
-def warp(frames: npt.NDArray[Any], matrix: Array) -> Movie:
-    """Samples (time, y, x) at the first view's pixels, bilinear; NaN outside the view."""
-    places = positions(matrix, frames.shape[1:])
-    inside = np.all(
-        (places >= 0) & (places <= np.array(frames.shape[1:])[:, None, None] - 1), axis=0
-    )
-    result = np.empty(frames.shape, dtype=np.float32)
+def _warped(view: xr.DataArray, matrix: Array, rows: slice) -> Movie:
+    """Some rows (time, y, x) of the first view's pixels, bilinear; NaN outside the view."""
+    if np.array_equal(matrix, np.eye(3)):
+        return _single(view.isel(y=rows).values)
+    shape = view.shape[1:]
+    places = positions(matrix, shape)[:, rows]
+    inside = np.all((places >= 0) & (places <= np.array(shape)[:, None, None] - 1), axis=0)
+    result = np.full((len(view), *inside.shape), np.nan, dtype=np.float32)
+    if not inside.any():
+        return result
+    first, last = (int(end(places[0][inside])) for end in (np.min, np.max))
+    frames = _single(view.isel(y=slice(first, last + 2)).values)
+    places -= np.array([first, 0])[:, None, None]
     for frame, out in zip(frames, result, strict=True):
         # Beside the border "nearest" only meets a weight of zero.
         map_coordinates(frame, places, output=out, order=1, mode="nearest")
         out[~inside] = np.nan
     return result
+
+
+def _warp_factors(matrices: Array, shape: tuple[int, ...]) -> Array:
+    """Deviation (band) [1] of independent pixels after the warp over that before it."""
+    weights = [positions(matrix, shape) % 1.0 for matrix in matrices]
+    # Bilinear: of each axis the weights 1 - w and w; the root of their mean square over the image.
+    squares = [np.prod((1.0 - weight) ** 2 + weight**2, axis=0) for weight in weights]
+    return np.sqrt([np.mean(square) for square in squares])
 
 
 def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
@@ -227,33 +262,47 @@ def _noise(signals: Array, stamps: Array) -> Array:
     return np.array(levels).T
 
 
-def _single(movie: xr.DataArray) -> Movie:
+def _missing(views: xr.DataArray) -> npt.NDArray[np.bool_]:
+    """Frames (band, time) that are NaN, or a copy of the one before, in every block of rows."""
+    parts = [
+        [clocks.missing(_single(movie)) for movie in views.isel(y=rows).values]
+        for rows in _rows.blocks(views.shape)
+    ]
+    return np.asarray(np.all(parts, axis=0))
+
+
+def _single(counts: npt.NDArray[Any]) -> Movie:
     """Counts in single precision, NaN where they are infinite or beyond it."""
-    counts = movie.values
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32, copy=False)
 
 
-def _registered(corrected: xr.Dataset, matrices: Array) -> xr.Dataset:
+def _registered(corrected: xr.Dataset, matrices: Array, *, lazy: bool) -> xr.Dataset:
     """All views, and the status, on the first one's grid."""
     counts = corrected["counts"]
-    views = np.empty(counts.shape, dtype=np.float32)
-    for band, matrix in enumerate(matrices):
-        movie = _single(counts.isel(band=band))
-        views[band] = movie if np.array_equal(matrix, np.eye(3)) else warp(movie, matrix)
-    result = corrected.assign(counts=counts.copy(data=views))
+
+    def views(rows: slice) -> Movie:
+        """Some rows of all bands."""
+        result = np.empty(counts[:, :, rows].shape, dtype=np.float32)
+        for out, view, matrix in zip(result, counts, matrices, strict=True):
+            out[...] = _warped(view, matrix, rows)
+        return result
+
+    warped = _rows.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
+    result = corrected.assign(counts=warped)
     if "status" in corrected:
         status = _warped_status(corrected["status"], matrices)
         result = result.assign(status=corrected["status"].copy(data=status))
     return result
 
 
-def _assembled(corrected: xr.Dataset, aligned: Movie, times: Array) -> xr.Dataset:
+def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr.Dataset:
     counts = corrected["counts"]
     attrs = schema.STAGES["corrected"]["counts"].attrs
     old = [name for name, part in corrected.data_vars.items() if "time" in part.dims]
     result = corrected.drop_vars(set(old) - {"counts", "segment"}).assign(
-        counts=(counts.dims, aligned, {**counts.attrs, **attrs})
+        counts=aligned.variable.copy(deep=False)
     )
+    result["counts"].attrs = {**counts.attrs, **attrs}
     result = result.assign_coords(time=("time", times, corrected["time"].attrs))
     return schema.check(result, "corrected")
 

@@ -7,6 +7,7 @@ options takes them as its frozen record, such as `SubspaceSettings`.
 import importlib
 from typing import TYPE_CHECKING, Any, Final
 
+from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
 from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection
 from dbthermal.separation._solve import METHODS, get_method, solve
@@ -25,6 +26,7 @@ __all__ = [
     "NaiveSettings",
     "RatioSettings",
     "SubspaceSettings",
+    "complete",
     "get_method",
     "materials",
     "reflected_change",

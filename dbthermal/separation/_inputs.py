@@ -27,7 +27,7 @@ _NOISE_PIXELS: Final = 4096
 _CLOCK_PIXELS: Final = 256
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
-_READ: Final = ("counts", "status", "segment", "noise_factor")
+_READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
 _MASK_DIMS: Final = (("time",), ("y", "x"), ("time", "y", "x"))
 
 
@@ -58,6 +58,7 @@ class Inputs:
     capture: xr.Dataset  # counts, where present status and segment, and `mask`; may be lazy
     curves: list[Curve]
     noise: Array  # standard deviation of the linearised signals (band) [K]
+    pattern: Array | None  # deviation of what the correction leaves, constant in time (band) [K]
     bands: list[int]  # places of the bands in the order of their noise
     emissivity: Array | None  # known beforehand (band, y, x) [1]
     emissivity_std: Array | None
@@ -114,6 +115,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         capture=capture,
         curves=curves,
         noise=noise,
+        pattern=_pattern(capture, curves),
         bands=order,
         emissivity=value,
         emissivity_std=std,
@@ -238,6 +240,20 @@ def _noise_factor(capture: xr.Dataset) -> Array | float:
     schema.check_variable(capture["noise_factor"], schema.NOISE_FACTOR, "'noise_factor'")
     factor = capture["noise_factor"].values.astype(np.float64)
     return planck.require_positive("noise_factor of the corrected", factor)
+
+
+def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array | None:
+    """Deviation (band) [K] of a residual fixed pattern, None without a variable `pattern_std`."""
+    if "pattern_std" not in capture:
+        return None
+    schema.check_variable(capture["pattern_std"], schema.PATTERN_STD, "'pattern_std'")
+    counts = capture["pattern_std"].values.astype(np.float64)
+    if not np.all((counts >= 0) & schema.measured(counts)):
+        raise ValueError(
+            f"Invalid pattern_std {counts.tolist()} count of the corrected. Must be zero or "
+            "positive, and finite."
+        )
+    return np.asarray(counts / [curve.reference_slope for curve in curves])
 
 
 def _known_emissivity(

@@ -74,10 +74,11 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     corrected : Dataset
         `counts` (band, time, y, x) [count], `time` [s], and optionally `status` (y, x) and
         `segment` (time), as `correction.correct_capture` gives them: a camera's raw counts must be
-        corrected first. Samples that are NaN are left out, and frames that repeat the one before in
-        a band. May be lazy, as from
-        `store.open_dataset`: it is read a few rows at a time, and never whole. "subspace" takes two
-        bands or more, and at least 32 frames; the other methods two bands.
+        corrected first. `pattern_std` (band) [count], an error of each pixel that is constant in
+        time, widens the bars of "subspace". Samples that are NaN are left out, and frames that
+        repeat the one before in a band. May be lazy, as from `store.open_dataset`: it is read a few
+        rows at a time, and never whole. "subspace" takes two bands or more, and at least 32 frames;
+        the other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
         where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture;

@@ -101,6 +101,7 @@ class Tile:
     noise: tuple[float, ...]  # standard deviation of each band's signal at the reference [K]
     shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
     rng: np.random.Generator  # the tile's own source of random starts
+    pattern: tuple[float, ...] | None = None  # residual fixed pattern of each band [K]
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
     emissivity: Array | None = None  # known beforehand (band, pixel) [1]
@@ -299,6 +300,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             noise=tuple(float(inputs.noise[band]) for band in bands),
             shape=(window[0].stop - window[0].start, window[1].stop - window[1].start),
             rng=rng,
+            pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
             segment=segment,
             material=None if material is None else material.select_pixels(places),
             emissivity=emissivity,
