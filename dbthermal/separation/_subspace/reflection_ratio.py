@@ -121,9 +121,7 @@ def estimate(
     )
 
 
-def rapid_scatter(
-    signals: Array, functions: smooth.Subspace, noise: Array
-) -> tuple[Array, Array]:
+def rapid_scatter(signals: Array, functions: smooth.Subspace, noise: Array) -> tuple[Array, Array]:
     """
     Noise-whitened scatter less noise, of what the largest orders leave, and its freedom.
 
