@@ -1,12 +1,13 @@
 """Resampling of all bands onto one clock and one pixel grid, the number of frames kept."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import map_coordinates
+from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import noise as noises
 from dbthermal import schema
@@ -21,6 +22,16 @@ TRANSFORM: Final = schema.Variable(
     ("band", "row", "column"), "float64", "1", "pixel of the first view to pixel of this one"
 )
 """Transform of `register`: for each band a 3x3 homography on (x, y, 1), in pixels."""
+
+MAP: Final = schema.Variable(
+    ("band", "axis", "y", "x"), "float64", "pixel", "row and column of the first view's pixel here"
+)
+"""Transform of a curved surface: for each band where each pixel of the first view lies in it."""
+
+# Pixels a side that a sample between pixels is made of.
+_TAPS: Final = 6
+# A weight that is none [1].
+_ROUNDING: Final = 1e-7
 
 # Standard deviations of noise beyond which a step lies between two frames.
 _STEP: Final = 5.0
@@ -61,8 +72,10 @@ def align(
         number for two bands, or (band), 0 in the first. By default `time_offset` of the registered
         views.
     transform : DataArray, optional
-        (band, row, column), from `register`: the views are warped by bilinear interpolation. Pixels
-        outside a view are NaN.
+        (band, row, column), from `register`; or, of a curved surface whose shape is known, (band,
+        axis, y, x) [pixel], the row and column in each view of each pixel of the first. The views
+        are interpolated by polynomials through 6x6 pixels, near a bad pixel by lines. Pixels
+        outside a view, or without a place in it (NaN), are NaN.
     clock : str, optional
         Band whose samples are not touched in time.
 
@@ -72,7 +85,8 @@ def align(
         Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
         exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
         `status` is that of all the pixels that it may be made of; `noise_factor` (band) [1], by how
-        much interpolation lessens the noise, which `separation.solve` takes into account.
+        much interpolation in time and by a warp lessens the noise, which `separation.solve` takes
+        into account.
         Attributes: `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band),
         `pauses` (times of the frames before and after each gap of more than 20 frame periods, in
         turn) [s], `transform` (the matrices, row by row). `exposure_time` and other variables over
@@ -100,10 +114,14 @@ def align(
     (True, [0, 1])
     """
     names = [str(name) for name in schema.check_corrected(corrected)["band"].values]
-    matrices = None if transform is None else _matrices(transform, names)
-    if matrices is not None:
+    factors, recorded = np.ones(len(names)), {}
+    if transform is not None:
         # Registered first: a moving reflection passes an unregistered view earlier or later.
-        corrected = _registered(corrected, matrices)
+        maps = _maps(transform, names, corrected["counts"].shape[2:])
+        corrected, factors = _registered(corrected, maps)
+        if "row" in transform.dims:
+            places = schema.band_positions(transform, names, "the transform")
+            recorded["transform"] = transform.values[places].ravel().tolist()
     counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     signals = sample(corrected)
@@ -113,7 +131,7 @@ def align(
     noise, relative = _noise(signals, stamps)
     reference = int(np.argmax(relative)) if clock is None else _place(clock, names)
     times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
-    aligned, factors = np.empty(counts.shape, dtype=np.float32), np.ones(len(names))
+    aligned = np.empty(counts.shape, dtype=np.float32)
     for band, row in enumerate(stamps):
         movie = _single(counts.isel(band=band))
         absent = clocks.missing(movie)
@@ -124,7 +142,8 @@ def align(
         plan.apply(movie, aligned[band], _largest(noise[band], movie))
         # (1 - w) I + w I' of two frames with independent noises, root mean square over time.
         shares = plan.weight[plan.valid]
-        factors[band] = np.sqrt(np.mean((1.0 - shares) ** 2 + shares**2)) if shares.size else 1.0
+        if shares.size:
+            factors[band] *= np.sqrt(np.mean((1.0 - shares) ** 2 + shares**2))
     lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
     result = _assembled(corrected, aligned, times)
     result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
@@ -133,21 +152,48 @@ def align(
         time_offset=offsets.tolist(),
         frames_lost=lost.tolist(),
         pauses=clocks.pauses(times).ravel().tolist(),
-        **({} if matrices is None else {"transform": matrices.ravel().tolist()}),
+        **recorded,
     )
 
 
-def warp(frames: npt.NDArray[Any], matrix: Array) -> Movie:
-    """Samples (time, y, x) at the first view's pixels, bilinear; NaN outside the view."""
-    places = positions(matrix, frames.shape[1:])
-    inside = np.all(
-        (places >= 0) & (places <= np.array(frames.shape[1:])[:, None, None] - 1), axis=0
-    )
-    result = np.empty(frames.shape, dtype=np.float32)
-    for frame, out in zip(frames, result, strict=True):
-        # Beside the border "nearest" only meets a weight of zero.
-        map_coordinates(frame, places, output=out, order=1, mode="nearest")
-        out[~inside] = np.nan
+def interpolation(places: Array, taps: int) -> csr_array:
+    """
+    Weights (pixel, pixel) [1] of samples at rows and columns (2, y, x) [pixel].
+
+    Those of the polynomials through so many neighbours a side (Lagrange): of 6 they keep 95 % of
+    what is four pixels long and 99.7 % from seven on, half-way between pixels; lines keep 71 and
+    90 %. A place outside has no weights.
+    """
+    shape = places.shape[1:]
+    nodes, inside, factors = np.arange(taps), np.ones(places[0].size, dtype=bool), []
+    spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
+    for place, size in zip(places.reshape(2, -1), shape, strict=True):
+        inside &= (place >= 0) & (place <= size - 1)
+        here = np.where(inside, place, 0.0)
+        # Near the border the polynomial is that of the outermost pixels.
+        first = np.clip(np.floor(here) - (taps // 2 - 1), 0, size - taps)
+        away = (here - first)[:, np.newaxis] - nodes
+        others = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
+        weight = np.prod(others / spacing, axis=2)
+        factors.append((weight, first[:, np.newaxis].astype(np.int32) + nodes))
+    (down, row), (right, column) = factors
+    weight = (down[:, :, np.newaxis] * right[:, np.newaxis]).astype(np.float32)
+    pixel = row[:, :, np.newaxis] * shape[1] + column[:, np.newaxis]
+    kept = inside[:, np.newaxis, np.newaxis] & (abs(weight) > _ROUNDING)
+    ends = np.concatenate([[0], np.cumsum(kept.sum(axis=(1, 2)))])
+    return csr_array((weight[kept], pixel[kept], ends), shape=(inside.size, inside.size))
+
+
+def _weights(places: Array, bad: npt.NDArray[np.bool_]) -> csr_array:
+    """Weights as `interpolation`, on lines near bad pixels (y, x), so that these do not spread."""
+    if np.array_equal(places, np.indices(bad.shape)):
+        return eye_array(bad.size, dtype=np.float32, format="csr")
+    fine = interpolation(places, min(_TAPS, *bad.shape))
+    near = (abs(fine) @ bad.ravel().astype(np.float32)) > 0
+    coarse = interpolation(places, 2)
+    keep, swap = (diags_array(part.astype(np.float32)) for part in (~near, near))
+    result = csr_array(keep @ fine + swap @ coarse)
+    result.eliminate_zeros()  # for a weight of 0 would pass a NaN on
     return result
 
 
@@ -187,16 +233,24 @@ def _offsets(corrected: xr.Dataset, offset: float | xr.DataArray | None, names: 
     return values
 
 
-def _matrices(transform: xr.DataArray, names: list[str]) -> Array:
-    """Homographies (band, 3, 3) in the capture's order."""
-    schema.check_variable(transform, TRANSFORM, "the transform")
+def _maps(transform: xr.DataArray, names: list[str], shape: tuple[int, ...]) -> list[Array]:
+    """Rows and columns (2, y, x) in each view of the first one's pixels, in the capture's order."""
     places = schema.band_positions(transform, names, "the transform")
+    if "axis" in transform.dims:
+        schema.check_variable(transform, MAP, "the transform")
+        if transform.shape[1:] != (2, *shape):
+            raise ValueError(
+                f"Invalid transform of shape {transform.shape[1:]}. Must be {(2, *shape)} in each "
+                "band, as the image."
+            )
+        return [np.asarray(view, dtype=np.float64) for view in transform.values[places]]
+    schema.check_variable(transform, TRANSFORM, "the transform")
     values = transform.values[places].astype(np.float64)
     if values.shape[1:] != (3, 3) or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Invalid transform of shape {values.shape}. Must be 3x3 and finite in each band."
         )
-    return np.asarray(values)
+    return [positions(matrix, shape) for matrix in values]
 
 
 def _place(clock: str, names: list[str]) -> int:
@@ -233,18 +287,31 @@ def _single(movie: xr.DataArray) -> Movie:
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32, copy=False)
 
 
-def _registered(corrected: xr.Dataset, matrices: Array) -> xr.Dataset:
-    """All views, and the status, on the first one's grid."""
+def _registered(corrected: xr.Dataset, maps: Sequence[Array]) -> tuple[xr.Dataset, Array]:
+    """All views, and the status, on the first one's grid; factor of each one's noise (band)."""
     counts = corrected["counts"]
-    views = np.empty(counts.shape, dtype=np.float32)
-    for band, matrix in enumerate(matrices):
+    views, less = np.empty(counts.shape, dtype=np.float32), np.ones(len(maps))
+    shape = counts.shape[2:]
+    status = corrected["status"].values if "status" in corrected else np.zeros(shape, np.uint32)
+    result = np.zeros_like(status)
+    for band, places in enumerate(maps):
         movie = _single(counts.isel(band=band))
-        views[band] = movie if np.array_equal(matrix, np.eye(3)) else warp(movie, matrix)
-    result = corrected.assign(counts=counts.copy(data=views))
+        present = ~clocks.missing(movie)
+        bad = (status > 0) | np.isnan(movie[present]).any(axis=0)
+        weights = _weights(places, bad)
+        outside = np.diff(weights.indptr).reshape(shape) == 0
+        for frame, out in zip(movie, views[band], strict=True):
+            out[:] = np.where(outside, np.nan, (weights @ frame.ravel()).reshape(shape))
+        used = ~outside.ravel()
+        # Independent noises of the pixels that a sample is made of: root mean square.
+        less[band] = np.sqrt(np.mean((weights**2).sum(axis=1)[used])) if used.any() else 1.0
+        for value in np.unique(status[status > 0]):
+            share = abs(weights) @ (status == value).ravel().astype(np.float32)
+            result[share.reshape(shape) > 0] |= value
+    registered = corrected.assign(counts=counts.copy(data=views))
     if "status" in corrected:
-        status = _warped_status(corrected["status"], matrices)
-        result = result.assign(status=corrected["status"].copy(data=status))
-    return result
+        registered = registered.assign(status=corrected["status"].copy(data=result))
+    return registered, less
 
 
 def _assembled(corrected: xr.Dataset, aligned: Movie, times: Array) -> xr.Dataset:
@@ -256,15 +323,3 @@ def _assembled(corrected: xr.Dataset, aligned: Movie, times: Array) -> xr.Datase
     )
     result = result.assign_coords(time=("time", times, corrected["time"].attrs))
     return schema.check(result, "corrected")
-
-
-def _warped_status(status: xr.DataArray, matrices: Array) -> npt.NDArray[Any]:
-    """Bits of every pixel that a warped one may be made of, in any of the views."""
-    result, bits = np.zeros_like(status.values), np.unique(status.values)
-    for places in (positions(matrix, status.shape) for matrix in matrices):
-        for value in bits[bits > 0]:
-            share = map_coordinates(
-                (status.values == value).astype(np.float64), places, order=1, mode="constant"
-            )
-            result[share > 0] |= value
-    return result
