@@ -101,6 +101,9 @@ SHUTTER_CLOSED: Final = "shutter_closed"
 NOISE_FACTOR: Final = _of("band", "1", "noise over that before the alignment")
 """Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
 
+PATTERN_STD: Final = _of("band", "count", "standard deviation of the residual fixed pattern")
+"""Variable `pattern_std`: what the correction leaves from pixel to pixel, constant in time."""
+
 SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
 """Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
 
@@ -110,6 +113,10 @@ STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
     {
         "capture": {"counts": _of("band time y x", "count", "raw signal", "uint16")},
         "corrected": {"counts": _of("band time y x", "count", "corrected signal", "float32")},
+        "reflection_shift": {
+            **_with_std("shift", "axis y x", "pixel", "shift of what is reflected"),
+            "known": _of("y x", "1", "texture tells the shift", "bool"),
+        },
         "separated": {
             **_with_std("object_temperature", "time y x", "K", "object temperature"),
             **_with_std("background_temperature", "time y x", "K", "background temperature"),
@@ -167,6 +174,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "segment": SEGMENT,
             "drift": _of("band time", "count", "drift taken out"),
             "noise_factor": NOISE_FACTOR,
+            "pattern_std": PATTERN_STD,
             "status": _STATUS,
         },
         "blackbody_frames": {"noise": NOISE},
@@ -174,6 +182,9 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "bad": _of("band y x", "1", "bad pixel", "bool"),
             "residual": _of("band", "count", "RMS residual over the good pixels"),
             "level": _of("band temperature", "count", "mean over the good pixels"),
+            "offset_std": _of("band", "count", "standard deviation of the offset at the centre"),
+            "gain_std": _of("band", "1", "standard deviation of the gain"),
+            "centre": _of("band", "count", "level at which the two errors are independent"),
         },
         "response": {
             "noise": NOISE,
@@ -245,6 +256,11 @@ class Status(Flags):
     OBJECT_JUMP = 1 << 13, "one step of the object, taken into its curve; the values hold"
     BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
     ROLES_MAY_BE_SWAPPED = 1 << 15, "mean emissivity below 1/2: object and background exchanged"
+    COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity of the same material"
+    COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity of a library, or stated"
+    COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background of surroundings"
+    COMPLETED_FRAMES = 1 << 19, "completed, not measured: some frames of the temperatures"
+    NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
 
 
 def status_attrs() -> dict[str, object]:
@@ -364,7 +380,10 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
     if array.size == 0:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
-    check_numbers(array, label, variable.units)
+    if variable.dtype != "bool":
+        check_numbers(array, label, variable.units)
+    elif array.dtype != bool:
+        raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
     for dim in array.dims:
         if dim == "band":
             _check_bands(array, label)

@@ -7,10 +7,11 @@ extra ``alignment``), `time_offset` by how much one camera is exposed later than
 
 from dbthermal.alignment._clocks import exposure_times, fill_times
 from dbthermal.alignment._offset import time_offset
+from dbthermal.alignment._reflections import reflection_shift
 from dbthermal.alignment._registration import register
 from dbthermal.alignment._resampling import align
 
-__all__ = ["align", "exposure_times", "fill_times", "register", "time_offset"]
+__all__ = ["align", "exposure_times", "fill_times", "reflection_shift", "register", "time_offset"]
 
 
 def __dir__() -> list[str]:

@@ -2,15 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.sparse import csr_array, diags_array, eye_array
 
+from dbthermal import _rows, schema
 from dbthermal import noise as noises
-from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
 from dbthermal.noise import MAD
@@ -45,6 +45,7 @@ def align(
     offset: float | xr.DataArray | None = None,
     transform: xr.DataArray | None = None,
     clock: str | None = None,
+    lazy: bool = False,
 ) -> xr.Dataset:
     """
     Resample all bands onto one clock, and onto the first band's grid.
@@ -74,10 +75,13 @@ def align(
     transform : DataArray, optional
         (band, row, column), from `register`; or, of a curved surface whose shape is known, (band,
         axis, y, x) [pixel], the row and column in each view of each pixel of the first. The views
-        are interpolated by polynomials through 6x6 pixels, near a bad pixel by lines. Pixels
-        outside a view, or without a place in it (NaN), are NaN.
+        are interpolated by polynomials through 6x6 pixels, near the border and bad pixels by
+        lines. Pixels outside a view, or without a place in it (NaN), are NaN.
     clock : str, optional
         Band whose samples are not touched in time.
+    lazy : bool
+        Compute the counts when they are read, some rows at a time and each time anew, as
+        `correction.correct_capture` does: the capture may be lazy, too.
 
     Returns
     -------
@@ -85,8 +89,8 @@ def align(
         Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
         exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
         `status` is that of all the pixels that it may be made of; `noise_factor` (band) [1], by how
-        much interpolation in time and by a warp lessens the noise, which `separation.solve` takes
-        into account.
+        much interpolation in time and over pixels lessens the noise, root mean square, which
+        `separation.solve` takes into account; `pattern_std`, lessened over pixels.
         Attributes: `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band),
         `pauses` (times of the frames before and after each gap of more than 20 frame periods, in
         turn) [s], `transform` (the matrices, row by row). `exposure_time` and other variables over
@@ -114,11 +118,10 @@ def align(
     (True, [0, 1])
     """
     names = [str(name) for name in schema.check_corrected(corrected)["band"].values]
-    factors, recorded = np.ones(len(names)), {}
+    views, shares, recorded = corrected["counts"], np.ones(len(names)), {}
     if transform is not None:
         # Registered first: a moving reflection passes an unregistered view earlier or later.
-        maps = _maps(transform, names, corrected["counts"].shape[2:])
-        corrected, factors = _registered(corrected, maps)
+        corrected, shares = _registered(corrected, _maps(transform, corrected), lazy=lazy)
         if "row" in transform.dims:
             places = schema.band_positions(transform, names, "the transform")
             recorded["transform"] = transform.values[places].ravel().tolist()
@@ -131,26 +134,38 @@ def align(
     noise, relative = _noise(signals, stamps)
     reference = int(np.argmax(relative)) if clock is None else _place(clock, names)
     times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
-    aligned = np.empty(counts.shape, dtype=np.float32)
-    for band, row in enumerate(stamps):
-        movie = _single(counts.isel(band=band))
-        absent = clocks.missing(movie)
-        if absent.any():
-            movie = np.where(absent[:, np.newaxis, np.newaxis], np.float32(np.nan), movie)
+    plans, factors, missing = [], np.ones(len(names)), _missing(views)
+    for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times).within(segment)
-        plan = replace(plan, valid=plan.valid & (plan.labels(segment) == segment))
-        plan.apply(movie, aligned[band], _largest(noise[band], movie))
+        plans.append(replace(plan, valid=plan.valid & (plan.labels(segment) == segment)))
         # (1 - w) I + w I' of two frames with independent noises, root mean square over time.
-        shares = plan.weight[plan.valid]
-        if shares.size:
-            factors[band] *= np.sqrt(np.mean((1.0 - shares) ** 2 + shares**2))
-    lost = np.isnan(aligned).all(axis=(2, 3)).sum(axis=1)
-    result = _assembled(corrected, aligned, times)
-    result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
+        weight = plans[band].weight[plans[band].valid]
+        factors[band] = np.sqrt(np.mean((1.0 - weight) ** 2 + weight**2)) if weight.size else 1.0
+
+    def aligned(rows: slice) -> Movie:
+        """Counts of some rows at the times of the reference."""
+        movies = counts.isel(y=rows)
+        result = np.empty(movies.shape, dtype=np.float32)
+        for band, plan in enumerate(plans):
+            movie = _single(movies.isel(band=band).values)
+            if missing[band].any():
+                movie = np.where(
+                    missing[band][:, np.newaxis, np.newaxis], np.float32(np.nan), movie
+                )
+            plan.apply(movie, result[band], _largest(noise[band], movie))
+        return result
+
+    lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
+    movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
+    result = _assembled(corrected, movie, times)
+    result = result.assign(noise_factor=("band", factors * shares, schema.NOISE_FACTOR.attrs))
+    if "pattern_std" in result:
+        result["pattern_std"] = result["pattern_std"] * shares
+        result["pattern_std"].attrs.update(schema.PATTERN_STD.attrs)
     return result.assign_attrs(
         clock=names[reference],
         time_offset=offsets.tolist(),
-        frames_lost=lost.tolist(),
+        frames_lost=lost,
         pauses=clocks.pauses(times).ravel().tolist(),
         **recorded,
     )
@@ -162,15 +177,14 @@ def interpolation(places: Array, taps: int) -> csr_array:
 
     Those of the polynomials through so many neighbours a side (Lagrange): of 6 they keep 95 % of
     what is four pixels long and 99.7 % from seven on, half-way between pixels; lines keep 71 and
-    90 %. A place outside has no weights.
+    90 %. A place without so many has no weights.
     """
     shape = places.shape[1:]
     nodes, inside, factors = np.arange(taps), np.ones(places[0].size, dtype=bool), []
     spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
     for place, size in zip(places.reshape(2, -1), shape, strict=True):
-        inside &= (place >= 0) & (place <= size - 1)
+        inside &= (place >= taps // 2 - 1) & (place <= size - taps // 2)
         here = np.where(inside, place, 0.0)
-        # Near the border the polynomial is that of the outermost pixels.
         first = np.clip(np.floor(here) - (taps // 2 - 1), 0, size - taps)
         away = (here - first)[:, np.newaxis] - nodes
         others = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
@@ -185,11 +199,11 @@ def interpolation(places: Array, taps: int) -> csr_array:
 
 
 def _weights(places: Array, bad: npt.NDArray[np.bool_]) -> csr_array:
-    """Weights as `interpolation`, on lines near bad pixels (y, x), so that these do not spread."""
+    """Weights as `interpolation`; lines near the border, and near bad pixels, not to spread them."""
     if np.array_equal(places, np.indices(bad.shape)):
         return eye_array(bad.size, dtype=np.float32, format="csr")
-    fine = interpolation(places, min(_TAPS, *bad.shape))
-    near = (abs(fine) @ bad.ravel().astype(np.float32)) > 0
+    fine = interpolation(places, _TAPS)
+    near = (np.diff(fine.indptr) == 0) | (abs(fine) @ bad.ravel().astype(np.float32) > 0)
     coarse = interpolation(places, 2)
     keep, swap = (diags_array(part.astype(np.float32)) for part in (~near, near))
     result = csr_array(keep @ fine + swap @ coarse)
@@ -233,24 +247,25 @@ def _offsets(corrected: xr.Dataset, offset: float | xr.DataArray | None, names: 
     return values
 
 
-def _maps(transform: xr.DataArray, names: list[str], shape: tuple[int, ...]) -> list[Array]:
+def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
     """Rows and columns (2, y, x) in each view of the first one's pixels, in the capture's order."""
-    places = schema.band_positions(transform, names, "the transform")
-    if "axis" in transform.dims:
-        schema.check_variable(transform, MAP, "the transform")
-        if transform.shape[1:] != (2, *shape):
+    names = [str(name) for name in corrected["band"].values]
+    shape = corrected["counts"].shape[2:]
+    expected = MAP if "axis" in transform.dims else TRANSFORM
+    schema.check_variable(transform, expected, "the transform")
+    values = transform.values[schema.band_positions(transform, names, "the transform")]
+    if expected is MAP:
+        if values.shape[1:] != (2, *shape):
             raise ValueError(
-                f"Invalid transform of shape {transform.shape[1:]}. Must be {(2, *shape)} in each "
+                f"Invalid transform of shape {values.shape[1:]}. Must be {(2, *shape)} in each "
                 "band, as the image."
             )
-        return [np.asarray(view, dtype=np.float64) for view in transform.values[places]]
-    schema.check_variable(transform, TRANSFORM, "the transform")
-    values = transform.values[places].astype(np.float64)
+        return [*values.astype(np.float64)]
     if values.shape[1:] != (3, 3) or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Invalid transform of shape {values.shape}. Must be 3x3 and finite in each band."
         )
-    return [positions(matrix, shape) for matrix in values]
+    return [positions(matrix, shape) for matrix in values.astype(np.float64)]
 
 
 def _place(clock: str, names: list[str]) -> int:
@@ -281,45 +296,76 @@ def _noise(signals: Array, stamps: Array) -> Array:
     return np.array(levels).T
 
 
-def _single(movie: xr.DataArray) -> Movie:
+def _missing(views: xr.DataArray) -> npt.NDArray[np.bool_]:
+    """Frames (band, time) that are NaN, or a copy of the one before, in every block of rows."""
+    parts = [
+        [clocks.missing(_single(movie)) for movie in views.isel(y=rows).values]
+        for rows in _rows.blocks(views.shape)
+    ]
+    return np.asarray(np.all(parts, axis=0))
+
+
+def _single(counts: npt.NDArray[Any]) -> Movie:
     """Counts in single precision, NaN where they are infinite or beyond it."""
-    counts = movie.values
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32, copy=False)
 
 
-def _registered(corrected: xr.Dataset, maps: Sequence[Array]) -> tuple[xr.Dataset, Array]:
+def _registered(
+    corrected: xr.Dataset, maps: Sequence[Array], *, lazy: bool
+) -> tuple[xr.Dataset, Array]:
     """All views, and the status, on the first one's grid; factor of each one's noise (band)."""
-    counts = corrected["counts"]
-    views, less = np.empty(counts.shape, dtype=np.float32), np.ones(len(maps))
-    shape = counts.shape[2:]
-    status = corrected["status"].values if "status" in corrected else np.zeros(shape, np.uint32)
-    result = np.zeros_like(status)
-    for band, places in enumerate(maps):
-        movie = _single(counts.isel(band=band))
-        present = ~clocks.missing(movie)
-        bad = (status > 0) | np.isnan(movie[present]).any(axis=0)
-        weights = _weights(places, bad)
-        outside = np.diff(weights.indptr).reshape(shape) == 0
-        for frame, out in zip(movie, views[band], strict=True):
-            out[:] = np.where(outside, np.nan, (weights @ frame.ravel()).reshape(shape))
-        used = ~outside.ravel()
-        # Independent noises of the pixels that a sample is made of: root mean square.
-        less[band] = np.sqrt(np.mean((weights**2).sum(axis=1)[used])) if used.any() else 1.0
-        for value in np.unique(status[status > 0]):
-            share = abs(weights) @ (status == value).ravel().astype(np.float32)
-            result[share.reshape(shape) > 0] |= value
-    registered = corrected.assign(counts=counts.copy(data=views))
-    if "status" in corrected:
-        registered = registered.assign(status=corrected["status"].copy(data=result))
-    return registered, less
+    counts, status = corrected["counts"], corrected.get("status")
+    flags = np.zeros(counts.shape[2:], dtype=np.uint8) if status is None else status.values
+    weights = [_weights(places, flags > 0) for places in maps]
+
+    def views(rows: slice) -> Movie:
+        """Some rows of all bands."""
+        parts = [_warped(view, part, rows) for view, part in zip(counts, weights, strict=True)]
+        return np.stack(parts)
+
+    warped = _rows.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
+    result = corrected.assign(counts=warped)
+    if status is not None:
+        result = result.assign(status=status.copy(data=_warped_status(flags, weights)))
+    # Independent noises of the pixels that a sample is made of: root mean square over the image.
+    squares = [(part**2).sum(axis=1)[np.diff(part.indptr) > 0] for part in weights]
+    return result, np.sqrt([np.mean(part) if part.size else 1.0 for part in squares])
 
 
-def _assembled(corrected: xr.Dataset, aligned: Movie, times: Array) -> xr.Dataset:
+def _warped(view: xr.DataArray, weights: csr_array, rows: slice) -> Movie:
+    """Some rows (time, y, x) of the first view's pixels; NaN outside the view."""
+    height, width = view.shape[1:]
+    top, end, _ = rows.indices(height)
+    part = csr_array(weights[top * width : end * width])
+    result = np.full((len(view), end - top, width), np.nan, dtype=np.float32)
+    if part.nnz == 0:
+        return result
+    first, last = part.indices.min() // width, part.indices.max() // width
+    part = csr_array(part[:, first * width : (last + 1) * width])
+    frames = _single(view.isel(y=slice(first, last + 1)).values)
+    inside = np.diff(part.indptr).reshape(end - top, width) > 0
+    for frame, out in zip(frames, result, strict=True):
+        out[inside] = (part @ frame.ravel()).reshape(inside.shape)[inside]
+    return result
+
+
+def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr.Dataset:
     counts = corrected["counts"]
     attrs = schema.STAGES["corrected"]["counts"].attrs
     old = [name for name, part in corrected.data_vars.items() if "time" in part.dims]
     result = corrected.drop_vars(set(old) - {"counts", "segment"}).assign(
-        counts=(counts.dims, aligned, {**counts.attrs, **attrs})
+        counts=aligned.variable.copy(deep=False)
     )
+    result["counts"].attrs = {**counts.attrs, **attrs}
     result = result.assign_coords(time=("time", times, corrected["time"].attrs))
     return schema.check(result, "corrected")
+
+
+def _warped_status(flags: npt.NDArray[Any], weights: Sequence[csr_array]) -> npt.NDArray[Any]:
+    """Bits (y, x) of every pixel that a warped one may be made of, in any of the views."""
+    result = np.zeros_like(flags)
+    for value in np.unique(flags[flags > 0]):
+        bad = (flags == value).ravel().astype(np.float32)
+        for part in weights:
+            result[(abs(part) @ bad).reshape(flags.shape) > 0] |= value
+    return result

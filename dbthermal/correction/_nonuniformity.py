@@ -28,7 +28,10 @@ OUTLIER: Final = 6.0
 """Robust z-score beyond which a pixel is bad [1]: 1 of 5e8 normal pixels."""
 
 _PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "offset_renewed"}
+_PATTERN = {"offset_std", "gain_std", "centre"}
 _PASSES = 2
+# About as many samples of a band tell its levels.
+_LEVELS = 65536
 # Below this a difference between pixels is rounding, and no pixel is an outlier [count].
 _ROUNDING = 0.01
 
@@ -113,11 +116,21 @@ def fit_correction(
     times the median absolute deviation) off the median of the others. Mean, fit and outliers are
     determined twice, then the fit is made with the remaining pixels.
 
+    The means are noisy, and so is the fit: at a level L it leaves from pixel to pixel, the same in
+    every frame of a capture, an error of the variance
+
+    .. math:: \sigma_f^2 + \sigma_g^2 (L - c)^2, \quad \sigma_f^2 = \frac{v}{n}, \quad
+       \sigma_g^2 = \frac{v}{\sum_T (\bar I - c)^2}
+
+    with c the mean level and v the variance of a mean about the fit: over n - 2 degrees of freedom
+    of n temperatures, or, of two temperatures, that of the noise over the number of frames.
+
     Parameters
     ----------
     blackbody : Dataset
         Stage `blackbody_frames` of `schema`: `counts` (band, temperature, y, x) [count] averaged
-        over time, at two temperatures or more.
+        over time, at two temperatures or more; optionally `noise` (band) [count] and the attribute
+        ``frames``, as from `blackbody_statistics`.
     threshold : float
         Limit of the robust z-score [1].
     maximum : int
@@ -129,8 +142,9 @@ def fit_correction(
         Stage `correction`: `gain` (band, y, x) [1] and `offset` (band, y, x) [count]; `bad` (band,
         y, x), bool; `residual` (band) [count], RMS over good pixels and temperatures; `level`
         (band, temperature) [count], the means that the pixels are brought to, for
-        `calibration.fit_response`. Bad pixels have gain 1 and offset 0: their counts pass
-        unchanged.
+        `calibration.fit_response`; `offset_std` [count], `gain_std` [1] and `centre` [count]
+        (band), the deviations above and c, but not of two temperatures without noise. Bad pixels
+        have gain 1 and offset 0: their counts pass unchanged.
 
     Raises
     ------
@@ -171,6 +185,7 @@ def fit_correction(
         "residual": residual,
         "level": level,
     }
+    values |= _residual_pattern(residual, level, blackbody)
     stage = {**schema.STAGES["correction"], **schema.OPTIONAL["correction"]}
     return xr.Dataset(
         {name: (stage[name].dims, part, stage[name].attrs) for name, part in values.items()},
@@ -190,7 +205,8 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     .. math:: f' = f - [(g F + f) - \overline{g F + f}]
 
     with F the image and the mean over the good pixels, so that the band's level stays: a single
-    image of unknown temperature says nothing of it (`undo_drift` does).
+    image of unknown temperature says nothing of it (`undo_drift` does). `offset_std` becomes that
+    of an image as noisy as one of the calibration's.
 
     Parameters
     ----------
@@ -226,8 +242,13 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     seen = correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
     level = np.mean(seen, axis=(1, 2), where=good, keepdims=True)
     offset = np.where(good, correction["offset"].values - (seen - level), 0.0)
-    variable = correction["offset"].copy(data=offset)
-    return correction.assign(offset=variable).assign_attrs(offset_renewed=1)
+    renewed = {"offset": correction["offset"].copy(data=offset)}
+    if correction.keys() >= _PATTERN and "level" in correction:
+        # The offset has the image's error, v, instead of that of n images, v / n.
+        images = correction.sizes["temperature"]
+        renewed["offset_std"] = correction["offset_std"] * np.sqrt(images)
+        renewed["centre"] = correction["centre"].copy(data=level[:, 0, 0])
+    return correction.assign(renewed).assign_attrs(offset_renewed=1)
 
 
 def correct(
@@ -263,7 +284,9 @@ def correct(
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), uint32,
         with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or
-        at 0) of `schema.Status`. The counts of these pixels are kept. Attributes:
+        at 0) of `schema.Status`. The counts of these pixels are kept. `pattern_std` (band) [count]
+        where the correction has its deviations: what it leaves from pixel to pixel, constant in
+        time, root mean square over the levels of the capture. Attributes:
         ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``),
         ``offset_interpolated``, and the numbers of marked pixels.
 
@@ -303,6 +326,8 @@ def correct(
         counts=(counts.dims, corrected, schema.STAGES["corrected"]["counts"].attrs),
         status=(("y", "x"), status, schema.status_attrs()),
     )
+    if correction.keys() >= _PATTERN:
+        result["pattern_std"] = _pattern_std(correction, result["counts"], status == 0)
     done = {
         f"gain_offset_{key}": correction.attrs[key] for key in _PARAMETERS & correction.attrs.keys()
     }
@@ -317,6 +342,38 @@ def correct(
         ),
         "corrected",
     )
+
+
+def _residual_pattern(residual: Array, level: Array, blackbody: xr.Dataset) -> dict[str, Array]:
+    """Deviations of offset and gain that the fit leaves, and their centre, see `fit_correction`."""
+    number, centre = level.shape[1], level.mean(axis=1)
+    if number > 2:
+        variance = residual**2 * number / (number - 2)
+    elif "noise" in blackbody and "frames" in blackbody.attrs:
+        variance = blackbody["noise"].values ** 2 / blackbody.attrs["frames"]
+    else:
+        return {}
+    energy = np.square(level - centre[:, np.newaxis]).sum(axis=1)
+    return {
+        "offset_std": np.sqrt(variance / number),
+        "gain_std": np.sqrt(variance / energy),
+        "centre": centre,
+    }
+
+
+def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr.DataArray:
+    """Deviation (band) [count] that a correction leaves at the levels of good pixels (y, x)."""
+    names = [str(name) for name in counts["band"].values]
+    places = schema.band_positions(correction, names, "the correction")
+    offset, gain, centre = (
+        correction[name].values[places] for name in ("offset_std", "gain_std", "centre")
+    )
+    step = max(1, int(np.cbrt(counts[0].size / _LEVELS)))
+    some = counts[:, ::step, ::step, ::step].values.astype(np.float64)
+    level = np.square(some - centre.reshape(-1, 1, 1, 1))
+    level = level.mean(axis=(1, 2, 3), where=good[::step, ::step])
+    std = np.sqrt(offset**2 + gain**2 * level)
+    return xr.DataArray(std, dims="band", attrs=schema.PATTERN_STD.attrs)
 
 
 def _difference_variance(counts: xr.DataArray) -> Array:

@@ -20,6 +20,7 @@ REASONS: Final = MappingProxyType(
         "invalid_samples": ("no samples, as outside a view", "#737373"),
         "constant_signal": ("signal never changes", "#969696"),
         "frozen_frames": ("frozen frames, as by a shutter", "#bdbdbd"),
+        "no_reflection_pair": ("reflection not seen by the second camera", "#d9d9d9"),
         "object_jump": ("object jumps", "#7f3b08"),
         "bands_apart": ("bands see the reflection at different times", "#b35806"),
         "object_not_smooth": ("object changes too fast, or noise is another", "#e08214"),

@@ -81,6 +81,7 @@ class Collection(BaseModel):
     citation: tuple[str, ...]
     terms: str
     used_by: tuple[str, ...]
+    optional: bool = False  # a mirror may lack it
     note: str
     files: Annotated[dict[str, File], BeforeValidator(_by_name)]
 
@@ -172,7 +173,10 @@ def provenance(collection: str) -> dict[str, str]:
 
 
 def main() -> int:
-    """Fetch or verify all collections, a line on each; exit status 1 if any is incomplete."""
+    """Fetch or verify all collections, a line on each; exit status 1 if any is incomplete.
+
+    An optional collection that a mirror has no folder for is left out, and the line says so.
+    """
     pooch.get_logger().setLevel("WARNING")  # one line a collection, not one a file
     try:
         collections = load().collections
@@ -181,6 +185,9 @@ def main() -> int:
         return 1
     status = 0
     for name, listed in collections.items():
+        if listed.optional and locked.mirror() is not None and not _folder(name).exists():
+            print(f"{name}: left out, '{_folder(name)}' does not exist")
+            continue
         try:
             number = len(fetch_collection(name))
         except (OSError, ValueError) as error:

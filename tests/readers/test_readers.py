@@ -256,9 +256,23 @@ def test_palette_video_says_that_it_is_not_radiometric(plasma: Path) -> None:
 
 @pytest.mark.parametrize("palette", ["turbo", "inferno", "viridis", "jet", "gray"])
 def test_palette_that_does_not_fit(plasma: Path, palette: str) -> None:
-    """Another palette than the video's is refused, with its distance and the limit."""
-    with pytest.raises(ValueError, match=rf"Palette '{palette}' does not fit.*at most 20"):
+    """Another palette than the video's is refused, with its distance and the better one's."""
+    with pytest.raises(ValueError, match=rf"Palette '{palette}' does not fit.*from 'plasma'"):
         readers.palette_video(plasma, palette)
+
+
+def test_noisy_video_is_accepted(tmp_path: Path) -> None:
+    """Noise that takes a video 20 to 35 of 255 from its palette is stated, and no refusal."""
+    rng = np.random.default_rng(3)
+    for noise in (0.06, 0.1):  # 1
+        noisy = np.clip(wave() + noise * rng.standard_normal(wave().shape), 0, 1)
+        path = film(tmp_path / "noisy.mp4", coloured(noisy, "plasma"))
+        attrs = readers.palette_video(path).attrs
+        print(f"noise {noise}: {attrs['palettes_compared']}")
+        assert 20 < attrs["palette_residual"] < 35
+        assert attrs["palettes_compared"].startswith("plasma ")
+        with pytest.raises(ValueError, match=r"Palette 'magma' does not fit.*from 'plasma'"):
+            readers.palette_video(path, "magma")
 
 
 @pytest.mark.parametrize("palette", ["plasmatic", "tab10"])
@@ -317,7 +331,7 @@ def test_masked_palette_video_width(masked: Path, width: int) -> None:
 
 def test_masked_palette_that_does_not_fit(masked: Path) -> None:
     """Another palette than the object's is refused."""
-    with pytest.raises(ValueError, match=r"Palette 'plasma' does not fit.*at most 35"):
+    with pytest.raises(ValueError, match=r"Palette 'plasma' does not fit.*from 'turbo'"):
         readers.masked_palette_video(masked, "plasma")
 
 

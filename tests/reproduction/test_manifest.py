@@ -111,15 +111,17 @@ def edit(root: Path, old: str, new: str) -> None:
 
 
 def test_the_list_is_complete() -> None:
-    """Every collection has an origin, a citation, terms; all but the mesh are used; 933 files."""
+    """Every collection has an origin, a citation, terms; all but the mesh are used; 949 files."""
     collections = manifest.load().collections
-    assert set(collections) == {"ecostress", "slum", "ucsb", "scenes", "meshes"}
+    names = {"ecostress", "slum", "ucsb", "scenes", "other_scenes", "meshes"}
+    assert set(collections) == names
+    assert [name for name in names if collections[name].optional] == ["other_scenes"]
     for collection in collections.values():
         assert collection.origin.startswith("https://")
         assert collection.origin.endswith("/")
         assert all((collection.citation, collection.terms))
         assert collection.used_by
-    assert sum(len(collection.files) for collection in collections.values()) == 933
+    assert sum(len(collection.files) for collection in collections.values()) == 949
 
 
 def test_the_list_notes_short_and_repeated_spectra() -> None:
@@ -249,6 +251,21 @@ def test_main(capsys: pytest.CaptureFixture[str]) -> None:
     """The command prints one line for a complete collection."""
     assert manifest.main() == 0
     assert re.fullmatch(r"notes: 2 files, 0\.0 MB, in .*notes\n", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_optional_collection(
+    copies: Path, project: Path, capsys: pytest.CaptureFixture[str], folder: bool
+) -> None:
+    """A mirror may lack an optional collection, but no part of one."""
+    edit(project, "    terms: free\n", "    terms: free\n    optional: true\n")
+    for path in copies.iterdir():
+        path.unlink()
+    if not folder:
+        copies.rmdir()
+    assert manifest.main() == int(folder)
+    said = capsys.readouterr()
+    assert ("notes: left out" in said.out, "Missing file" in said.err) == (not folder, folder)
 
 
 @pytest.mark.usefixtures("project")

@@ -103,8 +103,8 @@ def test_standard_deviations_are_those_of_the_scatter() -> None:
     for name, (value, stated) in pairs.items():
         share = np.median(np.std(value, axis=1) / np.sqrt(np.median(stated, axis=1)))
         print(f"{name}: scatter over stated {share:.3f}")
-        # The regression's variance is on the safe side: correlation is counted, never its lack.
-        assert (0.95 if name == "object" else 0.75) < share < 1.05, name
+        # In some pixels the line locks to no level of the background, and has the variance of both.
+        assert (0.95 if name == "object" else 0.80) < share < 1.05, name
 
 
 def test_emissivity_of_a_constant_object_is_undefined() -> None:

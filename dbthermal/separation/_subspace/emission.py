@@ -13,7 +13,8 @@ ways that add:
   a limit that the user states;
 - an extrapolation: the part of the resting background's change that is *not* along the object's
   curve is seen. Its spectrum over the smooth functions is continued to the curve, as that of a
-  random walk, whose energy falls with the square of the degree.
+  random walk, whose energy falls with the square of the degree; or as a line in time, where one
+  beside the object's curve changes the slope by more.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from dbthermal import _smooth as smooth
 from dbthermal import mixing
 from dbthermal.separation._subspace import residuals
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
-from dbthermal.separation._tiles import Array, Mask, Tile
+from dbthermal.separation._tiles import Array, Mask, Tile, Whole
 
 _ROUNDS: Final = 2
 # Energy of the object's change over that of its noise, below which its emissivity is undefined.
@@ -72,12 +73,18 @@ def estimate(
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
     omitted = smooth_variance * np.log(tile.time.size) / ratios.order
-    # Variance of the slope: of the ordinate's noise, and of the abscissa's, e_1^2 var q / sum u^2.
-    noise_variance = line.variance + first**2 * ratios.null_variance / line.energy
-    walk, upper = walk_variance(line, fit.emitted, functions, tile.noise[0])
+    # The slope is sum k z_1, with k = w u / sum w u^2 of the curve u about its mean. Its variance:
+    # of the ordinate's noise, and of the abscissa's.
+    kernel = line.weights * fit.emitted
+    kernel -= line.weights * (kernel.sum(axis=0) / line.weights.sum(axis=0))
+    kernel /= line.energy
+    noise_variance = line.variance + first**2 * _curve_variance(kernel, functions, ratios)
+    curve_std = first * np.sqrt(ratios.null_variance)
+    walk, upper = walk_variance(line, fit.emitted, functions, noise[0], curve_std, ratios.order)
     # A uniform distribution in [-d, d] has the variance d^2 / 3.
-    drift = ((1.0 - first) * background_drift / np.ptp(fit.emitted, axis=0)) ** 2 / 3.0
-    drifting = drift + upper
+    limit = (1.0 - first) * background_drift / np.sqrt(3.0)
+    linear = _linear_variance(tile, functions, ratios, fit, limit)
+    drifting = (limit / np.ptp(fit.emitted, axis=0)) ** 2 + np.maximum(upper, linear)
     if tile.material is not None:
         known = ratios.pooled & np.isfinite(tile.material.emissivity)
         noise_variance = np.where(known, tile.material.noise_variance, noise_variance)
@@ -209,7 +216,12 @@ def _emissivity_variance(
 
 
 def walk_variance(
-    line: residuals.Line, emitted: Array, functions: smooth.Subspace, noise: float
+    line: residuals.Line,
+    emitted: Array,
+    functions: smooth.Subspace,
+    noise: float,
+    curve_std: Array | float = 0.0,
+    order: Whole | int = 1,
 ) -> tuple[Array, Array]:
     r"""
     Variance (pixel) [1] of the regression's slope from a background that walks; its upper bound.
@@ -219,6 +231,8 @@ def walk_variance(
     of two octaves; for the bound, at the upper end of their 95 % interval,
 
     .. math:: \mathrm{var}(e_1) = \frac{A}{|u|^2} \sum_j \frac{\xi_j^2}{j^2}
+
+    The residual holds the `noise` of the signal and, below the `order`, that of the object's curve.
     """
     columns = functions.functions[:, functions.steps + 1 :]
     degree = np.arange(1.0, columns.shape[1] + 1)[:, np.newaxis]
@@ -231,7 +245,7 @@ def walk_variance(
     # The part orthogonal to the object's curve is the background's alone.
     spectrum = spectrum - unit * (unit * spectrum).sum(axis=0)
     # Energy of a walk at degree 1: j^2 times that at degree j, less the noise's.
-    walk = degree**2 * (spectrum**2 - noise**2 / share)
+    walk = degree**2 * (spectrum**2 - noise**2 / share - curve_std**2 * (degree < order))
     octaves, widened = [], []
     for low, high, lost in _OCTAVES:
         if (freedom := len(walk[low - 1 : high - 1]) - lost) > 0:
@@ -240,6 +254,60 @@ def walk_variance(
     scale = (unit**2 / degree**2).sum(axis=0) / energy
     expected, upper = (scale * np.max(one, axis=0, initial=0.0) for one in (octaves, widened))
     return np.asarray(expected), np.asarray(upper)
+
+
+def _linear_variance(
+    tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio, fit: _Fit, limit: Array
+) -> Array:
+    r"""
+    Variance (pixel) [1] of the regression's slope from a background that drifts linearly in time.
+
+    What the object's curve leaves of a line in time tells its size d, with a variance v. Normal
+    beforehand, of a variance D as large as the `limit`'s (pixel) [K] or as what is seen, the mean
+    square of the slope's error is
+
+    .. math:: \gamma^2 k (k d^2 + v), \quad k = D / (D + v)
+    """
+    drift = functions.functions[:, functions.steps + 1]
+    slope, size, kernel = _drift_beside(fit.line, fit.emitted, drift)
+    variance = tile.noise[0] ** 2 * np.einsum("tp,tp->p", kernel, kernel)
+    variance += fit.emissivity**2 * _curve_variance(kernel, functions, ratios)
+    before = np.maximum((limit / np.ptp(drift)) ** 2, size**2 + variance)
+    share = before / (before + variance)
+    return np.asarray(slope**2 * share * (share * size**2 + variance))
+
+
+def _drift_beside(line: residuals.Line, curve: Array, drift: Array) -> tuple[Array, Array, Array]:
+    r"""
+    Linear drift (time) beside the object's curve in the residual r of the robust line.
+
+    Its slope :math:`\gamma` on the curve (pixel), its size d (pixel), and the kernel k
+    (time, pixel) of :math:`d = \sum k r`. A large drift takes the weight from the frames that tell
+    it best: the second time the weights are those of the residual beside it.
+    """
+    weights = line.weights
+    for last in (False, True):
+        weighted, total = weights * curve, weights.sum(axis=0)
+        mean, middle = weighted.sum(axis=0) / total, drift @ weights / total
+        energy = np.einsum("tp,tp->p", weighted, curve) - total * mean**2
+        slope = (drift @ weighted - total * mean * middle) / energy
+        # w (t - gamma u), about its mean, over its product with t.
+        kernel = drift[:, np.newaxis] * weights
+        kernel -= (middle - slope * mean) * weights
+        kernel -= slope * weighted
+        kernel /= drift @ kernel
+        size = np.einsum("tp,tp->p", kernel, line.residual)
+        if not last:
+            beside = drift[:, np.newaxis] - (middle - slope * mean) - slope * curve
+            scaled = (line.residual - size * beside) / (residuals.TUNING * line.scale)
+            weights = np.maximum(1.0 - scaled**2, 0.0) ** 2
+    return slope, size, kernel
+
+
+def _curve_variance(kernel: Array, functions: smooth.Subspace, ratios: ReflectionRatio) -> Array:
+    """Variance (pixel) of the sum of a kernel (time, pixel) over the object's smoothed noise."""
+    part = (functions.object_part.T @ kernel) * functions.columns(ratios.order)
+    return np.asarray(ratios.null_variance * (part**2).sum(axis=0))
 
 
 def estimate_background(
@@ -287,6 +355,37 @@ def estimate_background(
     variance += through * (through * emission.epsilon_variance - contrast * covariance)
     variance += contrast**2 * (of_first * ratios.inverse_energy + slope)
     return background, np.asarray(variance)
+
+
+def pattern_variances(
+    tile: Tile, emission: Emission, ratios: ReflectionRatio, background: Array
+) -> tuple[Array | float, Array | float]:
+    r"""
+    Variances (time, pixel) [K^2] of object and background from a residual fixed pattern.
+
+    An offset :math:`\delta_m` of each band, constant in time, is no slope and no rapid change: the
+    emissivities are free of it. With the weights g of the bands in the background,
+
+    .. math:: \delta x = \frac{1}{h'} \sum w_m \delta_m, \quad
+              u' \delta y = \sum g_m \frac{\delta_m - e_m u_m' \delta x}{1 - e_m}
+    """
+    if tile.pattern is None:
+        return 0.0, 0.0
+    emitted = [
+        share * curve.slope(emission.temperature)
+        for share, curve in zip(emission.emissivity, tile.curves, strict=True)
+    ]
+    steepness, slope = _weighted(emitted, ratios.null_weights), tile.curves[0].slope(background)
+    reflectivity = 1.0 - emission.emissivity
+    precision = (reflectivity / np.array(tile.noise)[:, np.newaxis]) ** 2
+    direct = precision / precision.sum(axis=0) / reflectivity
+    through = _weighted(emitted, direct)
+    of_object = of_background = np.zeros(1)
+    for std, weight, share in zip(tile.pattern, ratios.null_weights, direct, strict=True):
+        part = weight / steepness
+        of_object = of_object + (std * part) ** 2
+        of_background = of_background + (std * (share - through * part) / slope) ** 2
+    return of_object, of_background
 
 
 def bend(tile: Tile, emission: Emission, background: Array) -> Array:

@@ -202,11 +202,12 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Esti
     undefined = still | flags[Status.GRAY]
     unidentified = undefined | emission.constant
     ratio_variance = ratios.variance + emission.level_std**2
+    by_pattern = emissions.pattern_variances(tile, emission, ratios, solution.background)
     result = Estimate(
         object_temperature=emission.temperature,
-        object_temperature_std=emission.temperature_std,
+        object_temperature_std=np.sqrt(emission.temperature_std**2 + by_pattern[0]),
         background_temperature=solution.background,
-        background_temperature_std=np.sqrt(solution.background_variance),
+        background_temperature_std=np.sqrt(solution.background_variance + by_pattern[1]),
         emissivity=emission.emissivity,
         emissivity_std=np.sqrt(emission.emissivity_variance),
         reflection_ratio=np.where(still, np.nan, ratios.ratio),
