@@ -136,8 +136,8 @@ class _Equations:
         """Return the equations of other emissivities."""
         return replace(self, first=first, shares=shares)
 
-    def there_signal(self, signal: Array, change: Array) -> Array:
-        """u_1(x(p)) (pixel, frame) [K]; for the loose pixels by the change of e_1 u_1(x)."""
+    def _there(self, signal: Array, change: Array) -> Array:
+        """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
         result = np.asarray(self.there @ signal)
         result[self.loose] = signal[self.loose] + change / self.first[self.loose, np.newaxis]
         return result
@@ -153,9 +153,9 @@ class _Equations:
         own = shares[0][:, np.newaxis] * alone
         return np.asarray(own + self.other_bands(shares[1:], alone))
 
-    def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array]:
+    def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array, Array]:
         """
-        Solve for u_1(x(r)) (pixel, frame) [K], of a target q and from a start.
+        Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
 
         The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
         beforehand. Also returns the last step (pixel) [K].
@@ -165,7 +165,7 @@ class _Equations:
         rest = np.setdiff1d(self.loose, np.flatnonzero(self.backward))
         signal, step = alone, np.zeros_like(alone)
         for _ in range(_STEPS):
-            there = self.there_signal(signal, change)
+            there = self._there(signal, change)
             right = target - self.other_bands(others, there)
             following = np.where(self.forward[:, np.newaxis], right / own, signal)
             # Newton's steps, of a slope near sum c = 1.
@@ -178,7 +178,12 @@ class _Equations:
             step, signal = np.abs(following - signal), following
             if step.max(initial=0.0) < _CONVERGED:
                 break
-        return signal, step.max(axis=1)
+        there = self._there(signal, change)
+        # A backward pixel's own equation holds for another x(p) than that between its neighbours.
+        right = target - own * signal - self.other_bands(others, there)
+        right /= others.sum(axis=0)[:, np.newaxis]
+        there = np.where(self.backward[:, np.newaxis], there + right, there)
+        return signal, there, step.max(axis=1)
 
 
 def solve(
@@ -203,8 +208,7 @@ def solve(
         def both(alone: Array, change: Array) -> tuple[Array, Array, Array, Array]:
             signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
             signal = np.ascontiguousarray(signal.T, dtype=np.float32)
-            here, step = equations.solve(equations.target(shares, signal), signal, change)
-            return signal, here, equations.there_signal(here, change), step
+            return signal, *equations.solve(equations.target(shares, signal), signal, change)
 
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
         looked_at = _bridge(film[some], solved)
@@ -396,7 +400,7 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
     alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
     linear = replace(equations, bend=None)
-    signal, _ = linear.solve(alone, alone, change.astype(np.float32))
+    signal, _, _ = linear.solve(alone, alone, change.astype(np.float32))
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
         uniform_filter(np.reshape(one, displacement.shape), 3).ravel()

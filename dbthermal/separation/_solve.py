@@ -341,7 +341,10 @@ def _survey(
             if np.any(wanted):
                 part = tile if np.all(wanted) else tile.select_pixels(wanted)
                 survey: Survey = inputs.apply(inputs.method.survey, part)
-                surveys.append((numbers[pixels][wanted], survey))
+                # Whitened by one noise for all, not by that of the tile.
+                scale = np.array(part.noise) / inputs.noise[inputs.bands]
+                scatter = survey.scatter * np.multiply.outer(scale, scale)[..., np.newaxis]
+                surveys.append((numbers[pixels][wanted], replace(survey, scatter=scatter)))
         bar.update(cut.status.size)
     return surveys
 
