@@ -126,9 +126,9 @@ class _Equations:
     first: Array  # e_1 (pixel) [1]
     shares: Array  # c of eq. 6 (band, pixel) [1]
     there: csr_array  # weights of x(p) (pixel, pixel), of the linked pixels
-    onward: csr_array  # weights of the equation at p + d(p) (pixel, pixel), of the backward ones
-    forward: Mask  # solved for x(r)
-    backward: Mask  # solved for x(p)
+    onward: csr_array  # weights of the equation at p + d(p) (backward pixel, pixel)
+    forward: Whole  # pixels solved for x(r)
+    backward: Whole  # pixels solved for x(p)
     loose: Whole  # solved pixels without such neighbours
     bend: _Bend | None
 
@@ -160,29 +160,30 @@ class _Equations:
         The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
         beforehand. Also returns the last step (pixel) [K].
         """
-        own, others = self.shares[0][:, np.newaxis], self.shares[1:]
-        beyond = np.asarray((self.onward @ others.T).T) if np.any(self.backward) else others
-        rest = np.setdiff1d(self.loose, np.flatnonzero(self.backward))
+        own, forward, backward = self.shares[0][:, np.newaxis], self.forward, self.backward
+        others, back = self.shares[1:], self.shares[1:, self.backward]
+        beyond = np.asarray((self.onward @ others.T).T)
+        slope = beyond.sum(axis=0)[:, np.newaxis]
+        rest = np.setdiff1d(self.loose, backward)
         signal, step = alone, np.zeros_like(alone)
         for _ in range(_STEPS):
             there = self._there(signal, change)
             right = target - self.other_bands(others, there)
-            following = np.where(self.forward[:, np.newaxis], right / own, signal)
+            following = signal.copy()
+            following[forward] = right[forward] / own[forward]
             # Newton's steps, of a slope near sum c = 1.
-            following[rest] = signal[rest] + right[rest] - own[rest] * signal[rest]
-            if np.any(self.backward):
-                right = np.asarray(self.onward @ (target - own * signal))
-                right = right - self.other_bands(beyond, signal)
-                near = signal + right / beyond.sum(axis=0)[:, np.newaxis]
-                following = np.where(self.backward[:, np.newaxis], near, following)
+            following[rest] += right[rest] - own[rest] * signal[rest]
+            # The same for x(p), of the equation at p + d(p).
+            right = np.asarray(self.onward @ (target - own * signal))
+            following[backward] += (right - self.other_bands(beyond, signal[backward])) / slope
             step, signal = np.abs(following - signal), following
             if step.max(initial=0.0) < _CONVERGED:
                 break
         there = self._there(signal, change)
         # A backward pixel's own equation holds for another x(p) than that between its neighbours.
-        right = target - own * signal - self.other_bands(others, there)
-        right /= others.sum(axis=0)[:, np.newaxis]
-        there = np.where(self.backward[:, np.newaxis], there + right, there)
+        right = target[backward] - own[backward] * signal[backward]
+        right -= self.other_bands(back, there[backward])
+        there[backward] += right / back.sum(axis=0)[:, np.newaxis]
         return signal, there, step.max(axis=1)
 
 
@@ -313,13 +314,13 @@ def _equations(inputs: Inputs, emissivity: Array, solved: Mask) -> _Equations:
     onward, reached = _among(displacement.onward, solved, displacement.shape[1])
     strong = np.abs(shares[1:].sum(axis=0)) < np.abs(shares[0])
     linked &= strong | reached
-    backward = linked & ~strong
+    backward = np.flatnonzero(linked & ~strong)
     return _Equations(
         first=first,
         shares=shares,
         there=_rows(there, linked),
-        onward=_rows(onward, backward),
-        forward=linked & strong,
+        onward=csr_array(onward[backward].astype(np.float32)),
+        forward=np.flatnonzero(linked & strong),
         backward=backward,
         loose=np.flatnonzero(solved & ~linked),
         bend=_bend([inputs.curves[band] for band in inputs.bands]),

@@ -131,7 +131,7 @@ def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
 def _flags(status: xr.DataArray) -> dict[str, xr.DataArray]:
     """Share of pixels with any flag, and with each."""
     bits = xr.DataArray(
-        np.array(list(schema.Status), dtype=status.dtype),
+        np.array(list(schema.Status), dtype=np.uint32),
         dims="flag",
         coords={"flag": list(schema.Status.bits())},
     )
