@@ -8,6 +8,8 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import alignment, calibration, emissivity, metrics, separation, simulation
+from dbthermal import correction as corrections
+from dbthermal import response as responses
 from reproduction import twins
 from reproduction.experiments.comparison import MOVING, arguments
 from reproduction.experiments.stress import INTERVAL
@@ -19,7 +21,7 @@ BEAD: Final = 3
 SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 """Methods that take the shift of the reflections."""
 
-REACH: Final = 8
+REACH: Final = 5
 """Pixels around a bead that they get: of some shifts, by which they pair the pixels."""
 
 _STRAY: Final = 0.01
@@ -40,10 +42,10 @@ def judge_twin(
     Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
 
     One of `twins.TWINS`, of a material of `emissivity.embedded_table`, of rows and columns, a
-    number of frames and their rate [Hz], by two cameras a baseline apart [m], whose views are registered perfectly
-    or as found (`twins.registered`), and by two at the first one's place. Of the variants (see
-    `at_thermocouple`), "calibrated" gets the emissivities that the bench finds for a piece of the
-    same material, with their deviations.
+    number of frames and their rate [Hz], by two cameras a baseline apart [m], whose views are
+    registered perfectly or as found (`twins.registered`), and by two at the first one's place. Of
+    the variants (see `at_thermocouple`), "calibrated" gets the emissivities that the bench finds
+    for a piece of the same material, with their deviations.
 
     Returns
     -------
@@ -52,13 +54,8 @@ def judge_twin(
         `at_thermocouple` and `over_the_image`; `emissivity_difference` (band) [1], mean magnitude
         of the default method's emissivity less the calibrated one over the pixels without a flag.
     """
-    rng, rig = np.random.default_rng(seed), simulation.Rig()
-    response = rig.response()
-    table = emissivity.embedded_table()["emissivity"]
-    true = table.sel(material=material, band=list(rig.bands), drop=True)
-    time = np.arange(int(clock[0])) / clock[1]
-    setting = twins.Capture(true, (shape[0], shape[1]), time, baseline)
-    scene = twins.twin(name, setting, rng)
+    rng, response = np.random.default_rng(seed), simulation.Rig().response()
+    scene = twins.twin(name, capture_of(material, shape, clock, baseline), rng)
     fit = on_bench(response, material, rng)
     known = {"emissivity": fit["emissivity"], "emissivity_std": fit["emissivity_std"]}
     informed = {
@@ -80,6 +77,49 @@ def judge_twin(
         parts.append(read.assign(both))
     label = xr.DataArray(list(views), dims="cameras", name="cameras")
     return xr.concat(parts, label, combine_attrs="override")
+
+
+def capture_of(
+    material: str, shape: Sequence[int], clock: Sequence[float], baseline: float
+) -> twins.Capture:
+    """Capture of a twin of a material, see `judge_twin`, in the bands of the default rig."""
+    table = emissivity.embedded_table()["emissivity"]
+    true = table.sel(material=material, band=list(simulation.Rig().bands), drop=True)
+    time = np.arange(int(clock[0])) / clock[1]
+    return twins.Capture(true, (shape[0], shape[1]), time, baseline)
+
+
+def separate_twin(
+    name: str,
+    seed: int,
+    capture: twins.Capture,
+    detector: xr.Dataset,
+    correction: xr.Dataset,
+    response: xr.Dataset,
+    **options: Any,
+) -> xr.Dataset:
+    """
+    Separate a twin, seen by the default rig with a fixed pattern, by the default method.
+
+    The detector is from `simulation.pattern`, correction and response are calibrated; options are
+    those of `twins.twin`. Returns the result of `separation.solve`, and in addition
+    `apparent_temperature` (band, time, y, x), of the registered views; `true_object_temperature`
+    and `true_background_temperature` (time, y, x) [K], of the first camera.
+    """
+    rng = np.random.default_rng(seed)
+    scene = twins.twin(name, capture, rng, **options)
+    counts = twins.observe(scene, simulation.Rig().response(), rng)
+    raw = simulation.capture(counts, detector)
+    corrected = twins.registered(scene, corrections.correct(raw, correction))
+    shift = alignment.reflection_shift(corrected, response) if capture.baseline else None
+    result = separation.solve(corrected, response, reflection_shift=shift)
+    seen = responses.apparent_temperature(response, corrected["counts"]).astype("float32")
+    films = {
+        f"true_{part}_temperature": scene[f"{part}_temperature"].astype("float32")
+        for part in ("object", "background")
+    }
+    films["apparent_temperature"] = seen
+    return result.assign(films).assign_attrs(corrected.attrs)
 
 
 def over_the_image(scene: xr.Dataset, separated: xr.Dataset) -> xr.Dataset:
