@@ -9,7 +9,8 @@ from scipy.ndimage import gaussian_filter, median_filter
 
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment._resampling import TRANSFORM, positions
+from dbthermal.alignment._resampling import TRANSFORM
+from dbthermal.alignment._warping import positions
 
 Array = npt.NDArray[np.float64]
 

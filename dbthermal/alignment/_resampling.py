@@ -1,17 +1,17 @@
 """Resampling of all bands onto one clock and one pixel grid, the number of frames kept."""
 
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import map_coordinates
 
 from dbthermal import _rows, schema
 from dbthermal import noise as noises
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
+from dbthermal.alignment._warping import displaced, registered, single
 from dbthermal.noise import MAD
 
 Array = npt.NDArray[np.float64]
@@ -24,8 +24,6 @@ TRANSFORM: Final = schema.Variable(
 
 # Standard deviations of noise beyond which a step lies between two frames.
 _STEP: Final = 5.0
-# A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
-_DIGITS: Final = 9
 
 
 def align(
@@ -34,6 +32,7 @@ def align(
     offset: float | xr.DataArray | None = None,
     transform: xr.DataArray | None = None,
     clock: str | None = None,
+    reflection_shift: xr.Dataset | None = None,
     lazy: bool = False,
 ) -> xr.Dataset:
     """
@@ -66,6 +65,8 @@ def align(
         outside a view are NaN.
     clock : str, optional
         Band whose samples are not touched in time.
+    reflection_shift : Dataset, optional
+        From the function `reflection_shift`, for `time_offset` to find the offset by.
     lazy : bool
         Compute the counts when they are read, some rows at a time and each time anew, as
         `correction.correct_capture` does: the capture may be lazy, too.
@@ -109,12 +110,14 @@ def align(
     views = corrected["counts"]
     shares = np.ones(len(names))
     if matrices is not None:
-        shares = _warp_factors(matrices, corrected["counts"].shape[2:])
         # Registered first: a moving reflection passes an unregistered view earlier or later.
-        corrected = _registered(corrected, matrices, lazy=lazy)
-    counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
+        corrected, shares = registered(corrected, matrices, lazy=lazy)
+    counts, alike = corrected["counts"], corrected
+    if reflection_shift is not None:
+        alike = displaced(corrected, reflection_shift, lazy=lazy)
+    offsets = _offsets(alike, offset, names)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
-    signals = sample(corrected)
+    signals = sample(alike)
     for band in () if offset is None else range(1, len(names)):  # `time_offset` has done it
         pair = [0, band]
         require_one_clock(corrected.isel(band=pair), signals[pair], stamps[pair])
@@ -134,7 +137,7 @@ def align(
         movies = counts.isel(y=rows)
         result = np.empty(movies.shape, dtype=np.float32)
         for band, plan in enumerate(plans):
-            movie = _single(movies.isel(band=band).values)
+            movie = single(movies.isel(band=band).values)
             if missing[band].any():
                 movie = np.where(
                     missing[band][:, np.newaxis, np.newaxis], np.float32(np.nan), movie
@@ -156,47 +159,6 @@ def align(
         pauses=clocks.pauses(times).ravel().tolist(),
         **({} if matrices is None else {"transform": matrices.ravel().tolist()}),
     )
-
-
-def _warped(view: xr.DataArray, matrix: Array, rows: slice) -> Movie:
-    """Some rows (time, y, x) of the first view's pixels, bilinear; NaN outside the view."""
-    if np.array_equal(matrix, np.eye(3)):
-        return _single(view.isel(y=rows).values)
-    shape = view.shape[1:]
-    places = positions(matrix, shape)[:, rows]
-    inside = np.all((places >= 0) & (places <= np.array(shape)[:, None, None] - 1), axis=0)
-    result = np.full((len(view), *inside.shape), np.nan, dtype=np.float32)
-    if not inside.any():
-        return result
-    first, last = (int(end(places[0][inside])) for end in (np.min, np.max))
-    frames = _single(view.isel(y=slice(first, last + 2)).values)
-    places -= np.array([first, 0])[:, None, None]
-    for frame, out in zip(frames, result, strict=True):
-        # Beside the border "nearest" only meets a weight of zero.
-        map_coordinates(frame, places, output=out, order=1, mode="nearest")
-        out[~inside] = np.nan
-    return result
-
-
-def _warp_factors(matrices: Array, shape: tuple[int, ...]) -> Array:
-    """Deviation (band) [1] of independent pixels after the warp over that before it."""
-    weights = [positions(matrix, shape) % 1.0 for matrix in matrices]
-    # Bilinear: of each axis the weights 1 - w and w; the root of their mean square over the image.
-    squares = [np.prod((1.0 - weight) ** 2 + weight**2, axis=0) for weight in weights]
-    return np.sqrt([np.mean(square) for square in squares])
-
-
-def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
-    r"""
-    Row and column (2, y, x) [pixel], in another view, of the pixels of the first.
-
-    .. math:: (x', y', 1)^T \propto H (x, y, 1)^T, counted from 0 at the centre of the first pixel.
-    """
-    rows, columns = np.indices(shape, dtype=np.float64)
-    column, row, scale = np.einsum(
-        "ij,jyx->iyx", matrix, np.stack([columns, rows, np.ones_like(rows)])
-    )
-    return np.asarray(np.round(np.stack([row, column]) / scale, _DIGITS))
 
 
 def _offsets(corrected: xr.Dataset, offset: float | xr.DataArray | None, names: list[str]) -> Array:
@@ -265,34 +227,10 @@ def _noise(signals: Array, stamps: Array) -> Array:
 def _missing(views: xr.DataArray) -> npt.NDArray[np.bool_]:
     """Frames (band, time) that are NaN, or a copy of the one before, in every block of rows."""
     parts = [
-        [clocks.missing(_single(movie)) for movie in views.isel(y=rows).values]
+        [clocks.missing(single(movie)) for movie in views.isel(y=rows).values]
         for rows in _rows.blocks(views.shape)
     ]
     return np.asarray(np.all(parts, axis=0))
-
-
-def _single(counts: npt.NDArray[Any]) -> Movie:
-    """Counts in single precision, NaN where they are infinite or beyond it."""
-    return np.where(schema.measured(counts), counts, np.nan).astype(np.float32, copy=False)
-
-
-def _registered(corrected: xr.Dataset, matrices: Array, *, lazy: bool) -> xr.Dataset:
-    """All views, and the status, on the first one's grid."""
-    counts = corrected["counts"]
-
-    def views(rows: slice) -> Movie:
-        """Some rows of all bands."""
-        result = np.empty(counts[:, :, rows].shape, dtype=np.float32)
-        for out, view, matrix in zip(result, counts, matrices, strict=True):
-            out[...] = _warped(view, matrix, rows)
-        return result
-
-    warped = _rows.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
-    result = corrected.assign(counts=warped)
-    if "status" in corrected:
-        status = _warped_status(corrected["status"], matrices)
-        result = result.assign(status=corrected["status"].copy(data=status))
-    return result
 
 
 def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr.Dataset:
@@ -305,15 +243,3 @@ def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr
     result["counts"].attrs = {**counts.attrs, **attrs}
     result = result.assign_coords(time=("time", times, corrected["time"].attrs))
     return schema.check(result, "corrected")
-
-
-def _warped_status(status: xr.DataArray, matrices: Array) -> npt.NDArray[Any]:
-    """Bits of every pixel that a warped one may be made of, in any of the views."""
-    result, bits = np.zeros_like(status.values), np.unique(status.values)
-    for places in (positions(matrix, status.shape) for matrix in matrices):
-        for value in bits[bits > 0]:
-            share = map_coordinates(
-                (status.values == value).astype(np.float64), places, order=1, mode="constant"
-            )
-            result[share > 0] |= value
-    return result
