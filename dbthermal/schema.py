@@ -260,6 +260,7 @@ class Status(Flags):
     COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity of a library, or stated"
     COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background of surroundings"
     COMPLETED_FRAMES = 1 << 19, "completed, not measured: some frames of the temperatures"
+    NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
 
 
 def status_attrs() -> dict[str, object]:

@@ -144,7 +144,7 @@ def test_coordinates_of_other_stages() -> None:
 
 def test_units_are_si() -> None:
     """Every variable and coordinate has a unit that the glossary allows."""
-    allowed = {"K", "count", "1", "m", "s", "m K", "count K-1"}
+    allowed = {"K", "count", "1", "m", "s", "m K", "count K-1", "pixel"}
     variables = [one for stage in schema.STAGES.values() for one in stage.values()]
     assert {one.units for one in [*variables, *schema.COORDINATES.values()]} <= allowed
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
 from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection
+from dbthermal.separation._scale import unscaled
 from dbthermal.separation._solve import METHODS, get_method, solve
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ __all__ = [
     "reflected_change",
     "solve",
     "uncalibrated_reflection",
+    "unscaled",
 ]
 
 # The settings are imported with their method when they are first used: one needs torch.

@@ -26,7 +26,9 @@ MOST_BRIDGED: Final = 0.15
 
 # Frames from which fewer pixels are sampled, of as many samples together.
 _LONG: Final = 2048
-_UNUSABLE: Final = np.uint32(Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
+_UNUSABLE: Final = np.uint32(
+    Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL | Status.NO_REFLECTION_PAIR
+)
 
 
 def status_bits(conditions: Mapping[Status, Mask]) -> Bits:
@@ -76,7 +78,7 @@ def read(
     valid &= ~copied[:, np.newaxis]
     counts[:, ~valid] = 0.0
     frames = valid.sum(axis=0)
-    invalid = frames < max(fewest, (1.0 - most_missing) * len(valid))
+    invalid = too_few(valid, fewest, most_missing)
     used = True if valid.all() else valid  # numpy's reductions are slower with a mask
     highest = counts.max(axis=1, where=used, initial=-np.inf)
     lowest = counts.min(axis=1, where=used, initial=np.inf)
@@ -93,6 +95,12 @@ def read(
         status |= part["status"].values.reshape(-1).astype(np.uint32)
     counts[:, :, unusable(status)] = 0.0
     return counts, valid, status
+
+
+def too_few(valid: Mask, fewest: int, most_missing: float = MOST_MISSING) -> Mask:
+    """Pixels (pixel) with fewer valid frames (time, pixel) than can be solved, see `read`."""
+    least = max(fewest, (1.0 - most_missing) * len(valid))
+    return np.asarray(valid.sum(axis=0) < least)
 
 
 def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:

@@ -3,6 +3,8 @@
 import importlib
 import operator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
@@ -12,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from dbthermal import schema
+from dbthermal.separation import _joint as joint
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Labels, Method, check
 from dbthermal.separation._pooling import pool as pooling
@@ -52,6 +55,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     emissivity_std: xr.DataArray | None = None,
     mask: xr.DataArray | None = None,
     pool: xr.DataArray | None = None,
+    reflection_shift: xr.Dataset | None = None,
     response_kind: str = "exact",
     workers: int = 2,
     seed: int = 0,
@@ -96,6 +100,12 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         Materials (y, x), integer: the pixels of one label share their emissivities, which makes
         all of them more certain; a negative one shares nothing. Known to the user, or found by
         `materials`. For "subspace" only.
+    reflection_shift : Dataset, optional
+        Where two cameras side by side see what the object mirrors, from
+        `alignment.reflection_shift`: the reflection that all other bands, of the second camera,
+        show at a pixel p is the one that the quietest band shows at :math:`p + d(p)`, `shift`
+        (axis, y, x) [pixel] with `shift_std`, `known` (y, x). The result is on the quietest band's
+        grid. For "subspace", "calibrated", "naive" and "dbvt".
     response_kind : {"exact", "linear"}
         Sakuma-Hattori response, or the paper's linear one.
     workers : int
@@ -139,6 +149,18 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     says; the object temperature is free of it. A step of the object during a shutter event is not
     detected.
 
+    With a `reflection_shift` d the other bands are resampled at the place p of each pixel r,
+    p + d(p) = r, and the object of two places enters the bands,
+
+    .. math:: I_1(r) = e_1 U_1(x(r)) + (1 - e_1) U_1(y), \quad
+              I_m'(r) = e_m U_m(x(p)) + (1 - e_m) U_m(y)
+
+    The pixels are solved as if x(p) were x(r), all of them are then solved together for the object,
+    and each once more with what follows for x(p) in the other bands. It costs 2 to 3 times as much
+    where the object is not the same in both places, and makes the object more certain: an error of
+    one pixel is averaged along the places p. A pixel of which the second camera does not see the
+    reflection has the bit `no_reflection_pair`.
+
     References
     ----------
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
@@ -173,6 +195,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         emissivity_std=emissivity_std,
         mask=mask,
         pool=pool,
+        reflection_shift=reflection_shift,
         response_kind=response_kind,
     )
     height, width = corrected.sizes["y"], corrected.sizes["x"]
@@ -187,15 +210,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
             disable=not progress,
         ) as bar,
     ):
-        rows = height if inputs.method.whole_image else tiles.BLOCK_ROWS
-        blocks = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
-        material = None
-        if inputs.labels is not None:
-            selected = pooling.select(inputs.labels)
-            surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), blocks)
-            material = _pool(inputs, [part for survey in surveys for part in survey])
-        for _ in threads.map(lambda block: _separate(inputs, block, material, result, bar), blocks):
-            pass
+        if inputs.displacement is None:
+            _separate_all(inputs, _materials(inputs, threads, bar), result, threads, bar)
+        else:
+            _solve_jointly(inputs, result, threads, bar)
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
@@ -242,6 +260,57 @@ def get_method(name: str) -> Method:
     module, record = _MODULES[name]
     method: Method = getattr(importlib.import_module(f"dbthermal.separation.{module}"), record)
     return method
+
+
+def _solve_jointly(
+    inputs: Inputs, result: xr.Dataset, threads: ThreadPoolExecutor, bar: "tqdm[Any]"
+) -> None:
+    """
+    Separate twice, the second time with the object of each camera's own place.
+
+    Where emissivities are pooled, they are those of the second time, and it is done once more.
+    """
+    material = None
+    _separate_all(inputs, material, result, threads, bar)
+    both = joint.solve(inputs, result, threads)
+    if inputs.labels is not None:
+        apart = inputs if both is None else replace(inputs, difference=both.difference)
+        material = _materials(apart, threads, bar)
+        _separate_all(inputs, material, result, threads, bar)
+        both = joint.solve(inputs, result, threads, pooled=True)
+    if both is not None:
+        apart = replace(inputs, difference=both.difference)
+        _separate_all(apart, material, result, threads, bar)
+        both.finish()
+
+
+def _materials(inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]") -> Material | None:
+    """Ratios and emissivity of the material of each pixel of the image; None if none are told."""
+    if inputs.labels is None:
+        return None
+    selected = pooling.select(inputs.labels)
+    surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), _blocks(inputs))
+    return _pool(inputs, [part for survey in surveys for part in survey])
+
+
+def _separate_all(
+    inputs: Inputs,
+    material: Material | None,
+    result: xr.Dataset,
+    threads: ThreadPoolExecutor,
+    bar: "tqdm[Any]",
+) -> None:
+    """Separate all blocks of rows into the result."""
+    separate = partial(_separate, inputs, material=material, result=result, bar=bar)
+    for _ in threads.map(separate, _blocks(inputs)):
+        pass
+
+
+def _blocks(inputs: Inputs) -> list[slice]:
+    """Rows that are read at once."""
+    height = inputs.capture.sizes["y"]
+    rows = height if inputs.method.whole_image else tiles.BLOCK_ROWS
+    return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
 
 
 def _separate(

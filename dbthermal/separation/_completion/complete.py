@@ -132,6 +132,7 @@ def complete(
         emissivity_std=None,
         mask=None,
         pool=materials,
+        reflection_shift=None,
         response_kind=str(result.attrs.get("response_kind", "exact")),
     )
     scene = scenes.gather(inputs, result, corrected, prior)
