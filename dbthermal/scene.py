@@ -154,7 +154,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     >>> statistics = correction.blackbody_statistics(movies)
     >>> fitted = correction.fit_correction(statistics)
     >>> response = calibration.fit_response(fitted["level"], statistics["noise"])
-    >>> result = separate_capture(raw, fitted, response, registration=None)
+    >>> options = {"registration": None, "aligning": {"offset": 0.0}}
+    >>> result = separate_capture(raw, fitted, response, **options)
     >>> error = result["object_temperature"] - scene["object_temperature"]
     >>> bool(abs(error).median() < 0.3)  # K
     True
@@ -171,7 +172,6 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         """Some rows of the result."""
         around, own = _around(rows, plan)
         part = plan.aligned.isel(y=around).load()
-        field = None if plan.field is None else plan.field.isel(y=around)
         labels = plan.labels.isel(y=around)
         result = solve(
             part,
@@ -218,7 +218,8 @@ def _planned(
     """Align a capture, and find what is of the whole image."""
     names = corrected["band"].values
     together = xr.DataArray(np.zeros(names.size), dims="band", coords={"band": names})
-    aligned = align(corrected, **{"offset": together, **options}, lazy=lazy)
+    first: Aligning = {"offset": together, **options}
+    aligned = align(corrected, **first, lazy=lazy)
     small, known = _reduced(aligned, response)
     field, found = _shift(small, known)
     if "offset" not in options:
@@ -311,7 +312,9 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
     values = {"known": (field["known"].dims, field["known"].values[near], field["known"].attrs)}
     for name in ("shift", "shift_std"):
         filled = field[name].values[:, nearest[0], nearest[1]]
-        wide = side * np.stack([map_coordinates(one, places, order=1, mode="nearest") for one in filled])
+        wide = side * np.stack(
+            [map_coordinates(one, places, order=1, mode="nearest") for one in filled]
+        )
         values[name] = (field[name].dims, np.where(lost[near], np.nan, wide), field[name].attrs)
     here = {dim: aligned[dim] for dim in ("y", "x") if dim in aligned.coords}
     return xr.Dataset(values, coords={"axis": field["axis"], **here}, attrs=field.attrs)

@@ -56,7 +56,7 @@ def displaced(corrected: xr.Dataset, field: xr.Dataset, *, lazy: bool) -> xr.Dat
         schema.check(field, "reflection_shift"), corrected, "the reflection shift", "the capture"
     )
     shift = field["shift"].where(field["known"]).transpose("axis", "y", "x").values
-    place = np.asarray(np.indices(shift.shape[1:]) + shift.astype(np.float64))
+    place = np.indices(shift.shape[1:], dtype=np.float64) + shift
     reference = str(field.attrs["reference_band"])
     places = [place if str(band) == reference else None for band in corrected["band"].values]
     return _resampled(corrected, places, lazy=lazy)

@@ -114,9 +114,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
         (part / SUMS).write_bytes(last_sums(part))
 
 
-def save_rows(
-    parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]
-) -> None:
+def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
     """
     Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
 
