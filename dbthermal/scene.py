@@ -178,6 +178,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
             response,
             settings=settings,
             pool=labels if bool((labels >= 0).any()) else None,
+            reflection_shift=None if plan.field is None else plan.field.isel(y=around),
             workers=workers,
         )
         result = complete(result, part, response, labels, workers=workers, **completing or {})
@@ -230,9 +231,10 @@ def _planned(
             aligned = align(corrected, **options, reflection_shift=wide, lazy=lazy)
             small, known = _reduced(aligned, response)
             field, found = _shift(small, known)
-    alone = solve(small, known, settings=settings, workers=workers)
+    apart = field if found == "apart" else None
+    alone = solve(small, known, settings=settings, reflection_shift=apart, workers=workers)
     labels = _labels(materials(alone, small, known), aligned)
-    wide = None if found != "apart" or field is None else _enlarged(field, aligned)
+    wide = None if apart is None else _enlarged(apart, aligned)
     kept = ("clock", "time_offset", "frames_lost", "transform")
     attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
     return _Plan(aligned, wide, labels, {**attrs, "reflections": found})

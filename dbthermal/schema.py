@@ -177,6 +177,11 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "pattern_std": PATTERN_STD,
             "status": _STATUS,
         },
+        "separated": {
+            "emissivity_covariance": _of(
+                "band other_band y x", "1", "covariance of band emissivities", "float32"
+            ),
+        },
         "blackbody_frames": {"noise": NOISE},
         "correction": {
             "bad": _of("band y x", "1", "bad pixel", "bool"),

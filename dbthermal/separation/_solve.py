@@ -1,7 +1,9 @@
 """The one entrance to all methods: the inputs are checked, and separated tile by tile."""
 
 import importlib
+import itertools
 import operator
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -120,7 +122,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     Dataset
         `object_temperature`, `background_temperature` (time, y, x) [K], `emissivity`
         (band, y, x) [1] and `reflection_ratio` (band, y, x) [1], the reflectivity over that of the
-        quietest band (attribute `reference_band`), each with `_std`; `status` (y, x), bits of
+        quietest band (attribute `reference_band`), each with `_std`; of "subspace" also
+        `emissivity_covariance` (band, other_band, y, x) [1]; `status` (y, x), bits of
         `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says that they
         are undefined, at samples that are invalid or masked, and where a method never estimates
         them (attribute `not_estimated`); where the status is 0, all others are finite. A known
@@ -199,7 +202,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         response_kind=response_kind,
     )
     height, width = corrected.sizes["y"], corrected.sizes["x"]
-    result = _allocate(corrected)
+    variables = dict(schema.STAGES["separated"])
+    if inputs.method.survey:
+        variables |= schema.OPTIONAL["separated"]
+    result = _allocate(corrected, variables)
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
@@ -358,17 +364,20 @@ def _pool(inputs: Inputs, surveys: list[tuple[Labels, Survey]]) -> Material | No
     return pooling.expand(materials, labels)
 
 
-def _allocate(corrected: xr.Dataset) -> xr.Dataset:
-    """Make an empty result of the stage `separated` with the coordinates of a capture."""
-    dims = ("band", "time", "y", "x")
+def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -> xr.Dataset:
+    """Make an empty result of some variables with the coordinates of a capture."""
+    sizes = {**corrected.sizes, "other_band": corrected.sizes["band"]}
     kept = {name: value for name, value in corrected.attrs.items() if name in _KEPT_ATTRS}
     arrays = {}
-    for name, variable in schema.STAGES["separated"].items():
-        shape = tuple(corrected.sizes[dim] for dim in variable.dims)
+    for name, variable in variables.items():
+        shape = tuple(sizes[dim] for dim in variable.dims)
         attrs = schema.status_attrs() if name == "status" else variable.attrs
         empty = np.empty(shape, dtype=variable.dtype)
         arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs={**attrs, **kept})
-    coordinates = {name: corrected[name] for name in dims if name in corrected.coords}
+    names = ("band", "time", "y", "x")
+    coordinates = {name: corrected[name] for name in names if name in corrected.coords}
+    if any("other_band" in variable.dims for variable in variables.values()):
+        coordinates["other_band"] = corrected["band"].rename(band="other_band")
     return xr.Dataset(arrays, coords=coordinates, attrs=kept)
 
 
@@ -385,9 +394,9 @@ def _write(
     and keeps its status; so do temperatures at frames of no estimate, and at invalid samples.
     """
     complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
-    for name, variable in schema.STAGES["separated"].items():
+    for name in map(str, result.data_vars):
         target = result[name].values[..., cut.window[0], cut.window[1]]
-        shape = target.shape[-2:]
+        dims, shape = result[name].dims, target.shape[-2:]
         if name == "status":
             target[...] = cut.status.reshape(shape)
         elif not complete or any(getattr(estimate, name) is None for _, _, estimate in estimates):
@@ -399,12 +408,13 @@ def _write(
             where = pixels.reshape(shape)
             if name == "status":
                 target[where] |= values
-            elif "band" in variable.dims:
-                for index, band in enumerate(bands):
-                    target[band][where] = values[index]
+            elif "band" in dims:
+                each = itertools.product(range(len(bands)), repeat=target.ndim - 2)
+                for place in each:
+                    target[tuple(bands[index] for index in place)][where] = values[place]
             else:
                 _write_film(target, frames, where, values)
-        if "time" in variable.dims and not np.all(cut.valid):
+        if "time" in dims and not np.all(cut.valid):
             target[~cut.valid.reshape(-1, *shape)] = np.nan
 
 

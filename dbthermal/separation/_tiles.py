@@ -161,6 +161,7 @@ class Estimate(_Pixels):
     status: Bits  # `schema.Status` (pixel)
     reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
     reflection_ratio_std: Array | None = None
+    emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
 
     def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
         """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""
@@ -169,8 +170,12 @@ class Estimate(_Pixels):
             "emissivity": no_emissivity,
             "background_temperature": no_background,
         }
+        covariance = self.emissivity_covariance
+        if covariance is not None:
+            covariance = np.where(no_emissivity, np.nan, covariance)
         return replace(
             self,
+            emissivity_covariance=covariance,
             **{
                 name + ending: np.where(where, np.nan, getattr(self, name + ending))
                 for name, where in undefined.items()
@@ -200,7 +205,7 @@ class Estimate(_Pixels):
         beyond = np.zeros(self.status.shape, dtype=bool)
         for field in fields(self):
             name = field.name
-            if name in ("status", *not_estimated) or name.endswith("_std"):
+            if name in ("status", *not_estimated) or name.endswith(("_std", "_covariance")):
                 continue
             if getattr(self, name) is None:
                 continue

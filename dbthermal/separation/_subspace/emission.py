@@ -51,7 +51,7 @@ class Emission:
     sensitivity: Array  # its derivative with epsilon (time, pixel) [K]
     smooth_variance: Array  # its variance from the smoothed noise (time, pixel) [K^2]
     emissivity: Array  # (band, pixel) [1]
-    emissivity_variance: Array  # (band, pixel) [1]
+    emissivity_covariance: Array  # (band, band, pixel) [1]
     epsilon_variance: Array  # of epsilon (pixel) [1]
     level_std: Array  # of the ratios, through the background's level (band, pixel) [1]
     noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
@@ -101,7 +101,7 @@ def estimate(
         sensitivity=sensitivity,
         smooth_variance=smooth_variance,
         emissivity=emissivity,
-        emissivity_variance=_emissivity_variance(
+        emissivity_covariance=_emissivity_covariance(
             emissivity[0], noise_variance + drifting, ratios, noise, level_std
         ),
         epsilon_variance=epsilon,
@@ -191,28 +191,34 @@ def _fieller(sensitivity: Array, epsilon: Array) -> Array:
     return np.asarray(sensitivity**2 * epsilon / (1.0 - NORMAL95**2 * epsilon) ** 2)
 
 
-def _emissivity_variance(
+def _emissivity_covariance(
     first: Array, slope_variance: Array, ratios: ReflectionRatio, noise: Array, level_std: Array
 ) -> Array:
     r"""
-    Variance of the emissivities (band, pixel) [1], from the ratios and from the slope (eq. 8).
+    Covariance of the emissivities (band, band, pixel) [1], from the ratios and the slope (eq. 8).
 
     .. math:: \delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o, \quad
               \delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m
     """
     ratio, weights = ratios.ratio, ratios.null_weights
     reflectivity, squares = 1.0 - first, (noise**2)[:, np.newaxis]
-    # Covariance of kappa_m with epsilon over sigma^2: s_m^2 w_m - kappa_m s_1^2 w_1.
-    covariance = squares * weights - ratio * squares[0] * weights[0]
-    covariance[0] = 0.0
-    # Terms with epsilon: (kappa e_1 (1 - e_1))^2 var(eps) + 2 kappa e_1 (1 - e_1)^2 cov.
-    through = (ratio * first * reflectivity) ** 2 * ratios.null_variance
-    through += 2.0 * ratio * first * reflectivity**2 * covariance
-    direct = reflectivity**2 * ratios.variance
+    pairs, energy = ratio[:, np.newaxis] * ratio, ratios.inverse_energy
+    # Of kappa_m with epsilon, over sigma^2: s_m^2 w_m - kappa_m s_1^2 w_1; with one another:
+    # kappa_m kappa_n s_1^2, and the variances of eq. 4.
+    with_epsilon = squares * weights - ratio * squares[0] * weights[0]
+    with_epsilon[0] = 0.0
+    between = pairs * squares[0] * energy
+    between[0], between[:, 0] = 0.0, 0.0
+    np.einsum("bbp->bp", between)[...] = ratios.variance
+    # Terms with epsilon: (e_1 (1 - e_1))^2 kappa_m kappa_n var(eps) and, of both with the other,
+    # e_1 (1 - e_1)^2 kappa_m cov(kappa_n, eps).
+    cross = ratio[:, np.newaxis] * with_epsilon
+    through = (first * reflectivity) ** 2 * pairs * ratios.null_variance
+    through += first * reflectivity**2 * (cross + cross.swapaxes(0, 1))
     # Through the background's level: -(1 - e_1) (kappa_m e_1 deps + dkappa_m).
     by_level = reflectivity * (ratio * first * (weights * level_std).sum(axis=0) + level_std)
-    noisy = through * ratios.inverse_energy + direct
-    return np.asarray(ratio**2 * slope_variance + noisy + by_level**2)
+    covariance = pairs * slope_variance + through * energy + reflectivity**2 * between
+    return np.asarray(covariance + by_level[:, np.newaxis] * by_level)
 
 
 def walk_variance(
