@@ -66,7 +66,7 @@ def register(
     ----------
     corrected : Dataset
         Stage `corrected` of `schema`: views of one object, displaced by at most about a tenth of
-        the image.
+        the image. Of a capture with a `segment` the longest is used.
     model : {"translation", "affine", "homography"}
         Kind of transform. An affine one fits cameras that look the same way.
 
@@ -109,12 +109,17 @@ def register(
     if model not in _MODELS:
         raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")
     counts = schema.check(corrected, "corrected")["counts"]
+    if "segment" in corrected:  # the longest: a new pattern would be detail that does not move
+        numbers, frames = np.unique(corrected["segment"], return_counts=True)
+        longest = corrected["segment"].values == numbers[np.argmax(frames)]
+        counts = counts.isel(time=longest)
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
         raise ValueError(
             f"Invalid image of {counts.sizes['y']} by {counts.sizes['x']} pixels to be registered. "
             f"Must be at least {_SMALLEST} either way."
         )
-    means = [_object_image(view) for view in counts]
+    bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
+    means = [_object_image(view, bad) for view in counts]
     matrices = [np.eye(3)]
     for view, mean in zip(counts[1:], means[1:], strict=True):
         matrices.append(_transform(means[0], mean, model, str(view["band"].item())))
@@ -127,7 +132,7 @@ def register(
     )
 
 
-def _object_image(view: xr.DataArray) -> Array:
+def _object_image(view: xr.DataArray, bad: npt.NDArray[np.bool_] | np.bool_) -> Array:
     """Mean over time of what changes smoothly (y, x), of mean 0 and standard deviation 1."""
     frames = np.asarray(view.values)
     present = np.flatnonzero(~clocks.missing(frames))
@@ -143,7 +148,7 @@ def _object_image(view: xr.DataArray) -> Array:
     around = median_filter(image, size=_MEDIAN_WINDOW)
     away = abs(image - around)
     # A bad pixel stays where it is in every view, and would pull the transform to the identity.
-    image = np.where(away > _OUTLYING * MAD * np.median(away), around, image)
+    image = np.where(bad | (away > _OUTLYING * MAD * np.median(away)), around, image)
     contrast = image.std()
     if not contrast > 0:
         raise ValueError(
@@ -203,6 +208,8 @@ def _refined(pair: list[Array], matrix: Array, model: str) -> Array:
     r"""
     Transform that minimises :math:`\sum (g I_1(p) + o - I_2(H p))^2`, by Gauss-Newton steps.
 
+    Of :math:`I_2` over the mean and deviation of what is compared, for else places where it varies
+    little would be the best: the correlation is largest there, which :math:`g` and :math:`o` leave.
     The enhanced correlation interpolates by lines, and is off by some hundredths of a pixel.
     """
     (rows, columns), spline = pair[0].shape, spline_filter(pair[1])
@@ -216,7 +223,8 @@ def _refined(pair: list[Array], matrix: Array, model: str) -> Array:
 
         def other(change: Array, inside: Mask = inside, start: Array = matrix) -> Array:
             where = positions(start + change, pair[0].shape)[:, inside]
-            return np.asarray(map_coordinates(spline, where, prefilter=False))
+            values = map_coordinates(spline, where, prefilter=False)
+            return np.asarray((values - values.mean()) / values.std())
 
         steps = [place * unit * _STEP for place in _FREE[model]]
         slopes = [(other(-step) - other(step)) / (2 * _STEP) for step in steps]

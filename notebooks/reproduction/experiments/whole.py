@@ -6,13 +6,16 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
+from scipy.ndimage import gaussian_filter
 
 from dbthermal import correction, simulation
 from dbthermal.calibration import fit_response
 from dbthermal.simulation import Rig
 from reproduction.experiments.nuisances import GLASS
-from reproduction.experiments.pictures import Picture, smooth_shift
+from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
 
+# Heating that differs from place to place, by so much [1], over so many pixels: the detail.
+_UNEVEN, _DETAIL = 0.1, 2.0
 _STEPS: Final = 2  # of the scene's clock in a frame
 
 
@@ -41,7 +44,7 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     frames: int,
 ) -> Recording:
     """
-    Record a picture of people mirrored in heated glass, `pictures.Picture`, by two cameras.
+    Record people mirrored in unevenly heated glass, `pictures.Picture`, by two cameras.
 
     The clock is the number of frames and their rate [Hz]. The cameras stand apart, so that the
     second sees the reflections at a `shift` that varies, see `pictures.smooth_shift` [pixel]; it
@@ -58,6 +61,9 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     glass = xr.DataArray(list(GLASS), dims="band", coords={"band": list(rig.bands)})
     picture = Picture(shape=wide, walkers=round(0.3 * time[-1]))
     scene = picture.draw(time, glass, rng, smooth_shift(wide, *shift))
+    detail = gaussian_filter(rng.standard_normal(wide), _DETAIL)
+    heated = xr.DataArray(1.0 + _UNEVEN * detail / detail.std(), dims=("y", "x"))
+    scene["object_temperature"] = ROOM + (scene["object_temperature"] - ROOM) * heated
     response = rig.response()
     seen = simulation.expose(
         scene, response, rng, every=_STEPS, offsets=(0, late), frames=count
