@@ -42,6 +42,8 @@ _MODULES: Final = {
     "bcp": ("_baselines.bcp", "METHOD"),
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
+# Share of the pixels of the materials that have an emissivity alone, from which it is theirs [1].
+_MOST_TOLD: Final = 0.9
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -296,7 +298,19 @@ def _materials(inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]") ->
         return None
     selected = pooling.select(inputs.labels)
     surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), _blocks(inputs))
-    return _pool(inputs, [part for survey in surveys for part in survey])
+    found = [part for survey in surveys for part in survey]
+    material = _pool(inputs, found)
+    told = sum(np.isfinite(part.emissivity).sum() for _, part in found)
+    if material is None or told > _MOST_TOLD * sum((part.frames > 0).sum() for _, part in found):
+        return material
+    # Emissivities of the few pixels with a ratio of their own are those of a selection by it.
+    ratio = replace(material, emissivity=np.full_like(material.emissivity, np.nan))
+    surveys = threads.map(
+        lambda block: _survey(inputs, block, selected, bar, ratio), _blocks(inputs)
+    )
+    again = _pool(inputs, [part for survey in surveys for part in survey])
+    assert again is not None
+    return replace(again, ratio=material.ratio, inverse_energy=material.inverse_energy)
 
 
 def _separate_all(
@@ -336,19 +350,32 @@ def _separate(
 
 
 def _survey(
-    inputs: Inputs, rows: slice, selected: Mask, bar: "tqdm[Any]"
+    inputs: Inputs,
+    rows: slice,
+    selected: Mask,
+    bar: "tqdm[Any]",
+    material: Material | None = None,
 ) -> list[tuple[Labels, Survey]]:
     """Survey the selected pixels of a block; with their numbers in the image."""
     surveys = []
-    for cut in tiles.cut(inputs, rows):
+    for cut in tiles.cut(inputs, rows, material):
         numbers = tiles.numbers(cut.window, inputs.capture.sizes["x"])
         for _, pixels, tile in cut.parts:
             wanted = selected[numbers[pixels]]
             if np.any(wanted):
                 part = tile if np.all(wanted) else tile.select_pixels(wanted)
                 survey: Survey = inputs.apply(inputs.method.survey, part)
+                # Whitened by one noise for all, not by that of the tile.
+                scale = np.array(part.noise) / inputs.noise[inputs.bands]
+                square = np.multiply.outer(scale, scale)[..., np.newaxis]
+                survey = replace(
+                    survey,
+                    scatter=survey.scatter * square,
+                    rapid_scatter=survey.rapid_scatter * square,
+                )
                 surveys.append((numbers[pixels][wanted], survey))
-        bar.update(cut.status.size)
+        if material is None:
+            bar.update(cut.status.size)
     return surveys
 
 

@@ -84,6 +84,8 @@ class Survey(_Pixels):
 
     scatter: Array  # noise-whitened scatter of rapid changes less noise (band, band, pixel) [1]
     frames: Array  # its degrees of freedom (pixel)
+    rapid_scatter: Array  # the same at the two largest orders looked at (2, band, band, pixel) [1]
+    rapid_frames: Array  # their degrees of freedom (2, pixel)
     ratio: Array  # reflection ratios of the pixel alone (band, pixel) [1]
     null_weights: Array  # see `ReflectionRatio` (band, pixel) [1]
     emissivity: Array  # of the first band, of the pixel alone (pixel) [1]; NaN where undefined

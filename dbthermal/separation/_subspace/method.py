@@ -228,9 +228,13 @@ def _survey(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Surv
     status = _report(tile, functions, solution).status
     ratios, emission = solution.ratios, solution.emission
     sound = (status & _BROKEN) == 0
+    noise = np.array(tile.noise)
+    rapid, freedom = reflection_ratio.rapid_scatter(solution.straight.signals, functions, noise)
     return Survey(
         scatter=np.where(sound, ratios.scatter, 0.0),
         frames=sound * np.asarray(tile.time.size - ratios.order, dtype=np.float64),
+        rapid_scatter=np.where(sound, rapid, 0.0),
+        rapid_frames=sound * freedom,
         ratio=ratios.ratio,
         null_weights=ratios.null_weights,
         emissivity=np.where(status == 0, emission.emissivity[0], np.nan),
