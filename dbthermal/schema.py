@@ -387,6 +387,8 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
     if variable.dtype != "bool":
         check_numbers(array, label, variable.units)
+        if variable is _STATUS and array.dtype.kind == "f":
+            raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be whole numbers.")
     elif array.dtype != bool:
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
     for dim in array.dims:

@@ -126,9 +126,9 @@ class _Equations:
     first: Array  # e_1 (pixel) [1]
     shares: Array  # c of eq. 6 (band, pixel) [1]
     there: csr_array  # weights of x(p) (pixel, pixel), of the linked pixels
-    onward: csr_array  # weights of the equation at p + d(p) (pixel, pixel), of the backward ones
-    forward: Mask  # solved for x(r)
-    backward: Mask  # solved for x(p)
+    onward: csr_array  # weights of the equation at p + d(p) (backward pixel, pixel)
+    forward: Whole  # pixels solved for x(r)
+    backward: Whole  # pixels solved for x(p)
     loose: Whole  # solved pixels without such neighbours
     bend: _Bend | None
 
@@ -136,8 +136,8 @@ class _Equations:
         """Return the equations of other emissivities."""
         return replace(self, first=first, shares=shares)
 
-    def there_signal(self, signal: Array, change: Array) -> Array:
-        """u_1(x(p)) (pixel, frame) [K]; for the loose pixels by the change of e_1 u_1(x)."""
+    def _there(self, signal: Array, change: Array) -> Array:
+        """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
         result = np.asarray(self.there @ signal)
         result[self.loose] = signal[self.loose] + change / self.first[self.loose, np.newaxis]
         return result
@@ -153,32 +153,38 @@ class _Equations:
         own = shares[0][:, np.newaxis] * alone
         return np.asarray(own + self.other_bands(shares[1:], alone))
 
-    def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array]:
+    def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array, Array]:
         """
-        Solve for u_1(x(r)) (pixel, frame) [K], of a target q and from a start.
+        Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
 
         The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
         beforehand. Also returns the last step (pixel) [K].
         """
-        own, others = self.shares[0][:, np.newaxis], self.shares[1:]
-        beyond = np.asarray((self.onward @ others.T).T) if np.any(self.backward) else others
-        rest = np.setdiff1d(self.loose, np.flatnonzero(self.backward))
+        own, forward, backward = self.shares[0][:, np.newaxis], self.forward, self.backward
+        others, back = self.shares[1:], self.shares[1:, self.backward]
+        beyond = np.asarray((self.onward @ others.T).T)
+        slope = beyond.sum(axis=0)[:, np.newaxis]
+        rest = np.setdiff1d(self.loose, backward)
         signal, step = alone, np.zeros_like(alone)
         for _ in range(_STEPS):
-            there = self.there_signal(signal, change)
+            there = self._there(signal, change)
             right = target - self.other_bands(others, there)
-            following = np.where(self.forward[:, np.newaxis], right / own, signal)
+            following = signal.copy()
+            following[forward] = right[forward] / own[forward]
             # Newton's steps, of a slope near sum c = 1.
-            following[rest] = signal[rest] + right[rest] - own[rest] * signal[rest]
-            if np.any(self.backward):
-                right = np.asarray(self.onward @ (target - own * signal))
-                right = right - self.other_bands(beyond, signal)
-                near = signal + right / beyond.sum(axis=0)[:, np.newaxis]
-                following = np.where(self.backward[:, np.newaxis], near, following)
+            following[rest] += right[rest] - own[rest] * signal[rest]
+            # The same for x(p), of the equation at p + d(p).
+            right = np.asarray(self.onward @ (target - own * signal))
+            following[backward] += (right - self.other_bands(beyond, signal[backward])) / slope
             step, signal = np.abs(following - signal), following
             if step.max(initial=0.0) < _CONVERGED:
                 break
-        return signal, step.max(axis=1)
+        there = self._there(signal, change)
+        # A backward pixel's own equation holds for another x(p) than that between its neighbours.
+        right = target[backward] - own[backward] * signal[backward]
+        right -= self.other_bands(back, there[backward])
+        there[backward] += right / back.sum(axis=0)[:, np.newaxis]
+        return signal, there, step.max(axis=1)
 
 
 def solve(
@@ -203,8 +209,7 @@ def solve(
         def both(alone: Array, change: Array) -> tuple[Array, Array, Array, Array]:
             signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
             signal = np.ascontiguousarray(signal.T, dtype=np.float32)
-            here, step = equations.solve(equations.target(shares, signal), signal, change)
-            return signal, here, equations.there_signal(here, change), step
+            return signal, *equations.solve(equations.target(shares, signal), signal, change)
 
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
         looked_at = _bridge(film[some], solved)
@@ -309,13 +314,13 @@ def _equations(inputs: Inputs, emissivity: Array, solved: Mask) -> _Equations:
     onward, reached = _among(displacement.onward, solved, displacement.shape[1])
     strong = np.abs(shares[1:].sum(axis=0)) < np.abs(shares[0])
     linked &= strong | reached
-    backward = linked & ~strong
+    backward = np.flatnonzero(linked & ~strong)
     return _Equations(
         first=first,
         shares=shares,
         there=_rows(there, linked),
-        onward=_rows(onward, backward),
-        forward=linked & strong,
+        onward=csr_array(onward[backward].astype(np.float32)),
+        forward=np.flatnonzero(linked & strong),
         backward=backward,
         loose=np.flatnonzero(solved & ~linked),
         bend=_bend([inputs.curves[band] for band in inputs.bands]),
@@ -396,13 +401,14 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
     alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
     linear = replace(equations, bend=None)
-    signal, _ = linear.solve(alone, alone, change.astype(np.float32))
+    signal, _, _ = linear.solve(alone, alone, change.astype(np.float32))
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
         uniform_filter(np.reshape(one, displacement.shape), 3).ravel()
         for one in ((signal.astype(np.float64) ** 2).mean(axis=1), size**2)
     )
-    return np.where(total > 0, energy / np.where(total > 0, total, 1.0), 1.0)
+    own = size[:, 0] > 0  # elsewhere the running sums are rounding
+    return np.where(own, energy / np.where(own, total, 1.0), 1.0)
 
 
 def _bend(curves: list[Curve]) -> _Bend:

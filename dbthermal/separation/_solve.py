@@ -366,6 +366,14 @@ def _survey(
             if np.any(wanted):
                 part = tile if np.all(wanted) else tile.select_pixels(wanted)
                 survey: Survey = inputs.apply(inputs.method.survey, part)
+                # Whitened by one noise for all, not by that of the tile.
+                scale = np.array(part.noise) / inputs.noise[inputs.bands]
+                square = np.multiply.outer(scale, scale)[..., np.newaxis]
+                survey = replace(
+                    survey,
+                    scatter=survey.scatter * square,
+                    rapid_scatter=survey.rapid_scatter * square,
+                )
                 surveys.append((numbers[pixels][wanted], survey))
         if material is None:
             bar.update(cut.status.size)

@@ -219,10 +219,9 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
             bridged |= _bridge(done[0], done[1], scene.inputs.capture["time"].values)
         for one, part in zip(both, done, strict=True):
             completed[one].values[:, y, x] = part
-    if "emissivity_covariance" in completed:
-        target = completed["emissivity_covariance"].values
-        own, other = target[:, :, y, x], values["emissivity_covariance"][np.ix_(order, order)]
-        target[:, :, y, x] = np.where(np.isnan(own), other, own)
+    if (name := "emissivity_covariance") in completed:
+        before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
+        completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)
     flags = filled * np.uint32(_BITS[source]) | bridged * np.uint32(Status.COMPLETED_FRAMES)
     completed["status"].values[y, x] |= flags
 

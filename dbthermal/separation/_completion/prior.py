@@ -96,21 +96,19 @@ def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> M
                 f"Unknown prior '{prior}'. Must be one of {known['material'].values.tolist()}."
             )
         prior = known.sel(material=prior)
-    value, std = (
-        (prior["emissivity"], prior["emissivity_std"])
-        if isinstance(prior, xr.Dataset)
-        else (prior, None)
-    )
-    values = _numbers(value, bands, "the prior")
+    std: xr.DataArray | None = None
+    if isinstance(prior, xr.Dataset):
+        if missing := {"emissivity", "emissivity_std"} - set(prior):
+            raise ValueError(f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}.")
+        prior, std = prior["emissivity"], prior["emissivity_std"]
+    values = _numbers(prior, bands, "prior")
     if not np.all((values > 0) & (values < 1)):
         raise ValueError(
             f"Invalid emissivities {values.tolist()} of the prior. Must lie in (0, 1)."
         )
-    stds = (
-        np.full(len(bands), SAMPLE_STD)
-        if std is None
-        else _numbers(std, bands, "the prior's deviation")
-    )
+    stds = np.full(len(bands), SAMPLE_STD)
+    if std is not None:
+        stds = _numbers(std, bands, "emissivity_std of the prior")
     if not np.all((stds > 0) & (stds < 1)):
         raise ValueError(
             f"Invalid emissivity_std {stds.tolist()} of the prior. Must lie in (0, 1)."

@@ -164,9 +164,9 @@ def require_same_capture(scene: Scene, result: xr.Dataset) -> None:
 
 def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Level:
     """Level of stated surroundings, of all pixels or of each."""
+    schema.check_numbers(xr.DataArray(surroundings), "surroundings", "K")
     values = np.asarray(surroundings, dtype=np.float64)
     if isinstance(surroundings, xr.DataArray):
-        schema.check_numbers(surroundings, "surroundings", "K")
         if surroundings.dims not in ((), ("y", "x")):
             rule = "Must be () or ('y', 'x')."
             raise ValueError(f"Invalid dims {surroundings.dims} of surroundings. {rule}")

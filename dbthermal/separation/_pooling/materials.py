@@ -196,6 +196,8 @@ def _checked(
     for name in _NEEDED:
         if name not in result:
             raise ValueError(f"Missing '{name}' in the result. Must be one of `solve`.")
+        label = f"'{name}' of the result"
+        schema.check_variable(result[name], schema.STAGES["separated"][name], label)
     if "reflection_ratio" in result.attrs.get("not_estimated", "").split():
         raise ValueError(
             f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
