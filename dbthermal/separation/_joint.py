@@ -407,7 +407,8 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
         uniform_filter(np.reshape(one, displacement.shape), 3).ravel()
         for one in ((signal.astype(np.float64) ** 2).mean(axis=1), size**2)
     )
-    return np.where(total > 0, energy / np.where(total > 0, total, 1.0), 1.0)
+    own = size[:, 0] > 0  # elsewhere the running sums are rounding
+    return np.where(own, energy / np.where(own, total, 1.0), 1.0)
 
 
 def _bend(curves: list[Curve]) -> _Bend:
