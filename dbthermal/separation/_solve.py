@@ -228,6 +228,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     ratios = () if inputs.method.survey else ("reflection_ratio", "reflection_ratio_std")
     return result.assign_attrs(
         method=method,
+        pooled=int(pool is not None),
         response_kind=response_kind,
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
