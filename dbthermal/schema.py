@@ -181,7 +181,6 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "emissivity_covariance": _of(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
             ),
-            "reflection_shift": _of("axis y x", "pixel", "shift of the reflections", "float32"),
         },
         "blackbody_frames": {"noise": NOISE},
         "correction": {
