@@ -206,7 +206,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     height, width = corrected.sizes["y"], corrected.sizes["x"]
     variables = dict(schema.STAGES["separated"])
     if inputs.method.survey:
-        variables |= schema.OPTIONAL["separated"]
+        name = "emissivity_covariance"
+        variables[name] = schema.OPTIONAL["separated"][name]
     result = _allocate(corrected, variables)
     with (
         threadpool_limits(limits=1, user_api="blas"),
@@ -228,6 +229,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     ratios = () if inputs.method.survey else ("reflection_ratio", "reflection_ratio_std")
     return result.assign_attrs(
         method=method,
+        pooled=int(pool is not None),
         response_kind=response_kind,
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
