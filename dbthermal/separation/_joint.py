@@ -220,7 +220,9 @@ def solve(
         here, beside, _ = both(looked_at, change[:, some])
         for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
             # A gradient as steep as the object's own change turns the step round: divide by it.
-            line = residuals.regress(here.T, first, inputs.noise[inputs.bands[0]])
+            line = residuals.regress(
+                here.T.astype(np.float64), first, inputs.noise[inputs.bands[0]]
+            )
             steep = np.maximum(_slope(here, beside), 1.0)
             slope = emissivity[0] + (line.slope - emissivity[0]) / steep
             known = line.energy > _LEAST_CHANGE**2 * len(some)
@@ -288,8 +290,8 @@ def _coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> tuple[Arra
     return first.astype(np.float32), shares.astype(np.float32)
 
 
-def _first_band(inputs: Inputs, frames: Whole) -> Array:
-    """Signal (frame, pixel) [K] of the reference band; 0, an outlier, where it is none."""
+def _first_band(inputs: Inputs, frames: Whole) -> npt.NDArray[np.float64]:
+    """Signal (frame, pixel) [K] of the reference band; 0, an outlier, where it is not measured."""
     band = inputs.bands[0]
     counts = inputs.capture["counts"].isel(band=band, time=frames).values.astype(np.float64)
     signal = inputs.curves[band].linearise(counts) - inputs.curves[band].reference
