@@ -207,7 +207,7 @@ def interpolation(places: Array, taps: int) -> csr_array:
 
 
 def _weights(places: Array, bad: npt.NDArray[np.bool_]) -> csr_array:
-    """Weights as `interpolation` does, lines near the border, and near bad pixels."""
+    """Weights as `interpolation`, of lines near the border and near bad pixels."""
     if np.array_equal(places, np.indices(bad.shape)):
         return eye_array(bad.size, dtype=np.float32, format="csr")
     fine = interpolation(places, _TAPS)

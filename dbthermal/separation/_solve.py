@@ -206,7 +206,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     height, width = corrected.sizes["y"], corrected.sizes["x"]
     variables = dict(schema.STAGES["separated"])
     if inputs.method.survey:
-        variables |= schema.OPTIONAL["separated"]
+        name = "emissivity_covariance"
+        variables[name] = schema.OPTIONAL["separated"][name]
     result = _allocate(corrected, variables)
     with (
         threadpool_limits(limits=1, user_api="blas"),
