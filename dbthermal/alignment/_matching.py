@@ -4,13 +4,13 @@ Sought is d with :math:`h_m(p, t) = k_m(p) h_1(p + d(p), t)` beside noise, m = 2
 whole pixels that explain most, then Gauss-Newton from coarse images to fine ones on a smooth field.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.ndimage import gaussian_filter, spline_filter1d
+from scipy.ndimage import gaussian_filter, spline_filter1d, uniform_filter
 
 from dbthermal.alignment._fields import Field, Information, Spline, weights
 
@@ -20,15 +20,17 @@ Movie = npt.NDArray[np.float32]
 
 WINDOW: Final = 2.5
 """Deviation of the window in which neighbours share a ratio and a whole-pixel match [pixel]."""
-BLUR: Final = 0.8
+BLUR: Final = 1.2
 """Deviation of the blur of all movies before they are matched, that nothing aliases [pixel]."""
 
 _ROUNDS: Final = 12
 _CONVERGED: Final = 2e-3  # change of the field at its end, in standard deviations of it or pixels
-_PIXELS: Final = 4096  # that are resampled at a time
+_ROWS: Final = 32  # that are resampled at a time
 _MISFIT: Final = 0.7  # by how much a residual's variance exceeds noise at half weight, relative
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
+_TAIL: Final = 4.0  # variances of the residual at which a sample has half its weight
+_USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 _TEXTURED: Final = 0.3  # least information over that which noise pretends, of a pixel that counts
 # Rough matches count as if each were known so well [pixel].
 _ROUGH: Final = 0.5
@@ -44,6 +46,7 @@ class Movies:
     noise: tuple[float, ...]  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
     factor: int = 1  # pixels of the capture along a side of one of these
+    around: tuple[int, int, int] = (3, 3, 5)  # samples among which a residual is judged
 
     @classmethod
     def blurred(
@@ -174,53 +177,94 @@ def inside(places: Array, valid: Mask) -> Mask:
     return np.asarray(result & valid[row, column])
 
 
-def _moments(movies: Movies, coefficients: Movie, places: Array) -> Array:
-    """Products (other, 10, y, x), summed over time, of moved, its slopes, and another movie."""
+@dataclass(frozen=True)
+class _Match:
+    """Ratio (y, x) of another movie to the moved first one, and its residual's variance."""
+
+    ratio: Array
+    variance: Array  # of a sample of the residual [K^2]
+
+    def trust(self, square: Movie, rows: slice) -> Movie:
+        """Weight of samples (y, x, time): 1 of noise, 0 of changes that are no reflection."""
+        scale = (1.0 / (_TAIL * self.variance[rows, :, np.newaxis])).astype(np.float32)
+        return np.asarray(1.0 / (1.0 + (square * scale) ** 2))
+
+
+def _moderate(movie: Movie) -> Movie:
+    """Weight of samples (..., time), smaller where a movie changes as it seldom does."""
+    usual = np.quantile(np.abs(movie), _USUAL, axis=-1, keepdims=True)
+    return np.asarray(1.0 / (1.0 + (movie / np.maximum(usual, 1e-12)) ** 2), dtype=np.float32)
+
+
+def _moments(
+    movies: Movies, coefficients: Movie, places: Array, matches: list[_Match] | None
+) -> Array:
+    """
+    Products (other, 12, y, x), summed over time, of moved, its slopes, and another movie.
+
+    The last two are the number of samples, and their smoothed residuals squared; all are weighted
+    by how well they matched.
+    """
     frames = coefficients.shape[1]
-    result = np.empty((len(movies.others), 10, places[0].size))
-    flat = places.reshape(2, -1)
-    for start in range(0, flat.shape[1], _PIXELS):
-        part = slice(start, start + _PIXELS)
-        moved = [m @ coefficients for m in interpolation(flat[:, part], movies.shape)]
-        for other, out in zip(movies.others, result, strict=True):
-            four = [*moved, other.reshape(-1, frames)[part]]
-            pairs = [(i, j) for i in range(4) for j in range(i, 4)]
+    result = np.zeros((len(movies.others), 12, *movies.shape))
+    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
+    for start in range(0, movies.shape[0], _ROWS):
+        rows = slice(start, start + _ROWS)
+        matrices = interpolation(places[:, rows].reshape(2, -1), movies.shape)
+        moved = [(m @ coefficients).reshape(-1, movies.shape[1], frames) for m in matrices]
+        for number, (other, out) in enumerate(zip(movies.others, result, strict=True)):
+            four = [*moved, other[rows]]
+            if matches is None:
+                weight = _moderate(four[0]) * _moderate(four[3])
+            else:
+                ratio = matches[number].ratio[rows, :, np.newaxis].astype(np.float32)
+                square = uniform_filter((four[3] - ratio * four[0]) ** 2, movies.around)
+                weight = matches[number].trust(square, rows)
+                out[11, rows] = np.median(square, axis=2)
+            out[10, rows] = weight.sum(axis=2)
+            weighted = [weight * one for one in four]
             for place, (i, j) in enumerate(pairs):
-                out[place, part] = np.einsum("pt,pt->p", four[i], four[j])
-    return result.reshape(len(movies.others), 10, *movies.shape)
+                out[place, rows] = np.einsum("yxt,yxt->yx", weighted[i], four[j])
+    return result
 
 
-def information(movies: Movies, coefficients: Movie, shift: Array) -> Information:
+def information(
+    movies: Movies, coefficients: Movie, shift: Array, matches: list[_Match] | None
+) -> tuple[Information, list[_Match]]:
     r"""
-    Information on a step of the field at each pixel, by Gauss-Newton.
+    Information on a step of the field at each pixel, by Gauss-Newton, and how well it matches.
 
     With a ratio k for each window, the residual r of a pixel, and the slope g of the moved movie,
 
-    .. math:: A = k^2 \sum_t g g^T / s^2, \quad b = k \sum_t g r / s^2
+    .. math:: A = k^2 \sum_t w g g^T / s^2, \quad b = k \sum_t w g r / s^2
 
     less what noise makes of the slopes; s^2 is the noise's variance where the residual is noise,
-    and larger where it is not.
+    and larger where it is not; w takes samples out whose residual is large.
     """
     places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
     value_noise, slope_noise = _blur_noise()
-    number = np.maximum(gaussian_filter(used.astype(np.float64), WINDOW), 1e-9) * movies.freedom
     noise = movies.noise[0] * value_noise
     tensor, gradient = np.zeros((3, *used.shape)), np.zeros((2, *used.shape))
-    chance = np.zeros(used.shape)
+    chance, found = np.zeros(used.shape), []
     for moments, level in zip(
-        _moments(movies, coefficients, places) * used, movies.noise[1:], strict=True
+        _moments(movies, coefficients, places, matches) * used, movies.noise[1:], strict=True
     ):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = moments
+        mm, my, mx, mh, yy, yx, yh, xx, xh, hh, samples, squares = moments
+        samples *= movies.freedom / coefficients.shape[1]
+        number = np.maximum(gaussian_filter(samples, WINDOW), 1e-9)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto = gaussian_filter(mm, WINDOW) - number * noise**2
         ratio = gaussian_filter(mh, WINDOW) / np.maximum(auto, 0.1 * number * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
+        floor = variance * value_noise**2
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
-        misfit = np.maximum(residual / (number * variance * value_noise**2), 1.0)
+        misfit = np.maximum(residual / (number * floor), 1.0)
+        spread = misfit * floor if matches is None else gaussian_filter(squares, WINDOW)
+        found.append(_Match(ratio, np.maximum(spread, floor)))
         weight = used / (misfit * (1.0 + ((misfit - 1.0) / _MISFIT) ** 2) * variance)
-        less = movies.freedom * (movies.noise[0] * slope_noise) ** 2
+        less = samples * (movies.noise[0] * slope_noise) ** 2
         tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
         gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
         chance += weight * ratio**2 * less
@@ -229,7 +273,7 @@ def information(movies: Movies, coefficients: Movie, shift: Array) -> Informatio
     )
     textured = tensor[0] + tensor[2] > _TEXTURED * gaussian_filter(chance, WINDOW)
     tensor, gradient = _positive(tensor) * textured, gradient * textured
-    return Information(tensor / movies.factor**2, gradient / movies.factor)
+    return Information(tensor / movies.factor**2, gradient / movies.factor), found
 
 
 def _positive(tensor: Array) -> Array:
@@ -242,9 +286,15 @@ def _positive(tensor: Array) -> Array:
     return np.stack([mean + half, share * b, mean - half])
 
 
+def clipped(movies: Movies) -> Movies:
+    """Movies of which changes as large as there are seldom are cut: an object's, if rapid."""
+    first, *others = (part * np.sqrt(_moderate(part)) for part in (movies.first, *movies.others))
+    return replace(movies, first=first, others=tuple(others))
+
+
 def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | None:
     """Field of whole-pixel matches, wrong ones taken for outliers; None without any."""
-    rough, share = whole_pixels(movies, reach)
+    rough, share = whole_pixels(clipped(movies), reach)
     if not share.any():
         return None
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
@@ -265,9 +315,10 @@ def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     for axis in (0, 1):
         coefficients = spline_filter1d(coefficients, 3, axis=axis, output=np.float32)
     coefficients = coefficients.reshape(-1, shape[2])
+    matches = None
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
-        data = information(movies, coefficients, shift)
+        data, matches = information(movies, coefficients, shift, matches)
         field = field.spline.fitted(data, movies.centres(), field)
         change = np.abs(field.on(movies.centres()) - shift)
         if change.max() < _CONVERGED * movies.factor:

@@ -28,8 +28,12 @@ _ROWS: Final = 32  # that are read at a time
 _SAMPLES: Final = 2**26  # of a band that are matched, at most: of a large image fewer frames
 _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
 _MISSING: Final = 0.1  # share of the frames that a pixel may lack
-# Periods [frame] of which slower changes are left out; the one that tells most is taken.
-_PERIODS: Final = (80.0, 20.0, 10.0, 5.0)
+# Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
+# rapidly enters. A longer one is taken that tells the shift at so many times more pixels, and whose
+# field differs by no more than so many deviations.
+_PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
+_MORE: Final = 1.25
+_AGREE: Final = 1.5
 _CLIP: Final = 3.0  # noise, to which the changes of a frame are clipped when frames are chosen
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
@@ -207,24 +211,23 @@ def _coarse(
     frames, best, result = capture.frames.size, 0.0, None
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
-            continue
-        movies = [
-            np.moveaxis(_filtered(part, capture.smoothing(period)), 0, -1).astype(np.float32)
-            for part in signals
-        ]
+            break
+        smoothing = capture.smoothing(period)
+        movies = [np.moveaxis(_filtered(part, smoothing), 0, -1) for part in signals]
         level = matching.Movies.coarse(
-            movies,
+            [movie.astype(np.float32) for movie in movies],
             matching.coarse_mask(valid, factor),
             capture.noise / factor,
             _freedom(frames, period),
             factor,
         )
-        field = matching.start(level, spline, reach)
-        if field is None:
+        begin = matching.start(level, spline, reach) if result is None else result[-1]
+        if begin is None:
             continue
-        field, data = matching.refine(level, field)
-        told = float(np.sum(data.tensor[0] + data.tensor[2]))
-        if told > best:
+        field, data = matching.refine(level, begin)
+        told = float(_told(data, factor).mean())
+        agrees = result is None or _agree(result[-1], field, level.centres())
+        if told > _MORE * best and agrees:
             energy = np.minimum((movies[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
             best, result = told, (capture, period, _energetic(energy, capture.valid.size), field)
     if result is None:
@@ -233,6 +236,19 @@ def _coarse(
             "Must be seen in both to find their shift; let somebody walk by."
         )
     return result
+
+
+def _told(data: Information, factor: int = 1) -> Mask:
+    """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
+    down, both, right = data.tensor * (4.0 * np.pi * (matching.WINDOW / factor) ** 2)
+    largest = 0.5 * (down + right) + np.hypot(0.5 * (down - right), both)
+    return np.asarray(largest > 1.0 / _KNOWN**2)
+
+
+def _agree(robust: Field, other: Field, centres: list[Array]) -> bool:
+    """Return whether a field lies within the deviation of another one that is more robust."""
+    apart = (robust.on(centres) - other.on(centres)) ** 2
+    return bool(np.mean(apart / robust.variances(centres)[[0, 2]]) < _AGREE**2)
 
 
 def _energetic(energy: Array, pixels: int) -> npt.NDArray[np.intp]:
@@ -278,10 +294,12 @@ def _noise(corrected: xr.Dataset, response: xr.Dataset, names: list[str], slopes
 
 
 def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
-    """Frames in which most pixels of every band are measured."""
+    """Frames in which most of the pixels that every band ever measures are measured."""
     step = max(1, int(np.sqrt(counts[0, 0].size / 4096)))
     some = schema.measured(counts[:, :, ::step, ::step].values)
-    used = np.flatnonzero(some.mean(axis=(2, 3)).min(axis=0) > _COMMON)
+    ever = some.any(axis=1).all(axis=0)  # a view may show the object alone
+    share = some[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(some.shape[1])
+    used = np.flatnonzero(share > _COMMON)
     if used.size < noises.MINIMUM_FRAMES:
         raise ValueError(
             f"Invalid capture of {used.size} frames that all bands have. Must be at least "
@@ -297,11 +315,8 @@ def _result(
     shape = capture.valid.shape
     centres = [np.arange(size, dtype=np.float64) for size in shape]
     shift, covariance = field.on(centres), field.variances(centres)
-    window = 4.0 * np.pi * matching.WINDOW**2
-    down, both, right = data.tensor * window
-    largest = 0.5 * (down + right) + np.hypot(0.5 * (down - right), both)
     reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
-    known = (largest > 1.0 / _KNOWN**2) & reached
+    known = _told(data) & reached
     near = np.asarray(distance_transform_edt(~known)) <= _NEAR * min(shape)
     near &= reached
     std = np.sqrt(np.maximum(covariance[[0, 2]], 0.0))

@@ -11,6 +11,7 @@ from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
 from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection
 from dbthermal.separation._scale import unscaled
+from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ __all__ = [
     "get_method",
     "materials",
     "reflected_change",
+    "separate",
     "solve",
     "uncalibrated_reflection",
     "unscaled",

@@ -103,7 +103,7 @@ def shifts(rng: Rng) -> Attack:
         return separation.solve(made.capture, response, method, reflection_shift=spoilt)
 
     names = ("shift|axis|known|band|pixel|reflection_shift|dims|coordinate|'x'",)
-    limit = "a wrong shift that is smooth is not seen" if what == "turned round" else ""
+    limit = "a wrong shift is not seen everywhere" if what in ("a step", "turned round") else ""
     good = what == "nothing" and method == "subspace"
     return Attack(f"shift {what}", act, lambda found: judge(made, found), names, good, limit)
 

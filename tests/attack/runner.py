@@ -26,7 +26,7 @@ CLASSES: Final[Mapping[str, tuple[Make, int]]] = {
     "responses": (arrays.responses, 4),
     "windows": (arrays.windows, 5),
     "shifts": (mirrored.shifts, 6),
-    "fields": (mirrored.fields, 3),
+    "fields": (mirrored.fields, 2),
     "completions": (mirrored.completions, 6),
     "offset": (stages.offset, 6),
     "align": (stages.aligned, 6),

@@ -184,3 +184,25 @@ def test_result_of_another_capture_is_refused(half: Case) -> None:
     _, other, _ = draw(SMALL, 9, 0.86, 0.72)
     with pytest.raises(ValueError, match=r"Must be of the same capture"):
         separation.complete(alone, other, RESPONSE)
+
+
+@pytest.mark.parametrize(
+    ("picture", "emissivity"),
+    [(replace(SMALL, still=0.5), (0.86, 0.72)), (SMALL, (0.98, 0.95)), (NOBODY, (0.86, 0.72))],
+)
+def test_one_call_gives_a_whole_picture(picture: Picture, emissivity: tuple[float, ...]) -> None:
+    """Everything is finite, intervals hold, and nothing completed passes as measured."""
+    scene, capture, alone = draw(picture, 7, *emissivity)
+    whole = separation.separate(capture, RESPONSE)
+    error = abs(whole["object_temperature"] - scene["object_temperature"])
+    within = float((error < 1.96 * whole["object_temperature_std"]).mean())
+    reading = separation.solve(capture, RESPONSE, "apparent")["object_temperature"]
+    apart = abs(reading - scene["object_temperature"])
+    print(f"{emissivity}: {float(error.median()):.3f} K, reading {float(apart.median()):.3f} K")
+    assert bool(error.notnull().all())
+    assert within > 0.9
+    assert float(error.median()) < float(apart.median())
+    # Without motion anywhere a value cannot be measured.
+    if bool(alone["object_temperature"].isnull().all()):
+        completed = (whole["status"] & int(COMPLETED)) != 0
+        assert bool((completed | (whole["material"] >= 0)).all())

@@ -13,7 +13,8 @@ fluctuation f(t), and any object at all:
 2. For each :math:`e_1` on a grid the rest is linear and Gaussian: evidence, mean and covariance of
    :math:`(e_m, c)` are closed forms, for each component of the prior. Their moments over the grid
    are kept in :math:`a = 1 / e_1`, :math:`\rho_m = e_m / e_1` and c, in which s is nearly linear:
-   :math:`s = c + a (z_1 - c)`.
+   :math:`s = c + a (z_1 - c)`. The mean of a is taken no farther from 1, the camera's own reading,
+   than is no worse than that with a probability of 95 %.
 3. Frame by frame s and f are the posterior mean, the latter of a variance that the bins show.
 """
 
@@ -34,6 +35,8 @@ _NODES: Final = np.cos(np.pi * (np.arange(4) + 0.5) / 4.0)
 _LEAST_RANGE: Final = 0.5
 # The first band's change over its noise, in variance, from which a slope is not attenuated.
 _SEEN: Final = 25.0
+# Probability that the object is farther off than the camera's own reading, at most [1].
+_WORSE: Final = 0.05
 _STEPS: Final = 2
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
 _NEWTON: Final = 3
@@ -191,8 +194,14 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     weight = np.exp(log - log.max(axis=(0, 1)))
     weight = weight / weight.sum(axis=(0, 1))
     plain = _average(weight, grid, np.ones_like(grid), values, covariance)
-    scaled = _average(weight, 1.0 / grid, 1.0 / grid, values, covariance)
-    return Moments(*scaled, plain[0][:-1], plain[1][:-1, :-1])
+    mean, spread = _average(weight, 1.0 / grid, 1.0 / grid, values, covariance)
+    # The blackest emissivity that is as improbable; the grid rises.
+    above = np.cumsum(weight.sum(axis=0)[::-1], axis=0) < _WORSE
+    blackest = np.take_along_axis(grid[::-1], np.minimum(above.sum(axis=0), len(grid) - 1)[None], 0)
+    moved = np.minimum(mean[0], 1.0 + 2.0 * (1.0 / blackest[0] - 1.0)) - mean[0]
+    mean[0] += moved
+    spread[0, 0] += moved**2
+    return Moments(mean, spread, plain[0][:-1], plain[1][:-1, :-1])
 
 
 def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Array:
@@ -291,14 +300,26 @@ class Frames:
     background_sensitivity: Array  # of c + f (parameter, time, pixel)
 
 
-def solve_frames(tile: Tile, static: Moments, fluctuation_variance: Array) -> Frames:
-    """Posterior mean of every frame (step 3), by Newton's method from the first band alone."""
+def solve_frames(
+    tile: Tile, static: Moments, fluctuation_variance: Array, *, apart: bool = False
+) -> Frames:
+    """
+    Posterior mean of every frame (step 3), by Newton's method from the first band alone.
+
+    Of cameras apart, what fluctuates in the other bands is another part of the background: noise.
+    """
     bands = range(len(tile.noise))
     a, c = static.mean[0], static.mean[-1]
     e = np.concatenate([np.ones((1, a.size)), static.mean[1:-1]]) / a
     precision = np.array(tile.noise)[:, np.newaxis, np.newaxis] ** -2.0
     level, rate = _all_bands(tile, c)
     by_f = ((1.0 - e) * rate)[:, np.newaxis]
+    if apart:
+        variance = 1.0 / precision[1:] + by_f[1:] ** 2 * fluctuation_variance
+        precision = np.concatenate(
+            [np.broadcast_to(precision[:1], variance[:1].shape), 1.0 / variance]
+        )
+        by_f = by_f * (np.arange(len(bands)) == 0)[:, np.newaxis, np.newaxis]
     s, f = c + a * (tile.signals[0] - c), np.zeros_like(tile.signals[0])
     for _ in range(_NEWTON):
         emitted, slope = _all_bands(tile, s)
@@ -318,7 +339,7 @@ def solve_frames(tile: Tile, static: Moments, fluctuation_variance: Array) -> Fr
     # Of the model with a, rho_m and c: e_1 = 1 / a, e_m = rho_m / a.
     changes = [-e[:, np.newaxis] / a * by_e]
     changes += [by_e / a * (np.array(bands) == m)[:, np.newaxis, np.newaxis] for m in bands[1:]]
-    changes += [np.broadcast_to(by_f, by_e.shape)]
+    changes += [np.broadcast_to(((1.0 - e) * rate)[:, np.newaxis], by_e.shape)]
     of_s, of_f = (np.array([-(part * k).sum(axis=0) for part in changes]) for k in (gain, other))
     of_f[-1] += 1.0
     shared = np.maximum(ff / determinant - white, 0.0)
