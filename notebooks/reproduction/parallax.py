@@ -46,7 +46,7 @@ def edges_shift(movie: xr.DataArray) -> xr.Dataset:
         with contextlib.suppress(ValueError):
             found = alignment.register(capture, model="translation").isel(band=1)
             parts.append(-found.values[[1, 0], 2])
-    known = np.array(parts or [[np.nan, np.nan]])
+    known = np.array(parts or [np.full(2, np.nan)])
     return _spread(np.median(known, axis=0), known.min(axis=0), known.max(axis=0))
 
 

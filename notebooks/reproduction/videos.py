@@ -216,7 +216,8 @@ def compare(scene: Scene, number: int) -> Comparison:
     undone = separation.unscaled(scene.movie, still(scene.outline))
     reflections = parallax.reflections_shift(undone, scene.outline)
     shared = parallax.shared_outline(scene.outline, reflections)
-    found, left_out = {}, {}
+    found: dict[str, xr.Dataset] = {}
+    left_out = {}
     for way in sorted(WAYS, key=lambda way: -WAYS[way][0]):  # the scale undone first
         of_scale, of_reflections = WAYS[way]
         movie = undone if of_scale else scene.movie
