@@ -246,6 +246,8 @@ def _shift(small: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | None, 
         field = reflection_shift(small, response)
     except ValueError as error:  # as where nothing moves, or the image is too small
         return None, str(error)
+    if not field["known"].values.any():
+        return None, "the shift is not known anywhere"
     shift, std = (
         np.hypot(*field[name].values[:, field["known"].values]) for name in ("shift", "shift_std")
     )
