@@ -71,7 +71,7 @@ def estimate(
     smooth_variance = leverage * ratios.null_variance / fit.steepness**2
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
-    omitted = smooth_variance * np.log(tile.time.size) / ratios.order
+    omitted = smooth_variance * np.log(tile.time.size) / (ratios.order + functions.steps)
     # Variance of the slope: of the ordinate's noise, and of the abscissa's, e_1^2 var q / sum u^2.
     noise_variance = line.variance + first**2 * ratios.null_variance / line.energy
     walk, upper = walk_variance(line, fit.emitted, functions, tile.noise[0])
@@ -134,7 +134,8 @@ def _alternate(tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio) 
     for _ in range(_ROUNDS):
         emitted = tile.blackbody(0, temperature)
         line = residuals.regress(emitted, tile.signals[0], tile.noise[0], start=line)
-        constant = line.energy < _OBJECT_TO_NOISE * ratios.order * ratios.null_variance
+        functions_used = ratios.order + functions.steps
+        constant = line.energy < _OBJECT_TO_NOISE * functions_used * ratios.null_variance
         emissivity = np.where(constant, middle, line.slope)
         if tile.material is not None:
             known = ratios.pooled & np.isfinite(tile.material.emissivity)
@@ -220,7 +221,7 @@ def walk_variance(
 
     .. math:: \mathrm{var}(e_1) = \frac{A}{|u|^2} \sum_j \frac{\xi_j^2}{j^2}
     """
-    columns = functions.functions[:, functions.steps + 1 :]
+    columns = functions.rising
     degree = np.arange(1.0, columns.shape[1] + 1)[:, np.newaxis]
     # Spectra of the residual, over the share of frames that the weights keep, and of the curve.
     share = line.weights.mean(axis=0)
