@@ -317,7 +317,8 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
         if places.size == 0:
             continue
         again = _divided(part.select_pixels(places), division.first[:, places], settings)
-        better = (again.status == 0) | (flagged[places] & (division.cost[places] < cost[places]))
+        cheaper = division.cost[places] < cost[places] - _LIKELY
+        better = (again.status == 0) | (flagged[places] & cheaper)
         places, again = places[better], again.select_pixels(better)
         best = best.replace_pixels(places, again)
         cost[places], divided[places] = division.cost[places], True
@@ -330,15 +331,11 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
 
 def _divided(tile: Tile, first: Mask, settings: SubspaceSettings) -> Estimate:
     """Estimate with pieces that begin with some frames (time, pixel), same pieces together."""
-    order = _functions(tile).orders
-    groups: dict[bytes, list[int]] = {}
-    for place, begins in enumerate(first.T):
-        groups.setdefault(begins.tobytes(), []).append(place)
-    parts = []
-    for places in groups.values():
+    order, groups, parts = _functions(tile).orders, pieces.alike(first), []
+    for places in groups:
         functions = smooth.piecewise(tile.time, first[:, places[0]], order, segment=tile.segment)
-        parts.append(_exact(tile.select_pixels(np.array(places)), functions, settings, _report))
-    return join(parts).select_pixels(np.argsort(np.concatenate([*groups.values()])))
+        parts.append(_exact(tile.select_pixels(places), functions, settings, _report))
+    return join(parts).select_pixels(np.argsort(np.concatenate(groups)))
 
 
 METHOD: Final = Method(

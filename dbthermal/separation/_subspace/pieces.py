@@ -76,12 +76,13 @@ def divide(signals: Array, time: Array, noise: Array, segment: Whole | None) -> 
         left = np.where(same, np.inf, costs)
         axis = axes[np.argmin(left, axis=0), np.arange(left.shape[1])]
         for _ in range(_ROUNDS):
-            cost, chosen = _best(scatters, axis)
+            chosen = _best(scatters, axis)[1]
             total = _total(scatters, chosen)
             axis = _axis(total)
         again = np.any(_angle(axis, taken) < _APART * deviation, axis=0)
         none = again | ~np.isfinite(left.min(axis=0))
-        divisions.append(Division(_first(chosen, edges), np.where(none, np.inf, cost)))
+        first, cost = _joined(white, axis, _first(chosen, edges), time, segment)
+        divisions.append(Division(first, np.where(none, np.inf, cost)))
         taken = np.concatenate([taken, axis[np.newaxis]])
         # An axis with an energy E along it, in units of the noise, is known to 1 / sqrt(E).
         deviation = 1.0 / np.sqrt(np.linalg.eigvalsh(total)[:, -1])
@@ -102,16 +103,11 @@ def _tree(time: bytes, segment: bytes | None) -> tuple[Whole, list[list[Piece]]]
     edges = np.round(np.linspace(0, times.size, 2**levels + 1)).astype(np.intp)
     for event in [] if events is None else np.flatnonzero(np.diff(events)) + 1:
         edges[1:-1][edges[1:-1] == event] += _LEAST // 2
-    tree = []
+    tree: list[list[Piece]] = []
     for level in range(levels + 1):
-        bounds, pieces = edges[:: 2 ** (levels - level)], []
-        for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
-            steps = smooth.camera_steps(None if events is None else events[start:stop])
-            order = min(smooth.PIECE_ORDER, stop - start - len(steps))
-            basis = smooth.polynomial_basis(times[start:stop], order)
-            basis = np.linalg.qr(np.column_stack([*steps, basis]))[0]
-            pieces.append((slice(start, stop), basis, len(steps) + _FUNCTIONS))
-        tree.append(pieces)
+        bounds = edges[:: 2 ** (levels - level)]
+        inside = [slice(start, stop) for start, stop in zip(bounds[:-1], bounds[1:], strict=True)]
+        tree.append([(one, *functions(times[one].tobytes(), None if events is None else events[one].tobytes())) for one in inside])
     return edges, tree
 
 
@@ -172,6 +168,68 @@ def _halve(costs: list[Array]) -> tuple[Array, list[Mask]]:
         chosen.append(inside & ~halve)
         inside = np.repeat(inside & halve, 2, axis=0)
     return least[0], [*chosen, inside]
+
+
+def _joined(
+    white: Array, axis: Array, first: Mask, time: Array, segment: Whole | None
+) -> tuple[Mask, Array]:
+    """
+    Best division that begins no pieces but those given (time, pixel), and its cost (pixel).
+
+    Halving makes more pieces than are needed: a change at a third of the time needs many. Of the
+    ends of pieces at hand the best are found by going through them in their order.
+    """
+    across = white - np.einsum("pb,btp->tp", axis, white) * axis.T[:, np.newaxis]
+    price = COST * _FUNCTIONS * (axis.shape[1] - 1)
+    joined, cost = np.zeros_like(first), np.empty(first.shape[1])
+    for places in alike(first):
+        edges = [*np.flatnonzero(first[:, places[0]]), time.size]
+        part = across[..., places]
+        least, before = np.full((len(edges), places.size), np.inf), []
+        least[0] = 0.0
+        for stop in range(1, len(edges)):
+            sums = [
+                least[start] + _energy(part, edges[start], edges[stop], time, segment) + price
+                for start in range(stop)
+            ]
+            before.append(np.argmin(sums, axis=0))
+            least[stop] = np.min(sums, axis=0)
+        cost[places] = least[-1]
+        at = np.full(places.size, len(edges) - 1)
+        while np.any(at > 0):
+            at = np.where(at > 0, np.array(before)[at - 1, np.arange(at.size)], 0)
+            joined[np.array(edges)[at], places] = True
+    return joined, cost
+
+
+def alike(first: Mask) -> list[Whole]:
+    """Pixels whose pieces begin with the same frames (time, pixel), together."""
+    groups: dict[bytes, list[int]] = {}
+    for place, begins in enumerate(first.T):
+        groups.setdefault(begins.tobytes(), []).append(place)
+    return [np.array(places) for places in groups.values()]
+
+
+def _energy(across: Array, start: int, stop: int, time: Array, segment: Whole | None) -> Array:
+    """Energy (pixel) of a signal (band, time, pixel) outside the functions of one piece."""
+    inside = slice(start, stop)
+    basis, chosen = functions(
+        time[inside].tobytes(), None if segment is None else segment[inside].tobytes()
+    )
+    held = basis[:, :chosen].T @ across[:, inside]
+    energy = np.einsum("btp,btp->p", across[:, inside], across[:, inside])
+    return np.asarray(energy - np.einsum("bkp,bkp->p", held, held))
+
+
+@lru_cache(maxsize=4096)
+def functions(time: bytes, segment: bytes | None) -> tuple[Array, int]:
+    """Functions of a piece (time, function), orthonormal, and how many are used to choose it."""
+    times = np.frombuffer(time)
+    steps = [] if segment is None else smooth.camera_steps(np.frombuffer(segment, dtype=np.intp))
+    order = max(1, min(smooth.PIECE_ORDER, times.size - len(steps)))
+    basis = smooth.polynomial_basis(times, order)
+    # Steps of the camera come first.
+    return np.linalg.qr(np.column_stack([*steps, basis]))[0], len(steps) + _FUNCTIONS
 
 
 def _total(scatters: list[Array], chosen: list[Mask]) -> Array:

@@ -156,14 +156,14 @@ def unexplained(residual: Array, rapid: Array, null_variance: Array, common: Arr
     object that the smooth functions do not follow. Or blocks differ in its correlation with the
     `rapid` part of the first band's signal h (time, pixel) [K]: these changes have not one ratio,
 
-    .. math:: \sum_b \frac{(\sum_t r h + n \, w_1 s_1^2)^2}{\sigma^2 \sum_t h^2}
+    .. math:: \sum_b \frac{(\sum_t r h - n \, w_1 s_1^2)^2}{\sigma^2 \sum_t h^2}
 
     which is a chi-square variable; its last term is `common` (time, pixel) [K^2] in each frame.
     """
     levels = int(np.log2(len(residual) / _BLOCK))
     edges = np.round(np.linspace(0, len(residual), 2**levels + 1)).astype(np.intp)
     length = np.diff(edges)[:, np.newaxis]
-    product, square = residual * rapid + common, rapid**2
+    product, square = residual * rapid - common, rapid**2
     sums, products, squares = (
         np.add.reduceat(part, edges[:-1], axis=0) for part in (residual, product, square)
     )
