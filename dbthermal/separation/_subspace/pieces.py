@@ -29,8 +29,6 @@ _FUNCTIONS: Final = 4
 # Cost of a function in units of the energy of noise: 1 for none, log N for an information criterion
 # that would rather miss a change than find one too many.
 COST: Final = 2.5
-# Fewest frames of a piece: their polynomial is any curve.
-_LEAST: Final = 4
 # Functions by whose cost pieces must be better than a smooth curve to be asked for.
 _MARGIN: Final = 3.0
 # Levels of the pieces that are enough to see that pieces are better.
@@ -38,6 +36,8 @@ _COARSE: Final = 4
 # Halvings after which the pieces give the axes to start from.
 _STARTS: Final = (0, 2, 3, 4, 5)
 _ROUNDS: Final = 5
+# Axes that are refined, of which the two best are kept: joined, they may change places.
+_AXES: Final = 4
 # Parts in which these are tried: together they would need much memory.
 _PARTS: Final = 8
 # Standard deviations between two axes that are told apart.
@@ -65,18 +65,19 @@ def divide(signals: Array, time: Array, noise: Array, segment: Whole | None) -> 
     edges, levels = _tree(time.tobytes(), None if segment is None else segment.tobytes())
     white = signals / noise[:, np.newaxis, np.newaxis]
     scatters = [_scatters(white, level) for level in levels]
+    prices = [COST * (len(noise) - 1) * np.array([p[2] for p in level]) for level in levels]
     starts = [_axis(scatters[level][0]) for level in _STARTS if level < len(scatters)]
     axes = np.concatenate(starts)
-    costs = np.concatenate([_best(scatters, some)[0] for some in np.array_split(axes, _PARTS)])
+    costs = np.concatenate([_best(scatters, prices, some)[0] for some in np.array_split(axes, _PARTS)])
     divisions: list[Division] = []
     taken = np.full((0, *axes.shape[1:]), np.nan)
     deviation = np.zeros(signals.shape[2])
-    for _ in range(2):
+    for _ in range(_AXES):
         same = np.any(_angle(axes, taken) < _APART * deviation, axis=0)
         left = np.where(same, np.inf, costs)
         axis = axes[np.argmin(left, axis=0), np.arange(left.shape[1])]
         for _ in range(_ROUNDS):
-            chosen = _best(scatters, axis)[1]
+            chosen = _best(scatters, prices, axis)[1]
             total = _total(scatters, chosen)
             axis = _axis(total)
         again = np.any(_angle(axis, taken) < _APART * deviation, axis=0)
@@ -86,7 +87,10 @@ def divide(signals: Array, time: Array, noise: Array, segment: Whole | None) -> 
         taken = np.concatenate([taken, axis[np.newaxis]])
         # An axis with an energy E along it, in units of the noise, is known to 1 / sqrt(E).
         deviation = 1.0 / np.sqrt(np.linalg.eigvalsh(total)[:, -1])
-    return divisions
+    rows = np.argsort([one.cost for one in divisions], axis=0, kind="stable")
+    every = np.arange(rows.shape[1])
+    firsts, least = (np.stack(part) for part in zip(*((d.first, d.cost) for d in divisions)))
+    return [Division(firsts[rank, :, every].T, least[rank, every]) for rank in rows[:2]]
 
 
 @lru_cache(maxsize=4)
@@ -99,10 +103,11 @@ def _tree(time: bytes, segment: bytes | None) -> tuple[Whole, list[list[Piece]]]
     """
     times = np.frombuffer(time)
     events = None if segment is None else np.frombuffer(segment, dtype=np.intp)
-    levels = int(np.log2(times.size / _LEAST))
+    # The polynomial of the shortest pieces is any curve.
+    levels = int(np.ceil(np.log2(times.size / smooth.PIECE_ORDER)))
     edges = np.round(np.linspace(0, times.size, 2**levels + 1)).astype(np.intp)
     for event in [] if events is None else np.flatnonzero(np.diff(events)) + 1:
-        edges[1:-1][edges[1:-1] == event] += _LEAST // 2
+        edges[1:-1][edges[1:-1] == event] += 1
     tree: list[list[Piece]] = []
     for level in range(levels + 1):
         bounds = edges[:: 2 ** (levels - level)]
@@ -140,18 +145,20 @@ def _angle(axes: Array, others: Array) -> Array:
     return np.asarray(np.arccos(np.minimum(np.abs(product), 1.0)))
 
 
-def _best(scatters: list[Array], axis: Array) -> tuple[Array, list[Mask]]:
+def _best(
+    scatters: list[Array], prices: list[Array], axis: Array
+) -> tuple[Array, list[Mask]]:
     """
     Least cost (..., pixel) of all divisions, and the pieces (piece, ..., pixel) chosen, by level.
 
-    For axes (..., pixel, band).
+    For axes (..., pixel, band), with the prices of the pieces' functions (piece).
     """
-    price, costs = COST * _FUNCTIONS * (axis.shape[-1] - 1), []
-    for scatter, _ in scatters:
+    costs = []
+    for (scatter, _), price in zip(scatters, prices, strict=True):
         turned = np.einsum("ipbc,...pc->i...pb", scatter, axis)
         along = np.einsum("...b,...b->...", turned, axis)
-        whole = np.einsum("ipbb->ip", scatter)
-        costs.append(whole.reshape(len(whole), *[1] * (axis.ndim - 2), -1) - along + price)
+        whole = np.einsum("ipbb->ip", scatter) + price[:, np.newaxis]
+        costs.append(whole.reshape(len(whole), *[1] * (axis.ndim - 2), -1) - along)
     return _halve(costs)
 
 
@@ -180,7 +187,6 @@ def _joined(
     ends of pieces at hand the best are found by going through them in their order.
     """
     across = white - np.einsum("pb,btp->tp", axis, white) * axis.T[:, np.newaxis]
-    price = COST * _FUNCTIONS * (axis.shape[1] - 1)
     joined, cost = np.zeros_like(first), np.empty(first.shape[1])
     for places in alike(first):
         edges = [*np.flatnonzero(first[:, places[0]]), time.size]
@@ -189,7 +195,7 @@ def _joined(
         least[0] = 0.0
         for stop in range(1, len(edges)):
             sums = [
-                least[start] + _energy(part, edges[start], edges[stop], time, segment) + price
+                least[start] + _cost(part, edges[start], edges[stop], time, segment)
                 for start in range(stop)
             ]
             before.append(np.argmin(sums, axis=0))
@@ -210,15 +216,16 @@ def alike(first: Mask) -> list[Whole]:
     return [np.array(places) for places in groups.values()]
 
 
-def _energy(across: Array, start: int, stop: int, time: Array, segment: Whole | None) -> Array:
-    """Energy (pixel) of a signal (band, time, pixel) outside the functions of one piece."""
+def _cost(across: Array, start: int, stop: int, time: Array, segment: Whole | None) -> Array:
+    """Cost (pixel) of one piece for a signal across the axis (band, time, pixel)."""
     inside = slice(start, stop)
     basis, chosen = functions(
         time[inside].tobytes(), None if segment is None else segment[inside].tobytes()
     )
     held = basis[:, :chosen].T @ across[:, inside]
     energy = np.einsum("btp,btp->p", across[:, inside], across[:, inside])
-    return np.asarray(energy - np.einsum("bkp,bkp->p", held, held))
+    energy -= np.einsum("bkp,bkp->p", held, held)
+    return np.asarray(energy + COST * chosen * (len(across) - 1))
 
 
 @lru_cache(maxsize=4096)
@@ -227,9 +234,10 @@ def functions(time: bytes, segment: bytes | None) -> tuple[Array, int]:
     times = np.frombuffer(time)
     steps = [] if segment is None else smooth.camera_steps(np.frombuffer(segment, dtype=np.intp))
     order = max(1, min(smooth.PIECE_ORDER, times.size - len(steps)))
-    basis = smooth.polynomial_basis(times, order)
     # Steps of the camera come first.
-    return np.linalg.qr(np.column_stack([*steps, basis]))[0], len(steps) + _FUNCTIONS
+    columns = [*steps, smooth.polynomial_basis(times, order)]
+    chosen = _FUNCTIONS if times.size > smooth.PIECE_ORDER else order
+    return np.linalg.qr(np.column_stack(columns))[0], len(steps) + chosen
 
 
 def _total(scatters: list[Array], chosen: list[Mask]) -> Array:
@@ -253,7 +261,7 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
     Of a null residual and the curve taken from it (time, pixel) [K], of noise of a variance (pixel)
     [K^2], with the number of functions used (pixel). Means over a few frames are enough to see it.
     """
-    levels = min(int(np.log2(len(time) / _LEAST)), _COARSE + 2)
+    levels = min(int(np.log2(len(time) / _FUNCTIONS)), _COARSE + 2)
     edges = np.round(np.linspace(0, len(time), 2**levels + 1)).astype(np.intp)
     root = np.sqrt(np.diff(edges))[:, np.newaxis]
     places = np.add.reduceat(time, edges[:-1]) / root[:, 0] ** 2
