@@ -6,6 +6,7 @@ then has polynomials in pieces of the time.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-PIECE_ORDER: Final = 6
+PIECE_ORDER: Final = 5
 """Number of polynomials in a piece of time."""
 
 # Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
@@ -98,13 +99,15 @@ def piecewise(
     time, rising = np.asarray(time, dtype=np.float64), subspace(time, order, segment=segment).rising
     edges = [*np.flatnonzero(first), time.size]
     blocks = []
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in pairwise(edges):
         inside = slice(start, stop)
         events = len(camera_steps(None if segment is None else segment[inside]))
         block = np.zeros((time.size, min(PIECE_ORDER, stop - start - events)))
         block[inside] = polynomial_basis(time[inside], block.shape[1])
         blocks.append(block)
-    functions, object_part = _without_steps(np.hstack(blocks), camera_steps(segment), np.empty((time.size, 0)))
+    functions, object_part = _without_steps(
+        np.hstack(blocks), camera_steps(segment), np.empty((time.size, 0))
+    )
     return Subspace(functions, object_part, functions.shape[1] - 1, rising)
 
 

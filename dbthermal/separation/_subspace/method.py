@@ -38,8 +38,12 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
    them apart (11) is taken out, and steps 1 to 4 are done again, on the exact model. It is known
    as well as the background's mean temperature, whose error the ratios carry. Near a gray body,
    whose ratios it makes alone, it is not known at all: such ratios are flagged.
-5. Where the residual is not noise, one jump of the object is looked for (`residuals`), and taken
-   into the subspace.
+5. Where the residual is not noise, or as many polynomials as there are hardly follow, the object
+   is taken to change rapidly now and then. Its curve is then a polynomial in each of some pieces of
+   the time, and steps 1 to 4 are done with these. Pieces and ratios are sought together, by the
+   least description length (12) (`pieces`): one of the bands' rapid changes lie along the
+   reflection ratios, others along the emissivities, and the object's are those that fewer pieces
+   describe. Of the two best explanations the one without a flag is taken, if both are likely.
 
 Every output carries a standard deviation, propagated from the noise. Second-order blind source
 separation in the sense of Belouchrani et al. (1997), doi:10.1109/78.554307, for the image
@@ -74,14 +78,17 @@ _PIECES: Final = np.uint32(1 << 31)
 # Last orders of the smooth curve at which its polynomials may be too few.
 _LAST: Final = 3
 # Flags of pixels in which rapid changes of the object are looked for.
-_SUSPECT: Final = np.uint32(
-    Status.OBJECT_NOT_SMOOTH
-    | Status.GRAY
-    | Status.CONSTANT_OBJECT
-    | Status.NONPHYSICAL_EMISSIVITY
-    | Status.ROLES_MAY_BE_SWAPPED
-    | Status.BACKGROUND_NEVER_RESTS
-) | _PIECES
+_SUSPECT: Final = (
+    np.uint32(
+        Status.OBJECT_NOT_SMOOTH
+        | Status.GRAY
+        | Status.CONSTANT_OBJECT
+        | Status.NONPHYSICAL_EMISSIVITY
+        | Status.ROLES_MAY_BE_SWAPPED
+        | Status.BACKGROUND_NEVER_RESTS
+    )
+    | _PIECES
+)
 # Cost of an explanation over that of the best, up to which it is preferred if it has no flag.
 _LIKELY: Final = 40.0
 _NEVER: Final = 1e9
@@ -248,7 +255,8 @@ def _survey(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Surv
     sound = (status & _BROKEN) == 0
     return Survey(
         scatter=np.where(sound, ratios.scatter, 0.0),
-        frames=sound * np.asarray(tile.time.size - ratios.order - functions.steps, dtype=np.float64),
+        frames=sound
+        * np.asarray(tile.time.size - ratios.order - functions.steps, dtype=np.float64),
         ratio=ratios.ratio,
         null_weights=ratios.null_weights,
         emissivity=np.where(status == 0, emission.emissivity[0], np.nan),

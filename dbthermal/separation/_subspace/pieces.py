@@ -16,6 +16,7 @@ data the object's is the one with fewer pieces.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -68,7 +69,9 @@ def divide(signals: Array, time: Array, noise: Array, segment: Whole | None) -> 
     prices = [COST * (len(noise) - 1) * np.array([p[2] for p in level]) for level in levels]
     starts = [_axis(scatters[level][0]) for level in _STARTS if level < len(scatters)]
     axes = np.concatenate(starts)
-    costs = np.concatenate([_best(scatters, prices, some)[0] for some in np.array_split(axes, _PARTS)])
+    costs = np.concatenate(
+        [_best(scatters, prices, some)[0] for some in np.array_split(axes, _PARTS)]
+    )
     divisions: list[Division] = []
     taken = np.full((0, *axes.shape[1:]), np.nan)
     deviation = np.zeros(signals.shape[2])
@@ -89,7 +92,9 @@ def divide(signals: Array, time: Array, noise: Array, segment: Whole | None) -> 
         deviation = 1.0 / np.sqrt(np.linalg.eigvalsh(total)[:, -1])
     rows = np.argsort([one.cost for one in divisions], axis=0, kind="stable")
     every = np.arange(rows.shape[1])
-    firsts, least = (np.stack(part) for part in zip(*((d.first, d.cost) for d in divisions)))
+    firsts, least = (
+        np.stack([getattr(one, name) for one in divisions]) for name in ("first", "cost")
+    )
     return [Division(firsts[rank, :, every].T, least[rank, every]) for rank in rows[:2]]
 
 
@@ -111,8 +116,18 @@ def _tree(time: bytes, segment: bytes | None) -> tuple[Whole, list[list[Piece]]]
     tree: list[list[Piece]] = []
     for level in range(levels + 1):
         bounds = edges[:: 2 ** (levels - level)]
-        inside = [slice(start, stop) for start, stop in zip(bounds[:-1], bounds[1:], strict=True)]
-        tree.append([(one, *functions(times[one].tobytes(), None if events is None else events[one].tobytes())) for one in inside])
+        inside = [slice(start, stop) for start, stop in pairwise(bounds)]
+        tree.append(
+            [
+                (
+                    one,
+                    *functions(
+                        times[one].tobytes(), None if events is None else events[one].tobytes()
+                    ),
+                )
+                for one in inside
+            ]
+        )
     return edges, tree
 
 
@@ -145,9 +160,7 @@ def _angle(axes: Array, others: Array) -> Array:
     return np.asarray(np.arccos(np.minimum(np.abs(product), 1.0)))
 
 
-def _best(
-    scatters: list[Array], prices: list[Array], axis: Array
-) -> tuple[Array, list[Mask]]:
+def _best(scatters: list[Array], prices: list[Array], axis: Array) -> tuple[Array, list[Mask]]:
     """
     Least cost (..., pixel) of all divisions, and the pieces (piece, ..., pixel) chosen, by level.
 
@@ -250,7 +263,7 @@ def _first(chosen: list[Mask], edges: Whole) -> Mask:
     """Frames (time, pixel) that a chosen piece begins with."""
     result = np.zeros((edges[-1], chosen[0].shape[1]), dtype=bool)
     for pieces in chosen:
-        result[edges[:-1 : (edges.size - 1) // len(pieces)]] |= pieces
+        result[edges[: -1 : (edges.size - 1) // len(pieces)]] |= pieces
     return result
 
 

@@ -181,14 +181,18 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     """
     Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
 
-    By more than most of its change within a second, and beyond its standard deviations.
+    By more than most of its change within a second, and beyond its standard deviations; not over a
+    pause of the frames.
     """
-    frames = max(3, 2 * int(np.ceil(0.5 * AROUND / np.median(np.diff(time)))))
+    interval = np.diff(time)
+    usual = float(np.median(interval))
+    frames = max(3, 2 * int(np.ceil(0.5 * AROUND / usual)))
     step = np.abs(np.diff(curve, axis=0))
     size = (frames, 1)
     around = maximum_filter(curve, size)[1:] - minimum_filter(curve, size)[1:]
     noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
-    return np.asarray(np.any((step > _CHANGE * noise) & (step > _MOST * around), axis=0))
+    jumps = (step > _CHANGE * noise) & (step > _MOST * around)
+    return np.asarray(np.any(jumps[interval < 2.0 * usual], axis=0))
 
 
 def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
