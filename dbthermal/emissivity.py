@@ -25,6 +25,7 @@ __all__ = [
     "condition_numbers",
     "embedded_table",
     "filter_noise",
+    "library_mixture",
     "pair_summary",
     "rank_filters",
 ]
@@ -43,6 +44,10 @@ where what is missing can change the average by 0.019 of its own difference from
 12.5 um (0.781), whose average would be that of another band."""
 
 _TABLE = "emissivity_table.csv"
+_MIXTURE = "emissivity_mixture.csv"
+# Share of the materials that are none of the libraries' [1], and what is known of them: mean and
+# standard deviation of an emissivity, and its correlation between two bands.
+_OTHERS = (0.05, 0.7, 0.25, 0.9)
 # Steps on which Planck's law is integrated beside those of the spectrum, and nodes in each.
 _STEPS = 64
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
@@ -166,6 +171,69 @@ def embedded_table() -> xr.Dataset:
     table = _dataset([row[0] for _, row in rows], list(FILTERS), values[:, :-1], coverage)
     notes = {name: ("material", [row[i] for _, row in rows]) for i, name in enumerate(names) if i}
     return table.assign_coords(notes).assign_attrs(temperature=300.0)
+
+
+def library_mixture(bands: Iterable[str]) -> xr.Dataset:
+    r"""
+    Joint distribution of the band emissivities of materials, where nothing is known of them.
+
+    A mixture of normal distributions over the 993 spectra of the libraries of `embedded_table`,
+    with a wide component for the one material in twenty that is assumed to be none of theirs,
+
+    .. math:: p(e) = \sum_k w_k N(e; \mu_k, C_k)
+
+    Parameters
+    ----------
+    bands : iterable of str
+        Names of `bands.FILTERS`, in the order that is wanted.
+
+    Returns
+    -------
+    Dataset
+        `weight` (component) [1], `mean` (component, band) [1], `covariance` (component, band,
+        other) [1].
+
+    Raises
+    ------
+    ValueError
+        If a band is none of the filters, or repeats.
+
+    Examples
+    --------
+    >>> mixture = library_mixture(["8-14", "9.5"])
+    >>> float((mixture["weight"] * mixture["mean"].sel(band="9.5")).sum().round(2))
+    0.87
+    """
+    names = [str(band) for band in bands]
+    unknown = [name for name in names if name not in FILTERS]
+    if unknown or len(set(names)) < len(names):
+        raise ValueError(
+            f"Invalid bands {names} of the library's emissivities. Must be of {list(FILTERS)}, "
+            "each once; of other bands give a prior on the emissivities."
+        )
+    with resources.as_file(resources.files("dbthermal").joinpath(_MIXTURE)) as path:
+        (_, titles), *rows = texts.table_rows(texts.read_text(path), _MIXTURE, comment="#")
+    count = len(FILTERS)
+    values = texts.numbers(rows, len(titles), _MIXTURE)
+    covariance = np.zeros((len(values), count, count))
+    i, j = np.tril_indices(count)
+    covariance[:, i, j] = covariance[:, j, i] = values[:, 1 + count :]
+    places = [list(FILTERS).index(name) for name in names]
+    share, mean, std, shared = _OTHERS
+    wide = std**2 * (shared + (1.0 - shared) * np.eye(len(names)))
+    means = values[:, 1 : 1 + count][:, places]
+    weight = np.append(values[:, 0] / values[:, 0].sum() * (1.0 - share), share)
+    return xr.Dataset(
+        {
+            "weight": ("component", weight),
+            "mean": (("component", "band"), np.vstack([means, np.full(len(names), mean)])),
+            "covariance": (
+                ("component", "band", "other"),
+                np.concatenate([covariance[:, places][:, :, places], wide[np.newaxis]]),
+            ),
+        },
+        coords={"band": names, "other": names},
+    )
 
 
 def condition_numbers(table: xr.Dataset) -> xr.DataArray:

@@ -177,6 +177,11 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "pattern_std": PATTERN_STD,
             "status": _STATUS,
         },
+        "separated": {
+            "emissivity_covariance": _of(
+                "band other_band y x", "1", "covariance of band emissivities", "float32"
+            ),
+        },
         "blackbody_frames": {"noise": NOISE},
         "correction": {
             "bad": _of("band y x", "1", "bad pixel", "bool"),
@@ -256,6 +261,11 @@ class Status(Flags):
     OBJECT_JUMP = 1 << 13, "sudden steps of the object, taken into its curve; the values hold"
     BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
     ROLES_MAY_BE_SWAPPED = 1 << 15, "mean emissivity below 1/2: object and background exchanged"
+    COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity of the same material"
+    COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity of a library, or stated"
+    COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background of surroundings"
+    COMPLETED_FRAMES = 1 << 19, "completed, not measured: some frames of the temperatures"
+    NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
 
 
 def status_attrs() -> dict[str, object]:
@@ -377,6 +387,8 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
     if variable.dtype != "bool":
         check_numbers(array, label, variable.units)
+        if variable is _STATUS and array.dtype.kind == "f":
+            raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be whole numbers.")
     elif array.dtype != bool:
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
     for dim in array.dims:

@@ -305,6 +305,31 @@ def test_embedded_table_from_the_libraries(spectra: dict[str, xr.Dataset]) -> No
         np.testing.assert_allclose(made[name], again[name], rtol=0, atol=5.01e-5)
 
 
+def test_library_mixture_is_a_distribution() -> None:
+    """Its weights add up to 1, its covariances are positive, and bands go by name."""
+    mixture = emissivity.library_mixture(["9.5", "8-14"])
+    assert float(mixture["weight"].sum()) == pytest.approx(1.0, abs=1e-12)
+    assert np.linalg.eigvalsh(mixture["covariance"]).min() > 0
+    other = emissivity.library_mixture(["8-14", "9.5"]).sel(band=["9.5", "8-14"])
+    np.testing.assert_array_equal(mixture["mean"], other["mean"])
+    with pytest.raises(ValueError, match=r"Invalid bands \['x'\] of the library's emissivities"):
+        emissivity.library_mixture(["x"])
+
+
+@pytest.mark.data
+def test_library_mixture_has_the_moments_of_the_libraries(spectra: dict[str, xr.Dataset]) -> None:
+    """Mean and covariance of all spectra, but for the wide component, and its floor of 0.005."""
+    made = emissivity.band_table(spectra, FILTERS, minimum_coverage=0.7)["emissivity"].values
+    mixture = emissivity.library_mixture(FILTERS).isel(component=slice(-1))
+    weight, mean = mixture["weight"].values / mixture["weight"].values.sum(), mixture["mean"].values
+    centre = weight @ mean
+    off = mean - centre
+    covariance = np.tensordot(weight, mixture["covariance"].values, 1) + (weight * off.T) @ off
+    np.testing.assert_allclose(centre, made.mean(axis=0), rtol=0, atol=1e-3)
+    expected = np.cov(made.T) + 0.005**2 * np.eye(5)
+    np.testing.assert_allclose(covariance, expected, rtol=0, atol=2e-4)
+
+
 @pytest.mark.data
 def test_plate_glass(spectra: dict[str, xr.Dataset]) -> None:
     """Plate window glass: 0.861 over 8-14 um and 0.718 at 9.5 um."""

@@ -144,7 +144,7 @@ def test_coordinates_of_other_stages() -> None:
 
 def test_units_are_si() -> None:
     """Every variable and coordinate has a unit that the glossary allows."""
-    allowed = {"K", "count", "1", "m", "s", "m K", "count K-1"}
+    allowed = {"K", "count", "1", "m", "s", "m K", "count K-1", "pixel"}
     variables = [one for stage in schema.STAGES.values() for one in stage.values()]
     assert {one.units for one in [*variables, *schema.COORDINATES.values()]} <= allowed
 
@@ -172,13 +172,14 @@ def test_status_of_16_bits_still_opens(tmp_path: Path) -> None:
     """A result stored with a 16-bit status passes its stage, and its bits mean the same."""
     older = example("separated")
     bits = np.array([[0, 1024], [1 << 15, 128 | 4]], dtype=np.uint16)
-    meanings = " ".join(Status.bits())
-    masks = np.array([bit.value for bit in Status], dtype=np.uint16)
+    first = {name: bit for name, bit in Status.bits().items() if bit < 1 << 16}
+    meanings = " ".join(first)
+    masks = np.array(list(first.values()), dtype=np.uint16)
     attrs = {"units": "1", "flag_masks": masks, "flag_meanings": meanings}
     store.save(older.assign(status=(("y", "x"), bits, attrs)), tmp_path / "older.zarr", {})
     opened = schema.check(store.open_dataset(tmp_path / "older.zarr"), "separated")["status"]
     assert opened.dtype == np.uint16
-    for name, value in Status.bits().items():
+    for name, value in first.items():
         np.testing.assert_array_equal(schema.has_flag(opened, name), bits & value != 0)
     assert Status(int(opened[1, 1])) == Status.SATURATED | Status.GRAY
 

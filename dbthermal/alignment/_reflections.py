@@ -1,32 +1,41 @@
-"""How far apart two cameras side by side see what a surface mirrors."""
+"""Shift between the reflections that two cameras side by side see in one surface."""
 
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.linalg import solveh_banded
+from scipy.ndimage import distance_transform_edt
 
-from dbthermal import _smooth as smooth
 from dbthermal import noise as noises
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _matching as matching
+from dbthermal.alignment._fields import Field, Information, Spline
 from dbthermal.alignment._offset import sample
 from dbthermal.schema import Status
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-_ORDER: Final = 10
-_BLUR: Final = 0.8  # of both bands before they are matched [pixel]
-_ROWS: Final = 32  # that are read at a time
 _UNUSABLE: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
-_JUDGED: Final = 4096  # pixels by which a frame is judged
-_COMMON: Final = 0.5  # share of them that must be measured
 _SMALLEST: Final = 24  # rows and columns of an image, at least
-_KNOWN: Final = 0.2  # largest deviation of a shift from the data of a window alone [pixel]
+_COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
+_ROWS: Final = 32  # that are read at a time
+_SAMPLES: Final = 2**26  # of a band that are matched, at most: of a large image fewer frames
+_COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
+_MISSING: Final = 0.1  # share of the frames that a pixel may lack
+# Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
+# rapidly enters. A longer one is taken that tells the shift at so many times more pixels, and whose
+# field differs by no more than so many deviations.
+_PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
+_MORE: Final = 1.25
+_AGREE: Final = 1.5
+_CLIP: Final = 3.0  # noise, to which the changes of a frame are clipped when frames are chosen
+_KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
 
@@ -34,82 +43,247 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
     r"""
     Displacement between the reflections that two cameras side by side see in one surface.
 
-    Work in progress: see the class of the result. What the other bands show at p, the reference
-    band shows at p + d(p), :math:`z_2(p) = k(p) z_1(p + d(p))` of what is mirrored.
+    A registration of the object's surface does not register what that surface mirrors. What the
+    other bands show at p, the reference band, the quietest, shows at p + d(p):
+
+    .. math:: h_m(p, t) = k_m(p) h_1(p + d(p), t)
+
+    with h the rapid changes of a band, which are the reflection's, and k a ratio of the material.
+    The reflection's own texture tells d, along the baseline mostly: upright bodies have little
+    texture along them, and that component is smooth, with a large deviation, and does no harm.
+    It is needed where `separation.solve` flags `bands_apart` and there is no offset in time; where
+    the cameras see from one place the shift is zero within its deviation.
 
     Parameters
     ----------
     corrected : Dataset
-        Stage `corrected` of `schema`, registered on the object's surface.
+        Stage `corrected` of `schema`, registered on the object's surface, all bands but the
+        quietest by cameras at one place. Missing frames and samples are NaN; `status` and `segment`
+        are respected. It may be lazy: it is read twice, in blocks of rows.
     response : Dataset
         Stage `response` of `schema`.
 
     Returns
     -------
     Dataset
-        Stage `reflection_shift` of `schema`.
+        Stage `reflection_shift` of `schema`: `shift` (axis, y, x) [pixel], rows down and columns to
+        the right, `shift_std`, and `known` (y, x), where texture tells the shift. It is
+        extrapolated near by, and NaN farther off and where p + d(p) leaves the image. Attributes:
+        `reference_band`, `bands` (the others).
 
     Raises
     ------
     TypeError, ValueError
-        If an input is not as described, or nothing is found to match.
+        If an input is not as described, the image is too small, nothing that both bands see changes
+        rapidly, or the shift is beyond a third of the image.
     """
-    schema.check_corrected(corrected)
-    names = [str(name) for name in corrected["band"].values]
-    shape = (corrected.sizes["y"], corrected.sizes["x"])
-    if len(names) < 2:
-        raise ValueError(f"Invalid bands {names} of the corrected. Must be two or more.")
-    if min(shape) < _SMALLEST:
-        raise ValueError(
-            f"Invalid image of {shape[0]} rows and {shape[1]} columns. Must have at least "
-            f"{_SMALLEST} of each to find a reflection's shift."
+    movies = _Capture.of(corrected, response)
+    shape = movies.valid.shape
+    spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
+    factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
+    movies, period, used, field = _coarse(movies, spline, factor)
+    fine = movies.rapid(period, used)
+    freedom = _freedom(movies.frames.size, period) * used.size / movies.frames.size
+    while True:
+        factor = max(1, factor // 2)
+        level = matching.Movies.blurred(fine, movies.valid, movies.noise, freedom, factor)
+        field, data = matching.refine(level, field)
+        if factor == 1:
+            return _result(corrected, movies, field, data)
+
+
+@dataclass(frozen=True)
+class _Capture:
+    """Capture and all that matching needs to know of it, the quietest band first."""
+
+    counts: xr.DataArray
+    bands: list[int]
+    names: list[str]
+    slopes: Array  # of the bands [count/K]
+    noise: Array  # of the bands [K]
+    valid: Mask  # pixels (y, x)
+    frames: npt.NDArray[np.intp]  # that every band has
+    rough: npt.NDArray[np.intp]  # first of four frames that follow one another evenly
+
+    @classmethod
+    def of(cls, corrected: xr.Dataset, response: xr.Dataset) -> "_Capture":
+        """Check a capture and its response."""
+        counts = schema.check_corrected(corrected)["counts"]
+        names = [str(name) for name in counts["band"].values]
+        if len(names) < 2:
+            raise ValueError(f"Invalid bands {names} of the corrected. Must be two or more.")
+        if min(counts.shape[2:]) < _SMALLEST:
+            raise ValueError(
+                f"Invalid image of {counts.shape[2]} rows and {counts.shape[3]} columns. Must have "
+                f"at least {_SMALLEST} of each to match reflections."
+            )
+        slopes = np.array([responses.curve(response, name).reference_slope for name in names])
+        noise = _noise(corrected, response, names, slopes)
+        order = np.argsort(noise, kind="stable")
+        valid = np.ones(counts.shape[2:], dtype=bool)
+        if "status" in corrected:
+            valid &= (corrected["status"].values & _UNUSABLE) == 0
+        frames = _frames(counts)
+        times, segment = corrected["time"].values[frames], clocks.segments(corrected)[frames]
+        steps = np.diff(times)
+        joined = (steps < 1.5 * np.median(steps)) & (np.diff(segment) == 0)
+        rough = np.flatnonzero(joined[:-2] & joined[1:-1] & joined[2:])
+        return cls(
+            counts,
+            order.tolist(),
+            [names[i] for i in order],
+            slopes[order],
+            noise[order],
+            valid,
+            frames,
+            rough,
         )
-    noise = _noise(corrected, response, names)
-    order = [int(band) for band in np.argsort(noise, kind="stable")]
-    valid = _valid(corrected)
-    frames = _frames(corrected)
-    first, second = (_rapid(corrected, response, band, frames, valid) for band in order[:2])
-    blurred = _blurred()
-    pair = matching.Pair(first, second, valid, (noise[order[0]], noise[order[1]]), blurred)
-    reach = (shape[0] // 6, shape[1] // 6)
-    rough, gain = matching.whole_pixels(pair, reach)
-    if not np.any(gain > 50.0):
-        raise ValueError("Missing texture: nothing that both bands mirror changes rapidly.")
-    field = matching.refine(pair, rough, np.where(gain > 50.0, gain, 0.0) / 100.0, max(shape) / 3.0)
-    return _result(corrected, field, names[order[0]], [names[band] for band in order[1:]])
+
+    def signals(self, band: int, rows: slice) -> Array:
+        """Signals (time, y, x) [K] of some rows of a band, in the frames, NaN where missing."""
+        place = self.bands[band]
+        values = self.counts.isel(band=place, y=rows).values[self.frames]
+        return np.asarray(np.where(schema.measured(values), values, np.nan) / self.slopes[band])
+
+    def smoothing(self, period: float) -> Array:
+        """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
+        size, weight = self.frames.size, (2.0 * np.sin(np.pi / period)) ** -6
+        result = np.zeros((4, size))
+        result[-1] = 1.0
+        third = np.array([-1.0, 3.0, -3.0, 1.0])
+        for lag in range(4):
+            for first in range(4 - lag):
+                np.add.at(
+                    result[3 - lag],
+                    self.rough + first + lag,
+                    weight * third[first] * third[first + lag],
+                )
+        return result
+
+    def rapid(self, period: float, used: npt.NDArray[np.intp]) -> list[matching.Movie]:
+        """Rapid changes of the bands (y, x, time) [K] in some of the frames."""
+        matrix = self.smoothing(period)
+        nearest = distance_transform_edt(~self.valid, return_distances=False, return_indices=True)
+        result = []
+        for band in range(len(self.bands)):
+            movie = np.empty((*self.valid.shape, used.size), dtype=np.float32)
+            for start in range(0, self.valid.shape[0], _ROWS):
+                rows = slice(start, start + _ROWS)
+                signal = self.signals(band, rows)
+                movie[rows] = np.moveaxis(_filtered(signal, matrix)[used], 0, -1)
+            movie[~self.valid] = movie[tuple(nearest[:, ~self.valid])]
+            result.append(movie)
+        return result
+
+    def binned(self, factor: int) -> tuple[list[Array], Mask]:
+        """Signals (time, y, x) [K] of squares of pixels, and the pixels that lack few frames."""
+        valid, result = self.valid.copy(), []
+        height, width = (size // factor for size in valid.shape)
+        for band in range(len(self.bands)):
+            image = np.zeros((self.frames.size, height, width))
+            step = max(1, _ROWS // factor)
+            for start in range(0, height, step):
+                rows = slice(start * factor, min(start + step, height) * factor)
+                signal = self.signals(band, rows)
+                valid[rows] &= np.isnan(signal).mean(axis=0) <= _MISSING
+                weight = valid[rows, : width * factor].astype(float)
+                parts = (
+                    (part * weight)
+                    .reshape(*part.shape[:-2], -1, factor, width, factor)
+                    .sum((-3, -1))
+                    for part in (_filled(signal)[..., : width * factor], np.ones_like(weight))
+                )
+                total, number = parts
+                image[:, start : start + step] = total / np.maximum(number, 1.0)
+            result.append(image)
+        valid[height * factor :] &= self.valid[height * factor :]
+        return result, valid
 
 
-def _result(
-    corrected: xr.Dataset, field: matching.Field, reference: str, others: list[str]
-) -> xr.Dataset:
-    """Field as a dataset, NaN far from where it is known."""
-    shape = field.shift.shape[1:]
-    window = 2.0 * np.pi * 3.0**2
-    down, both, right = (gaussian_filter(part, 3.0) * window for part in field.information)
+def _coarse(
+    capture: _Capture, spline: Spline, factor: int
+) -> tuple[_Capture, float, npt.NDArray[np.intp], Field]:
+    """Capture with its valid pixels, the period that tells most, energetic frames, rough field."""
+    signals, valid = capture.binned(factor)
+    capture = replace(capture, valid=valid)
+    height, width = signals[0].shape[1:]
+    reach = (int(height / 3), int(width / 3))
+    frames, best, result = capture.frames.size, 0.0, None
+    for period in _PERIODS:
+        if frames < 2 * period and result is not None:
+            break
+        smoothing = capture.smoothing(period)
+        movies = [np.moveaxis(_filtered(part, smoothing), 0, -1) for part in signals]
+        level = matching.Movies.coarse(
+            [movie.astype(np.float32) for movie in movies],
+            matching.coarse_mask(valid, factor),
+            capture.noise / factor,
+            _freedom(frames, period),
+            factor,
+        )
+        begin = matching.start(level, spline, reach) if result is None else result[-1]
+        if begin is None:
+            continue
+        field, data = matching.refine(level, begin)
+        told = float(_told(data, factor).mean())
+        agrees = result is None or _agree(result[-1], field, level.centres())
+        if told > _MORE * best and agrees:
+            energy = np.minimum((movies[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
+            best, result = told, (capture, period, _energetic(energy, capture.valid.size), field)
+    if result is None:
+        raise ValueError(
+            "Missing texture in the reflections: no rapid change that the bands share. "
+            "Must be seen in both to find their shift; let somebody walk by."
+        )
+    return result
+
+
+def _told(data: Information, factor: int = 1) -> Mask:
+    """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
+    down, both, right = data.tensor * (4.0 * np.pi * (matching.WINDOW / factor) ** 2)
     largest = 0.5 * (down + right) + np.hypot(0.5 * (down - right), both)
-    inside = matching._inside(np.indices(shape) + field.shift, shape)
-    known = (largest > 1.0 / _KNOWN**2) & inside
-    near = np.asarray(distance_transform_edt(~known)) <= _NEAR * min(shape)
-    near &= inside
-    std = np.sqrt(np.maximum(field.covariance[[0, 2]], 0.0))
-    definitions = schema.STAGES["reflection_shift"]
-    values = {
-        "shift": np.where(near, field.shift, np.nan).astype(np.float32),
-        "shift_std": np.where(near, std, np.nan).astype(np.float32),
-        "known": known,
-    }
-    places = {name: corrected[name] for name in ("y", "x") if name in corrected.coords}
-    result = xr.Dataset(
-        {name: (one.dims, values[name], one.attrs) for name, one in definitions.items()},
-        coords={"axis": ["y", "x"], **places},
-        attrs={**corrected.attrs, "reference_band": reference, "bands": others},
-    )
-    return schema.check(result, "reflection_shift")
+    return np.asarray(largest > 1.0 / _KNOWN**2)
 
 
-def _noise(corrected: xr.Dataset, response: xr.Dataset, names: list[str]) -> Array:
+def _agree(robust: Field, other: Field, centres: list[Array]) -> bool:
+    """Return whether a field lies within the deviation of another one that is more robust."""
+    apart = (robust.on(centres) - other.on(centres)) ** 2
+    return bool(np.mean(apart / robust.variances(centres)[[0, 2]]) < _AGREE**2)
+
+
+def _energetic(energy: Array, pixels: int) -> npt.NDArray[np.intp]:
+    """Frames of the largest energy (time), no more than memory allows."""
+    most = max(noises.MINIMUM_FRAMES, _SAMPLES // pixels)
+    return np.sort(np.argsort(energy)[::-1][:most])
+
+
+def _freedom(frames: int, period: float) -> float:
+    """Degrees of freedom of white noise that a smoother leaves, see `_Capture.smoothing`."""
+    frequency = np.pi * (np.arange(frames) + 0.5) / frames
+    ratio = (np.sin(0.5 * frequency) / np.sin(np.pi / period)) ** 6
+    return float(np.sum((ratio / (1.0 + ratio)) ** 2))
+
+
+def _filled(signal: Array) -> Array:
+    """Signal (time, y, x) with missing samples on the line between those before and after."""
+    lacking = np.isnan(signal).any(axis=0)
+    places = np.arange(len(signal))
+    for row, column in np.argwhere(lacking):
+        part = signal[:, row, column]
+        here = np.isfinite(part)
+        signal[:, row, column] = np.interp(places, places[here], part[here]) if here.any() else 0.0
+    return signal
+
+
+def _filtered(signal: Array, smoothing: Array) -> Array:
+    """Signal (time, y, x) less what a smoother passes."""
+    flat = _filled(signal).reshape(len(signal), -1)
+    flat = flat - flat.mean(axis=0)
+    return np.asarray(flat - solveh_banded(smoothing, flat)).reshape(signal.shape)
+
+
+def _noise(corrected: xr.Dataset, response: xr.Dataset, names: list[str], slopes: Array) -> Array:
     """Noise (band) [K], of the response or else of the capture."""
-    slopes = np.array([responses.curve(response, name).reference_slope for name in names])
     if "noise" in response:
         factor = corrected["noise_factor"].values if "noise_factor" in corrected else 1.0
         return np.asarray(responses.noise(response, names) / slopes * factor)
@@ -119,57 +293,43 @@ def _noise(corrected: xr.Dataset, response: xr.Dataset, names: list[str]) -> Arr
     return noises.estimate_bands(parts, corrected["time"].values[here])
 
 
-def _valid(corrected: xr.Dataset) -> Mask:
-    """Pixels (y, x) that are not marked as bad."""
-    if "status" not in corrected:
-        return np.ones((corrected.sizes["y"], corrected.sizes["x"]), dtype=bool)
-    return np.asarray((corrected["status"].values & _UNUSABLE) == 0)
-
-
-def _frames(corrected: xr.Dataset) -> Mask:
-    """Frames (time) in which most pixels of every band are measured."""
-    step = max(1, int(np.sqrt(corrected.sizes["y"] * corrected.sizes["x"] / _JUDGED)))
-    some = corrected["counts"].isel(y=slice(None, None, step), x=slice(None, None, step))
-    used = np.asarray(schema.measured(some.values).mean(axis=(2, 3)).min(axis=0) > _COMMON)
-    if used.sum() < noises.MINIMUM_FRAMES:
+def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
+    """Frames in which most of the pixels that every band ever measures are measured."""
+    step = max(1, int(np.sqrt(counts[0, 0].size / 4096)))
+    some = schema.measured(counts[:, :, ::step, ::step].values)
+    ever = some.any(axis=1).all(axis=0)  # a view may show the object alone
+    share = some[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(some.shape[1])
+    used = np.flatnonzero(share > _COMMON)
+    if used.size < noises.MINIMUM_FRAMES:
         raise ValueError(
-            f"Invalid capture of {used.sum()} frames that both bands have. Must be at least "
+            f"Invalid capture of {used.size} frames that all bands have. Must be at least "
             f"{noises.MINIMUM_FRAMES}."
         )
     return used
 
 
-def _rapid(
-    corrected: xr.Dataset, response: xr.Dataset, band: int, frames: Mask, valid: Mask
-) -> matching.Movie:
-    """What a smooth curve leaves of a band (y, x, time) [K], slightly blurred."""
-    counts = corrected["counts"].isel(band=band)
-    curve = responses.curve(response, str(corrected["band"].values[band]))
-    times, segment = corrected["time"].values[frames], clocks.segments(corrected)[frames]
-    functions = smooth.subspace(times, min(_ORDER, times.size // 4), segment=segment).functions
-    result = np.zeros((*valid.shape, times.size), dtype=np.float32)
-    for start in range(0, valid.shape[0], _ROWS):
-        block = counts.isel(y=slice(start, start + _ROWS)).values[frames]
-        flat = block.reshape(len(block), -1) / curve.reference_slope
-        flat = np.where(schema.measured(flat), flat, np.nan)
-        flat -= _mean(flat)
-        np.nan_to_num(flat, copy=False)
-        flat -= functions @ (functions.T @ flat)
-        result[start : start + _ROWS] = np.moveaxis(flat.reshape(block.shape), 0, -1)
-    result[~valid] = 0.0
-    return np.asarray(gaussian_filter(result, (_BLUR, _BLUR, 0.0)))
-
-
-def _mean(flat: Array) -> Array:
-    """Mean over the frames (pixel) of samples (time, pixel) of which some are NaN."""
-    number = np.isfinite(flat).sum(axis=0)
-    return np.asarray(np.nansum(flat, axis=0) / np.maximum(number, 1))
-
-
-def _blurred() -> tuple[float, float]:
-    """Noise of value and slope over that before the blur."""
-    impulse = np.zeros((33, 33, 1), dtype=np.float32)
-    impulse[16, 16] = 1.0
-    kernel = gaussian_filter(impulse, (_BLUR, _BLUR, 0.0))
-    slope = 0.5 * (kernel[2:] - kernel[:-2])
-    return float(np.sqrt(np.sum(kernel**2))), float(np.sqrt(np.sum(slope**2)))
+def _result(
+    corrected: xr.Dataset, capture: _Capture, field: Field, data: Information
+) -> xr.Dataset:
+    """Field as a dataset, NaN far from where it is known."""
+    shape = capture.valid.shape
+    centres = [np.arange(size, dtype=np.float64) for size in shape]
+    shift, covariance = field.on(centres), field.variances(centres)
+    reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
+    known = _told(data) & reached
+    near = np.asarray(distance_transform_edt(~known)) <= _NEAR * min(shape)
+    near &= reached
+    std = np.sqrt(np.maximum(covariance[[0, 2]], 0.0))
+    definitions = schema.STAGES["reflection_shift"]
+    values = {
+        "shift": np.where(near, shift, np.nan).astype(np.float32),
+        "shift_std": np.where(near, std, np.nan).astype(np.float32),
+        "known": known,
+    }
+    places = {name: corrected[name] for name in ("y", "x") if name in corrected.coords}
+    result = xr.Dataset(
+        {name: (one.dims, values[name], one.attrs) for name, one in definitions.items()},
+        coords={"axis": ["y", "x"], **places},
+        attrs={**corrected.attrs, "reference_band": capture.names[0], "bands": capture.names[1:]},
+    )
+    return schema.check(result, "reflection_shift")

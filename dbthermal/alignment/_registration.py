@@ -1,17 +1,22 @@
 """Registration of several views of one object, by the enhanced correlation coefficient."""
 
+from contextlib import suppress
+from operator import itemgetter
 from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import gaussian_filter, median_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, median_filter, spline_filter
 
 from dbthermal import schema
+from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._resampling import TRANSFORM, positions
+from dbthermal.noise import MAD
 
 Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
 
 # Kinds of transform, of two, six and eight numbers.
 _MODELS: Final = ("translation", "affine", "homography")
@@ -19,8 +24,22 @@ _MODELS: Final = ("translation", "affine", "homography")
 _BLURS: Final = (0.08, 0.04, 0.02)
 _FINEST: Final = 0.7
 _SMALLEST: Final = 16
-# A bad pixel stays where it is in every view, and would pull the transform towards the identity.
-_MEDIAN_WINDOW: Final = 3
+# A pixel that differs from the median around it by more than so many standard deviations is bad.
+_MEDIAN_WINDOW, _OUTLYING = 3, 6.0
+# Of smooth curves: most frames that they are fitted to, functions, steps of the weights, Tukey's
+# constant in standard deviations, and the least weight, which keeps a fit to few frames solvable.
+_FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
+# Numbers of a homography that each model changes, one matrix each.
+_FREE: Final = {
+    model: np.eye(9)[places].reshape(-1, 3, 3)
+    for model, places in (
+        ("translation", [2, 5]),
+        ("affine", range(6)),
+        ("homography", range(8)),
+    )
+}
+# Gauss-Newton: steps, length of a difference and of the last step, border left out [pixel].
+_NEWTON, _STEP, _CONVERGED, _MARGIN = 15, 1e-2, 1e-4, 3
 # Steps, and relative change of the correlation, at which the maximisation stops.
 _STEPS, _TOLERANCE = 200, 1e-7
 _LEAST_CORRELATION: Final = 0.5
@@ -34,8 +53,11 @@ def register(
     r"""
     Estimate the transform from the pixels of the first view to those of the others.
 
-    Means over time, in which the background is blurred, are compared. The transform maximises their
-    correlation, which neither gain nor offset of a view changes [1]_, at blurs from coarse to fine.
+    Compared are means over time of smooth curves fitted robustly to each pixel, in which what
+    passes by in the reflection hardly counts; and by how much each pixel rises steadily, as only a
+    heated object does. What correlates better is used. The transform maximises their correlation,
+    which neither gain nor offset of a view changes [1]_, at blurs from coarse to fine, and then
+    minimises their difference by splines, to some hundredths of a pixel.
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
@@ -47,7 +69,7 @@ def register(
     ----------
     corrected : Dataset
         Stage `corrected` of `schema`: views of one object, displaced by at most about a tenth of
-        the image.
+        the image. Of a capture with a `segment` the longest is used.
     model : {"translation", "affine", "homography"}
         Kind of transform. An affine one fits cameras that look the same way.
 
@@ -90,15 +112,23 @@ def register(
     if model not in _MODELS:
         raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")
     counts = schema.check(corrected, "corrected")["counts"]
+    if "segment" in corrected:  # the longest: a new pattern would be detail that does not move
+        numbers, frames = np.unique(corrected["segment"], return_counts=True)
+        longest = corrected["segment"].values == numbers[np.argmax(frames)]
+        counts = counts.isel(time=longest)
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
         raise ValueError(
             f"Invalid image of {counts.sizes['y']} by {counts.sizes['x']} pixels to be registered. "
             f"Must be at least {_SMALLEST} either way."
         )
-    means = [_mean_image(view) for view in counts]
+    bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
+    (mean, rise), *others = [_object_images(view, bad) for view in counts]
     matrices = [np.eye(3)]
-    for view, mean in zip(counts[1:], means[1:], strict=True):
-        matrices.append(_transform(means[0], mean, model, str(view["band"].item())))
+    for view, images in zip(counts[1:], others, strict=True):
+        found = [_transform(mean, images[0], model, str(view["band"].item()))]
+        with suppress(ValueError):  # where the object is constant
+            found.append(_transform(rise, images[1], model, str(view["band"].item())))
+        matrices.append(max(found, key=itemgetter(0))[1])
     return xr.DataArray(
         np.stack(matrices),
         dims=TRANSFORM.dims,
@@ -108,27 +138,60 @@ def register(
     )
 
 
-def _mean_image(view: xr.DataArray) -> Array:
-    """Mean over time of a view (y, x), without single bad pixels; mean 0, standard deviation 1."""
+def _object_images(view: xr.DataArray, bad: npt.NDArray[np.bool_] | np.bool_) -> list[Array]:
+    """Mean over time of what changes smoothly, and its rise (y, x), see `_scaled`."""
     frames = np.asarray(view.values)
-    mean = frames[~clocks.missing(frames)].mean(axis=0, dtype=np.float64)
-    if not np.all(np.isfinite(mean)):
+    present = np.flatnonzero(~clocks.missing(frames))
+    chosen = np.unique(np.linspace(0, present.size - 1, min(present.size, _FRAMES)).astype(int))
+    frames = frames[present[chosen]].astype(np.float64)
+    if not np.all(np.isfinite(frames)):
         raise ValueError(
-            f"Invalid view in band '{view['band'].item()}': {np.sum(~np.isfinite(mean))} pixels "
-            "are not finite. Must be finite in every frame that is not missing."
+            f"Invalid view in band '{view['band'].item()}': "
+            f"{np.sum(~np.isfinite(frames).all(axis=0))} pixels are not finite. Must be finite in "
+            "every frame that is not missing."
         )
-    mean = median_filter(mean, size=_MEDIAN_WINDOW)
-    contrast = mean.std()
-    if not contrast > 0:
+    mean = np.stack([_smooth_mean(row) for row in frames.swapaxes(0, 1)])
+    line = polynomial_basis(np.arange(len(frames)), min(2, len(frames)))[:, -1]
+    rise = np.tensordot(line, frames, axes=1)
+    if not mean.std() > 0:
         raise ValueError(
             f"Invalid view in band '{view['band'].item()}': all pixels are alike. Must show an "
             "object."
         )
-    return np.asarray((mean - mean.mean()) / contrast)
+    return [_scaled(mean, bad), _scaled(rise, bad)]
 
 
-def _transform(first: Array, other: Array, model: str, band: str) -> Array:
-    """Homography (3, 3) from pixels of the first mean image (y, x) to those of the other."""
+def _scaled(image: Array, bad: npt.NDArray[np.bool_] | np.bool_) -> Array:
+    """Image (y, x) of mean 0 and standard deviation 1, bad pixels as those around them."""
+    around = median_filter(image, size=_MEDIAN_WINDOW)
+    away = abs(image - around)
+    # A bad pixel stays where it is in every view, and would pull the transform to the identity.
+    image = np.where(bad | (away > _OUTLYING * MAD * np.median(away)), around, image)
+    return np.asarray((image - image.mean()) / (image.std() or 1.0))
+
+
+def _smooth_mean(signal: Array) -> Array:
+    """
+    Mean (pixel,) of smooth curves through signals (time, pixel), with Tukey's bisquare weights.
+
+    What passes by in the reflection is an outlier: a plain mean holds some of it, in each band
+    another share, and a warm spot without detail then seems displaced by 0.2 pixel.
+    """
+    functions = polynomial_basis(np.arange(len(signal)), min(_ORDER, len(signal)))
+    products = np.einsum("ti,tj->tij", functions, functions).reshape(len(signal), -1)
+    weights = np.ones_like(signal)
+    for _ in range(_ROBUST_STEPS):
+        matrix = (weights.T @ products).reshape(-1, functions.shape[1], functions.shape[1])
+        right = (weights * signal).T @ functions
+        curve = functions @ np.linalg.solve(matrix, right[..., np.newaxis])[..., 0].T
+        residual = abs(signal - curve)
+        scale = _TUKEY * MAD * np.median(residual, axis=0) + np.finfo(np.float32).tiny
+        weights = (1.0 - np.minimum(residual / scale, 1.0) ** 2) ** 2 + _LEAST_WEIGHT
+    return np.asarray(curve.mean(axis=0))
+
+
+def _transform(first: Array, other: Array, model: str, band: str) -> tuple[float, Array]:
+    """Correlation of two images (y, x), by the homography (3, 3) from the first to the other."""
     matrix, correlation = np.eye(3), 0.0
     stages = [(share * first.shape[0], "affine") for share in _BLURS]
     stages[0] = (stages[0][0], "translation")
@@ -150,7 +213,42 @@ def _transform(first: Array, other: Array, model: str, band: str) -> Array:
             f"Invalid view in band '{band}': it shares {shared:.0%} of the image with the first. "
             f"Must be at least {_LEAST_OVERLAP:.0%}."
         )
-    return matrix
+    pair = [gaussian_filter(image, _FINEST) for image in (first, other)]
+    return correlation, _refined(pair, matrix, model)
+
+
+def _refined(pair: list[Array], matrix: Array, model: str) -> Array:
+    r"""
+    Transform that minimises :math:`\sum (g I_1(p) + o - I_2(H p))^2`, by Gauss-Newton steps.
+
+    Of :math:`I_2` over the mean and deviation of what is compared, for else places where it varies
+    little would be the best: the correlation is largest there, which :math:`g` and :math:`o` leave.
+    The enhanced correlation interpolates by lines, and is off by some hundredths of a pixel.
+    """
+    (rows, columns), spline = pair[0].shape, spline_filter(pair[1])
+    unit = np.array([1 / columns, 1 / rows, 1] * 2 + [columns**-2, rows**-2, 0]).reshape(3, 3)
+    for _ in range(_NEWTON):
+        places = positions(matrix, pair[0].shape)
+        inside = np.zeros(pair[0].shape, dtype=bool)
+        inside[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN] = True
+        inside &= np.all(places >= _MARGIN, axis=0)
+        inside &= (places[0] < rows - _MARGIN) & (places[1] < columns - _MARGIN)
+
+        def other(change: Array, inside: Mask = inside, start: Array = matrix) -> Array:
+            where = positions(start + change, pair[0].shape)[:, inside]
+            values = map_coordinates(spline, where, prefilter=False)
+            return np.asarray((values - values.mean()) / values.std())
+
+        steps = [place * unit * _STEP for place in _FREE[model]]
+        slopes = [(other(-step) - other(step)) / (2 * _STEP) for step in steps]
+        first = pair[0][inside]
+        design = np.stack([*slopes, first, np.ones_like(first)], axis=1)
+        found = np.linalg.lstsq(design, other(np.zeros((3, 3))), rcond=None)[0]
+        change = sum(part * place * unit for part, place in zip(found, _FREE[model], strict=False))
+        matrix = (matrix + change) / (matrix + change)[2, 2]
+        if np.max(np.abs(found[: len(slopes)])) < _CONVERGED:
+            break
+    return np.asarray(matrix)
 
 
 def _maximise(

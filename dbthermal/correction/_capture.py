@@ -1,8 +1,11 @@
 """All corrections of a capture, in the one order in which they are right."""
 
+from collections.abc import Callable
+
+import numpy as np
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import _rows, schema
 from dbthermal.correction._nonuniformity import (
     DETECTOR_MAXIMUM,
     OUTLIER,
@@ -14,7 +17,7 @@ from dbthermal.correction._shutter import find_shutter, mark_shutter
 from dbthermal.correction._temporal import undo_drift, undo_lag
 
 
-def correct_capture(
+def correct_capture(  # noqa: PLR0913 - one option a step, by name
     capture: xr.Dataset,
     correction: xr.Dataset,
     *,
@@ -24,6 +27,7 @@ def correct_capture(
     time_constant: float | xr.DataArray | None = None,
     bad_pixels: float | None = OUTLIER,
     drift_reference: xr.DataArray | None = None,
+    lazy: bool = False,
 ) -> xr.Dataset:
     """
     Raw capture to corrected counts with a status: every correction, in the right order.
@@ -63,13 +67,17 @@ def correct_capture(
     drift_reference : DataArray, optional
         True on a patch of constant temperature in view, (y, x), bool. By default the common drift
         is left.
+    lazy : bool
+        Compute the counts when they are read, some rows at a time and each time anew: those of a
+        long capture need twice the memory of the raw ones, which may be lazy too.
 
     Returns
     -------
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32, NaN where a frame is no
-        measurement; `status` (y, x); `segment` (time); `drift` (band, time) [count]. The attributes
-        of the steps state what was done with which parameters: ``shutter_events`` is the number of
+        measurement; `status` (y, x); `segment` (time); `drift` (band, time) [count]; `pattern_std`
+        (band) [count], if the correction has its deviations, as from `correct`. The attributes of
+        the steps state what was done with which parameters: ``shutter_events`` is the number of
         renewals of the offsets, ``frames_taken_out`` that of the frames set to NaN (by band), and
         ``shutter_closed_frames`` that of the frames recorded as closed (by band), -1 without
         `frame_flags`.
@@ -110,23 +118,47 @@ def correct_capture(
     before = correction if flat is None else renew_offset(correction, flat)
     after = None if flat_after is None else renew_offset(correction, flat_after)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
-    result = correct(capture, before, after=after, maximum=maximum)
-    if events is not None:
-        result = mark_shutter(result, events)
-        if after is not None and result["segment"].values[-1] > 0:
-            raise ValueError(
-                f"Invalid flat_after: {result.attrs['shutter_events']} shutter events renew the "
-                "offsets within the capture. Must have none, for offsets in proportion to time."
-            )
-    result = mark_repeats(_without_damaged(result), capture["counts"], shutter=shutter)
-    if time_constant is not None:
-        result = undo_lag(result, time_constant)
+
+    def measured(rows: slice) -> xr.Dataset:
+        """Steps of some rows that need no others."""
+        last = None if after is None else after.isel(y=rows)
+        part = correct(capture.isel(y=rows), before.isel(y=rows), after=last, maximum=maximum)
+        part = _without_damaged(part if events is None else mark_shutter(part, events))
+        return part if time_constant is None else undo_lag(part, time_constant)
+
+    result = _by_rows(measured, capture["counts"]) if lazy else measured(slice(None))
+    if events is not None and after is not None and result["segment"].values[-1] > 0:
+        raise ValueError(
+            f"Invalid flat_after: {result.attrs['shutter_events']} shutter events renew the "
+            "offsets within the capture. Must have none, for offsets in proportion to time."
+        )
+    result = mark_repeats(result, capture["counts"], shutter=shutter)
     if bad_pixels is not None:
         result = mark_bad(result, threshold=bad_pixels)
     if drift_reference is not None:
-        result = undo_drift(result, drift_reference)
+        result = undo_drift(result, drift_reference, lazy=lazy)
     number = -1 if closed is None else closed.sum("time").values.tolist()
     return result.assign_attrs(shutter_closed_frames=number)
+
+
+def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
+    """All rows of a function of some, block by block; the counts are left to be computed."""
+    parts = [measured(rows).drop_vars("counts") for rows in _rows.blocks(raw.shape)]
+    whole = xr.concat(
+        parts,
+        "y",
+        data_vars="minimal",
+        coords="minimal",
+        compat="override",
+        combine_attrs="override",
+    )
+    if "pattern_std" in whole:
+        squares = [part["pattern_std"].values ** 2 for part in parts]
+        whole["pattern_std"].values[:] = np.sqrt(np.mean(squares, axis=0))
+    counts = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
+    return whole.assign(
+        counts=_rows.lazy(lambda rows: measured(rows)["counts"].values, counts)
+    ).assign_attrs(dead_pixels=sum(part.attrs["dead_pixels"] for part in parts))
 
 
 def _closed(capture: xr.Dataset) -> xr.DataArray | None:

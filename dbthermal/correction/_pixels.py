@@ -134,12 +134,13 @@ def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> 
     Mark pixels that are clipped at a level below the end of the raw counts, or frozen for a while.
 
     The counts (band, time, y, x) are raw, where nothing has been rounded yet; samples that are NaN
-    in the corrected dataset do not count. Frozen pixels are looked for only where the frames of a
-    closed `shutter` were taken out. See `_samples`.
+    in the corrected dataset, frame by frame, do not count. Frozen pixels are looked for only where
+    the frames of a closed `shutter` were taken out. See `_samples`.
     """
     saturated, frozen = (np.zeros((raw.sizes["y"], raw.sizes["x"]), dtype=bool) for _ in range(2))
-    for movie, measured in zip(raw, corrected["counts"], strict=True):
-        clipped, still = _repeats(movie, measured)
+    row = corrected["counts"].isel(y=slice(1)).values  # a frame is measured as a whole
+    for movie, frames in zip(raw, np.isfinite(row).any(axis=(2, 3)), strict=True):
+        clipped, still = _repeats(movie, frames)
         saturated |= clipped
         frozen |= still & shutter
     bits = saturated * np.uint32(Status.SATURATED) | frozen * np.uint32(Status.FROZEN_FRAMES)
@@ -150,9 +151,11 @@ def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> 
     )
 
 
-def _repeats(movie: xr.DataArray, measured: xr.DataArray) -> tuple[Mask, Mask]:
+def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
     """
     Pixels (y, x) of one band, raw counts (time, y, x), that are clipped, and that are frozen.
+
+    Judged are the measured frames (time).
 
     A level on which several pixels have their highest or lowest samples is the camera's: all pixels
     that reach it are clipped, be it once.
@@ -164,7 +167,7 @@ def _repeats(movie: xr.DataArray, measured: xr.DataArray) -> tuple[Mask, Mask]:
     ends = np.zeros((2, 3, *image))
     for rows in _blocks(movie):
         counts = movie.isel(y=rows).values.reshape(len(movie), -1)
-        valid = np.isfinite(measured.isel(y=rows).values).reshape(counts.shape)
+        valid = np.broadcast_to(frames[:, np.newaxis], counts.shape)
         still = samples.frozen(samples.repeated(counts, valid), grain.chance)
         frozen[rows] = still.reshape(-1, image[1])
         for highest in (False, True):

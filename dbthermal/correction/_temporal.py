@@ -4,8 +4,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _rows, planck, schema
 from dbthermal import _smooth as smooth
-from dbthermal import planck, schema
 from dbthermal._coordinates import laid_on
 
 Array = npt.NDArray[np.float64]
@@ -81,7 +81,9 @@ def lag_coefficients(
     return np.exp(-ratio), -np.expm1(-ratio)
 
 
-def undo_drift(corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5) -> xr.Dataset:
+def undo_drift(
+    corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5, lazy: bool = False
+) -> xr.Dataset:
     r"""
     Subtract from all of a band the drift that a patch of constant temperature shows.
 
@@ -104,6 +106,8 @@ def undo_drift(corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5
         True on the patch, (y, x), bool: a blackbody, a wall. Pixels with a `status` are left out.
     order : int
         Number of polynomials in a segment, the constant included.
+    lazy : bool
+        As in `correct_capture`.
 
     Returns
     -------
@@ -135,10 +139,16 @@ def undo_drift(corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5
         coords={name: counts[name] for name in ("band", "time")},
         attrs=schema.OPTIONAL["corrected"]["drift"].attrs,
     )
-    undone = (counts - drift).astype(counts.dtype if counts.dtype.kind == "f" else np.float32)
-    return corrected.assign(
-        counts=undone.transpose(*counts.dims).assign_attrs(counts.attrs), drift=drift
-    ).assign_attrs(drift_order=order, drift_pixels=len(rows))
+
+    def undone(part: slice) -> npt.NDArray[np.floating]:
+        """Counts of some rows without the drift."""
+        seen = counts.isel(y=part).values
+        return np.asarray(seen - curves[..., np.newaxis, np.newaxis], dtype=seen.dtype)
+
+    undo = _rows.lazy(undone, counts) if lazy else counts.copy(data=undone(slice(None)))
+    return corrected.assign(counts=undo, drift=drift).assign_attrs(
+        drift_order=order, drift_pixels=len(rows)
+    )
 
 
 def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -> Array:

@@ -15,11 +15,16 @@ from dbthermal.figures.drawing import canvas, percent, provenance_note
 
 REASONS: Final = MappingProxyType(
     {
+        "completed_from_prior": ("completed, by a library's or stated emissivity", "#8e4585"),
+        "completed_from_material": ("completed, by the same material elsewhere", "#d6619b"),
+        "completed_from_surroundings": ("completed, by the surroundings", "#e78ac3"),
+        "completed_frames": ("some frames completed", "#f7cfe2"),
         "dead_pixel": ("dead pixel", "#000000"),
         "saturated": ("saturated", "#4d4d4d"),
         "invalid_samples": ("no samples, as outside a view", "#737373"),
         "constant_signal": ("signal never changes", "#969696"),
         "frozen_frames": ("frozen frames, as by a shutter", "#bdbdbd"),
+        "no_reflection_pair": ("reflection not seen by the second camera", "#d9d9d9"),
         "object_jump": ("object jumps", "#7f3b08"),
         "bands_apart": ("bands see the reflection at different times", "#b35806"),
         "object_not_smooth": ("object changes too fast, or noise is another", "#e08214"),
@@ -34,7 +39,7 @@ REASONS: Final = MappingProxyType(
     }
 )
 """Words and colour of each flag, causes before what follows: a pixel with several is drawn as its
-first."""
+first. What is completed is drawn as that, whatever was the reason not to measure it."""
 
 _RIGHT: Final = "#a8d5b0"
 
@@ -46,7 +51,7 @@ def status(result: xr.Dataset) -> Figure:
     Parameters
     ----------
     result : Dataset
-        From `separation.solve`: `status` (y, x), bits of `schema.Status`.
+        From `separation.solve` or `complete`: `status` (y, x), bits of `schema.Status`.
 
     Returns
     -------
@@ -82,7 +87,9 @@ def status(result: xr.Dataset) -> Figure:
     right.set_axis_off()
     patches = [_patch(name, share) for name, share in shown.items()]
     right.legend(handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9)
+    completed = sum(share for name, share in shares.items() if name.startswith("completed"))
     good = f"{percent(shares[''])} of the pixels have no flag"
+    good += f", {percent(completed)} are completed" if completed else ""
     figure.suptitle(f"Status: {good}" + provenance_note(result))
     return figure
 
@@ -95,9 +102,10 @@ def _patch(name: str, share: float) -> Patch:
 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
     """Name of the most decisive flag of each pixel; empty without a flag."""
-    unknown = int(np.bitwise_or.reduce(flags.values, axis=None)) & ~sum(schema.Status)
+    bits = flags.values.astype(np.uint32)  # of older results they are of 16 bit
+    unknown = int(np.bitwise_or.reduce(bits, axis=None)) & ~sum(schema.Status)
     if unknown:
         raise ValueError(f"Unknown bits {unknown} of a status. Must be of {schema.Status.bits()}.")
     names = sorted(schema.Status.bits(), key=list(REASONS).index)
-    masks = [(flags.values & schema.Status.bits()[name]) != 0 for name in names]
+    masks = [(bits & schema.Status.bits()[name]) != 0 for name in names]
     return np.select(masks, [np.array(name) for name in names], default=np.array(""))

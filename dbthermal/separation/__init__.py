@@ -7,8 +7,11 @@ options takes them as its frozen record, such as `SubspaceSettings`.
 import importlib
 from typing import TYPE_CHECKING, Any, Final
 
+from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
 from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection
+from dbthermal.separation._scale import unscaled
+from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
 
 if TYPE_CHECKING:
@@ -25,11 +28,14 @@ __all__ = [
     "NaiveSettings",
     "RatioSettings",
     "SubspaceSettings",
+    "complete",
     "get_method",
     "materials",
     "reflected_change",
+    "separate",
     "solve",
     "uncalibrated_reflection",
+    "unscaled",
 ]
 
 # The settings are imported with their method when they are first used: one needs torch.

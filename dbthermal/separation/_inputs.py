@@ -15,7 +15,9 @@ from dbthermal import response as responses
 from dbthermal._coordinates import laid_on
 from dbthermal.response import Curve
 from dbthermal.schema import Status
+from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _quality as quality
+from dbthermal.separation._displaced import Displacement
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.intp]
@@ -61,6 +63,8 @@ class Inputs:
     emissivity: Array | None  # known beforehand (band, y, x) [1]
     emissivity_std: Array | None
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
+    displacement: Displacement | None  # of the second camera's reflections
+    difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `_joint.Joint`
 
     def apply(self, function: Callable[..., Any] | None, tile: Any) -> Any:
         """Apply a function of the method to a tile, with the settings where it has any."""
@@ -80,6 +84,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     emissivity_std: xr.DataArray | None,
     mask: xr.DataArray | None,
     pool: xr.DataArray | None,
+    reflection_shift: xr.Dataset | None,
     response_kind: str,
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
@@ -102,6 +107,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     noise = _noise(capture, response, curves)
     _check_clock(capture, method, curves, noise)
     value, std = _known_emissivity(corrected, emissivity, emissivity_std)
+    order = [int(band) for band in np.argsort(noise, kind="stable")]
     return Inputs(
         method=method,
         settings=settings,
@@ -110,10 +116,11 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         curves=curves,
         noise=noise,
         pattern=_pattern(capture, curves),
-        bands=[int(band) for band in np.argsort(noise, kind="stable")],
+        bands=order,
         emissivity=value,
         emissivity_std=std,
         labels=_labels(corrected, pool),
+        displacement=_displacement(corrected, reflection_shift, method, name, order[0]),
     )
 
 
@@ -288,6 +295,19 @@ def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str) -> Array:
     values = laid_on(array, corrected, name, "the capture").values.astype(np.float64)
     shape = tuple(corrected.sizes[dim] for dim in ("band", "y", "x"))
     return np.broadcast_to(values.reshape(shape[0], *values.shape[1:] or (1, 1)), shape)
+
+
+def _displacement(
+    corrected: xr.Dataset, shift: xr.Dataset | None, method: Method, name: str, reference: int
+) -> Displacement | None:
+    """Displacement of the second camera's reflections, for a method that tells them apart."""
+    if shift is None:
+        return None
+    if method.whole_image or "background_temperature" in method.not_estimated:
+        raise ValueError(
+            f"Invalid reflection_shift for method '{name}', which separates no reflection. Omit it."
+        )
+    return displaced.check(shift, corrected, reference)
 
 
 def _labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:

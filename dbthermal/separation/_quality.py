@@ -26,7 +26,9 @@ MOST_BRIDGED: Final = 0.15
 
 # Frames from which fewer pixels are sampled, of as many samples together.
 _LONG: Final = 2048
-_UNUSABLE: Final = np.uint32(Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
+_UNUSABLE: Final = np.uint32(
+    Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL | Status.NO_REFLECTION_PAIR
+)
 
 
 def status_bits(conditions: Mapping[Status, Mask]) -> Bits:
@@ -49,7 +51,10 @@ def grains(part: xr.Dataset, noise: npt.ArrayLike = np.inf) -> list[samples.Grai
 
 
 def read(
-    part: xr.Dataset, fewest: int = 1, known: list[samples.Grain] | None = None
+    part: xr.Dataset,
+    fewest: int = 1,
+    known: list[samples.Grain] | None = None,
+    most_missing: float = MOST_MISSING,
 ) -> tuple[Array, Mask, Bits]:
     """
     Read the samples of a part of the capture, and judge its pixels.
@@ -57,9 +62,9 @@ def read(
     Returns the counts (band, time, pixel) [count], zero where they are invalid and in unusable
     pixels; the samples that are valid in all bands (time, pixel), by their values and by the
     variable `mask`, in frames that repeat none (`_samples.copies`); and the status (pixel). A pixel
-    with fewer valid frames than `fewest`, or than `MOST_MISSING` of all, cannot be solved; see
-    `bridge` for pixels that lack a few. The `grains` of a larger part, if known, tell what repeats
-    by chance.
+    with fewer valid frames than `fewest`, or that lacks more than `most_missing` of all, cannot be
+    solved; see `bridge` for pixels that lack a few. The `grains` of a larger part, if known, tell
+    what repeats by chance.
     """
     raw = part["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1).astype(np.float64)
@@ -73,7 +78,7 @@ def read(
     valid &= ~copied[:, np.newaxis]
     counts[:, ~valid] = 0.0
     frames = valid.sum(axis=0)
-    invalid = frames < max(fewest, MOST_MISSING * len(valid))
+    invalid = too_few(valid, fewest, most_missing)
     used = True if valid.all() else valid  # numpy's reductions are slower with a mask
     highest = counts.max(axis=1, where=used, initial=-np.inf)
     lowest = counts.min(axis=1, where=used, initial=np.inf)
@@ -90,6 +95,12 @@ def read(
         status |= part["status"].values.reshape(-1).astype(np.uint32)
     counts[:, :, unusable(status)] = 0.0
     return counts, valid, status
+
+
+def too_few(valid: Mask, fewest: int, most_missing: float = MOST_MISSING) -> Mask:
+    """Pixels (pixel) with fewer valid frames (time, pixel) than can be solved, see `read`."""
+    least = max(fewest, (1.0 - most_missing) * len(valid))
+    return np.asarray(valid.sum(axis=0) < least)
 
 
 def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:

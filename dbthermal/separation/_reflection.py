@@ -9,13 +9,13 @@ import xarray as xr
 from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
+from dbthermal.separation import _scale as scale
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-# Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
+# Magnitude of the correlation below which a pixel shows noise alone.
 _UNCORRELATED: Final = 0.1
-_FEWEST: Final = 100
 
 
 def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
@@ -95,17 +95,19 @@ def uncalibrated_reflection(
     Without a response there are no temperatures, but the rapid changes are still the background's.
     Smooth functions of time, which hold the object's change, are projected out of both bands. Frame
     by frame, the gain and offset errors of the picture's own scaling are fitted to the uncorrelated
-    pixels (correlation below 0.1) and subtracted. With :math:`\lambda` the noise variance of the
-    second band over that of the first there, the ratio k of a pixel is that of Deming's regression
-    [2]_, the pooled ratio is its median over the correlated pixels, and the reflection in the first
-    band's unit is the best linear estimate
+    pixels (correlation below 0.1) and subtracted: small ones, and rapid. Large or slow ones are
+    undone before, by `unscaled`, whose `gain` then weights the frames by their noise. With
+    :math:`\lambda` the noise variance of the second band over that of the first there, the ratio k
+    of a pixel is that of Deming's regression [2]_, the pooled ratio is its median over the
+    correlated pixels, and the reflection in the first band's unit is the best linear estimate
 
     .. math:: r(t) = \frac{r_1(t) + (k / \lambda) \, r_2(t)}{1 + k^2 / \lambda}
 
     Parameters
     ----------
     signal : DataArray
-        (band, time, y, x), two bands in units of their own, `time` [s].
+        (band, time, y, x), two bands in units of their own, `time` [s]; the coordinate `gain`
+        (band, time) [1], if it has one, is what the noise of each frame was divided by.
     mask : DataArray, optional
         Pixels (y, x) of the object; all if not given.
     order : int
@@ -147,8 +149,10 @@ def uncalibrated_reflection(
     inside = _check(signal, mask, correlated)
     frames, image = signal.sizes["time"], signal.shape[2:]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
-    functions = smooth.polynomial_basis(signal["time"].values, order)
-    rapid = np.stack([part - functions @ (functions.T @ part) for part in values])
+    weight = _frame_weight(signal)
+    functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, order))
+    rapid = weight * values
+    rapid -= [functions @ (functions.T @ part) for part in rapid]
     quiet = inside & (np.abs(_correlation(rapid)) < _UNCORRELATED)
     _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")
     rapid -= [_scaling(*parts, quiet) for parts in zip(rapid, values.mean(axis=1), strict=True)]
@@ -163,7 +167,7 @@ def uncalibrated_reflection(
     pooled = float(np.median(ratio[moving]))
     # r = (r_1 / s_1^2 + k r_2 / s_2^2) / (1 / s_1^2 + k^2 / s_2^2)
     reflection = rapid[0] + pooled / noise_ratio * rapid[1]
-    reflection /= 1.0 + pooled**2 / noise_ratio
+    reflection /= weight * (1.0 + pooled**2 / noise_ratio)
     units = {"units": signal.attrs["units"]} if "units" in signal.attrs else {}
     variables = {
         name: (("y", "x"), part.reshape(image), {"units": "1"})
@@ -185,27 +189,29 @@ def uncalibrated_reflection(
 
 def _check(signal: xr.DataArray, mask: xr.DataArray | None, correlated: float) -> Mask:
     """Refuse all but two movies; return the pixels (pixel) to take the statistics from."""
-    if signal.dims != ("band", "time", "y", "x") or signal.sizes["band"] != 2:
-        raise ValueError(
-            f"Invalid signal {dict(signal.sizes)}. Must be (band, time, y, x) of two bands."
-        )
+    scale.check_signal(signal)
     if not 0 < correlated < 1:
         raise ValueError(f"Invalid correlation {correlated}. Must lie in (0, 1).")
-    if not np.all(schema.measured(signal.values)):
-        raise ValueError(
-            f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
-        )
     if mask is None:
         return np.ones(signal.sizes["y"] * signal.sizes["x"], dtype=bool)
-    if mask.dims != ("y", "x"):
-        raise ValueError(f"Invalid dims {mask.dims} of the mask. Must be ('y', 'x').")
-    return np.asarray(laid_on(mask, signal, "the mask", "the signal").values.astype(bool).ravel())
+    return scale.pixels_of(mask, signal)
+
+
+def _frame_weight(signal: xr.DataArray) -> Array:
+    """Weight (time, 1) of frames, inverse to the geometric mean of the bands' noise; mean 1."""
+    if "gain" not in signal.coords:
+        return np.ones((signal.sizes["time"], 1))
+    gain = schema.check_numbers(signal["gain"], "the gain", "1").transpose("band", "time").values
+    if not np.all(schema.measured(gain) & (gain > 0)):
+        raise ValueError(f"Invalid gain {np.min(gain)} of a frame. Must be finite and > 0.")
+    weight = np.exp(np.log(gain).mean(axis=0))
+    return np.asarray(weight / weight.mean())[:, np.newaxis]
 
 
 def _require(pixels: Mask, rule: str) -> None:
-    if pixels.sum() < _FEWEST:
+    if pixels.sum() < scale.FEWEST:
         raise ValueError(
-            f"Invalid signal: {pixels.sum()} pixels have a {rule}. Must be at least {_FEWEST}."
+            f"Invalid signal: {pixels.sum()} pixels have a {rule}. Must be at least {scale.FEWEST}."
         )
 
 
@@ -218,9 +224,8 @@ def _correlation(rapid: Array) -> Array:
 
 def _scaling(rapid: Array, mean: Array, quiet: Mask) -> Array:
     """Gain and offset errors (time, pixel) of each frame, fitted to the quiet pixels."""
-    design = np.stack([np.ones_like(mean), mean], axis=1)
-    errors, *_ = np.linalg.lstsq(design[quiet], rapid[:, quiet].T, rcond=None)
-    return np.asarray((design @ errors).T)
+    offset, gain = scale.frame_errors(rapid, mean, quiet)
+    return np.asarray(offset[:, np.newaxis] + gain[:, np.newaxis] * mean)
 
 
 def _deming(rapid: Array, power: Array, noise_ratio: float) -> Array:

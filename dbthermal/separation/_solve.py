@@ -1,8 +1,12 @@
 """The one entrance to all methods: the inputs are checked, and separated tile by tile."""
 
 import importlib
+import itertools
 import operator
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
@@ -12,6 +16,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from dbthermal import schema
+from dbthermal.separation import _joint as joint
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Labels, Method, check
 from dbthermal.separation._pooling import pool as pooling
@@ -37,6 +42,8 @@ _MODULES: Final = {
     "bcp": ("_baselines.bcp", "METHOD"),
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
+# Share of the pixels of the materials that have an emissivity alone, from which it is theirs [1].
+_MOST_TOLD: Final = 0.9
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -52,6 +59,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     emissivity_std: xr.DataArray | None = None,
     mask: xr.DataArray | None = None,
     pool: xr.DataArray | None = None,
+    reflection_shift: xr.Dataset | None = None,
     response_kind: str = "exact",
     workers: int = 2,
     seed: int = 0,
@@ -96,6 +104,12 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         Materials (y, x), integer: the pixels of one label share their emissivities, which makes
         all of them more certain; a negative one shares nothing. Known to the user, or found by
         `materials`. For "subspace" only.
+    reflection_shift : Dataset, optional
+        Where two cameras side by side see what the object mirrors, from
+        `alignment.reflection_shift`: the reflection that all other bands, of the second camera,
+        show at a pixel p is the one that the quietest band shows at :math:`p + d(p)`, `shift`
+        (axis, y, x) [pixel] with `shift_std`, `known` (y, x). The result is on the quietest band's
+        grid. For "subspace", "calibrated", "naive" and "dbvt".
     response_kind : {"exact", "linear"}
         Sakuma-Hattori response, or the paper's linear one.
     workers : int
@@ -110,7 +124,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     Dataset
         `object_temperature`, `background_temperature` (time, y, x) [K], `emissivity`
         (band, y, x) [1] and `reflection_ratio` (band, y, x) [1], the reflectivity over that of the
-        quietest band (attribute `reference_band`), each with `_std`; `status` (y, x), bits of
+        quietest band (attribute `reference_band`), each with `_std`; of "subspace" also
+        `emissivity_covariance` (band, other_band, y, x) [1]; `status` (y, x), bits of
         `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says that they
         are undefined, at samples that are invalid or masked, and where a method never estimates
         them (attribute `not_estimated`); where the status is 0, all others are finite. A known
@@ -138,6 +153,18 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     event leaves stays in the background, and makes the emissivity less certain, as its deviation
     says; the object temperature is free of it. A step of the object during a shutter event is not
     detected.
+
+    With a `reflection_shift` d the other bands are resampled at the place p of each pixel r,
+    p + d(p) = r, and the object of two places enters the bands,
+
+    .. math:: I_1(r) = e_1 U_1(x(r)) + (1 - e_1) U_1(y), \quad
+              I_m'(r) = e_m U_m(x(p)) + (1 - e_m) U_m(y)
+
+    The pixels are solved as if x(p) were x(r), all of them are then solved together for the object,
+    and each once more with what follows for x(p) in the other bands. It costs 2 to 3 times as much
+    where the object is not the same in both places, and makes the object more certain: an error of
+    one pixel is averaged along the places p. A pixel of which the second camera does not see the
+    reflection has the bit `no_reflection_pair`.
 
     References
     ----------
@@ -173,10 +200,15 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         emissivity_std=emissivity_std,
         mask=mask,
         pool=pool,
+        reflection_shift=reflection_shift,
         response_kind=response_kind,
     )
     height, width = corrected.sizes["y"], corrected.sizes["x"]
-    result = _allocate(corrected)
+    variables = dict(schema.STAGES["separated"])
+    if inputs.method.survey:
+        name = "emissivity_covariance"
+        variables[name] = schema.OPTIONAL["separated"][name]
+    result = _allocate(corrected, variables)
     with (
         threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
@@ -187,21 +219,17 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
             disable=not progress,
         ) as bar,
     ):
-        rows = height if inputs.method.whole_image else tiles.BLOCK_ROWS
-        blocks = [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
-        material = None
-        if inputs.labels is not None:
-            selected = pooling.select(inputs.labels)
-            surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), blocks)
-            material = _pool(inputs, [part for survey in surveys for part in survey])
-        for _ in threads.map(lambda block: _separate(inputs, block, material, result, bar), blocks):
-            pass
+        if inputs.displacement is None:
+            _separate_all(inputs, _materials(inputs, threads, bar), result, threads, bar)
+        else:
+            _solve_jointly(inputs, result, threads, bar)
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
     ratios = () if inputs.method.survey else ("reflection_ratio", "reflection_ratio_std")
     return result.assign_attrs(
         method=method,
+        pooled=int(pool is not None),
         response_kind=response_kind,
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
@@ -244,6 +272,69 @@ def get_method(name: str) -> Method:
     return method
 
 
+def _solve_jointly(
+    inputs: Inputs, result: xr.Dataset, threads: ThreadPoolExecutor, bar: "tqdm[Any]"
+) -> None:
+    """
+    Separate twice, the second time with the object of each camera's own place.
+
+    Where emissivities are pooled, they are those of the second time, and it is done once more.
+    """
+    material = None
+    _separate_all(inputs, material, result, threads, bar)
+    both = joint.solve(inputs, result, threads)
+    if inputs.labels is not None:
+        apart = inputs if both is None else replace(inputs, difference=both.difference)
+        material = _materials(apart, threads, bar)
+        _separate_all(inputs, material, result, threads, bar)
+        both = joint.solve(inputs, result, threads, pooled=True)
+    if both is not None:
+        apart = replace(inputs, difference=both.difference)
+        _separate_all(apart, material, result, threads, bar)
+        both.finish()
+
+
+def _materials(inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]") -> Material | None:
+    """Ratios and emissivity of the material of each pixel of the image; None if none are told."""
+    if inputs.labels is None:
+        return None
+    selected = pooling.select(inputs.labels)
+    surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), _blocks(inputs))
+    found = [part for survey in surveys for part in survey]
+    material = _pool(inputs, found)
+    told = sum(np.isfinite(part.emissivity).sum() for _, part in found)
+    if material is None or told > _MOST_TOLD * sum((part.frames > 0).sum() for _, part in found):
+        return material
+    # Emissivities of the few pixels with a ratio of their own are those of a selection by it.
+    ratio = replace(material, emissivity=np.full_like(material.emissivity, np.nan))
+    surveys = threads.map(
+        lambda block: _survey(inputs, block, selected, bar, ratio), _blocks(inputs)
+    )
+    again = _pool(inputs, [part for survey in surveys for part in survey])
+    assert again is not None
+    return replace(again, ratio=material.ratio, inverse_energy=material.inverse_energy)
+
+
+def _separate_all(
+    inputs: Inputs,
+    material: Material | None,
+    result: xr.Dataset,
+    threads: ThreadPoolExecutor,
+    bar: "tqdm[Any]",
+) -> None:
+    """Separate all blocks of rows into the result."""
+    separate = partial(_separate, inputs, material=material, result=result, bar=bar)
+    for _ in threads.map(separate, _blocks(inputs)):
+        pass
+
+
+def _blocks(inputs: Inputs) -> list[slice]:
+    """Rows that are read at once."""
+    height = inputs.capture.sizes["y"]
+    rows = height if inputs.method.whole_image else tiles.BLOCK_ROWS
+    return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
+
+
 def _separate(
     inputs: Inputs, rows: slice, material: Material | None, result: xr.Dataset, bar: "tqdm[Any]"
 ) -> None:
@@ -261,19 +352,32 @@ def _separate(
 
 
 def _survey(
-    inputs: Inputs, rows: slice, selected: Mask, bar: "tqdm[Any]"
+    inputs: Inputs,
+    rows: slice,
+    selected: Mask,
+    bar: "tqdm[Any]",
+    material: Material | None = None,
 ) -> list[tuple[Labels, Survey]]:
     """Survey the selected pixels of a block; with their numbers in the image."""
     surveys = []
-    for cut in tiles.cut(inputs, rows):
+    for cut in tiles.cut(inputs, rows, material):
         numbers = tiles.numbers(cut.window, inputs.capture.sizes["x"])
         for _, pixels, tile in cut.parts:
             wanted = selected[numbers[pixels]]
             if np.any(wanted):
                 part = tile if np.all(wanted) else tile.select_pixels(wanted)
                 survey: Survey = inputs.apply(inputs.method.survey, part)
+                # Whitened by one noise for all, not by that of the tile.
+                scale = np.array(part.noise) / inputs.noise[inputs.bands]
+                square = np.multiply.outer(scale, scale)[..., np.newaxis]
+                survey = replace(
+                    survey,
+                    scatter=survey.scatter * square,
+                    rapid_scatter=survey.rapid_scatter * square,
+                )
                 surveys.append((numbers[pixels][wanted], survey))
-        bar.update(cut.status.size)
+        if material is None:
+            bar.update(cut.status.size)
     return surveys
 
 
@@ -289,17 +393,20 @@ def _pool(inputs: Inputs, surveys: list[tuple[Labels, Survey]]) -> Material | No
     return pooling.expand(materials, labels)
 
 
-def _allocate(corrected: xr.Dataset) -> xr.Dataset:
-    """Make an empty result of the stage `separated` with the coordinates of a capture."""
-    dims = ("band", "time", "y", "x")
+def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -> xr.Dataset:
+    """Make an empty result of some variables with the coordinates of a capture."""
+    sizes = {**corrected.sizes, "other_band": corrected.sizes["band"]}
     kept = {name: value for name, value in corrected.attrs.items() if name in _KEPT_ATTRS}
     arrays = {}
-    for name, variable in schema.STAGES["separated"].items():
-        shape = tuple(corrected.sizes[dim] for dim in variable.dims)
+    for name, variable in variables.items():
+        shape = tuple(sizes[dim] for dim in variable.dims)
         attrs = schema.status_attrs() if name == "status" else variable.attrs
         empty = np.empty(shape, dtype=variable.dtype)
         arrays[name] = xr.DataArray(empty, dims=variable.dims, attrs={**attrs, **kept})
-    coordinates = {name: corrected[name] for name in dims if name in corrected.coords}
+    names = ("band", "time", "y", "x")
+    coordinates = {name: corrected[name] for name in names if name in corrected.coords}
+    if any("other_band" in variable.dims for variable in variables.values()):
+        coordinates["other_band"] = corrected["band"].rename(band="other_band")
     return xr.Dataset(arrays, coords=coordinates, attrs=kept)
 
 
@@ -316,9 +423,9 @@ def _write(
     and keeps its status; so do temperatures at frames of no estimate, and at invalid samples.
     """
     complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
-    for name, variable in schema.STAGES["separated"].items():
+    for name in map(str, result.data_vars):
         target = result[name].values[..., cut.window[0], cut.window[1]]
-        shape = target.shape[-2:]
+        dims, shape = result[name].dims, target.shape[-2:]
         if name == "status":
             target[...] = cut.status.reshape(shape)
         elif not complete or any(getattr(estimate, name) is None for _, _, estimate in estimates):
@@ -330,12 +437,13 @@ def _write(
             where = pixels.reshape(shape)
             if name == "status":
                 target[where] |= values
-            elif "band" in variable.dims:
-                for index, band in enumerate(bands):
-                    target[band][where] = values[index]
+            elif "band" in dims:
+                each = itertools.product(range(len(bands)), repeat=target.ndim - 2)
+                for place in each:
+                    target[tuple(bands[index] for index in place)][where] = values[place]
             else:
                 _write_film(target, frames, where, values)
-        if "time" in variable.dims and not np.all(cut.valid):
+        if "time" in dims and not np.all(cut.valid):
             target[~cut.valid.reshape(-1, *shape)] = np.nan
 
 

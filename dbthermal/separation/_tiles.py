@@ -16,6 +16,7 @@ import numpy.typing as npt
 from dbthermal import mixing
 from dbthermal.response import Curve
 from dbthermal.schema import Status
+from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import Bits, status_bits
@@ -35,6 +36,10 @@ SAMPLES: Final = 2**19
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
 
+# Tiles whose pixels are read together where they are then sorted by their noise.
+_TOGETHER: Final = 12
+# Resampled samples whose noise differs by less are separated together [1].
+_NOISE_STEP: Final = 0.05
 # A temperature leaves the calibrated range if it is so many standard deviations outside.
 _RANGE_SIGMAS: Final = 5.0
 # A temperature [K], emissivity [1] or deviation beyond is no result.
@@ -91,6 +96,8 @@ class Survey(_Pixels):
 
     scatter: Array  # noise-whitened scatter of rapid changes less noise (band, band, pixel) [1]
     frames: Array  # its degrees of freedom (pixel)
+    rapid_scatter: Array  # the same at the two largest orders looked at (2, band, band, pixel) [1]
+    rapid_frames: Array  # their degrees of freedom (2, pixel)
     ratio: Array  # reflection ratios of the pixel alone (band, pixel) [1]
     null_weights: Array  # see `ReflectionRatio` (band, pixel) [1]
     emissivity: Array  # of the first band, of the pixel alone (pixel) [1]; NaN where undefined
@@ -143,7 +150,7 @@ class Tile:
         signals, time = self.signals[:, selected], self.time[selected]
         return replace(self, signals=signals, time=time, segment=segment)
 
-    def select_pixels(self, selected: Mask) -> "Tile":
+    def select_pixels(self, selected: Mask | Whole) -> "Tile":
         """Return the tile of the selected pixels (pixel) alone, as one row."""
         known: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[..., selected]
@@ -168,6 +175,7 @@ class Estimate(_Pixels):
     status: Bits  # `schema.Status` (pixel)
     reflection_ratio: Array | None = None  # reflectivity over the first band's (band, pixel) [1]
     reflection_ratio_std: Array | None = None
+    emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
 
     def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
         """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""
@@ -176,8 +184,12 @@ class Estimate(_Pixels):
             "emissivity": no_emissivity,
             "background_temperature": no_background,
         }
+        covariance = self.emissivity_covariance
+        if covariance is not None:
+            covariance = np.where(no_emissivity, np.nan, covariance)
         return replace(
             self,
+            emissivity_covariance=covariance,
             **{
                 name + ending: np.where(where, np.nan, getattr(self, name + ending))
                 for name, where in undefined.items()
@@ -207,7 +219,7 @@ class Estimate(_Pixels):
         beyond = np.zeros(self.status.shape, dtype=bool)
         for field in fields(self):
             name = field.name
-            if name in ("status", *not_estimated) or name.endswith("_std"):
+            if name in ("status", *not_estimated) or name.endswith(("_std", "_covariance")):
                 continue
             if getattr(self, name) is None:
                 continue
@@ -260,10 +272,13 @@ def numbers(window: Window, width: int) -> Whole:
 
 def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterator[Cut]:
     """Read a block of rows and cut it into tiles; with the material of each pixel of the image."""
-    block = inputs.capture.isel(y=rows).load()
-    method, bands, width = inputs.method, inputs.bands, block.sizes["x"]
+    displacement, method, bands = inputs.displacement, inputs.method, inputs.bands
+    source = rows if displacement is None else displacement.source(rows)
+    block = inputs.capture.isel(y=source).load()
+    width = block.sizes["x"]
     fitting = max(1, min(PIXELS, SAMPLES // block.sizes["time"]))
-    size = getattr(inputs.settings, "batch", fitting)
+    most = int(getattr(inputs.settings, "batch", fitting))
+    size = most if displacement is None else max(width, _TOGETHER * most)
     size = block.sizes["y"] * width if method.whole_image else size
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
@@ -272,11 +287,16 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     grains = None
     for window in windows(rows, width, size):
         rng, places = generator(inputs.seed, window), numbers(window, width)
-        local = slice(window[0].start - rows.start, window[0].stop - rows.start)
         grains = grains or quality.grains(block, inputs.noise * slopes)
-        counts, valid, status = quality.read(
-            block.isel(y=local, x=window[1]), method.minimum_frames, grains
-        )
+        gain = np.ones(places.size)
+        if displacement is None:
+            local = slice(window[0].start - rows.start, window[0].stop - rows.start)
+            view = block.isel(y=local, x=window[1])
+            counts, valid, status = quality.read(view, method.minimum_frames, grains)
+        else:
+            counts, valid, status, gain = displaced.read(
+                block, displacement, window[0], source, method.minimum_frames, grains
+            )
         counts, usable = quality.bridge(counts, valid, time)
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
@@ -297,7 +317,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             time=time,
             curves=curves,
             noise=tuple(float(inputs.noise[band]) for band in bands),
-            shape=(local.stop - local.start, window[1].stop - window[1].start),
+            shape=(window[0].stop - window[0].start, window[1].stop - window[1].start),
             rng=rng,
             pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
             segment=segment,
@@ -305,9 +325,29 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             emissivity=emissivity,
             emissivity_std=std,
         )
+        if inputs.difference is not None:
+            tile.signals[1:] -= inputs.difference(window[0])
         parts = []
         for frames, pixels in sets:
             part = tile if np.all(frames) else tile.select_frames(frames)
             whole = method.whole_image or np.all(pixels)
             parts.append((frames, pixels, part if whole else part.select_pixels(pixels)))
+        if displacement is not None:
+            parts = [alike for one in parts for alike in _of_one_noise(*one, gain, most)]
         yield Cut(window, status, valid, parts)
+
+
+def _of_one_noise(
+    frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
+) -> Iterator[tuple[Mask, Mask, Tile]]:
+    """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise."""
+    order = np.rint(np.log(gain[pixels]) / _NOISE_STEP).astype(np.intp)
+    for level in np.unique(order):
+        alike = np.flatnonzero(order == level)
+        for start in range(0, alike.size, most):
+            chosen = alike[start : start + most]
+            part = np.zeros_like(pixels)
+            part[np.flatnonzero(pixels)[chosen]] = True
+            factor = float(np.exp(np.log(gain[part]).mean()))
+            noise = (tile.noise[0], *(factor * std for std in tile.noise[1:]))
+            yield frames, part, replace(tile.select_pixels(chosen), noise=noise)

@@ -83,11 +83,16 @@ class Camera:
         """Size of a pixel at unit distance [1]."""
         return float(2.0 * np.tan(np.radians(self.field_of_view) / 2.0) / self.shape[1])
 
-    def directions(self) -> Array:
-        """Unit vectors of the rays through the pixels' middles, (pixel, 3) in C order."""
-        places = np.indices(self.shape).reshape(2, -1).T
+    def directions(self, places: npt.ArrayLike | None = None) -> Array:
+        """
+        Unit vectors (..., 3) of the rays through rows and columns (..., 2) [pixel].
+
+        By default through the pixels' middles, (pixel, 3) in C order.
+        """
+        if places is None:
+            places = np.indices(self.shape).reshape(2, -1).T
         middle = (np.array(self.shape) - 1.0) / 2.0
-        down, right = ((places - middle) * self._pixel).T
+        down, right = np.moveaxis((np.asarray(places) - middle) * self._pixel, -1, 0)
         return unit(np.stack([right, down, np.ones_like(right)], axis=-1) @ self.axes)
 
     def project(self, points: npt.ArrayLike) -> Array:

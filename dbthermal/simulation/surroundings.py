@@ -138,6 +138,8 @@ class _Target:
     def __init__(self, actor: Actor, origins: Array, directions: Array) -> None:
         self.actor, self.caster = actor, Caster(actor.mesh)
         self.rays = (origins, directions)
+        self.square = np.einsum("rx,rx->r", origins, origins)
+        self.ahead = np.einsum("rx,rx->r", origins, directions)
         low, high = actor.mesh.bounds
         self.middle = (low + high) / 2.0
         self.radius = float(np.max(np.linalg.norm(actor.mesh.vertices - self.middle, axis=1)))
@@ -161,9 +163,8 @@ class _Target:
     def _near(self, middle: Array) -> npt.NDArray[np.bool_]:
         """Rays that pass through the sphere about the actor."""
         origins, directions = self.rays
-        way = middle - origins
-        along = np.einsum("rx,rx->r", way, directions)
-        square = np.einsum("rx,rx->r", way, way)
+        along = directions @ middle - self.ahead
+        square = self.square - 2.0 * (origins @ middle) + middle @ middle
         inside = square < self.radius**2
         return np.asarray(inside | ((along > 0) & (square - along**2 < self.radius**2)))
 

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from attack import arrays, files, kills, media, stages, steps
+from attack import arrays, files, kills, media, mirrored, stages, steps
 from attack.oracle import BAD, GOOD, LIMIT, SECONDS, Attack, Outcome, carry_out
 
 Make = Callable[[np.random.Generator], Attack]
@@ -25,6 +25,9 @@ CLASSES: Final[Mapping[str, tuple[Make, int]]] = {
     "shapes": (arrays.shapes, 4),
     "responses": (arrays.responses, 4),
     "windows": (arrays.windows, 5),
+    "shifts": (mirrored.shifts, 6),
+    "fields": (mirrored.fields, 2),
+    "completions": (mirrored.completions, 6),
     "offset": (stages.offset, 6),
     "align": (stages.aligned, 6),
     "register": (stages.registered, 3),

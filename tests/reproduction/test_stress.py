@@ -255,6 +255,20 @@ def test_status_in_words() -> None:
     assert plt.get_fignums() == []
 
 
+def test_completed_is_told_from_measured() -> None:
+    """What is completed is drawn as that, not as good and not as the reason to complete it."""
+    prior = schema.Status.COMPLETED_FROM_PRIOR | schema.Status.COMPLETED_FROM_SURROUNDINGS
+    flags = np.array([[0, schema.Status.GRAY | prior, schema.Status.COMPLETED_FRAMES, 4]])
+    figure = status(xr.Dataset({"status": (("y", "x"), flags.astype(np.uint32))}))
+    legend = figure.axes[1].get_legend()
+    assert legend is not None
+    names = ("completed_from_prior", "completed_frames", "gray")
+    shown = ["25.0 %  good", *(f"25.0 %  {REASONS[name][0]}" for name in names)]
+    assert [text.get_text() for text in legend.get_texts()] == shown
+    of_all = "25.0 % of the pixels have no flag, 50.0 % are completed"
+    assert figure.get_suptitle() == f"Status: {of_all}"
+
+
 def test_a_few_pixels_are_not_none() -> None:
     """One pixel in 10,000 is not shown as a share of zero."""
     flags = np.zeros((100, 100), dtype=np.uint16)

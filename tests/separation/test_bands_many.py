@@ -82,6 +82,13 @@ def test_order_of_bands_does_not_matter(order: list[int]) -> None:
         np.testing.assert_allclose(
             mixed[name].values.astype(float), plain[name].values, rtol=1e-5, atol=1e-6
         )
+    covariance = mixed["emissivity_covariance"].sel(other_band=names).values
+    np.testing.assert_allclose(
+        covariance, plain["emissivity_covariance"].values, rtol=1e-4, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        np.einsum("bbyx->byx", covariance), plain["emissivity_std"].values ** 2, rtol=1e-4
+    )
 
 
 def test_the_quietest_band_is_the_reference() -> None:

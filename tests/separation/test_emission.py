@@ -92,9 +92,10 @@ def test_standard_deviations_are_those_of_the_scatter() -> None:
     ratios, found = solved(tile)
     found = replace(found, drift_variance=np.zeros(1500))
     background, variance = emission.estimate_background(tile, found, ratios)
-    of_emissivity = emission._emissivity_variance(
+    covariance = emission._emissivity_covariance(
         found.emissivity[0], found.noise_variance, ratios, np.array(tile.noise), found.level_std
     )
+    of_emissivity = np.einsum("bbp->bp", covariance)
     pairs = {
         "object": (found.temperature, found.temperature_std**2),
         "emissivity": (found.emissivity, of_emissivity),
@@ -103,8 +104,22 @@ def test_standard_deviations_are_those_of_the_scatter() -> None:
     for name, (value, stated) in pairs.items():
         share = np.median(np.std(value, axis=1) / np.sqrt(np.median(stated, axis=1)))
         print(f"{name}: scatter over stated {share:.3f}")
-        # The regression's variance is on the safe side: correlation is counted, never its lack.
-        assert (0.95 if name == "object" else 0.75) < share < 1.05, name
+        # In some pixels the line locks to no level of the background, and has the variance of both.
+        assert (0.95 if name == "object" else 0.80) < share < 1.05, name
+
+
+def test_correlation_of_the_emissivities_is_that_of_the_scatter() -> None:
+    """Over many pixels of one truth, the errors of two bands go together as stated."""
+    tile = tile_of((0.86, 0.72, 0.79), 3000, 1.0)
+    ratios, found = solved(tile)
+    covariance = emission._emissivity_covariance(
+        found.emissivity[0], found.noise_variance, ratios, np.array(tile.noise), found.level_std
+    )
+    stds = np.sqrt(np.einsum("bbp->bp", covariance))
+    stated = np.median(covariance / (stds[:, np.newaxis] * stds), axis=-1)
+    scatter = np.asarray(np.corrcoef(found.emissivity))
+    print(f"correlations {scatter[0, 1:]}, {scatter[1, 2]:.3f}; stated {stated[0, 1:]}")
+    np.testing.assert_allclose(scatter, stated, rtol=0, atol=0.05)
 
 
 def test_emissivity_of_a_constant_object_is_undefined() -> None:

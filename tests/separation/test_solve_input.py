@@ -103,9 +103,9 @@ BAD: dict[str, tuple[Callable[[xr.Dataset, xr.Dataset], object], str]] = {
     ),
     "status bits": (
         lambda c, r: separation.solve(
-            c.assign(status=(("y", "x"), np.full((4, 5), 2**16, np.uint32))), r
+            c.assign(status=(("y", "x"), np.full((4, 5), 2**21, np.uint32))), r
         ),
-        "Unknown bits 65536 in the status",
+        "Unknown bits 2097152 in the status",
     ),
     "noise": (
         lambda c, r: separation.solve(c, r.assign(noise=("band", [1.0, -1.0]))),

@@ -26,6 +26,7 @@ def capture() -> xr.Dataset:
 def inputs_of(capture: xr.Dataset, method: str = "subspace", **known: object) -> _inputs.Inputs:
     """Checked inputs of a method."""
     none = dict.fromkeys(("settings", "emissivity", "emissivity_std", "mask", "pool"))
+    none["reflection_shift"] = None
     given: dict[str, object] = {**none, "seed": 3, "response_kind": "exact", **known}
     return _inputs.check(
         capture,

@@ -1,6 +1,6 @@
 """Reflection ratios and emissivity of each material, from the surveys of its pixels."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -16,7 +16,12 @@ MOST: Final = 2048
 
 # Deviations beyond which a pixel is not of the material, and rounds of leaving such ones out.
 _OUTLIER_SIGMAS: Final = 4.0
-_ROUNDS: Final = 3
+_ROUNDS: Final = 6
+# Deviations beyond which the order of the pixels is too small for their material.
+_ORDER_SIGMAS: Final = 3.0
+# Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
+_ENERGY_SIGMAS: Final = 8.0
+_LEAST_ENERGY: Final = 0.01
 
 
 def select(labels: Labels) -> Mask:
@@ -57,9 +62,13 @@ def estimate(labels: Labels, count: int, survey: Survey, noise: Array) -> Materi
     used = labels
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         for _ in range(_ROUNDS):
-            ratio, inverse_energy = _ratios(used, count, survey, noise)
-            used = np.where(_outliers(used, ratio, survey, noise), -1, used)
-        return Material(ratio, inverse_energy, *_emissivities(used, count, survey, ratio))
+            found = _ratios(used, count, survey, noise)
+            outliers = _outliers(used, found, survey, noise)
+            if not np.any(outliers):
+                break
+            used = np.where(outliers, -1, used)
+        ratio = found.ratio
+        return Material(ratio, found.variance, *_emissivities(used, count, survey, ratio))
 
 
 def _sum(labels: Labels, values: Array, count: int) -> Array:
@@ -77,23 +86,87 @@ def _inverse_energy(scatter: Array, ratio: Array, noise: Array, freedom: Array) 
     return reflection_ratio.inverse_energy(energy, length, freedom)
 
 
-def _ratios(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Array, Array]:
-    """Ratios (band, material) of the summed scatters, and their variance [1/K^2]."""
+@dataclass(frozen=True)
+class _Ratios:
+    """Ratios of each material."""
+
+    ratio: Array  # (band, material) [1]
+    variance: Array  # (material) [1/K^2]
+    rapid: Mask  # at the largest order, not at those of the pixels (material)
+
+
+def _ratios(labels: Labels, count: int, survey: Survey, noise: Array) -> _Ratios:
+    """
+    Ratios of the summed scatters, at the order of each pixel unless the largest contradicts it.
+
+    Then at that; and what four functions less would change, beyond noise, is a variance.
+    """
+    used, frames = survey.scatter, survey.frames
+    parts = [(used, frames), *zip(survey.rapid_scatter, survey.rapid_frames, strict=True)]
+    own, fewer, most = (_at_order(labels, count, *part, noise) for part in parts)
+    rapid = _apart(own, most, noise)[0] > _ORDER_SIGMAS
+    ratio, variance = (np.where(rapid, *pair) for pair in zip(most, own, strict=True))
+    return _Ratios(ratio, variance + np.where(rapid, _apart(fewer, most, noise)[1], 0.0), rapid)
+
+
+def _at_order(
+    labels: Labels, count: int, scatter: Array, frames: Array, noise: Array
+) -> tuple[Array, Array]:
+    """Ratios (band, material) of scatters summed over each, and their variance [1/K^2]."""
     bands = range(len(noise))
-    scatter = np.array([[_sum(labels, survey.scatter[i, j], count) for j in bands] for i in bands])
-    informed = np.einsum("bbm->m", scatter) > 0
-    scatter = np.where(informed, scatter, np.eye(len(noise))[..., np.newaxis])
-    ratio = reflection_ratio.principal_ratio(np.moveaxis(scatter, -1, 0), noise)
-    variance = _inverse_energy(scatter, ratio, noise, _sum(labels, survey.frames, count))
+    total = np.array([[_sum(labels, scatter[i, j], count) for j in bands] for i in bands])
+    informed = np.einsum("bbm->m", total) > 0
+    total = np.where(informed, total, np.eye(len(noise))[..., np.newaxis])
+    ratio = reflection_ratio.principal_ratio(np.moveaxis(total, -1, 0), noise)
+    freedom = _sum(labels, frames, count)
+    # Energy along the axis, over that of the noise: a whole picture sees what is not there.
+    whitened = ratio / noise[:, np.newaxis]
+    unit = whitened / np.sqrt((whitened**2).sum(axis=0))
+    along = np.einsum("bm,bcm,cm->m", unit, total, unit)
+    informed &= along > np.maximum(_ENERGY_SIGMAS * np.sqrt(2.0 * freedom), _LEAST_ENERGY * freedom)
+    variance = _inverse_energy(total, ratio, noise, freedom)
     return np.where(informed, ratio, np.nan), np.where(informed, variance, np.nan)
 
 
-def _outliers(labels: Labels, ratio: Array, survey: Survey, noise: Array) -> Mask:
-    """Pixels whose own ratio is not that of their material."""
-    inverse = _inverse_energy(survey.scatter, survey.ratio, noise, survey.frames)
-    variance = reflection_ratio.ratio_variance(survey.ratio, inverse, noise)
-    apart = np.abs(survey.ratio - ratio[:, labels]) > _OUTLIER_SIGMAS * np.sqrt(variance)
-    return np.asarray(np.any(apart[1:], axis=0) & (survey.frames > 0) & (labels >= 0))
+def _apart(
+    one: tuple[Array, Array], other: tuple[Array, Array], noise: Array
+) -> tuple[Array, Array]:
+    """
+    Difference of the ratios at two orders in standard deviations, and its excess [1/K^2].
+
+    The estimate at the smaller order is the more certain one, and their difference has the
+    difference of their variances (Hausman 1978, doi:10.2307/1913827).
+    """
+    scale = noise[1:, np.newaxis] ** 2 + (other[0][1:] * noise[0]) ** 2
+    square = np.max((one[0] - other[0])[1:] ** 2 / scale, axis=0)
+    expected = np.abs(other[1] - one[1])
+    return np.sqrt(square / expected), np.maximum(square - expected, 0.0)
+
+
+def _outliers(labels: Labels, material: _Ratios, survey: Survey, noise: Array) -> Mask:
+    """
+    Pixels whose ratio, at the order of their material, is not the material's.
+
+    Both by its own deviation, and by that of the material's ratio in the pixel: near black, pixels
+    that tell little have ratios of a wide and skew distribution. Those far off pull the ratio, and
+    go first: at least half as far as the farthest of the material.
+    """
+    rapid = material.rapid[labels]
+    scatter = np.where(rapid, survey.rapid_scatter[1], survey.scatter)
+    frames = np.where(rapid, survey.rapid_frames[1], survey.frames)
+    whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
+    own = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
+    inverse = _inverse_energy(scatter, own, noise, frames)
+    std = np.sqrt(reflection_ratio.ratio_variance(own, inverse, noise))
+    common = material.ratio[:, labels]
+    score = np.nan_to_num(np.max(np.abs(own - common)[1:] / std[1:], axis=0)) * (labels >= 0)
+    farthest = np.zeros(len(material.rapid))
+    np.maximum.at(farthest, labels, score)
+    apart = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
+    axis = common / noise[:, np.newaxis]
+    apart &= ~reflection_ratio.agrees(whole, axis / np.sqrt((axis**2).sum(axis=0)))
+    known = np.isfinite(material.variance[labels])
+    return np.asarray(apart & known & (survey.frames > 0) & (labels >= 0))
 
 
 def _emissivities(

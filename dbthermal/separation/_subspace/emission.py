@@ -13,7 +13,8 @@ ways that add:
   a limit that the user states;
 - an extrapolation: the part of the resting background's change that is *not* along the object's
   curve is seen. Its spectrum over the smooth functions is continued to the curve, as that of a
-  random walk, whose energy falls with the square of the degree.
+  random walk, whose energy falls with the square of the degree; or as a line in time, where one
+  beside the object's curve changes the slope by more.
 """
 
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from dbthermal import _smooth as smooth
 from dbthermal import mixing
 from dbthermal.separation._subspace import residuals
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
-from dbthermal.separation._tiles import Array, Mask, Tile
+from dbthermal.separation._tiles import Array, Mask, Tile, Whole
 
 _ROUNDS: Final = 2
 # Energy of the object's change over that of its noise, below which its emissivity is undefined.
@@ -50,7 +51,7 @@ class Emission:
     sensitivity: Array  # its derivative with epsilon (time, pixel) [K]
     smooth_variance: Array  # its variance from the smoothed noise (time, pixel) [K^2]
     emissivity: Array  # (band, pixel) [1]
-    emissivity_variance: Array  # (band, pixel) [1]
+    emissivity_covariance: Array  # (band, band, pixel) [1]
     epsilon_variance: Array  # of epsilon (pixel) [1]
     level_std: Array  # of the ratios, through the background's level (band, pixel) [1]
     noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
@@ -67,17 +68,23 @@ def estimate(
     line, first, noise = fit.line, fit.emissivity, np.array(tile.noise)
     # Eq. 6 by implicit differentiation: dx/deps = (dh/deps - dq/deps) / h', var x = var q / h'^2.
     sensitivity = (fit.partial - functions.object_part @ ratios.coefficients[0]) / fit.steepness
-    leverage = functions.leverage()[:, ratios.order - 1]
+    leverage, used = functions.leverage()[:, ratios.order - 1], ratios.order + functions.steps
     smooth_variance = leverage * ratios.null_variance / fit.steepness**2
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
-    omitted = smooth_variance * np.log(tile.time.size) / (ratios.order + functions.steps)
-    # Variance of the slope: of the ordinate's noise, and of the abscissa's, e_1^2 var q / sum u^2.
-    noise_variance = line.variance + first**2 * ratios.null_variance / line.energy
-    walk, upper = walk_variance(line, fit.emitted, functions, tile.noise[0])
+    omitted = smooth_variance * np.log(tile.time.size) / used
+    # The slope is sum k z_1, with k = w u / sum w u^2 of the curve u about its mean. Its variance:
+    # of the ordinate's noise, and of the abscissa's.
+    kernel = line.weights * fit.emitted
+    kernel -= line.weights * (kernel.sum(axis=0) / line.weights.sum(axis=0))
+    kernel /= line.energy
+    noise_variance = line.variance + first**2 * _curve_variance(kernel, functions, ratios)
+    curve_std = first * np.sqrt(ratios.null_variance)
+    walk, upper = walk_variance(line, fit.emitted, functions, noise[0], curve_std, used)
     # A uniform distribution in [-d, d] has the variance d^2 / 3.
-    drift = ((1.0 - first) * background_drift / np.ptp(fit.emitted, axis=0)) ** 2 / 3.0
-    drifting = drift + upper
+    limit = (1.0 - first) * background_drift / np.sqrt(3.0)
+    linear = _linear_variance(tile, functions, ratios, fit, limit)
+    drifting = (limit / np.ptp(fit.emitted, axis=0)) ** 2 + np.maximum(upper, linear)
     if tile.material is not None:
         known = ratios.pooled & np.isfinite(tile.material.emissivity)
         noise_variance = np.where(known, tile.material.noise_variance, noise_variance)
@@ -94,7 +101,7 @@ def estimate(
         sensitivity=sensitivity,
         smooth_variance=smooth_variance,
         emissivity=emissivity,
-        emissivity_variance=_emissivity_variance(
+        emissivity_covariance=_emissivity_covariance(
             emissivity[0], noise_variance + drifting, ratios, noise, level_std
         ),
         epsilon_variance=epsilon,
@@ -185,32 +192,43 @@ def _fieller(sensitivity: Array, epsilon: Array) -> Array:
     return np.asarray(sensitivity**2 * epsilon / (1.0 - NORMAL95**2 * epsilon) ** 2)
 
 
-def _emissivity_variance(
+def _emissivity_covariance(
     first: Array, slope_variance: Array, ratios: ReflectionRatio, noise: Array, level_std: Array
 ) -> Array:
     r"""
-    Variance of the emissivities (band, pixel) [1], from the ratios and from the slope (eq. 8).
+    Covariance of the emissivities (band, band, pixel) [1], from the ratios and the slope (eq. 8).
 
     .. math:: \delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o, \quad
               \delta e_m = \kappa_m \delta e_1 - (1 - e_1) \delta \kappa_m
     """
     ratio, weights = ratios.ratio, ratios.null_weights
     reflectivity, squares = 1.0 - first, (noise**2)[:, np.newaxis]
-    # Covariance of kappa_m with epsilon over sigma^2: s_m^2 w_m - kappa_m s_1^2 w_1.
-    covariance = squares * weights - ratio * squares[0] * weights[0]
-    covariance[0] = 0.0
-    # Terms with epsilon: (kappa e_1 (1 - e_1))^2 var(eps) + 2 kappa e_1 (1 - e_1)^2 cov.
-    through = (ratio * first * reflectivity) ** 2 * ratios.null_variance
-    through += 2.0 * ratio * first * reflectivity**2 * covariance
-    direct = reflectivity**2 * ratios.variance
+    pairs, energy = ratio[:, np.newaxis] * ratio, ratios.inverse_energy
+    # Of kappa_m with epsilon, over sigma^2: s_m^2 w_m - kappa_m s_1^2 w_1; with one another:
+    # kappa_m kappa_n s_1^2, and the variances of eq. 4.
+    with_epsilon = squares * weights - ratio * squares[0] * weights[0]
+    with_epsilon[0] = 0.0
+    between = pairs * squares[0] * energy
+    between[0], between[:, 0] = 0.0, 0.0
+    np.einsum("bbp->bp", between)[...] = ratios.variance
+    # Terms with epsilon: (e_1 (1 - e_1))^2 kappa_m kappa_n var(eps) and, of both with the other,
+    # e_1 (1 - e_1)^2 kappa_m cov(kappa_n, eps).
+    cross = ratio[:, np.newaxis] * with_epsilon
+    through = (first * reflectivity) ** 2 * pairs * ratios.null_variance
+    through += first * reflectivity**2 * (cross + cross.swapaxes(0, 1))
     # Through the background's level: -(1 - e_1) (kappa_m e_1 deps + dkappa_m).
     by_level = reflectivity * (ratio * first * (weights * level_std).sum(axis=0) + level_std)
-    noisy = through * ratios.inverse_energy + direct
-    return np.asarray(ratio**2 * slope_variance + noisy + by_level**2)
+    covariance = pairs * slope_variance + through * energy + reflectivity**2 * between
+    return np.asarray(covariance + by_level[:, np.newaxis] * by_level)
 
 
 def walk_variance(
-    line: residuals.Line, emitted: Array, functions: smooth.Subspace, noise: float
+    line: residuals.Line,
+    emitted: Array,
+    functions: smooth.Subspace,
+    noise: float,
+    curve_std: Array | float = 0.0,
+    order: Whole | int = 1,
 ) -> tuple[Array, Array]:
     r"""
     Variance (pixel) [1] of the regression's slope from a background that walks; its upper bound.
@@ -220,6 +238,8 @@ def walk_variance(
     of two octaves; for the bound, at the upper end of their 95 % interval,
 
     .. math:: \mathrm{var}(e_1) = \frac{A}{|u|^2} \sum_j \frac{\xi_j^2}{j^2}
+
+    The residual holds the `noise` of the signal and, below the `order`, that of the object's curve.
     """
     columns = functions.rising
     degree = np.arange(1.0, columns.shape[1] + 1)[:, np.newaxis]
@@ -232,7 +252,7 @@ def walk_variance(
     # The part orthogonal to the object's curve is the background's alone.
     spectrum = spectrum - unit * (unit * spectrum).sum(axis=0)
     # Energy of a walk at degree 1: j^2 times that at degree j, less the noise's.
-    walk = degree**2 * (spectrum**2 - noise**2 / share)
+    walk = degree**2 * (spectrum**2 - noise**2 / share - curve_std**2 * (degree < order))
     octaves, widened = [], []
     for low, high, lost in _OCTAVES:
         if (freedom := len(walk[low - 1 : high - 1]) - lost) > 0:
@@ -241,6 +261,60 @@ def walk_variance(
     scale = (unit**2 / degree**2).sum(axis=0) / energy
     expected, upper = (scale * np.max(one, axis=0, initial=0.0) for one in (octaves, widened))
     return np.asarray(expected), np.asarray(upper)
+
+
+def _linear_variance(
+    tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio, fit: _Fit, limit: Array
+) -> Array:
+    r"""
+    Variance (pixel) [1] of the regression's slope from a background that drifts linearly in time.
+
+    What the object's curve leaves of a line in time tells its size d, with a variance v. Normal
+    beforehand, of a variance D as large as the `limit`'s (pixel) [K] or as what is seen, the mean
+    square of the slope's error is
+
+    .. math:: \gamma^2 k (k d^2 + v), \quad k = D / (D + v)
+    """
+    drift = functions.rising[:, 0]
+    slope, size, kernel = _drift_beside(fit.line, fit.emitted, drift)
+    variance = tile.noise[0] ** 2 * np.einsum("tp,tp->p", kernel, kernel)
+    variance += fit.emissivity**2 * _curve_variance(kernel, functions, ratios)
+    before = np.maximum((limit / np.ptp(drift)) ** 2, size**2 + variance)
+    share = before / (before + variance)
+    return np.asarray(slope**2 * share * (share * size**2 + variance))
+
+
+def _drift_beside(line: residuals.Line, curve: Array, drift: Array) -> tuple[Array, Array, Array]:
+    r"""
+    Linear drift (time) beside the object's curve in the residual r of the robust line.
+
+    Its slope :math:`\gamma` on the curve (pixel), its size d (pixel), and the kernel k
+    (time, pixel) of :math:`d = \sum k r`. A large drift takes the weight from the frames that tell
+    it best: the second time the weights are those of the residual beside it.
+    """
+    weights = line.weights
+    for last in (False, True):
+        weighted, total = weights * curve, weights.sum(axis=0)
+        mean, middle = weighted.sum(axis=0) / total, drift @ weights / total
+        energy = np.einsum("tp,tp->p", weighted, curve) - total * mean**2
+        slope = (drift @ weighted - total * mean * middle) / energy
+        # w (t - gamma u), about its mean, over its product with t.
+        kernel = drift[:, np.newaxis] * weights
+        kernel -= (middle - slope * mean) * weights
+        kernel -= slope * weighted
+        kernel /= drift @ kernel
+        size = np.einsum("tp,tp->p", kernel, line.residual)
+        if not last:
+            beside = drift[:, np.newaxis] - (middle - slope * mean) - slope * curve
+            scaled = (line.residual - size * beside) / (residuals.TUNING * line.scale)
+            weights = np.maximum(1.0 - scaled**2, 0.0) ** 2
+    return slope, size, kernel
+
+
+def _curve_variance(kernel: Array, functions: smooth.Subspace, ratios: ReflectionRatio) -> Array:
+    """Variance (pixel) of the sum of a kernel (time, pixel) over the object's smoothed noise."""
+    part = (functions.object_part.T @ kernel) * functions.columns(ratios.order)
+    return np.asarray(ratios.null_variance * (part**2).sum(axis=0))
 
 
 def estimate_background(

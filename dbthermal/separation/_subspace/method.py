@@ -224,7 +224,8 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Esti
         background_temperature=solution.background,
         background_temperature_std=np.sqrt(solution.background_variance + by_pattern[1]),
         emissivity=emission.emissivity,
-        emissivity_std=np.sqrt(emission.emissivity_variance),
+        emissivity_std=np.sqrt(np.einsum("bbp->bp", emission.emissivity_covariance)),
+        emissivity_covariance=emission.emissivity_covariance,
         reflection_ratio=np.where(still, np.nan, ratios.ratio),
         reflection_ratio_std=np.where(still, np.nan, np.sqrt(ratio_variance)),
         status=status_bits(flags),
@@ -253,10 +254,14 @@ def _survey(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Surv
     status = _report(tile, functions, solution).status
     ratios, emission = solution.ratios, solution.emission
     sound = (status & _BROKEN) == 0
+    noise = np.array(tile.noise)
+    rapid, freedom = reflection_ratio.rapid_scatter(solution.straight.signals, functions, noise)
     return Survey(
         scatter=np.where(sound, ratios.scatter, 0.0),
         frames=sound
         * np.asarray(tile.time.size - ratios.order - functions.steps, dtype=np.float64),
+        rapid_scatter=np.where(sound, rapid, 0.0),
+        rapid_frames=sound * freedom,
         ratio=ratios.ratio,
         null_weights=ratios.null_weights,
         emissivity=np.where(status == 0, emission.emissivity[0], np.nan),

@@ -21,6 +21,9 @@ LOWEST_ORDER: Final = 3
 HIGHEST_ORDER: Final = 14
 """Smallest and largest smooth subspace that the data may choose (number of functions)."""
 
+# Functions by which the two largest orders differ that the ratios of a material are compared at.
+_FEWER: Final = 4
+
 CHANCE: Final = float(2.0 * norm.sf(4.0))
 """Chance of four standard deviations, at which a hypothesis on the ratios is rejected."""
 
@@ -116,6 +119,22 @@ def estimate(
         scatter=np.moveaxis(chosen, 0, -1) - free * np.eye(len(noise))[..., np.newaxis],
         pooled=pooled,
     )
+
+
+def rapid_scatter(signals: Array, functions: smooth.Subspace, noise: Array) -> tuple[Array, Array]:
+    """
+    Noise-whitened scatter less noise, of what the largest orders leave, and its freedom.
+
+    (2, band, band, pixel) and (2, pixel), of `_FEWER` functions less and of all. What the order of
+    one pixel leaves of its object, unseen in its noise, adds up over the pixels of a material.
+    """
+    whitened = signals / noise[:, np.newaxis, np.newaxis]
+    coefficients = np.einsum("tc,btp->bcp", functions.functions, whitened, optimize=True)
+    orders = np.array([max(1, functions.orders - _FEWER), functions.orders])
+    scatter = _scatter(whitened, coefficients, functions.steps)[orders - 1]
+    freedom = signals.shape[1] - functions.steps - orders[:, np.newaxis, np.newaxis, np.newaxis]
+    scatter = np.moveaxis(scatter, 1, -1) - freedom * np.eye(len(noise))[..., np.newaxis]
+    return scatter, np.broadcast_to(freedom[:, 0, 0], (2, signals.shape[2])).astype(np.float64)
 
 
 def principal_ratio(scatter: Array, noise: Array) -> Array:
@@ -214,14 +233,18 @@ def _scatter(whitened: Array, coefficients: Array, steps: int) -> Array:
 
 
 def _agrees(scatter: Array, order: Whole, axis: Array) -> Mask:
+    """Pixels of which the scatter at an order agrees with a known axis; false for NaN."""
+    return agrees(scatter[order, np.arange(order.size)], axis)
+
+
+def agrees(scatter: Array, axis: Array) -> Mask:
     """
-    Pixels of which the scatter agrees with a known axis; false for NaN.
+    Pixels of which the scatter (pixel, band, band) agrees with a unit axis (band, pixel).
 
     Of a background along the unit vector v and white noise, the part across v is not correlated
     with that along it: :math:`|S v|^2 / (v^T S v) - v^T S v` is a chi-square variable.
     """
-    chosen = scatter[order, np.arange(order.size)]
-    turned = np.einsum("pbc,cp->bp", chosen, axis)
+    turned = np.einsum("pbc,cp->bp", scatter, axis)
     along = np.einsum("bp,bp->p", axis, turned)
     statistic = np.einsum("bp,bp->p", turned, turned) / along - along
     return np.asarray(statistic < chi2.isf(CHANCE, len(axis) - 1))

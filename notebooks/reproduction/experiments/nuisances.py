@@ -157,9 +157,7 @@ def parallax(
     captures = [
         alignment.align(capture, offset=0.0, transform=matrix) for matrix in (estimate, true)
     ]
-    # Bilinear interpolation lowers the noise of a view: it is taken from the capture.
-    response = known.drop_vars(["noise", "netd"])
-    result = _compare(_view(wide, (0.0, 0.0)), (*captures, single), response, VIEWS)
+    result = _compare(_view(wide, (0.0, 0.0)), (*captures, single), known, VIEWS)
     away = float(np.hypot(*(estimate - true).values[1, :2, 2]))
     return result.assign(misregistered=((), away, {"units": "pixel"}))
 

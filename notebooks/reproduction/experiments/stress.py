@@ -106,21 +106,32 @@ def _width(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
     return xr.DataArray(width, dims="band", coords={"band": error["band"]})
 
 
-def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
-    """Pixels (kind, pixel) with an error beyond four standard deviations."""
+def wrong(truth: xr.Dataset, result: xr.Dataset, far: float = FAR) -> xr.DataArray:
+    """Pixels (y, x) whose object temperature or an emissivity is off by more than `far` [1]."""
+    of_object, of_emissivity = _beyond(truth, result, far)
+    return of_object | of_emissivity
+
+
+def _beyond(truth: xr.Dataset, result: xr.Dataset, far: float) -> tuple[xr.DataArray, xr.DataArray]:
+    """Pixels (y, x) with an object, and with an emissivity, beyond so many deviations."""
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     allowed = (result["object_temperature_std"] ** 2).where(squared.notnull())
-    of_object = squared.mean("time") > FAR**2 * allowed.mean("time")
+    of_object = squared.mean("time") > far**2 * allowed.mean("time")
     apart = abs(result["emissivity"] - truth["emissivity"])
-    of_any = of_object | (apart > FAR * result["emissivity_std"]).any("band")
+    return of_object, (apart > far * result["emissivity_std"]).any("band")
+
+
+def _bad(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
+    """Pixels (kind, pixel) with an error beyond four standard deviations."""
+    of_object, of_emissivity = _beyond(truth, result, FAR)
     label = xr.DataArray(list(KINDS), dims="kind", name="kind")
-    return xr.concat([_flat(of_object), _flat(of_any)], label)
+    return xr.concat([_flat(of_object), _flat(of_object | of_emissivity)], label)
 
 
 def _flags(status: xr.DataArray) -> dict[str, xr.DataArray]:
     """Share of pixels with any flag, and with each."""
     bits = xr.DataArray(
-        np.array(list(schema.Status), dtype=status.dtype),
+        np.array(list(schema.Status), dtype=np.uint32),
         dims="flag",
         coords={"flag": list(schema.Status.bits())},
     )

@@ -109,6 +109,7 @@ def glass_plate(
         camera,
         _written(writing, camera),
         [(0.02, 0.0, 0.01)],
+        BOARD_DISTANCE,
     )
 
 

@@ -8,10 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 import xarray as xr
+from scipy.special import ndtr
 
 from dbthermal import schema, simulation
 from dbthermal.simulation import heat
-from dbthermal.simulation.rays import Array, Camera, Caster, Hits, Mask, unit
+from dbthermal.simulation.rays import Array, Camera, Caster, unit
 from dbthermal.simulation.surroundings import Actor, incident, painted
 from reproduction.twins.people import pacing, person
 
@@ -22,6 +23,17 @@ TABLE: Final = 0.75
 STEP: Final = 0.1
 """Longest step of the heat transport [s]."""
 
+# Share of a pixel's light from which it shows nothing but the object [1].
+_WHOLE: Final = 0.99
+# Standard deviations of the blur beyond which a lens sends no light.
+_TAIL: Final = 4.0
+# Frames that are ray-traced at once, for the memory.
+_FRAMES: Final = 25
+# Newton's method: steps, length of a difference, longest step, and last step [pixel].
+_NEWTON, _SLOPE, _LARGEST, _CONVERGED = 30, 0.05, 3.0, 3e-3
+# Share of the squared slopes that is added to them.
+_DAMPING: Final = 1e-3
+
 
 def clock(frames: int = 350, rate: float = 10.0) -> Array:
     """Times (frame,) of a capture from 0 on [s], at a frame rate [Hz]."""
@@ -31,7 +43,7 @@ def clock(frames: int = 350, rate: float = 10.0) -> Array:
 @dataclass(frozen=True)
 class Capture:
     """
-    Recording conditions of a twin: emissivity, image size, times and baseline.
+    Recording conditions of a twin: emissivity, image size, times, baseline and sharpness.
 
     Attributes
     ----------
@@ -42,23 +54,33 @@ class Capture:
     time : ndarray, shape (time,)
         Times [s], two or more; 350 frames at 10 Hz.
     baseline : float
-        How far the second camera is to the right of the first [m]. With 0 both see the same
-        reflections. Otherwise the object's surface is taken as perfectly registered, and the
-        second band sees it from the second camera.
+        How far the second camera is to the right of the first [m]. With 0 both are one.
+    blur : float
+        Standard deviation of the lens's blur [pixel], taken as Gaussian. Diffraction alone gives
+        0.42 wavelengths times the f-number: 0.35 pixel of 12 um at 10 um and f/1; with aberrations
+        and the focus of a real lens 0.5 to 0.7.
+    rays : int
+        Rays for each pixel along either side. At 3 a body's outline is drawn to 0.05 pixel.
     """
 
     emissivity: xr.DataArray
     shape: tuple[int, int] = (144, 192)
     time: Array = field(default_factory=clock)
     baseline: float = 0.0
+    blur: float = 0.6
+    rays: int = 3
 
     def __post_init__(self) -> None:
-        """Check bands and baseline."""
+        """Check bands, baseline and rays."""
         if self.emissivity.dims != ("band",):
             raise ValueError(f"Invalid dims {self.emissivity.dims} of emissivity. Must be (band,).")
         if self.baseline and self.emissivity.sizes["band"] != 2:
             names = [str(name) for name in self.emissivity["band"].values]
             raise ValueError(f"Invalid bands {names} for a baseline. Must be two.")
+        if not (self.blur > 0 and self.rays >= 1):
+            raise ValueError(
+                f"Invalid blur {self.blur} or rays {self.rays} of a pixel. Must be positive."
+            )
 
 
 @dataclass(frozen=True)
@@ -67,7 +89,8 @@ class Stage:
     Object, camera and surroundings of a twin.
 
     Name; mesh of the object [m] and its temperature (time, vertex) [K]; first camera; bodies that
-    move, or stand, around it; points (thermocouple, 3) of the surface with thermocouples [m].
+    move, or stand, around it; points (thermocouple, 3) of the surface with thermocouples [m]; how
+    far from the object's surface lies what it mirrors, for the true shift of the reflections [m].
     """
 
     name: str
@@ -76,81 +99,144 @@ class Stage:
     camera: Camera
     actors: Sequence[Actor]
     thermocouples: npt.ArrayLike = ()
-
-
-@dataclass(frozen=True)
-class _View:
-    """The object as the first camera sees it: intersections of the pixels' rays."""
-
-    caster: Caster
-    hits: Hits
-
-    @property
-    def on_object(self) -> Mask:
-        return self.hits.met
-
-    @property
-    def seen(self) -> Hits:
-        return self.hits.select(self.hits.met)
+    mirrored: float = 1.2
 
 
 def take(stage: Stage, capture: Capture) -> xr.Dataset:
     """
-    Scene of a stage, ray-traced.
+    Scene of a stage, ray-traced, through the lens and averaged over the pixels.
 
-    A scene for `simulation.observe`, and in addition `on_object` (y, x), and `thermocouple_y`,
+    A scene for `observe`, and in addition `object_share` (y, x), the share of a pixel's light that
+    comes from the object; `on_object` (y, x), where that is all; and `thermocouple_y`,
     `thermocouple_x` (thermocouple): rows and columns of the virtual thermocouples, which the camera
     must see (ValueError). Beside the object, the object temperature is that of the background seen
-    directly there, which makes the emissivity, defined everywhere, irrelevant. With a baseline
-    `background_temperature` is (band, time, y, x), and `hidden_from_second` (y, x) marks the points
-    that the second camera does not see; its background is that of the first there, and off the
-    object. A concave object's reflection in itself is of its own temperature (one bounce).
+    directly there, which makes the emissivity, defined everywhere, irrelevant. A concave object's
+    reflection in itself is of its own temperature (one bounce).
+
+    Temperatures are blurred, instead of radiances: at an outline 10 K warmer than the room that is
+    0.1 K too cold, in both bands. With a baseline, the temperatures that the second camera sees, at
+    its own pixels, are `second_object_temperature` and `second_background_temperature`; at the
+    first camera's pixels (y, x) stand `place_in_second` (axis) [pixel], where the second sees the
+    same point of the surface, NaN if it does not, and `shift` (axis) [pixel], where the first sees
+    what the second sees reflected here (`alignment.reflection_shift`), of bodies at the distance
+    that the stage says.
     """
-    directions = stage.camera.directions()
-    origins = np.array(np.broadcast_to(np.asarray(stage.camera.position), directions.shape))
     caster = Caster(stage.mesh)
-    view = _View(caster, caster.cast(origins, directions))
-    on = view.on_object
-    origins[on], directions[on] = caster.mirrored(view.seen, directions[on])
-    background = incident(origins, directions, capture.time, AMBIENT, stage.actors)
-    background[:, on] = _with_itself(stage, view, origins[on], directions[on], background[:, on])
-    emitted = background.copy()
-    emitted[:, on] = view.caster.interpolate(view.seen, stage.temperature)
-    warm, cold = (part.reshape(-1, *capture.shape) for part in (emitted, background))
+    warm, cold, share = _rendered(stage, capture, caster, stage.camera)
     scene = simulation.scene(capture.time, warm, cold, capture.emissivity)
-    scene["on_object"] = (("y", "x"), on.reshape(capture.shape), {"units": "1"})
+    scene["object_share"] = (("y", "x"), share, {"units": "1"})
+    scene["on_object"] = (("y", "x"), share > _WHOLE, {"units": "1"})
     if capture.baseline:
-        scene = _with_second(scene, stage, capture, view)
-    scene = _with_thermocouples(scene, stage, view.caster)
+        other = stage.camera.beside(capture.baseline)
+        dims = scene["object_temperature"].dims
+        warm, cold, _ = _rendered(stage, capture, caster, other)
+        for name, part in (("object", warm), ("background", cold)):
+            scene[f"second_{name}_temperature"] = (dims, part.astype(np.float32), {"units": "K"})
+        for name, part in zip(
+            ("place_in_second", "shift"), _seen_by_both(stage, caster, other), strict=True
+        ):
+            scene[name] = (("axis", "y", "x"), part, {"units": "pixel"})
+        scene = scene.assign_coords(axis=["y", "x"])
+    scene = _with_thermocouples(scene, stage, caster)
     return scene.assign_attrs(twin=stage.name, baseline=capture.baseline)
 
 
-def _with_itself(
-    stage: Stage, view: _View, origins: Array, directions: Array, reflected: Array
-) -> Array:
-    """Reflection (time, ray) [K] with the object's own where a reflected ray meets it."""
-    again = view.caster.cast(origins, directions)
-    reflected[:, again.met] = view.caster.interpolate(again.select(again.met), stage.temperature)
-    return reflected
+def _rendered(
+    stage: Stage, capture: Capture, caster: Caster, camera: Camera
+) -> tuple[Array, Array, Array]:
+    """What is emitted and what is reflected (time, y, x) [K], and the object's share (y, x) [1]."""
+    rays, (rows, columns) = capture.rays, camera.shape
+    # Each row of rays lies a little further right, that upright outlines meet many columns.
+    shear = (np.arange(rays) - (rays - 1) / 2.0) / rays**2
+    down = _optics(rows, capture)
+    right = [_optics(columns, capture, offset) for offset in shear]
+    row, column = _places(rows, rays), _places(columns, rays)
+    places = np.empty((rows * rays, columns * rays, 2))
+    places[..., 0], places[..., 1] = (
+        row[:, np.newaxis],
+        column + np.tile(shear, rows)[:, np.newaxis],
+    )
+    directions = camera.directions(places.reshape(-1, 2))
+    origins = np.array(np.broadcast_to(np.asarray(camera.position), directions.shape))
+    hits = caster.cast(origins, directions)
+    on, seen = hits.met, hits.select(hits.met)
+    origins[on], directions[on] = caster.mirrored(seen, directions[on])
+    again = caster.cast(origins[on], directions[on])
+    itself, bounced = np.flatnonzero(on)[again.met], again.select(again.met)
+
+    def pixels(values: Array) -> Array:
+        grid = values.reshape(-1, rows * rays, columns * rays)
+        parts = (down[:, n::rays] @ grid[:, n::rays] @ right[n].T for n in range(rays))
+        return np.asarray(sum(parts))
+
+    warm, cold = np.empty((2, capture.time.size, *camera.shape))
+    for start in range(0, capture.time.size, _FRAMES):
+        part = slice(start, start + _FRAMES)
+        values = incident(origins, directions, capture.time[part], AMBIENT, stage.actors)
+        values[:, itself] = caster.interpolate(bounced, stage.temperature[part])
+        cold[part] = pixels(values)
+        values[:, on] = caster.interpolate(seen, stage.temperature[part])
+        warm[part] = pixels(values)
+    return warm, cold, pixels(on.astype(np.float64))[0]
 
 
-def _with_second(scene: xr.Dataset, stage: Stage, capture: Capture, view: _View) -> xr.Dataset:
-    """The scene with a background for each band, the second from a second camera."""
-    other = stage.camera.beside(capture.baseline)
-    points = view.caster.points(view.seen)
-    seen = view.caster.visible(points, other.position)
-    rays = view.caster.mirrored(view.seen, unit(points - np.asarray(other.position)))
-    reflected = incident(*rays, capture.time, AMBIENT, stage.actors)
-    reflected = _with_itself(stage, view, *rays, reflected)
-    first = scene["background_temperature"]
-    second = first.values.copy().reshape(capture.time.size, -1)
-    second[:, np.flatnonzero(view.on_object)[seen]] = reflected[:, seen]
-    both = np.stack([first.values, second.reshape(first.shape)])
-    hidden = np.zeros(view.on_object.size, dtype=bool)
-    hidden[view.on_object] = ~seen
-    scene["background_temperature"] = (("band", *first.dims), both, first.attrs)
-    scene["hidden_from_second"] = (("y", "x"), hidden.reshape(capture.shape), {"units": "1"})
-    return scene
+def _places(size: int, rays: int) -> Array:
+    """Places (ray,) of the rays of a row or column [pixel]."""
+    return np.asarray((np.arange(size * rays) + 0.5) / rays - 0.5)
+
+
+def _optics(size: int, capture: Capture, offset: float = 0.0) -> Array:
+    """Weights (pixel, ray) of the rays along a row or column: a pixel's square, blurred."""
+    away = _places(size, capture.rays) + offset - np.arange(size)[:, np.newaxis]
+    weights = ndtr((away + 0.5) / capture.blur) - ndtr((away - 0.5) / capture.blur)
+    weights[abs(away) > 0.5 + _TAIL * capture.blur] = 0.0
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+def _seen_by_both(stage: Stage, caster: Caster, other: Camera) -> tuple[Array, Array]:
+    """Where the second camera sees a surface point, and where the first sees its reflection."""
+    camera, shape = stage.camera, (2, *stage.camera.shape)
+    hits = caster.cast(np.asarray(camera.position), camera.directions())
+    points = caster.points(hits.select(hits.met))
+    seen = caster.visible(points, other.position)
+    met, points = np.flatnonzero(hits.met)[seen], points[seen]
+    places, shift = np.full((2, 2, hits.met.size), np.nan)
+    places[:, met] = other.project(points).T
+    towards = unit(points - np.asarray(other.position))
+    way = caster.cast(np.asarray(other.position), towards)
+    origins, directions = caster.mirrored(way, towards)
+    pixels = np.stack(np.unravel_index(met, camera.shape), axis=-1).astype(np.float64)
+    place = _reflecting(caster, camera, pixels, origins + stage.mirrored * directions)
+    shift[:, met] = (place - pixels).T
+    return places.reshape(shape), shift.reshape(shape)
+
+
+def _reflecting(caster: Caster, camera: Camera, start: Array, bodies: Array) -> Array:
+    """Pixels (point, 2) in which a camera sees points reflected, by Newton's method, else NaN."""
+    # Two directions across the way to each body, in which a reflected ray may miss it.
+    across = np.linalg.svd(unit(bodies)[:, np.newaxis])[2][:, 1:]
+
+    def miss(place: Array) -> Array:
+        directions, result = camera.directions(place), np.full_like(place, np.nan)
+        hits = caster.cast(np.asarray(camera.position), directions)
+        origins, reflected = caster.mirrored(hits.select(hits.met), directions[hits.met])
+        gap = reflected - unit(bodies[hits.met] - origins)
+        result[hits.met] = np.einsum("pax,px->pa", across[hits.met], gap)
+        return result
+
+    place = start.copy()
+    for _ in range(_NEWTON):
+        gap, steps = miss(place), _SLOPE * np.eye(2)
+        slope = np.stack([(miss(place + step) - gap) / _SLOPE for step in steps], axis=-1)
+        # Damped, for along an edge that is straight the reflection hardly changes.
+        normal = np.einsum("pai,paj->pij", slope, slope)
+        normal += _DAMPING * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+        known, step = np.isfinite(normal).all(axis=(1, 2)), np.full_like(place, np.nan)
+        towards = -np.einsum("pai,pa->pi", slope, gap)[known, :, np.newaxis]
+        step[known] = np.linalg.solve(normal[known], towards)[..., 0]
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        place = place + step / np.maximum(1.0, length / _LARGEST)
+    return np.where(length < _CONVERGED, place, np.nan)
 
 
 def _with_thermocouples(scene: xr.Dataset, stage: Stage, caster: Caster) -> xr.Dataset:

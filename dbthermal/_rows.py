@@ -1,0 +1,63 @@
+"""Arrays that are computed when they are read, some rows of the image at a time.
+
+A long capture fits in memory raw, but not corrected beside it. What is computed of it row by row is
+read like an array on disk: the same calls, the memory of the rows that are asked for.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from xarray.backends import BackendArray
+from xarray.core import indexing
+
+Values = npt.NDArray[Any]
+
+# Samples of a block that is computed at once.
+_BLOCK: Final = 2**24
+
+
+class _Rows(BackendArray):
+    """Array (..., y, x) by a function of some rows of it."""
+
+    def __init__(
+        self, compute: Callable[[slice], Values], shape: tuple[int, ...], dtype: str
+    ) -> None:
+        self._compute, self.shape, self.dtype = compute, shape, np.dtype(dtype)
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Values:
+        kind = indexing.IndexingSupport.OUTER
+        return np.asarray(indexing.explicit_indexing_adapter(key, self.shape, kind, self._read))
+
+    def _read(self, key: tuple[Any, ...]) -> Values:
+        """Values at a number, slice or array of places along each dim."""
+        places = [np.arange(size)[one] for size, one in zip(self.shape, key, strict=True)]
+        *others, rows, columns = (np.atleast_1d(place) for place in places)
+        result = np.empty([*map(len, others), rows.size, columns.size], dtype=self.dtype)
+        for block in blocks(self.shape):
+            (wanted,) = np.nonzero((rows >= block.start) & (rows < block.stop))
+            if wanted.size:
+                first, last = rows[wanted].min(), rows[wanted].max()
+                values = self._compute(slice(int(first), int(last) + 1))
+                result[..., wanted, :] = values[np.ix_(*others, rows[wanted] - first, columns)]
+        whole = (slice(None) if place.ndim else 0 for place in places)
+        return np.asarray(result[tuple(whole)])
+
+
+def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Yield rows of an array (..., y, x) that are computed at once."""
+    height = shape[-2]
+    rows = max(1, min(height, _BLOCK * height // max(1, int(np.prod(shape)))))
+    for top in range(0, height, rows):
+        yield slice(top, min(top + rows, height))
+
+
+def lazy(
+    compute: Callable[[slice], Values], like: xr.DataArray, dtype: str = "float32"
+) -> xr.DataArray:
+    """Array of the dims (..., y, x), coordinates and attributes of another, computed by rows."""
+    array = _Rows(compute, like.shape, dtype)
+    variable = xr.Variable(like.dims, indexing.LazilyIndexedArray(array), like.attrs)
+    return xr.DataArray(variable, coords=like.coords, name=like.name)

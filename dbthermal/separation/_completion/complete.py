@@ -1,0 +1,252 @@
+"""Completion of a result: a temperature with its deviation at every pixel that both cameras see."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from threadpoolctl import threadpool_limits
+
+from dbthermal import schema
+from dbthermal._coordinates import laid_on
+from dbthermal.schema import Status
+from dbthermal.separation import _quality as quality
+from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._completion import posterior
+from dbthermal.separation._completion import scene as scenes
+from dbthermal.separation._completion.scene import FILMS, MAPS, Scene, Values
+from dbthermal.separation._inputs import Method, check
+from dbthermal.separation._solve import solve
+from dbthermal.separation._tiles import Array, Mask, Whole
+
+_BITS: Final = {
+    scenes.OWN: Status.COMPLETED_FRAMES,
+    scenes.MATERIAL: Status.COMPLETED_FROM_MATERIAL | Status.COMPLETED_FROM_SURROUNDINGS,
+    scenes.PRIOR: Status.COMPLETED_FROM_PRIOR | Status.COMPLETED_FROM_SURROUNDINGS,
+}
+_METHOD: Final = Method(posterior.curve, any_bands=True, survey=posterior.curve)
+
+
+def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
+    result: xr.Dataset,
+    corrected: xr.Dataset,
+    response: xr.Dataset,
+    materials: xr.DataArray | None = None,
+    surroundings: float | xr.DataArray | None = None,
+    prior: str | xr.DataArray | xr.Dataset | None = None,
+    *,
+    surroundings_std: float = 2.0,
+    reflection_shift: xr.Dataset | None = None,
+    workers: int = 2,
+) -> xr.Dataset:
+    r"""
+    Complete a result: a temperature with its deviation wherever both cameras have data.
+
+    Where a pixel has no value of its own, the posterior of the image formation (`mixing`) is taken
+    with a prior on what the pixel cannot tell: its emissivities e, and the level c of its
+    background, about which that fluctuates by f. No prior is set on the object's temperature x.
+
+    .. math:: p(x, e, c, f \mid z) \propto p(z \mid x, e, c, f) \, p(e) \, p(c) \, p(f)
+
+    The emissivities are those of the pixel, where measured; else those of its material elsewhere;
+    else of the `prior`. The pixel's own bands always add what they tell: how the bands' changes
+    compare, the ratio of their emissivities, and where they agree, the level of the background.
+    Near black, the result tends to the camera's own reading.
+
+    Parameters
+    ----------
+    result : Dataset
+        From `solve` by a method with standard deviations, of the same capture.
+    corrected, response : Dataset
+        As in `solve`. The capture may be lazy.
+    materials : DataArray, optional
+        Labels (y, x), as from `materials`: pixels of one label have one material; -1 for none.
+    surroundings : float or DataArray, optional
+        Temperature of what is reflected [K], stated or measured; a DataArray is () or (y, x).
+        If not given, it is estimated from the pixels that show it, beside a room of 295 K that is
+        uncertain by 8 K.
+    prior : str, DataArray or Dataset, optional
+        Emissivities where no others are known: the name of a material of
+        `emissivity.embedded_table`, or emissivities (band) [1] in (0, 1), both with a deviation of
+        0.02 between samples of a material, or a Dataset of `emissivity` and `emissivity_std`
+        (band) [1]. If not given, `emissivity.library_mixture` of the bands.
+    surroundings_std : float
+        Standard deviation of the surroundings that are stated [K].
+    reflection_shift : Dataset, optional
+        As in `solve`, where the result was made with one: the cameras stand apart.
+    workers : int
+        Number of threads.
+
+    Returns
+    -------
+    Dataset
+        The variables of the result, and its values bit for bit where it has any; `status` has the
+        bits ``completed_from_material`` or ``completed_from_prior``, and
+        ``completed_from_surroundings``, where others were added, and ``completed_frames`` where
+        frames of a pixel were, beside the bits that say why there was none. Values stay NaN at bad
+        pixels and constant signals. A sample that is NaN in a band is bridged from those around it.
+        Attributes `surroundings`, `surroundings_std` [K] and `surroundings_source`.
+
+    Raises
+    ------
+    TypeError
+        If an argument is of the wrong type.
+    ValueError
+        If a dim, unit, band or coordinate is not as described, an emissivity of the prior lies
+        outside (0, 1), the surroundings are colder than 150 K, as in degrees Celsius, the result
+        is of another capture, or the bands are none of the libraries' and there is no prior.
+
+    Notes
+    -----
+    The deviations hold the uncertainty of the model: noise is averaged over time as far as the
+    curve allows, the errors of emissivities and level are not. An error of a prior is shared by all
+    pixels that it completes.
+
+    References
+    ----------
+    .. [1] Gelman et al. (2013), Bayesian Data Analysis, 3rd edition, doi:10.1201/b16018
+
+    Examples
+    --------
+    A plate of glass that nothing moves before, so that `solve` tells nothing:
+
+    >>> import numpy as np, xarray as xr
+    >>> from dbthermal import separation, simulation
+    >>> rig, rng, time = simulation.Rig(), np.random.default_rng(1), np.arange(100) / 10
+    >>> glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    >>> warm = simulation.heating(time, 293.15, 333.15, 10.0)[:, None, None] * np.ones((4, 6))
+    >>> scene = simulation.scene(time, warm, np.full_like(warm, 295.15), glass)
+    >>> capture = simulation.observe(scene, rig.response(), rng)
+    >>> alone = separation.solve(capture, rig.response())
+    >>> whole = complete(alone, capture, rig.response(), prior="plate window glass")
+    >>> error = abs(whole["object_temperature"] - scene["object_temperature"])
+    >>> int(alone["object_temperature"].count()), bool(error.max() < 2.0)  # K
+    (0, True)
+    """
+    result = _checked(result, corrected)
+    inputs = check(
+        corrected,
+        response,
+        _METHOD,
+        "complete",
+        settings=None,
+        seed=0,
+        emissivity=None,
+        emissivity_std=None,
+        mask=None,
+        pool=materials,
+        reflection_shift=reflection_shift,
+        response_kind=str(result.attrs.get("response_kind", "exact")),
+    )
+    told = result
+    if materials is not None and not result.attrs.get("pooled"):
+        told = solve(corrected, response, pool=materials, reflection_shift=reflection_shift)
+    scene = scenes.gather(inputs, result, told, prior)
+    if not scene.apart:  # else the result's reflections are those of two places
+        scenes.require_same_capture(scene, result)
+    if surroundings is not None:
+        scene = replace(scene, level=scenes.stated(scene, surroundings, surroundings_std))
+    level = scenes.find_level(scene)
+    if surroundings is not None:
+        level = replace(scene.level, fluctuation=level.fluctuation)
+    scene = replace(scene, level=level)
+    completed = result.copy(deep=True)
+    height = corrected.sizes["y"]
+    tops = range(0, height, tiles.BLOCK_ROWS)
+    blocks = [slice(top, min(top + tiles.BLOCK_ROWS, height)) for top in tops]
+    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
+        for _ in threads.map(lambda rows: _complete_rows(scene, rows, completed), blocks):
+            pass
+    completed["status"].attrs.update(schema.status_attrs())
+    return completed.assign_attrs(
+        surroundings=float(np.mean(scene.kelvin(level.signal))),
+        surroundings_std=float(np.mean(level.std)),
+        surroundings_source="capture" if surroundings is None else "stated",
+    )
+
+
+def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
+    """Result in the capture's order of bands, and of the same frames and pixels."""
+    schema.check_corrected(corrected)
+    schema.check(result, "separated")
+    for name in ("object_temperature_std", "emissivity_std"):
+        if name in result.attrs.get("not_estimated", "").split():
+            raise ValueError(
+                f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
+                "standard deviation. Must be of one that does, as 'subspace'."
+            )
+    return laid_on(result, corrected, "the result", "the capture")
+
+
+def _complete_rows(scene: Scene, rows: slice, completed: xr.Dataset) -> None:
+    """Complete the pixels of some rows, in place; what was measured is not touched."""
+    lacking = np.zeros(completed["status"].values[rows].shape, dtype=bool)
+    for name in (*FILMS, *MAPS):
+        lacking |= np.isnan(completed[name].values[:, rows]).any(axis=0)
+    if not lacking.any():
+        return
+    block = scene.inputs.capture.isel(y=rows).load()
+    grains = quality.grains(block)
+    for window in tiles.windows(rows, block.sizes["x"]):
+        local = (slice(window[0].start - rows.start, window[0].stop - rows.start), window[1])
+        if not lacking[local].any():
+            continue
+        places = tiles.numbers(window, block.sizes["x"])
+        tile, valid = scene.tile(block.isel(y=local[0], x=local[1]), grains)
+        wanted = valid.any(axis=0) & lacking[local].ravel()
+        sources = np.where(wanted, scene.sources(places), -1)
+        for source in np.unique(sources[wanted]):
+            here = sources == source
+            part = (tile.select_pixels(here), valid[:, here])
+            values, _ = scenes.solve(scene, *part, int(source), places[here])
+            _fill(scene, completed, places[here], values, int(source))
+
+
+def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, source: int) -> None:
+    """Fill in missing values, bridge the gaps that remain, and set the bits that say so."""
+    y, x = np.divmod(places, completed.sizes["x"])
+    filled, bridged = np.zeros((2, places.size), dtype=bool)
+    order = np.argsort(scene.inputs.bands)  # the capture's
+    for name in (*FILMS, *MAPS):
+        both = (name, f"{name}_std")
+        old = [completed[one].values[:, y, x].astype(np.float64) for one in both]
+        new = [values[one][order] if name in MAPS else values[one] for one in both]
+        take = np.isnan(old[0]) & np.isfinite(new[0]) & np.isfinite(new[1])
+        done = [np.where(take, *pair) for pair in zip(new, old, strict=True)]
+        filled |= take.any(axis=0)
+        if name in FILMS:
+            bridged |= _bridge(done[0], done[1], scene.inputs.capture["time"].values)
+        for one, part in zip(both, done, strict=True):
+            completed[one].values[:, y, x] = part
+    if (name := "emissivity_covariance") in completed:
+        before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
+        completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)
+    flags = filled * np.uint32(_BITS[source]) | bridged * np.uint32(Status.COMPLETED_FRAMES)
+    completed["status"].values[y, x] |= flags
+
+
+def _bridge(value: Array, std: Array, time: Array) -> Mask:
+    """
+    Bridge gaps of curves (time, pixel) by lines, in place; pixels (pixel) that had any.
+
+    The deviation grows as that of a random walk of the curve's own steps.
+    """
+    gaps = np.isnan(value)
+    pixels = np.flatnonzero(gaps.any(axis=0) & ~gaps.all(axis=0))
+    for pixel in pixels:
+        gap = gaps[:, pixel]
+        known, missing = np.flatnonzero(~gap), np.flatnonzero(gap)
+        after = np.searchsorted(known, missing)
+        left, right = known[np.maximum(after - 1, 0)], known[np.minimum(after, known.size - 1)]
+        since, until = np.abs(time[missing] - time[left]), np.abs(time[right] - time[missing])
+        steps = np.diff(value[known, pixel]) ** 2 / np.diff(time[known])
+        rate = steps.mean() if steps.size else 0.0
+        apart = np.where(left == right, 1.0, since + until)
+        walk = rate * np.where(left == right, since, since * until / apart)
+        value[missing, pixel] = np.interp(time[missing], time[known], value[known, pixel])
+        variance = np.interp(time[missing], time[known], std[known, pixel] ** 2)
+        std[missing, pixel] = np.sqrt(variance + walk)
+    result = np.zeros(value.shape[1], dtype=bool)
+    result[pixels] = True
+    return result

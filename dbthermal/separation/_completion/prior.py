@@ -1,0 +1,127 @@
+"""Priors on the emissivities: mixtures of normal distributions, of each pixel or of all."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import emissivity, schema
+from dbthermal.separation._quality import Bits
+from dbthermal.separation._tiles import Array, Mask, Whole
+
+SAMPLE_STD: Final = 0.02
+"""Deviation of the emissivity of one sample of a material from that of the table [1]."""
+
+# Grid of the first emissivity for a wide prior, finer towards 1; its points for a narrow one, and
+# how far these go.
+_GRID: Final = np.concatenate(
+    [np.linspace(0.03, 0.78, 16), np.linspace(0.8, 0.97, 18), np.linspace(0.975, 0.9975, 7)]
+)
+_POINTS: Final = 17
+_SIGMAS: Final = 4.0
+_LIMITS: Final = (0.005, 0.9995)
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Normal distributions of the emissivities; of more than one component the same everywhere."""
+
+    weight: Array  # (component,)
+    mean: Array  # (component, band, pixel) [1]
+    covariance: Array  # (component, band, band, pixel) [1]
+
+    def grid(self) -> tuple[Array, Array]:
+        """Grid (grid, pixel) of the first emissivity, and the spacing of its points."""
+        pixels = self.mean.shape[-1]
+        if len(self.weight) > 1:
+            grid = np.repeat(_GRID[:, np.newaxis], pixels, axis=1)
+        else:
+            std = np.sqrt(self.covariance[0, 0, 0])
+            low = np.maximum(self.mean[0, 0] - _SIGMAS * std, _LIMITS[0])
+            high = np.minimum(self.mean[0, 0] + _SIGMAS * std, _LIMITS[1])
+            grid = low + np.linspace(0.0, 1.0, _POINTS)[:, np.newaxis] * (high - low)
+        return grid, np.gradient(grid, axis=0)
+
+    def conditional(self, grid: Array) -> tuple[Array, Array, Array]:
+        """
+        Log-density of the first emissivity, mean and variance of the others given it.
+
+        (component, grid, pixel), (component, band - 1, grid, pixel), and of ones for the grid. The
+        others are taken as independent given the first.
+        """
+        first = self.covariance[:, 0, 0, np.newaxis]
+        off = grid - self.mean[:, 0, np.newaxis]
+        log = np.log(self.weight)[:, np.newaxis, np.newaxis] - 0.5 * (
+            np.log(first) + off**2 / first
+        )
+        slope = self.covariance[:, 1:, 0] / self.covariance[:, :1, 0]
+        mean = self.mean[:, 1:, np.newaxis] + slope[:, :, np.newaxis] * off[:, np.newaxis]
+        diagonal = np.einsum("kbbp->kbp", self.covariance)[:, 1:]
+        variance = diagonal - slope * self.covariance[:, 1:, 0]
+        return log, mean, np.maximum(variance, 1e-8)[:, :, np.newaxis]
+
+    def at(self, places: Whole | int) -> "Mixture":
+        """Return the mixture of some pixels, or of labels (pixel,)."""
+        return Mixture(self.weight, self.mean[..., places], self.covariance[..., places])
+
+
+def of_materials(
+    value: Array, covariance: Array, status: Bits, labels: Whole
+) -> tuple[Mixture, Mask]:
+    """Pooled emissivities of each label, as in its pixels without a flag, and the labels of any."""
+    count = int(labels.max(initial=-1)) + 1
+    mean = np.full((len(value), count + 1), 0.5)
+    spread = np.repeat(np.eye(len(value))[..., np.newaxis], count + 1, axis=2)
+    known = np.zeros(count + 1, dtype=bool)
+    good = (status == 0) & np.all((value > 0) & (value < 1), axis=0)
+    for label in np.unique(labels[good & (labels >= 0)]):
+        here = good & (labels == label)
+        mean[:, label] = np.median(value[:, here], axis=1)
+        spread[..., label] = np.median(covariance[..., here], axis=-1)
+        known[label] = True
+    return Mixture(np.ones(1), mean[np.newaxis], spread[np.newaxis]), known
+
+
+def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> Mixture:
+    """Prior of the libraries, of a material of the table, or of the user; see `complete`."""
+    if prior is None:
+        table = emissivity.library_mixture(bands)
+        parts = (table[name].values[..., np.newaxis] for name in ("mean", "covariance"))
+        return Mixture(table["weight"].values, *parts)
+    if isinstance(prior, str):
+        known = emissivity.embedded_table()["emissivity"]
+        if prior not in known["material"]:
+            raise ValueError(
+                f"Unknown prior '{prior}'. Must be one of {known['material'].values.tolist()}."
+            )
+        prior = known.sel(material=prior)
+    std: xr.DataArray | None = None
+    if isinstance(prior, xr.Dataset):
+        if missing := {"emissivity", "emissivity_std"} - set(prior):
+            raise ValueError(f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}.")
+        prior, std = prior["emissivity"], prior["emissivity_std"]
+    values = _numbers(prior, bands, "prior")
+    if not np.all((values > 0) & (values < 1)):
+        raise ValueError(
+            f"Invalid emissivities {values.tolist()} of the prior. Must lie in (0, 1)."
+        )
+    stds = np.full(len(bands), SAMPLE_STD)
+    if std is not None:
+        stds = _numbers(std, bands, "emissivity_std of the prior")
+    if not np.all((stds > 0) & (stds < 1)):
+        raise ValueError(
+            f"Invalid emissivity_std {stds.tolist()} of the prior. Must lie in (0, 1)."
+        )
+    return Mixture(
+        np.ones(1), values[np.newaxis, :, np.newaxis], np.diag(stds**2)[np.newaxis, ..., np.newaxis]
+    )
+
+
+def _numbers(array: xr.DataArray, bands: list[str], label: str) -> Array:
+    """Values (band,) of an array in the order of some bands."""
+    schema.check_numbers(array, label, "1")
+    if array.dims != ("band",):
+        raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")
+    places = schema.band_positions(array, bands, label)
+    return array.values[places].astype(np.float64)

@@ -1,0 +1,260 @@
+"""Knowledge of a scene beside a pixel's own signals, and the completion of pixels with it."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import schema
+from dbthermal._coordinates import laid_on
+from dbthermal.schema import Status
+from dbthermal.separation import _quality as quality
+from dbthermal.separation import _smoothing as smoothing
+from dbthermal.separation._completion import posterior
+from dbthermal.separation._completion import prior as priors
+from dbthermal.separation._completion.posterior import Level
+from dbthermal.separation._completion.prior import Mixture
+from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._tiles import Array, Mask, Tile, Whole
+
+FILMS: Final = ("object_temperature", "background_temperature")
+MAPS: Final = ("emissivity", "reflection_ratio")
+OWN, MATERIAL, PRIOR = range(3)
+"""Sources of the emissivities of a pixel."""
+
+# The room, where nobody says how warm it is and no pixel shows it: temperature and deviation [K].
+_ROOM: Final = (295.15, 8.0)
+# Fluctuation of a background that is not known [K]; least deviations of a level and of it [K].
+_FLUCTUATION: Final = 2.0
+_LEAST: Final = (0.2, 0.1)
+# Pixels from which the surroundings are estimated, and the residual of a result is judged.
+_SAMPLE: Final = 400
+# Stated temperatures below are in degrees Celsius, or no room's [K].
+_COLDEST: Final = 150.0
+# Residual, in standard deviations of the noise, from which a result is of another capture.
+_STRANGE: Final = 8.0
+_UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
+# Median of the absolute deviations of a normal distribution, inverse; variance of its median.
+_MAD: Final = 1.4826
+_MEDIAN: Final = np.pi / 2.0
+# Precision of a level that a pixel does not show [1/K^2].
+_NOTHING: Final = 1e-9
+
+Values = dict[str, Array]
+"""Completed values of some pixels by their names in the stage `separated`."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All that is known of a scene; bands in the order of their noise, pixels of the image flat."""
+
+    inputs: Inputs
+    status: Array  # of the result (pixel)
+    emissivity: Array  # as measured (band, pixel) [1], NaN where not
+    covariance: Array  # (band, band, pixel) [1]
+    labels: Whole  # material (pixel), -1 for none
+    material: Mixture  # of each label, and of none
+    material_known: Mask  # (label + 1,)
+    general: Mixture  # of any pixel
+    offset: Array  # deviation of a pixel's offset against the others, of the other bands [K]
+    level: Level
+    apart: bool  # the cameras do not see the same reflection in a pixel
+
+    def sources(self, places: Whole) -> Whole:
+        """Source of the emissivities of pixels (pixel)."""
+        value, covariance = self.emissivity[:, places], self.covariance[..., places]
+        known = (value > 0) & (value < 1) & np.isfinite(covariance).all(axis=0)
+        by_material = self.material_known[self.labels[places]]
+        return np.where(known.all(axis=0), OWN, np.where(by_material, MATERIAL, PRIOR))
+
+    def mixture(self, source: int, places: Whole) -> Mixture:
+        """Prior on the emissivities of pixels of one source."""
+        if source == OWN:
+            value, covariance = self.emissivity[:, places], self.covariance[..., places]
+            return Mixture(np.ones(1), value[np.newaxis], covariance[np.newaxis])
+        if source == MATERIAL:
+            return self.material.at(self.labels[places])
+        return self.general.at(np.zeros_like(places))
+
+    def kelvin(self, signal: Any) -> Array:
+        """Temperature [K] of signals of the quietest band, less its reference."""
+        curve = self.inputs.curves[self.inputs.bands[0]]
+        return curve.temperature(np.asarray(signal) + curve.reference)
+
+    def tile(self, part: xr.Dataset, grains: Any = None) -> tuple[Tile, Mask]:
+        """Tile of all pixels of a part of the capture, and its valid samples (time, pixel)."""
+        inputs = self.inputs
+        counts, valid, status = quality.read(part, 1, grains, most_missing=1.0)
+        valid = valid & ((status & _UNUSABLE) == 0)
+        curves = tuple(inputs.curves[band] for band in inputs.bands)
+        pairs = zip(inputs.bands, curves, strict=True)
+        signals = [curve.linearise(counts[band]) - curve.reference for band, curve in pairs]
+        return Tile(
+            signals=np.where(valid, signals, 0.0),
+            time=part["time"].values.astype(np.float64),
+            curves=curves,
+            noise=tuple(float(inputs.noise[band]) for band in inputs.bands),
+            shape=(1, valid.shape[1]),
+            rng=np.random.default_rng(0),
+        ), valid
+
+    def sample(self) -> tuple[Tile, Mask, Whole]:
+        """Tile of evenly spaced pixels, their valid samples, and their numbers in the image."""
+        capture = self.inputs.capture
+        numbers = np.arange(self.labels.size).reshape(capture.sizes["y"], capture.sizes["x"])
+        every = slice(None, None, max(1, int(np.sqrt(self.labels.size / _SAMPLE))))
+        return *self.tile(capture.isel(y=every, x=every).load()), numbers[every, every].ravel()
+
+
+def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -> Scene:
+    """Gather what is known of the emissivities; the background is a room of any temperature."""
+    bands = inputs.bands
+    value, shared = (_flat(one["emissivity"])[bands] for one in (result, pooled))
+    covariance, shared_covariance = (_covariance(one, bands) for one in (result, pooled))
+    status = result["status"].values.ravel()
+    labels = np.full(status.size, -1) if inputs.labels is None else inputs.labels
+    flags = pooled["status"].values.ravel()
+    material, known = priors.of_materials(shared, shared_covariance, flags, labels)
+    names = [str(result["band"].values[band]) for band in bands]
+    pattern = (np.zeros(len(bands)) if inputs.pattern is None else inputs.pattern)[bands]
+    curve = inputs.curves[bands[0]]
+    return Scene(
+        inputs=inputs,
+        status=status,
+        emissivity=value,
+        covariance=covariance,
+        labels=labels,
+        material=material,
+        material_known=known,
+        general=priors.stated(prior, names),
+        offset=np.hypot(pattern[1:], pattern[0]),
+        level=Level(float(curve.signal(_ROOM[0])) - curve.reference, _ROOM[1], _FLUCTUATION),
+        apart=inputs.displacement is not None,
+    )
+
+
+def _flat(array: xr.DataArray) -> Array:
+    """Values (..., pixel) of maps."""
+    return array.values.astype(np.float64).reshape(*array.shape[:-2], -1)
+
+
+def _covariance(result: xr.Dataset, bands: list[int]) -> Array:
+    """Covariance of the emissivities (band, band, pixel), in the order of the bands."""
+    if "emissivity_covariance" in result:
+        return _flat(result["emissivity_covariance"])[np.ix_(bands, bands)]
+    variance = _flat(result["emissivity_std"])[bands] ** 2
+    return variance * np.eye(len(bands))[..., np.newaxis]
+
+
+def require_same_capture(scene: Scene, result: xr.Dataset) -> None:
+    """Refuse a result whose values do not give the capture's signals back."""
+    tile, valid, places = scene.sample()
+    films = [result[name].values.reshape(len(valid), -1)[:, places] for name in FILMS]
+    with np.errstate(all="ignore"):
+        mixed = tile.mixed(scene.emissivity[:, places], np.array(films, dtype=np.float64))
+        score = np.abs(tile.signals - mixed) / np.array(tile.noise)[:, np.newaxis, np.newaxis]
+    score = score[:, valid & (scene.status[places] == 0) & np.isfinite(score).all(axis=0)]
+    if score.size and np.median(score) > _STRANGE:
+        raise ValueError(
+            f"Invalid result: its values are {np.median(score):.0f} times the noise off the "
+            "signals of the capture. Must be of the same capture."
+        )
+
+
+def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Level:
+    """Level of stated surroundings, of all pixels or of each."""
+    schema.check_numbers(xr.DataArray(surroundings), "surroundings", "K")
+    values = np.asarray(surroundings, dtype=np.float64)
+    if isinstance(surroundings, xr.DataArray):
+        if surroundings.dims not in ((), ("y", "x")):
+            rule = "Must be () or ('y', 'x')."
+            raise ValueError(f"Invalid dims {surroundings.dims} of surroundings. {rule}")
+        capture = scene.inputs.capture
+        values = laid_on(surroundings, capture, "surroundings", "the capture").values.ravel()
+    bad = ~((values >= _COLDEST) & (values < np.inf))
+    if np.any(bad):
+        raise ValueError(
+            f"Invalid surroundings {values[bad].flat[0]} K. Must be at least {_COLDEST} K: in "
+            "kelvin, not in degrees Celsius."
+        )
+    if not 0 < std < np.inf:
+        raise ValueError(f"Invalid surroundings_std {std} K. Must be positive.")
+    curve = scene.inputs.curves[scene.inputs.bands[0]]
+    signal = curve.signal(values) - curve.reference
+    return Level(signal, std * curve.slope(values), _FLUCTUATION)
+
+
+def solve(
+    scene: Scene, tile: Tile, valid: Mask, source: int, places: Whole
+) -> tuple[Values, Array]:
+    """
+    Complete the pixels of a tile whose emissivities come from one source.
+
+    Beside the values, the posterior mean and variance of the background's level, the prior's
+    variance, and the variance of the background over time (4, pixel).
+    """
+    with np.errstate(all="ignore"):
+        level = scene.level.at(places)
+        means = posterior.bins(tile, valid)
+        data = posterior.curve(tile, means, scene.offset)
+        static = posterior.moments(tile, data, scene.mixture(source, places), level)
+        variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
+        variance = np.maximum(variance, _LEAST[1] ** 2)
+        frames = posterior.solve_frames(tile, static, variance, apart=scene.apart)
+        signal, left = smoothing.smooth(frames.signal, frames.white, valid, tile.time)
+        left = left + frames.shared + posterior.through(frames.sensitivity, static.covariance)
+        behind = static.mean[-1] + frames.fluctuation
+        around = frames.fluctuation_variance + posterior.through(
+            frames.background_sensitivity, static.covariance
+        )
+        values: Values = {}
+        for name, mean, spread in zip(FILMS, (signal, behind), (left, around), strict=True):
+            temperature = tile.temperature(0, np.where(valid, mean, np.nan))
+            values[name] = temperature
+            values[f"{name}_std"] = np.sqrt(spread) / tile.curves[0].slope(temperature)
+        pairs = ((static.emissivity, static.emissivity_covariance), static.reflection_ratio())
+        values["emissivity_covariance"] = static.emissivity_covariance
+        for name, (mean, covariance) in zip(MAPS, pairs, strict=True):
+            values[name] = mean
+            values[f"{name}_std"] = np.sqrt(np.einsum("bbp->bp", covariance))
+    found = (static.mean[-1], static.covariance[-1, -1], np.square(level.std), variance)
+    return values, np.array(np.broadcast_arrays(*found))
+
+
+def find_level(scene: Scene) -> Level:
+    """
+    Level of the background over the pixels, from those that show it, beside what is known.
+
+    Each pixel's posterior without the prior in it is a measurement; their weighted median, and the
+    scatter that they do not explain, which is how much pixels differ.
+    """
+    tile, valid, places = scene.sample()
+    sources = np.where(valid.any(axis=0), scene.sources(places), -1)
+    parts = [
+        solve(scene, tile.select_pixels(here), valid[:, here], int(source), places[here])[1]
+        for source in np.unique(sources[sources >= 0])
+        for here in [sources == source]
+    ]
+    if not parts:
+        return scene.level
+    mean, after, before, fluctuation = np.concatenate(parts, axis=1)
+    level = replace(scene.level, fluctuation=max(float(np.sqrt(np.median(fluctuation))), _LEAST[1]))
+    # A posterior of precision 1 / after holds the prior's 1 / before.
+    variance = 1.0 / np.maximum(1.0 / after - 1.0 / before, _NOTHING)
+    room, wide = float(np.mean(scene.level.signal)), float(np.mean(np.square(scene.level.std)))
+    with np.errstate(over="ignore"):  # of pixels that tell nothing
+        value = room + (mean - room) * variance / after
+    seen = np.isfinite(value) & (variance < before)
+    if not np.any(seen):
+        return level
+    value, variance = value[seen], variance[seen]
+    weight = 1.0 / (variance + np.median(variance))
+    order = np.argsort(value)
+    share = np.cumsum(weight[order]) / weight.sum()
+    middle = float(value[order][np.searchsorted(share, 0.5)])
+    scatter = (_MAD * float(np.median(np.abs(value - middle)))) ** 2
+    between = max(scatter - float(np.median(variance)), 0.0)
+    own = between + _MEDIAN / float(np.sum(1.0 / variance)) + _LEAST[0] ** 2
+    signal = (middle * wide + room * own) / (wide + own)
+    return replace(level, signal=signal, std=float(np.sqrt(own * wide / (own + wide))))

@@ -1,0 +1,278 @@
+r"""Samples of two cameras that stand side by side, paired by what is reflected.
+
+The second camera shows at p the reflection that the reference band shows at :math:`r = p + d(p)`.
+Its bands are resampled at the p of each pixel r: then all bands hold the reflection of r, and only
+the object's own signal is that of another place (`_joint`). The resampling is one sparse matrix W,
+cubic convolution by Keys (1981), doi:10.1109/TASSP.1981.1163711, so that the noise of a resampled
+sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.sparse import csr_array, kron
+
+from dbthermal import _samples as samples
+from dbthermal import schema
+from dbthermal._coordinates import laid_on
+from dbthermal.schema import Status
+from dbthermal.separation import _quality as quality
+from dbthermal.separation._quality import Bits
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+# Rounds in which p + d(p) = r is solved, and the error that is left [pixel].
+_ROUNDS: Final = 100
+_SOLVED: Final = 1e-3
+_UNSOLVED: Final = 1e-2
+# A place so far outside of the image is still extrapolated [pixel].
+_OUTSIDE: Final = 0.5
+# Weight of pixels without a value that the others may take over [1].
+_LOST_WEIGHT: Final = 0.25
+# Weight below which a pixel's flags do not count [1].
+_NO_WEIGHT: Final = 1e-3
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Places at which the second camera sees what the reference band shows at each pixel."""
+
+    shape: tuple[int, int]
+    reference: int  # place of the reference band in the capture
+    others: list[int]  # of the second camera's bands
+    resample: csr_array  # weights at p of the pixels around, p + d(p) = r (r, pixel); 0 without p
+    onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
+    paired: Mask  # the second camera sees what is reflected at r (pixel)
+    distance: Array  # rows and columns from p to r (2, pixel) [pixel]
+    std: Array  # its standard deviation (2, pixel) [pixel]
+
+    def source(self, rows: slice) -> slice:
+        """Rows of the image that hold some rows, and what the second camera shows of them."""
+        width = self.shape[1]
+        first, last = self.resample.indptr[[rows.start * width, rows.stop * width]]
+        used = self.resample.indices[first:last] // width
+        if used.size == 0:
+            return rows
+        return slice(min(rows.start, int(used.min())), max(rows.stop, int(used.max()) + 1))
+
+    def weights(self, rows: slice, source: slice) -> csr_array:
+        """Weights of the pixels of some rows of the source, for those of some rows."""
+        width = self.shape[1]
+        start = self.resample.indptr[rows.start * width : rows.stop * width + 1]
+        part = slice(start[0], start[-1])
+        columns = self.resample.indices[part] - source.start * width
+        shape = (start.size - 1, (source.stop - source.start) * width)
+        return csr_array((self.resample.data[part], columns, start - start[0]), shape=shape)
+
+
+def check(field: object, corrected: xr.Dataset, reference: int) -> Displacement:
+    """Check a field of the reflections' shift, see `solve`, against the capture, and invert it."""
+    label = "the reflection shift"
+    if not isinstance(field, xr.Dataset):
+        raise TypeError(
+            f"Invalid reflection_shift of type {type(field).__name__}. Must be a Dataset."
+        )
+    schema.check(field, "reflection_shift")
+    names = [str(name) for name in corrected["band"].values]
+    _check_bands(field, names, names[reference])
+    field = laid_on(field, corrected, label, "the capture")
+    if [str(name) for name in field["axis"].values] != ["y", "x"]:
+        raise ValueError(f"Invalid axis {field['axis'].values.tolist()} of {label}. Must be y, x.")
+    shift = field["shift"].values.astype(np.float64)
+    std = field["shift_std"].values.astype(np.float64)
+    known = field["known"].values
+    size = np.array(shift.shape[1:])
+    finite = np.all(schema.measured(shift), axis=0)
+    if np.any(known & ~finite) or not np.any(finite):
+        raise ValueError(f"Invalid {label[4:]}: no number where it is known. Must be finite there.")
+    if np.any(~(std[:, finite] >= 0) | ~schema.measured(std[:, finite])):
+        raise ValueError(f"Invalid shift_std of {label}. Must be zero or positive, and finite.")
+    largest = np.abs(shift[:, finite]).max(axis=1)
+    if np.any(largest >= size):
+        raise ValueError(
+            f"Invalid {label[4:]} of {largest.max():g} pixel. Must be less than the image, "
+            f"{size[0]} rows and {size[1]} columns."
+        )
+    return displacement(shift, std, finite, reference, len(names))
+
+
+def _check_bands(field: xr.Dataset, names: list[str], reference: str) -> None:
+    """Check the bands that the field says it is of, where it does."""
+    others = sorted(name for name in names if name != reference)
+    stated = str(field.attrs.get("reference_band", reference))
+    if stated != reference:
+        raise ValueError(
+            f"Invalid reference band '{stated}' of the reflection shift. "
+            f"Must be the quietest of the capture, '{reference}'."
+        )
+    bands = sorted(map(str, np.atleast_1d(field.attrs.get("bands", others))))
+    if bands != others:
+        raise ValueError(
+            f"Invalid bands {bands} of the reflection shift. Must be all but the reference, "
+            f"{others}."
+        )
+
+
+def displacement(
+    shift: Array, std: Array, finite: Mask, reference: int, bands: int
+) -> Displacement:
+    """Displacement by a shift (2, y, x) [pixel] with a deviation, where it is finite (y, x)."""
+    shape = finite.shape
+    nearest = distance_transform_edt(~finite, return_distances=False, return_indices=True)
+    shift = shift[:, nearest[0], nearest[1]]
+    there = np.indices(shape, dtype=np.float64)
+    place, solved = _inverse(shift, there)
+    at = tuple(
+        np.clip(np.rint(one), 0, size - 1).astype(np.intp)
+        for one, size in zip(place, shape, strict=True)
+    )
+    paired = solved & _inside(place, shape) & finite[at]
+    onward = there + shift
+    return Displacement(
+        shape=(shape[0], shape[1]),
+        reference=reference,
+        others=[band for band in range(bands) if band != reference],
+        resample=_interpolation(place, paired),
+        onward=_interpolation(onward, _inside(onward, shape) & finite),
+        paired=paired.ravel(),
+        distance=(there - place).reshape(2, -1),
+        std=np.where(finite, std, 0.0)[:, at[0], at[1]].reshape(2, -1),
+    )
+
+
+def _inverse(shift: Array, there: Array) -> tuple[Array, Mask]:
+    """Places p (2, y, x) with p + d(p) = r, by iteration, and where it has come to an end."""
+    place = there - shift
+    for _ in range(_ROUNDS):
+        at = [map_coordinates(one, place, order=1, mode="nearest") for one in shift]
+        step = np.abs(there - at - place).max(axis=0)
+        place = there - at
+        if step.max() < _SOLVED:
+            break
+    return place, step < _UNSOLVED
+
+
+def _inside(place: Array, shape: tuple[int, ...]) -> Mask:
+    """Return which places (2, y, x) [pixel] lie in the image, or hardly outside."""
+    last = np.array(shape)[:, np.newaxis, np.newaxis] - 1
+    return np.asarray(np.all((place >= -_OUTSIDE) & (place <= last + _OUTSIDE), axis=0))
+
+
+def _interpolation(place: Array, used: Mask) -> csr_array:
+    """Weights (pixel, pixel) of an image at places (2, y, x) [pixel]; 0 where they are not used."""
+    height, width = used.shape
+    (row, down), (column, right) = (
+        _keys(one[used], size) for one, size in zip(place, used.shape, strict=True)
+    )
+    # On the image with a line more on each side, extrapolated: a plane stays one at the border.
+    index = (row[:, np.newaxis] * (width + 2) + column).reshape(16, -1).T
+    weight = (down[:, np.newaxis] * right).reshape(16, -1).T
+    start = np.concatenate([[0], np.cumsum(16 * used.ravel())])
+    padded = csr_array(
+        (weight.ravel(), index.ravel(), start), shape=(used.size, (height + 2) * (width + 2))
+    )
+    result = csr_array(padded @ kron(_extension(height), _extension(width), format="csr"))
+    result.eliminate_zeros()
+    result.sort_indices()
+    return result
+
+
+def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
+    """Index in the extended line and weight (4, place) of cubic convolution, linear outside."""
+    first = np.clip(np.floor(place), 0, max(size - 2, 0))
+    t = place - first
+    cubic = [
+        ((-0.5 * t + 1.0) * t - 0.5) * t,
+        (1.5 * t - 2.5) * t**2 + 1.0,
+        ((-1.5 * t + 2.0) * t + 0.5) * t,
+        (0.5 * t - 0.5) * t**2,
+    ]
+    none = np.zeros_like(t)
+    weight = np.where((t >= 0) & (t <= 1), cubic, [none, 1.0 - t, t, none])
+    return first.astype(np.intp) + np.arange(4)[:, np.newaxis], weight
+
+
+def _extension(size: int) -> csr_array:
+    """Matrix (size + 2, size) that adds a sample on each side of a line, extrapolated."""
+    matrix = np.eye(size + 2, size, k=-1)
+    matrix[0, : min(size, 2)] = (2.0, -1.0) if size > 1 else 1.0
+    matrix[-1, -min(size, 2) :] = (-1.0, 2.0) if size > 1 else 1.0
+    return csr_array(matrix)
+
+
+def read(
+    block: xr.Dataset,
+    displacement: Displacement,
+    rows: slice,
+    source: slice,
+    fewest: int,
+    grains: list[samples.Grain],
+) -> tuple[Array, Mask, Bits, Array]:
+    """
+    Read some rows of the reference band, and what the others show of the same reflections.
+
+    Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
+    `quality.read`; and the noise (pixel) [1] of a resampled sample over that of a sample.
+    """
+    reference, others = displacement.reference, displacement.others
+    own = displacement.source(rows)
+    first = block.isel(
+        band=[reference], y=slice(rows.start - source.start, rows.stop - source.start)
+    )
+    second = block.isel(band=others, y=slice(own.start - source.start, own.stop - source.start))
+    counts, valid, status = quality.read(first, fewest, [grains[reference]])
+    seen, measured, flags = quality.read(second, fewest, [grains[band] for band in others])
+    seen, usable = quality.bridge(seen, measured, block["time"].values.astype(np.float64))
+    weights = without(
+        displacement.weights(rows, own), quality.unusable(flags), displacement.shape[1]
+    )
+    counts = np.stack([counts[0]] * (len(others) + 1))
+    for band, one in zip(others, seen, strict=True):
+        counts[band] = (weights @ one.T).T
+    share = abs(weights)
+    if not measured.all():  # a sample that was bridged does not count where its weight is small
+        valid = valid & ((share @ ~usable.T).T <= 0.0)
+        valid &= (share @ ~measured.T).T <= _LOST_WEIGHT
+    first_pixel = rows.start * displacement.shape[1]
+    unpaired = ~displacement.paired[first_pixel : first_pixel + status.size]
+    status |= quality.status_bits(
+        {
+            Status.NO_REFLECTION_PAIR: unpaired,
+            Status.INVALID_SAMPLES: quality.too_few(valid, fewest) & ~unpaired,
+        }
+    )
+    for bit in Status:
+        holds = (flags & np.uint32(bit)) != 0
+        if np.any(holds):
+            status[share @ holds > _NO_WEIGHT] |= np.uint32(bit)
+    counts[:, :, quality.unusable(status)] = 0.0
+    gain = np.sqrt(np.asarray((weights**2).sum(axis=1)).ravel())
+    return counts, valid, status, gain
+
+
+def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
+    """
+    Weights without the bad pixels, whose part the others take over; a plane stays one.
+
+    Where that part is large the weights stay as they are.
+    """
+    part = abs(weights) @ bad
+    rows = np.flatnonzero((part > 0) & (part <= _LOST_WEIGHT))
+    if rows.size == 0:
+        return weights
+    weights = weights.copy()
+    for row in rows:
+        entries = slice(weights.indptr[row], weights.indptr[row + 1])
+        pixels, values = weights.indices[entries], weights.data[entries]
+        plane = np.stack([np.ones(pixels.size), *np.divmod(pixels, width)])
+        plane[1:] -= plane[1:] @ np.abs(values)[:, np.newaxis] / np.abs(values).sum()
+        off = bad[pixels]
+        # The smallest change of the others with the same sums over the plane.
+        values[~off] += np.linalg.lstsq(plane[:, ~off], plane[:, off] @ values[off], rcond=None)[0]
+        values[off] = 0.0
+    return weights

@@ -1,0 +1,422 @@
+r"""The object of two cameras that stand side by side, where each sees another place of it.
+
+Paired by what is reflected (`_displaced`), the bands hold the object of two places, r of the
+reference band and p of the second camera. The combination without background (eq. 5 and 6 of
+`_subspace.method`) is
+
+.. math:: c_1 u_1(x(r)) + \sum_{m > 1} c_m u_m(x(p)) = q(r), \quad c_m = w_m e_m, \quad \sum c_m = 1
+
+A method solves it as if x(p) were x(r), which gives q. Then the equations of all pixels are solved
+together, frame by frame, each for the term of the larger coefficient:
+
+.. math:: u_1(x(r)) \leftarrow \Big[q(r) - \sum_{m > 1} c_m u_m(x(p))\Big] / c_1
+
+contracts by :math:`g = |\sum_{m > 1} c_m / c_1|` a step, for two bands
+:math:`(e_2 / e_1) / \kappa`, where the reflection is the stronger one in the second camera;
+elsewhere the same equation, solved for x(p), contracts by 1/g. Both fail for a gray body alone.
+Errors of single pixels are averaged along the chain of places, with the weights
+:math:`(1 - g) g^j`.
+"""
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import uniform_filter
+from scipy.sparse import csr_array, diags_array
+
+from dbthermal import _smooth as smooth
+from dbthermal import schema
+from dbthermal.response import Curve
+from dbthermal.schema import Status
+from dbthermal.separation._displaced import without
+from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._subspace.reflection_ratio import null_combination
+
+Array = npt.NDArray[np.floating[Any]]
+Mask = npt.NDArray[np.bool_]
+Whole = npt.NDArray[np.intp]
+
+# Steps of the iteration, and the change that ends it [K].
+_STEPS: Final = 60
+_CONVERGED: Final = 1e-3
+# Rounds of the emissivities and the object, and the change that ends them [1].
+_ROUNDS: Final = 20
+_SETTLED: Final = 1e-3
+# Frames that are solved together.
+_FRAMES: Final = 8
+# Frames from which it is told whether the object's gradient matters, and the share of the object's
+# deviation from which it does, in more than a few of the samples.
+_LOOKED_AT: Final = 12
+_MATTERS: Final = 0.2
+_MOST: Final = 0.99
+# Draws of noise by which the deviations are propagated.
+_DRAWS: Final = 64
+# Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
+_MARGIN: Final = 0.02
+# Rows of the capture that are read at once.
+_ROWS: Final = 32
+# Smooth functions of the change beside a pixel that is not solved.
+_ORDER: Final = 14
+# Degree of the polynomial that the bend between two responses is.
+_DEGREE: Final = 5
+
+
+@dataclass(frozen=True)
+class _Bend:
+    """Polynomials of u_m(x) - u_1(x) in u_1(x), for all bands but the first."""
+
+    coefficients: Array  # (band - 1, degree + 1), of the position in the calibrated range
+    lowest: float  # [K]
+    highest: float
+
+    def __call__(self, shares: Array, signal: Array) -> Array:
+        """Sum over the bands of shares (band - 1, pixel) times u_m(x) (pixel, frame) [K]."""
+        middle, half = 0.5 * (self.highest + self.lowest), 0.5 * (self.highest - self.lowest)
+        position = np.clip((signal - middle) / half, -1.0, 1.0)
+        # One polynomial for each pixel, by Horner's rule.
+        together = np.asarray(self.coefficients.T @ shares, dtype=signal.dtype)
+        bend = np.broadcast_to(together[-1][:, np.newaxis], signal.shape).copy()
+        for one in together[-2::-1]:
+            bend *= position
+            bend += one[:, np.newaxis]
+        return np.asarray(bend + shares.sum(axis=0)[:, np.newaxis] * signal)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Object of all pixels, of which each camera sees another place; its films are in a result."""
+
+    inputs: Inputs
+    result: xr.Dataset  # its object temperature is x(r), its background temperature x(p)
+    emissivity: Array  # of which it is made (band, pixel) [1]
+    factor: Array  # variance of the object over that of a pixel alone (pixel) [1]
+    unsettled: Mask  # the iteration did not come to an end (pixel)
+
+    def difference(self, rows: slice) -> Array:
+        """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of rows; 0 where not known."""
+        here, beside = (
+            self.result[f"{one}_temperature"].values[:, rows].astype(np.float64)
+            for one in ("object", "background")
+        )
+        here, beside = (one.reshape(len(one), -1) for one in (here, beside))
+        pixels = slice(rows.start * self.result.sizes["x"], rows.stop * self.result.sizes["x"])
+        parts = []
+        for one, place in zip(self.emissivity[1:], self.inputs.bands[1:], strict=True):
+            curve = self.inputs.curves[place]
+            parts.append(one[pixels] * (curve.signal(beside) - curve.signal(here)))
+        return np.asarray(np.nan_to_num(parts, nan=0.0))
+
+    def finish(self) -> None:
+        """Give the object its deviation, in place, when all is solved; flag what is unsettled."""
+        status = self.result["status"].values
+        std = self.result["object_temperature_std"].values
+        std *= np.sqrt(self.factor).reshape(status.shape)
+        unsettled = self.unsettled.reshape(status.shape) & (status == 0)
+        status[unsettled] |= np.uint32(Status.NOT_CONVERGED)
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Equations of all pixels, and by which way each is solved."""
+
+    first: Array  # e_1 (pixel) [1]
+    shares: Array  # c of eq. 6 (band, pixel) [1]
+    there: csr_array  # weights of x(p) (pixel, pixel), of the linked pixels
+    onward: csr_array  # weights of the equation at p + d(p) (backward pixel, pixel)
+    forward: Whole  # pixels solved for x(r)
+    backward: Whole  # pixels solved for x(p)
+    loose: Whole  # solved pixels without such neighbours
+    bend: _Bend | None
+
+    def of(self, first: Array, shares: Array) -> "_Equations":
+        """Return the equations of other emissivities."""
+        return replace(self, first=first, shares=shares)
+
+    def _there(self, signal: Array, change: Array) -> Array:
+        """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
+        result = np.asarray(self.there @ signal)
+        result[self.loose] = signal[self.loose] + change / self.first[self.loose, np.newaxis]
+        return result
+
+    def other_bands(self, shares: Array, signal: Array) -> Array:
+        """Sum of shares (band - 1, pixel) times u_m(x), of u_1(x) (pixel, frame) [K]."""
+        if self.bend is None:
+            return np.asarray(shares.sum(axis=0)[:, np.newaxis] * signal)
+        return self.bend(shares, signal)
+
+    def target(self, shares: Array, alone: Array) -> Array:
+        """Combination q (pixel, frame) [K], of the u_1(x) that it gives with x(p) = x(r)."""
+        own = shares[0][:, np.newaxis] * alone
+        return np.asarray(own + self.other_bands(shares[1:], alone))
+
+    def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array, Array]:
+        """
+        Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
+
+        The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
+        beforehand. Also returns the last step (pixel) [K].
+        """
+        own, forward, backward = self.shares[0][:, np.newaxis], self.forward, self.backward
+        others, back = self.shares[1:], self.shares[1:, self.backward]
+        beyond = np.asarray((self.onward @ others.T).T)
+        slope = beyond.sum(axis=0)[:, np.newaxis]
+        rest = np.setdiff1d(self.loose, backward)
+        signal, step = alone, np.zeros_like(alone)
+        for _ in range(_STEPS):
+            there = self._there(signal, change)
+            right = target - self.other_bands(others, there)
+            following = signal.copy()
+            following[forward] = right[forward] / own[forward]
+            # Newton's steps, of a slope near sum c = 1.
+            following[rest] += right[rest] - own[rest] * signal[rest]
+            # The same for x(p), of the equation at p + d(p).
+            right = np.asarray(self.onward @ (target - own * signal))
+            following[backward] += (right - self.other_bands(beyond, signal[backward])) / slope
+            step, signal = np.abs(following - signal), following
+            if step.max(initial=0.0) < _CONVERGED:
+                break
+        there = self._there(signal, change)
+        # A backward pixel's own equation holds for another x(p) than that between its neighbours.
+        right = target[backward] - own[backward] * signal[backward]
+        right -= self.other_bands(back, there[backward])
+        there[backward] += right / back.sum(axis=0)[:, np.newaxis]
+        return signal, there, step.max(axis=1)
+
+
+def solve(
+    inputs: Inputs, result: xr.Dataset, threads: Executor, *, pooled: bool = False
+) -> Joint | None:
+    """
+    Solve the equations of all pixels, from a result that takes x(p) for x(r).
+
+    Writes x(r) as the object temperature and x(p) as the background temperature of the result.
+    None, and nothing is written, where the object hardly differs between the two places.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        film, there = (_flat(result[f"{one}_temperature"]) for one in ("object", "background"))
+        raw = _emissivity(inputs, result)
+        solved = np.isfinite(raw[0]) & (_finite(film) > 1)
+        emissivity = _inside(raw)
+        equations = _equations(inputs, emissivity, solved)
+        change, variance = _changes(inputs, equations)
+        curve = inputs.curves[inputs.bands[0]]
+        _, shares = _coefficients(inputs, raw, solved)
+
+        def both(alone: Array, change: Array) -> tuple[Array, Array, Array, Array]:
+            signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
+            signal = np.ascontiguousarray(signal.T, dtype=np.float32)
+            return signal, *equations.solve(equations.target(shares, signal), signal, change)
+
+        some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
+        looked_at = _bridge(film[some], solved)
+        known = np.isfinite(result["emissivity"].values[inputs.bands[0]]).ravel()
+        for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
+            alone, here, _, _ = both(looked_at, change[:, some])
+            # z_1 has the slope e_1 on u_1(x), of which it had another before.
+            factor = np.where(known, _slope(here, alone), 1.0)
+            before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - raw[0] * factor))
+            equations = equations.of(*_coefficients(inputs, emissivity, solved))
+            if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
+                break
+        _, here, beside, _ = both(looked_at, change[:, some])
+        std = _flat(result["object_temperature_std"])[some].astype(np.float64)
+        share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
+        if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
+            return None
+        _bridge(film, solved)
+        unsettled = np.zeros(solved.size, dtype=bool)
+        parts = [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
+        results = threads.map(lambda part: both(film[part], change[:, part]), parts)
+        for part, (_, *pair, step) in zip(parts, results, strict=True):
+            film[part], there[part] = (
+                np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
+            )
+            unsettled |= step > 10.0 * _CONVERGED
+        size = np.sqrt(np.mean(np.where(np.isfinite(std), std, 0.0) ** 2, axis=0))
+        factor = _factor(inputs, equations, size, variance)
+    return Joint(inputs, result, emissivity, factor, unsettled)
+
+
+def _flat(film: xr.DataArray) -> Array:
+    """View (time, pixel) of a film of the result."""
+    return film.values.reshape(film.shape[0], -1)
+
+
+def _emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
+    """Emissivities (band, pixel) [1] by which a pixel is solved, the quietest band first."""
+    emissivity, ratio = (
+        result[name].values[inputs.bands].reshape(len(inputs.bands), -1).astype(np.float64)
+        for name in ("emissivity", "reflection_ratio")
+    )
+    # That of a constant object is taken from the middle of what its ratios leave.
+    middle = 1.0 - ratio * (0.5 / np.maximum(ratio.max(axis=0), 1.0))
+    return np.where(np.isfinite(emissivity), emissivity, middle)
+
+
+def _ratio(emissivity: Array) -> Array:
+    """Reflection ratios (band, pixel) [1] of emissivities."""
+    return np.asarray((1.0 - emissivity) / (1.0 - emissivity[0]))
+
+
+def _inside(emissivity: Array) -> Array:
+    """Emissivities of the same ratios, none of them outside or at the end of (0, 1)."""
+    ratio = _ratio(emissivity)
+    # e_m > 0 leaves 0 < 1 - e_1 < 1 / kappa.
+    most = 1.0 / np.maximum(ratio.max(axis=0), 1.0)
+    place = np.clip((1.0 - emissivity[0]) / most, _MARGIN, 1.0 - _MARGIN)
+    return np.asarray(1.0 - ratio * most * place)
+
+
+def _coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> tuple[Array, Array]:
+    """First emissivity (pixel) [1] and coefficients c (band, pixel) [1] of eq. 6, of sum 1."""
+    weights, _ = null_combination(_ratio(emissivity).astype(np.float64), inputs.noise[inputs.bands])
+    shares = np.where(solved, weights * emissivity, 0.0)
+    shares[0, ~solved] = 1.0
+    first = np.where(solved, emissivity[0], 1.0)
+    return first.astype(np.float32), shares.astype(np.float32)
+
+
+def _slope(abscissa: Array, ordinate: Array) -> Array:
+    """Slope (pixel) of signals (pixel, frame) over others."""
+    abscissa = abscissa - abscissa.mean(axis=1, keepdims=True)
+    slope = (abscissa * ordinate).sum(axis=1) / (abscissa**2).sum(axis=1)
+    return np.where(np.isfinite(slope), slope, 1.0)
+
+
+def _finite(film: Array) -> Whole:
+    """Frames (pixel) of a film (time, pixel) with a number."""
+    number = np.zeros(film.shape[1], dtype=np.intp)
+    for frame in film:
+        number += np.isfinite(frame)
+    return number
+
+
+def _bridge(film: Array, solved: Mask) -> Array:
+    """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
+    frames = np.arange(len(film))
+    for pixel in np.flatnonzero(solved & (_finite(film) < len(film))):
+        known = np.isfinite(film[:, pixel])
+        if known.any():
+            film[~known, pixel] = np.interp(frames[~known], frames[known], film[known, pixel])
+    return film
+
+
+def _equations(inputs: Inputs, emissivity: Array, solved: Mask) -> _Equations:
+    """Equations of the solved pixels: each for the place with the larger coefficient."""
+    displacement = inputs.displacement
+    assert displacement is not None
+    first, shares = _coefficients(inputs, emissivity, solved)
+    there, linked = _among(displacement.resample, solved, displacement.shape[1])
+    onward, reached = _among(displacement.onward, solved, displacement.shape[1])
+    strong = np.abs(shares[1:].sum(axis=0)) < np.abs(shares[0])
+    linked &= strong | reached
+    backward = np.flatnonzero(linked & ~strong)
+    return _Equations(
+        first=first,
+        shares=shares,
+        there=_rows(there, linked),
+        onward=csr_array(onward[backward].astype(np.float32)),
+        forward=np.flatnonzero(linked & strong),
+        backward=backward,
+        loose=np.flatnonzero(solved & ~linked),
+        bend=_bend([inputs.curves[band] for band in inputs.bands]),
+    )
+
+
+def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mask]:
+    """Weights of solved pixels alone, and the solved pixels for which that is possible."""
+    weights = without(weights, ~solved, width)
+    weights.eliminate_zeros()
+    used = np.diff(weights.indptr) > 0
+    return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
+
+
+def _rows(weights: csr_array, used: Mask) -> csr_array:
+    """Weights in single precision, with the rows that are not used set to 0."""
+    result = csr_array(diags_array(used.astype(np.float32)) @ weights.astype(np.float32))
+    result.eliminate_zeros()
+    return result
+
+
+def _changes(inputs: Inputs, equations: _Equations) -> tuple[Array, Array]:
+    """
+    Change of e_1 u_1(x) from r to p (loose, time) [K], of the loose pixels; its variance (loose).
+
+    From the reference band, which shows both places: smoothed over time, the difference between
+    its signals holds little of that between their reflections.
+    """
+    displacement, capture, loose = inputs.displacement, inputs.capture, equations.loose
+    assert displacement is not None
+    width, height, band = capture.sizes["x"], capture.sizes["y"], displacement.reference
+    curve = inputs.curves[band]
+    change = np.zeros((loose.size, capture.sizes["time"]), dtype=np.float32)
+    for top in range(0, height, _ROWS):
+        rows = slice(top, min(top + _ROWS, height))
+        chosen = (loose >= rows.start * width) & (loose < rows.stop * width)
+        if not np.any(chosen):
+            continue
+        source = displacement.source(rows)
+        counts = capture["counts"].isel(band=band, y=source).values.astype(np.float64)
+        signal = _bridged(curve.linearise(counts).reshape(len(counts), -1)).T
+        local = loose[chosen]
+        at = displacement.weights(rows, source)[local - rows.start * width]
+        change[chosen] = at @ signal - signal[local - source.start * width]
+    basis = smooth.polynomial_basis(capture["time"].values, min(_ORDER, change.shape[1] // 4))
+    smoothed = (change @ basis) @ basis.T
+    # The mean of correlated errors: K / N, times (1 + rho) / (1 - rho).
+    error = change - smoothed
+    energy = (error**2).sum(axis=1)
+    lagged = np.clip((error[:, 1:] * error[:, :-1]).sum(axis=1) / energy, 0.0, 0.98)
+    variance = energy * basis.shape[1] / change.shape[1] ** 2 * (1.0 + lagged) / (1.0 - lagged)
+    return smoothed.astype(np.float32), np.asarray(variance, dtype=np.float64)
+
+
+def _bridged(signal: Array) -> Array:
+    """Signal (time, pixel), straight over samples that are no measurement; 0 without any."""
+    measured = schema.measured(signal)
+    frames = np.arange(len(signal))
+    for pixel in np.flatnonzero(~measured.all(axis=0)):
+        known = measured[:, pixel]
+        values = np.interp(frames, frames[known], signal[known, pixel]) if known.any() else 0.0
+        signal[:, pixel] = values
+    return signal
+
+
+def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) -> Array:
+    """
+    Variance (pixel) [1] of the object over that of a pixel alone, by draws of the noise.
+
+    The `std` (pixel) [K] is that of a pixel alone; the `variance` (loose) [K^2] that of `_changes`.
+    """
+    displacement = inputs.displacement
+    assert displacement is not None
+    rng = np.random.default_rng(inputs.seed)
+    size = np.where(np.isfinite(std), std, 0.0)[:, np.newaxis]
+    drawn = displacement.resample @ rng.standard_normal((size.size, _DRAWS))
+    gain = np.sqrt(np.asarray((displacement.resample**2).sum(axis=1)).ravel())[:, np.newaxis]
+    alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
+    change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
+    linear = replace(equations, bend=None)
+    signal, _, _ = linear.solve(alone, alone, change.astype(np.float32))
+    # Over a few pixels: neighbours have nearly the same, and the draws are few.
+    energy, total = (
+        uniform_filter(np.reshape(one, displacement.shape), 3).ravel()
+        for one in ((signal.astype(np.float64) ** 2).mean(axis=1), size**2)
+    )
+    own = size[:, 0] > 0  # elsewhere the running sums are rounding
+    return np.where(own, energy / np.where(own, total, 1.0), 1.0)
+
+
+def _bend(curves: list[Curve]) -> _Bend:
+    """Bend between the responses of some bands, over the calibrated range."""
+    first = curves[0]
+    lowest, highest = (float(first.signal(t)) for t in (first.lowest, first.highest))
+    nodes = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
+    signal = 0.5 * (highest + lowest) + 0.5 * (highest - lowest) * nodes
+    parts = [curve.signal(first.temperature(signal)) - signal for curve in curves[1:]]
+    coefficients = np.polynomial.polynomial.polyfit(nodes, np.transpose(parts), _DEGREE)
+    return _Bend(coefficients.T, lowest - first.reference, highest - first.reference)

@@ -1,0 +1,265 @@
+"""Rates of false alarms and of misses of every flag of a separation, on simulated scenes."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import map_coordinates
+
+from dbthermal import correction, separation, simulation
+from dbthermal.schema import Status
+from reproduction.experiments import cases, stress
+from reproduction.experiments.pictures import Picture, smooth_shift
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Change = Callable[[xr.Dataset, Mask, np.random.Generator], xr.Dataset]
+
+FAR: Final = 5.0
+"""Standard deviations of error from which a value is wrong [1]."""
+
+PICTURED: Final = frozenset({"bad", "lost", "shift", "still"})
+"""Keys of scenes that are pictures: shift of the reflections, at its middle and varying by [pixel];
+share at rest; share of the samples lost in every second column; and of bad pixels in a band [1]."""
+
+_SHARES: Final = ("without_it", "without_any", "wrong")
+_COUNTED: Final = ("pixels", *_SHARES)
+# Shares of the samples that are no numbers, and that lie beyond the detector's limit [1].
+_INVALID: Final = 0.6
+_CLIPPED: Final = 0.1
+# Share of the frames that repeat the one before, in runs of so many frames.
+_FROZEN: Final = 0.3
+_RUN: Final = 10
+_HIGHEST: Final = 313.15  # of a response that was calibrated too little [K]
+_FLICKER: Final = 2.0  # of an object, standard deviation [K]
+_SHAPE: Final = (36, 48)  # of a picture
+_MOVING: Final = 0.3  # least standard deviation of a reflection that moves [K]
+_KNOWN: Final = 0.03  # deviation of a shift that is known [pixel]
+_ITERATIONS: Final = 20
+
+
+def rates(
+    expected: Mapping[str, Sequence[Mapping[str, Any]]],
+    clean: Mapping[str, Mapping[str, Any]],
+    base: Mapping[str, Any],
+    *,
+    pixels: int,
+    clock: Sequence[float],
+    seed: int,
+) -> xr.Dataset:
+    """
+    Rates of each flag: of false alarms where nothing is wrong, of misses where it should come.
+
+    Parameters
+    ----------
+    expected : mapping
+        Flag, in lower case, to the scenes in which it should come: what differs from the `base`,
+        see `cases.simulate`, or a picture's (`PICTURED`). Where it should come in some pixels
+        alone, the others count as false alarms; damaged samples (`FAULTS`) are in every second one.
+    clean : mapping
+        Scenes by name in which none should come.
+    base : mapping
+        The body that warms, of all scenes.
+    pixels : int
+        Number of pixels of a scene.
+    clock : sequence of float
+        Number of frames, and their rate [Hz].
+    seed : int
+        Seed of all scenes.
+
+    Returns
+    -------
+    Dataset
+        Over `flag`: `pixels` and `clean_pixels`, in which it should come, and in which none should;
+        shares [1]: `false_alarms` of the latter, and of the former `without_it`, `without_any` flag
+        and, without any, `wrong`: an object temperature or emissivity beyond `FAR` deviations. The
+        flag "any" has the false alarms of all together. NaN where there is no pixel.
+    """
+    names = [*Status.bits(), "any"]
+    counts = xr.Dataset(
+        {name: ("flag", np.zeros(len(names))) for name in (*_COUNTED, "clean_pixels", "alarms")},
+        coords={"flag": names},
+    )
+    for scene in clean.values():
+        result = _solved({**base, **scene}, "", pixels, clock, seed)[1]
+        _count_alarms(counts, result["status"].values)
+    for flag, scenes in expected.items():
+        for scene in scenes:
+            _count_misses(counts, flag, *_solved({**base, **scene}, flag, pixels, clock, seed))
+    shares = {name: counts[name] / counts["pixels"].where(counts["pixels"] > 0) for name in _SHARES}
+    shares["false_alarms"] = counts["alarms"] / counts["clean_pixels"]
+    judged = counts[["pixels", "clean_pixels"]].assign(shares)
+    judged = judged.map(lambda one: one.assign_attrs(units="1"))
+    return judged.assign_attrs(origin="simulated", seed=seed, far=FAR)
+
+
+def table(rates: xr.Dataset) -> str:
+    """Table in Markdown of the `rates` [%] of the flags that should have come somewhere."""
+    heads = ("false alarms", "not flagged by it", "by no flag", "by no flag, and wrong")
+    columns = ("false_alarms", *_SHARES)
+    lines = [f"| flag | pixels | {' | '.join(heads)} |", f"| --- |{' --: |' * (len(heads) + 1)}"]
+    for name in rates["flag"].values:
+        row = rates.sel(flag=name)
+        if row["pixels"] > 0 or name == "any":
+            shown = [100.0 * float(row[column]) for column in columns]
+            cells = ["" if np.isnan(one) else f"{one:.2f} %" for one in shown]
+            lines.append(f"| `{name}` | {int(row['pixels'])} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _solved(
+    case: Mapping[str, Any], flag: str, pixels: int, clock: Sequence[float], seed: int
+) -> tuple[xr.Dataset, xr.Dataset, Mask]:
+    """Truth, separation, and pixels (y, x) in which the flag should come, of one scene."""
+    rig, time = simulation.Rig(), np.arange(int(clock[0])) / clock[1]
+    if PICTURED & case.keys():
+        return _pictured(case, flag, rig, time, seed)
+    truth, capture, response = cases.simulate(case, rig, time, pixels, seed)
+    rng = np.random.default_rng([seed, pixels])
+    holds: Mask = np.ones((1, pixels), dtype=bool)
+    if flag in FAULTS:
+        holds[:, ::2] = False
+        capture = FAULTS[flag](capture, holds, rng)
+    elif flag == Status.OBJECT_NOT_SMOOTH.label:
+        walk = simulation.Background(kind="random walk", correlation_time=1.0, amplitude=_FLICKER)
+        flicker = walk.draw(time, pixels, rng)[:, np.newaxis] - walk.level
+        warm = truth["object_temperature"]
+        truth = truth.assign(object_temperature=warm.copy(data=warm.values + flicker))
+        capture = simulation.observe(truth, response, rng)
+    elif flag == Status.OUTSIDE_RESPONSE.label:
+        response = replace(rig, highest=_HIGHEST).response()
+        holds &= truth["object_temperature"].max("time").values > _HIGHEST + 1.0
+    return truth, separation.solve(capture, response), holds
+
+
+def _pictured(
+    case: Mapping[str, Any], flag: str, rig: simulation.Rig, time: Array, seed: int
+) -> tuple[xr.Dataset, xr.Dataset, Mask]:
+    """As `_solved`, of a picture (`PICTURED`)."""
+    rng, response, shift = np.random.default_rng(seed), rig.response(), None
+    pair = xr.DataArray(case["emissivity"], dims="band", coords={"band": list(rig.bands)})
+    if "shift" in case:
+        shift = smooth_shift(_SHAPE, *case["shift"])
+    drawn = Picture(shape=_SHAPE, still=case.get("still", 0.0)).draw(time, pair, rng, shift)
+    capture = simulation.observe(drawn, response, rng)
+    if "lost" in case:
+        lost = xr.zeros_like(capture["counts"][0], dtype=bool)
+        lost.values[...] = rng.random(lost.shape) < case["lost"]
+        lost[:, :, ::2] = False
+        capture = capture.assign(counts=capture["counts"].where(~lost))
+    if "bad" in case:
+        capture = simulation.spoil_pixels(capture, case["bad"], rng)
+        spoiled = np.asarray((capture["spoiled"] > 0).any("band"))
+        return drawn, separation.solve(correction.mark_bad(capture), response), spoiled
+    if shift is None:
+        alone = separation.solve(capture, response)
+        labels = xr.zeros_like(alone["status"], dtype=int)
+        known = flag == Status.COMPLETED_FROM_MATERIAL.label
+        parts = (labels, None, None) if known else (None, None, pair)
+        whole = separation.complete(alone, capture, response, *parts)
+        missing = alone["object_temperature"].isnull()
+        some = flag == Status.COMPLETED_FRAMES.label
+        holds = missing.any("time") & ~missing.all("time") if some else missing.all("time")
+        return drawn, whole, holds.values
+    if flag == Status.BANDS_APART.label:
+        moving = drawn["background_temperature"].std("time").max("band") > _MOVING
+        return drawn, separation.solve(capture, response), moving.values
+    field = xr.Dataset(
+        {
+            "shift": (("axis", "y", "x"), shift, {"units": "pixel"}),
+            "shift_std": (("axis", "y", "x"), np.full(shift.shape, _KNOWN), {"units": "pixel"}),
+            "known": (("y", "x"), np.ones(_SHAPE, dtype=bool), {"units": "1"}),
+        },
+        {"axis": ["y", "x"], "y": capture["y"], "x": capture["x"]},
+    )
+    result = separation.solve(capture, response, reflection_shift=field)
+    return drawn, result, _unpaired(shift)
+
+
+def _unpaired(shift: Array) -> Mask:
+    """Pixels r (y, x) whose p, with p + d(p) = r, lies outside the image."""
+    grid = np.indices(_SHAPE, dtype=np.float64)
+    place = grid.copy()
+    for _ in range(_ITERATIONS):
+        place = grid - [map_coordinates(one, place, order=1, mode="nearest") for one in shift]
+    size = np.reshape(_SHAPE, (2, 1, 1))
+    return np.asarray(((place < -0.5) | (place > size - 0.5)).any(axis=0))
+
+
+def _invalid(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
+    """Most samples of a band no numbers."""
+    counts = capture["counts"].copy(deep=True)
+    lost = (rng.random(counts.shape[1:]) < _INVALID) & pixels
+    counts.values[0][lost] = np.nan
+    return capture.assign(counts=counts)
+
+
+def _constant(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
+    """The signal of a band, drawn for each pixel, the same in all frames."""
+    counts = capture["counts"].copy(deep=True)
+    band = rng.integers(0, counts.sizes["band"], pixels.shape)
+    stuck = (band == np.arange(counts.sizes["band"])[:, np.newaxis, np.newaxis]) & pixels
+    counts.values[...] = np.where(stuck[:, np.newaxis], counts.values[:, :1], counts.values)
+    return capture.assign(counts=counts)
+
+
+def _saturated(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
+    """The highest samples of a band, drawn for each pixel, at one level."""
+    counts = capture["counts"].copy(deep=True)
+    limit = np.quantile(counts.values, 1.0 - _CLIPPED, axis=1, keepdims=True)
+    band = rng.integers(0, counts.sizes["band"], pixels.shape)
+    clipped = (band == np.arange(counts.sizes["band"])[:, np.newaxis, np.newaxis]) & pixels
+    values = np.where(clipped[:, np.newaxis], np.minimum(counts.values, limit), counts.values)
+    counts.values[...] = values
+    return capture.assign(counts=counts)
+
+
+def _frozen(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
+    """Runs of frames in which all bands repeat the frame before."""
+    counts = capture["counts"].copy(deep=True)
+    frames = counts.sizes["time"]
+    for start in rng.choice(frames // _RUN, int(_FROZEN * frames / _RUN), replace=False) * _RUN:
+        held = counts.values[:, start : start + 1]
+        part = counts.values[:, start : start + _RUN]
+        part[...] = np.where(pixels, held, part)
+    return capture.assign(counts=counts)
+
+
+FAULTS: Final[Mapping[str, Change]] = {
+    Status.INVALID_SAMPLES.label: _invalid,
+    Status.CONSTANT_SIGNAL.label: _constant,
+    Status.SATURATED.label: _saturated,
+    Status.FROZEN_FRAMES.label: _frozen,
+}
+"""Flag -> what damages the samples of a capture at some pixels (y, x), so that it should come."""
+
+
+def _count_alarms(counts: xr.Dataset, status: npt.NDArray[np.uint32]) -> None:
+    """Add the flags of pixels in which none should come, in place."""
+    bits = np.array(list(Status.bits().values()), dtype=status.dtype)
+    alarms = ((status.ravel()[:, np.newaxis] & bits) != 0).sum(axis=0)
+    counts["alarms"].values += np.append(alarms, np.count_nonzero(status))
+    counts["clean_pixels"].values += status.size
+
+
+def _count_misses(
+    counts: xr.Dataset, flag: str, truth: xr.Dataset, result: xr.Dataset, holds: Mask
+) -> None:
+    """Add the pixels in which a flag should come, and what became of them, in place."""
+    status, place = result["status"].values, list(counts["flag"].values).index(flag)
+    apart = ~holds & (status & Status.bits()[flag] != 0)
+    counts["alarms"].values[place] += np.count_nonzero(apart)
+    counts["clean_pixels"].values[place] += np.count_nonzero(~holds)
+    none = holds & (status == 0)
+    wrong = stress.wrong(truth, result, FAR).values
+    parts = {
+        "pixels": holds,
+        "without_it": holds & ((status & Status.bits()[flag]) == 0),
+        "without_any": none,
+        "wrong": none & wrong,
+    }
+    for name, mask in parts.items():
+        counts[name].values[place] += np.count_nonzero(mask)

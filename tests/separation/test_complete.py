@@ -1,0 +1,208 @@
+"""Completed pictures: a value everywhere, true intervals, and nothing measured is touched."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from captures import emissivity_of
+
+from dbthermal import schema, separation
+from dbthermal.schema import Status
+from dbthermal.simulation import Rig, observe
+from reproduction.experiments.pictures import ROOM, Picture
+
+RIG = Rig()
+RESPONSE = RIG.response()
+TIME = np.arange(200) / 10.0
+SMALL = Picture(shape=(20, 24))
+NOBODY = replace(SMALL, walkers=1, warmer=(0.0, 0.0))
+Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+COMPLETED = (
+    Status.COMPLETED_FROM_MATERIAL
+    | Status.COMPLETED_FROM_PRIOR
+    | Status.COMPLETED_FROM_SURROUNDINGS
+    | Status.COMPLETED_FRAMES
+)
+
+
+def draw(picture: Picture, seed: int, *emissivity: float) -> Case:
+    """Scene, capture, and result alone."""
+    rng = np.random.default_rng(seed)
+    scene = picture.draw(TIME, emissivity_of(*emissivity), rng)
+    capture = observe(scene, RESPONSE, rng)
+    return scene, capture, separation.solve(capture, RESPONSE)
+
+
+@pytest.fixture(scope="module")
+def half() -> Case:
+    """Glass of which half the picture mirrors a still room."""
+    return draw(replace(SMALL, still=0.5), 1, 0.86, 0.72)
+
+
+def test_measured_values_are_untouched(half: Case) -> None:
+    """What was measured stays bit for bit; all else is finite and says that it is completed."""
+    _, capture, alone = half
+    whole = separation.complete(alone, capture, RESPONSE)
+    for name in alone.data_vars:
+        if name not in ("status", "noise"):
+            assert bool(whole[name].notnull().all()), name
+            xr.testing.assert_identical(whole[name].where(alone[name].notnull()), alone[name])
+    missing = alone["object_temperature"].isnull().any("time")
+    completed = (whole["status"] & int(COMPLETED)) != 0
+    assert bool(missing.any())
+    assert bool((completed | ~missing).all())
+    assert bool((whole["status"] & int(Status.COMPLETED_FROM_PRIOR)).where(missing, 1).all())
+    xr.testing.assert_equal(whole["status"] & ~np.uint32(COMPLETED), alone["status"])
+
+
+def test_material_elsewhere_completes_within_noise(half: Case) -> None:
+    """With the labels of one material the still half is right within 0.1 K, and says from what."""
+    scene, capture, alone = half
+    labels = xr.zeros_like(alone["status"]).astype(int)
+    whole = separation.complete(alone, capture, RESPONSE, labels)
+    missing = alone["object_temperature"].isnull()
+    error = abs(whole["object_temperature"] - scene["object_temperature"]).where(missing)
+    within = error < 1.96 * whole["object_temperature_std"]
+    cover = float(within.where(missing).mean())
+    print(f"still half by its material: {float(error.median()):.3f} K, intervals hold {cover:.3f}")
+    assert float(error.median()) < 0.1  # [K]
+    assert cover > 0.9
+    still = whole["status"].where(missing.any("time"), 0).astype(int)
+    assert bool((((still & int(Status.COMPLETED_FROM_MATERIAL)) != 0) | (still == 0)).all())
+
+
+def test_nobody_walks() -> None:
+    """Glass before a still room: nothing is measured, and all of it completed from the library."""
+    scene, capture, alone = draw(NOBODY, 2, 0.86, 0.72)
+    assert bool(alone["object_temperature"].isnull().all())
+    whole = separation.complete(alone, capture, RESPONSE)
+    reading = separation.solve(capture, RESPONSE, "apparent")
+    errors = [
+        abs(part["object_temperature"] - scene["object_temperature"]) for part in (whole, reading)
+    ]
+    within = float((errors[0] < 1.96 * whole["object_temperature_std"]).mean())
+    print(f"{float(errors[0].median()):.2f} K, reading {float(errors[1].median()):.2f} K, {within}")
+    assert float(errors[0].median()) < float(errors[1].median())
+    assert within > 0.9
+    # The bands agree where the object is as warm as the room: that tells the room.
+    assert whole.attrs["surroundings"] == pytest.approx(ROOM, abs=0.5)  # [K]
+    assert whole.attrs["surroundings_source"] == "capture"
+
+
+def test_known_material_and_surroundings_narrow_the_bars() -> None:
+    """The table's glass and a room stated within 0.3 K leave a fraction of the library's bar."""
+    scene, capture, alone = draw(NOBODY, 3, 0.86, 0.72)
+    wide = separation.complete(alone, capture, RESPONSE)
+    narrow = separation.complete(
+        alone,
+        capture,
+        RESPONSE,
+        surroundings=ROOM,
+        surroundings_std=0.3,
+        prior="plate window glass",
+    )
+    name = "object_temperature"
+    error = abs(narrow[name] - scene[name])
+    assert float(narrow[f"{name}_std"].mean()) < 0.6 * float(wide[f"{name}_std"].mean())
+    assert float((error < 1.96 * narrow[f"{name}_std"]).mean()) > 0.9
+
+
+def test_black_gives_the_reading() -> None:
+    """A prior of 0.99 within 0.005 gives the camera's reading within its bar."""
+    _, capture, alone = draw(NOBODY, 4, 0.985, 0.98)
+    black = emissivity_of(0.99, 0.99)
+    prior = xr.Dataset({"emissivity": black, "emissivity_std": xr.full_like(black, 0.005)})
+    whole = separation.complete(alone, capture, RESPONSE, prior=prior)
+    reading = separation.solve(capture, RESPONSE, "apparent")["object_temperature"]
+    apart = abs(whole["object_temperature"] - reading)
+    assert float(apart.median()) < 0.3  # [K]
+    assert bool((apart < 4.0 * np.hypot(whole["object_temperature_std"], RIG.noise[0])).all())
+
+
+def test_lost_frames_of_a_measured_pixel(half: Case) -> None:
+    """Frames that are lost in a band are bridged, flagged, and right within their intervals."""
+    scene, capture, _ = half
+    lost = capture.copy(deep=True)
+    lost["counts"].values[1, [0, 50, 51, 52, 53, 54, 55, 120, 199]] = np.nan
+    alone = separation.solve(lost, RESPONSE)
+    whole = separation.complete(alone, lost, RESPONSE)
+    measured = alone["object_temperature"].notnull().any("time")
+    gaps = alone["object_temperature"].isnull() & measured
+    error = abs(whole["object_temperature"] - scene["object_temperature"])
+    within = float((error < 1.96 * whole["object_temperature_std"]).where(gaps).mean())
+    print(f"bridged: {float(error.where(gaps).median()):.3f} K, intervals hold {within:.3f}")
+    assert bool(whole["object_temperature"].notnull().all())
+    flagged = (whole["status"] & int(Status.COMPLETED_FRAMES)) != 0
+    assert bool(flagged.where(measured, True).all())
+    assert within > 0.9
+
+
+def test_dead_pixels_stay_empty(half: Case) -> None:
+    """A pixel that the correction marks as bad, or of a constant signal, gets no value."""
+    _, capture, _ = half
+    broken = capture.copy(deep=True)
+    broken["counts"].values[0, :, 3, 4] = 15000.0
+    dead = np.zeros(tuple(capture.sizes[dim] for dim in ("y", "x")), dtype=np.uint32)
+    dead[5, 6] = Status.DEAD_PIXEL
+    broken["status"] = (("y", "x"), dead, schema.status_attrs())
+    whole = separation.complete(separation.solve(broken, RESPONSE), broken, RESPONSE)
+    for place in ((3, 4), (5, 6)):
+        assert bool(whole["object_temperature"][:, place[0], place[1]].isnull().all())
+        assert not whole["status"].values[place] & int(COMPLETED)
+    assert bool(whole["object_temperature"].isnull().any("time").sum() == 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"prior": emissivity_of(1.2, 0.9)}, r"Invalid emissivities \[1.2, 0.9\] of the prior"),
+        ({"prior": "glas"}, "Unknown prior 'glas'"),
+        ({"surroundings": 22.0}, r"Invalid surroundings 22.0 K.* not in degrees Celsius"),
+        (
+            {"surroundings": xr.DataArray(22.0, attrs={"units": "degC"})},
+            "Invalid units 'degC' of surroundings",
+        ),
+        ({"surroundings": 295.0, "surroundings_std": 0.0}, "Invalid surroundings_std 0.0 K"),
+        (
+            {"materials": xr.DataArray(np.zeros((3, 4), int), dims=("y", "x"))},
+            "Invalid size 3 of 'y' of the pool",
+        ),
+    ],
+)
+def test_wrong_knowledge_is_named(half: Case, changes: dict[str, Any], message: str) -> None:
+    """What is stated in another unit, shape or range raises an error that names it."""
+    _, capture, alone = half
+    with pytest.raises(ValueError, match=message):
+        separation.complete(alone, capture, RESPONSE, **changes)
+
+
+def test_result_of_another_capture_is_refused(half: Case) -> None:
+    """Values that do not give the signals back are of another capture."""
+    _, _, alone = half
+    _, other, _ = draw(SMALL, 9, 0.86, 0.72)
+    with pytest.raises(ValueError, match=r"Must be of the same capture"):
+        separation.complete(alone, other, RESPONSE)
+
+
+@pytest.mark.parametrize(
+    ("picture", "emissivity"),
+    [(replace(SMALL, still=0.5), (0.86, 0.72)), (SMALL, (0.98, 0.95)), (NOBODY, (0.86, 0.72))],
+)
+def test_one_call_gives_a_whole_picture(picture: Picture, emissivity: tuple[float, ...]) -> None:
+    """Everything is finite, intervals hold, and nothing completed passes as measured."""
+    scene, capture, alone = draw(picture, 7, *emissivity)
+    whole = separation.separate(capture, RESPONSE)
+    error = abs(whole["object_temperature"] - scene["object_temperature"])
+    within = float((error < 1.96 * whole["object_temperature_std"]).mean())
+    reading = separation.solve(capture, RESPONSE, "apparent")["object_temperature"]
+    apart = abs(reading - scene["object_temperature"])
+    print(f"{emissivity}: {float(error.median()):.3f} K, reading {float(apart.median()):.3f} K")
+    assert bool(error.notnull().all())
+    assert within > 0.9
+    assert float(error.median()) < float(apart.median())
+    # Without motion anywhere a value cannot be measured.
+    if bool(alone["object_temperature"].isnull().all()):
+        completed = (whole["status"] & int(COMPLETED)) != 0
+        assert bool((completed | (whole["material"] >= 0)).all())

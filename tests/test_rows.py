@@ -1,0 +1,80 @@
+"""Counts that are computed when they are read are those computed at once."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import _rows, alignment, correction, simulation
+
+SHAPE = (2, 5, 13, 7)
+WHOLE = xr.DataArray(
+    np.random.default_rng(1).random(SHAPE, dtype=np.float32), dims=("band", "time", "y", "x")
+)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        {"y": slice(2, 9)},
+        {"y": slice(None, None, 4), "x": slice(1, 6, 2)},
+        {"band": 1, "time": [0, 3], "y": 5},
+        {"y": xr.DataArray([1, 9, 12], dims="p"), "x": xr.DataArray([0, 3, 6], dims="p")},
+        {"time": np.array([True, False, True, True, False]), "y": slice(None, None, -1)},
+    ],
+    ids=str,
+)
+def test_rows_are_read_as_an_array(monkeypatch: pytest.MonkeyPatch, place: dict[str, Any]) -> None:
+    """Every way of indexing gives what the array has there, and computes only rows around it."""
+    monkeypatch.setattr(_rows, "_BLOCK", 150)
+    computed: list[slice] = []
+
+    def compute(rows: slice) -> np.ndarray:
+        computed.append(rows)
+        return WHOLE.values[:, :, rows]
+
+    array = _rows.lazy(compute, WHOLE)
+    part = array.isel(place)
+    assert not computed
+    np.testing.assert_array_equal(part.values, WHOLE.isel(place).values)
+    assert max(rows.stop - rows.start for rows in computed) <= 2
+    wanted = np.arange(SHAPE[2])[place["y"]]
+    assert min(rows.start for rows in computed) >= np.min(wanted)
+    assert max(rows.stop for rows in computed) <= np.max(wanted) + 1
+
+
+def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Computed by rows, the counts, status and all else are those computed at once."""
+    rng, rig, shape = np.random.default_rng(2), simulation.Rig(bad_fraction=0.01), (24, 28)
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    scene = simulation.walkers(np.arange(150) / 10.0, shape, glass, rng)
+    seen = simulation.observe(scene, rig.response(), rng)
+    seen = simulation.fire_shutter(simulation.spoil_pixels(seen, 0.01, rng), [7.0], rng)
+    detector = simulation.pattern(rig, shape, rng)
+    movies = simulation.blackbody_movies(rig, np.array([280.0, 310.0, 340.0]), 16, detector, rng)
+    fitted = correction.fit_correction(correction.blackbody_statistics(movies))
+    raw = simulation.capture(seen, detector)
+    patch = xr.DataArray(np.indices(shape).max(axis=0) < 5, dims=("y", "x"))
+    transform = xr.DataArray(
+        np.stack([np.eye(3), [[1.01, 0.0, 1.5], [0.01, 0.99, -2.25], [0.0, 0.0, 1.0]]]),
+        dims=("band", "row", "column"),
+        coords={"band": list(rig.bands)},
+    )
+
+    def process(*, lazy: bool) -> tuple[xr.Dataset, xr.Dataset]:
+        corrected = correction.correct_capture(
+            raw, fitted, time_constant=0.012, drift_reference=patch, lazy=lazy
+        )
+        aligned = alignment.align(corrected, offset=0.03, transform=transform, lazy=lazy)
+        return corrected, aligned
+
+    at_once = process(lazy=False)
+    monkeypatch.setattr(_rows, "_BLOCK", 40000)
+    for whole, by_rows in zip(at_once, process(lazy=True), strict=True):
+        # The level's root mean square is that of other samples.
+        np.testing.assert_allclose(whole["pattern_std"], by_rows["pattern_std"], rtol=0.02)
+        assert "..." in repr(by_rows)  # not computed
+        xr.testing.assert_identical(
+            whole.drop_vars("pattern_std"), by_rows.load().drop_vars("pattern_std")
+        )
