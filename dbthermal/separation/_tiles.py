@@ -6,9 +6,9 @@ cache. A tile's bands are in the order of their noise, the quietest first: the r
 emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -65,6 +65,18 @@ class _Pixels:
                 parts[field.name] = value.copy()
                 parts[field.name][..., selected] = getattr(part, field.name)
         return replace(self, **parts)
+
+
+Record = TypeVar("Record", bound=_Pixels)
+
+
+def join(parts: Sequence[Record]) -> Record:
+    """Record of the pixels of all parts, one after another."""
+    values = (([getattr(part, one.name) for part in parts], one.name) for one in fields(parts[0]))
+    joined: dict[str, Any] = {
+        name: None if value[0] is None else np.concatenate(value, axis=-1) for value, name in values
+    }
+    return replace(parts[0], **joined)
 
 
 @dataclass(frozen=True)
