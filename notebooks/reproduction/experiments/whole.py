@@ -17,7 +17,7 @@ from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
 from reproduction.experiments.stress import INTERVAL
 
 # Heating that differs from place to place, by so much [1], over so many pixels: the detail.
-_UNEVEN, _DETAIL = 0.1, 2.0
+_UNEVEN, _DETAIL = 0.05, 3.0
 _STEPS: Final = 2  # of the scene's clock in a frame
 
 
@@ -96,6 +96,14 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
         clean=simulation.observe(one_place, response, rng),
         scene=one_place,
     )
+
+
+def registration(view: Sequence[int]) -> xr.DataArray:
+    """Transform of the second view, see `record`, as measured on a target with detail."""
+    matrices = np.stack([np.eye(3), np.eye(3)])
+    matrices[1, :2, 2] = -view[0], -view[1]
+    bands = {"band": list(Rig().bands)}
+    return xr.DataArray(matrices, dims=("band", "row", "column"), coords=bands)
 
 
 def calibrate(movies: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
