@@ -25,7 +25,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import gaussian_filter1d, uniform_filter
 from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
@@ -115,9 +115,17 @@ class Joint:
 
     def finish(self) -> None:
         """Give the object its deviation, in place, when all is solved; flag what is unsettled."""
-        status = self.result["status"].values
+        displacement, status = self.inputs.displacement, self.result["status"].values
+        assert displacement is not None
+        # A reflection resampled off by dd: dq = sum_m w_m (1 - e_m) grad(y) . dd, in the mean.
+        background = self.result["background_temperature"].values.mean(axis=0, dtype=np.float64)
+        slopes = [gaussian_filter1d(background, 1.0, axis=axis, order=1) for axis in (0, 1)]
+        weight = ((1.0 - self.emissivity[1:]) * _weights(self.inputs, self.emissivity)[1:]).sum(0)
+        off = weight * np.reshape(slopes, (2, -1)) * displacement.std
+        off = np.nan_to_num(np.sqrt((off**2).sum(axis=0)))
         std = self.result["object_temperature_std"].values
         std *= np.sqrt(self.factor).reshape(status.shape)
+        np.hypot(std, off.reshape(status.shape).astype(std.dtype), out=std)
         unsettled = self.unsettled.reshape(status.shape) & (status == 0)
         status[unsettled] |= np.uint32(Status.NOT_CONVERGED)
 
@@ -218,6 +226,10 @@ def solve(
         looked_at = _bridge(film[some], solved)
         first = _first_band(inputs, some)
         here, beside, _ = both(looked_at, change[:, some])
+        std = _flat(result["object_temperature_std"])[some].astype(np.float64)
+        share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
+        if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
+            return None
         for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
             # A gradient as steep as the object's own change turns the step round: divide by it.
             line = residuals.regress(
@@ -232,10 +244,6 @@ def solve(
             here, beside, _ = both(looked_at, change[:, some])
             if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
                 break
-        std = _flat(result["object_temperature_std"])[some].astype(np.float64)
-        share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
-        if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
-            return None
         _bridge(film, solved)
         unsettled = np.zeros(solved.size, dtype=bool)
         parts = [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
@@ -281,10 +289,15 @@ def _inside(emissivity: Array) -> Array:
     return np.asarray(1.0 - ratio * most * place)
 
 
+def _weights(inputs: Inputs, emissivity: Array) -> Array:
+    """Weights w of eq. 5 (band, pixel) [1], of the bands without background."""
+    noise = inputs.noise[inputs.bands]
+    return null_combination(_ratio(emissivity).astype(np.float64), noise)[0]
+
+
 def _coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> tuple[Array, Array]:
     """First emissivity (pixel) [1] and coefficients c (band, pixel) [1] of eq. 6, of sum 1."""
-    weights, _ = null_combination(_ratio(emissivity).astype(np.float64), inputs.noise[inputs.bands])
-    shares = np.where(solved, weights * emissivity, 0.0)
+    shares = np.where(solved, _weights(inputs, emissivity) * emissivity, 0.0)
     shares[0, ~solved] = 1.0
     first = np.where(solved, emissivity[0], 1.0)
     return first.astype(np.float32), shares.astype(np.float32)

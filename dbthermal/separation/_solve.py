@@ -57,6 +57,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     settings: "Settings | None" = None,
     emissivity: xr.DataArray | None = None,
     emissivity_std: xr.DataArray | None = None,
+    emissivity_covariance: xr.DataArray | None = None,
     mask: xr.DataArray | None = None,
     pool: xr.DataArray | None = None,
     reflection_shift: xr.Dataset | None = None,
@@ -98,6 +99,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional
         Its standard deviation, same dims.
+    emissivity_covariance : DataArray, optional
+        In its place the covariance, (band, other_band) or (band, other_band, y, x), as of a result.
     mask : DataArray, optional
         Samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
@@ -198,6 +201,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         seed=seed,
         emissivity=emissivity,
         emissivity_std=emissivity_std,
+        emissivity_covariance=emissivity_covariance,
         mask=mask,
         pool=pool,
         reflection_shift=reflection_shift,

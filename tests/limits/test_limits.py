@@ -94,7 +94,7 @@ def test_known_emissivities_give_the_closed_form() -> None:
     )
     noise = responses.noise(RIG.response(), list(RIG.bands))
     std = noise / [curve.reference_slope for curve in curves]
-    variance = temperature_variance(mixed, (std[0], std[1]), temperatures, np.zeros(2))
+    variance = temperature_variance(mixed, (std[0], std[1]), temperatures, np.zeros((2, 2)))
     for name, expected in zip(("object", "background"), np.sqrt(variance), strict=True):
         np.testing.assert_allclose(found[f"{name}_temperature_std"], expected, rtol=1e-9)
     assert not found["emissivity_std"].any()

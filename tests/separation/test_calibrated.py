@@ -1,5 +1,7 @@
 """Separation with known emissivities: exact without noise, and at its closed-form variance."""
 
+import functools
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -108,9 +110,45 @@ def test_nonsense_in_one_pixel_stays_there(glass: Glass) -> None:
     assert not np.any(result["status"].values[1:])
 
 
+def test_emissivities_whose_errors_go_together(glass: Glass) -> None:
+    """With the ratio known far better than the emissivities, their covariance makes it solvable.
+
+    By two deviations alone each pixel would be gray; the intervals hold with the covariance, which
+    is laid on the bands by their names.
+    """
+    scene, capture, response = glass
+    rng, shape = np.random.default_rng(5), scene["emissivity"].shape[1:]
+    shared, own = 0.02 * rng.standard_normal(shape), 0.004 * rng.standard_normal(shape)
+    known = scene["emissivity"] + xr.DataArray(
+        [shared, 2.0 * shared + own], dims=("band", "y", "x")
+    )
+    together = 0.02**2 * np.array([[1.0, 2.0], [2.0, 4.0]]) + np.diag([0.0, 0.004**2])
+    names = list(RIG.bands)
+    covariance = xr.DataArray(
+        together[::-1, ::-1],
+        {"band": names[::-1], "other_band": names[::-1]},
+        ("band", "other_band"),
+    )
+    solve = functools.partial(separation.solve, capture, response, "calibrated", emissivity=known)
+    result = solve(emissivity_covariance=covariance)
+    apart = solve(
+        emissivity_std=xr.DataArray(np.sqrt(np.diag(together)), {"band": names}, ("band",))
+    )
+    assert float(schema.has_flag(apart["status"], "gray").mean()) > 0.9
+    assert not np.any(schema.has_flag(result["status"], "gray"))
+    error = abs(result["object_temperature"] - scene["object_temperature"])
+    share = float((error < 1.96 * result["object_temperature_std"]).where(error.notnull()).mean())
+    print(f"object: 95 % intervals hold in {share:.3f}")
+    assert 0.92 < share < 0.98
+    with pytest.raises(ValueError, match="no negative eigenvalue"):
+        solve(emissivity_covariance=covariance - 0.1)
+    with pytest.raises(ValueError, match="beside an emissivity_covariance"):
+        solve(emissivity_covariance=covariance, emissivity_std=abs(known))
+
+
 def test_linear_variances_are_the_closed_form() -> None:
     """The design's figures for glass with noise (0.04, 0.4) K: 0.40 K and 2.4 K a frame."""
     mixed = mixing.matrix([0.86, 0.72])
-    none = np.zeros(2)
+    none = np.zeros((2, 2))
     variance = temperature_variance(mixed, (0.04, 0.4), np.array([300.0, 300.0]), none)
     np.testing.assert_allclose(np.sqrt(variance), [0.40, 2.4], rtol=0, atol=0.07)  # [K]

@@ -30,15 +30,18 @@ def separate(tile: Tile) -> Estimate:
     if tile.emissivity is None:
         raise ValueError("Missing emissivity. Method 'calibrated' must be given one.")
     emissivity = tile.emissivity
-    emissivity_std = (
-        np.zeros_like(emissivity) if tile.emissivity_std is None else tile.emissivity_std
-    )
+    covariance = np.zeros((2, *emissivity.shape))
+    if tile.emissivity_covariance is not None:
+        covariance = tile.emissivity_covariance
+    (first, both), (_, second) = covariance
     noise = (tile.noise[0], tile.noise[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         temperatures, last_step = _newton(tile, emissivity)
         jacobian = _jacobian(tile, emissivity, temperatures)
-        stds = np.sqrt(temperature_variance(jacobian, noise, temperatures, emissivity_std))
-    least = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * np.hypot(*emissivity_std))
+        stds = np.sqrt(temperature_variance(jacobian, noise, temperatures, covariance))
+    # var(e_1 - e_2); rounding may leave less than nothing of it.
+    spread = np.sqrt(np.maximum(first + second - 2.0 * both, 0.0))
+    least = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * spread)
     gray = np.abs(emissivity[0] - emissivity[1]) <= least
     solved = np.all(np.abs(last_step) < _CONVERGED, axis=(0, 1))
     solved &= np.all(np.isfinite(stds), axis=(0, 1))
@@ -50,7 +53,7 @@ def separate(tile: Tile) -> Estimate:
             background_temperature=temperatures[1],
             background_temperature_std=stds[1],
             emissivity=emissivity,
-            emissivity_std=emissivity_std,
+            emissivity_std=np.sqrt(np.stack([first, second])),
             status=status_bits({Status.GRAY: gray, Status.OUTSIDE_RESPONSE: ~solved & ~gray}),
         )
         .undefine(undefined, np.zeros_like(gray), undefined)
@@ -59,27 +62,30 @@ def separate(tile: Tile) -> Estimate:
 
 
 def temperature_variance(
-    jacobian: Array, noise: tuple[float, float], temperatures: Array, emissivity_std: Array
+    jacobian: Array, noise: tuple[float, float], temperatures: Array, covariance: Array
 ) -> Array:
     r"""
     Variance (2, ...) of object and background [K^2] of a single frame; the Cramer-Rao bound.
 
     From the derivatives (band, 2, ...) of the signals with the two temperatures (2, ...) [K], the
-    noise of the signals [K] and the deviation (2, ...) of the emissivities [1]. For slopes 1
+    noise of the signals [K] and the covariance (2, 2, ...) of the emissivities [1]. For slopes 1
 
     .. math:: \mathrm{var}(x) = [(1-e_2)^2 s_1^2 + (1-e_1)^2 s_2^2] / (e_1-e_2)^2, \quad
               \mathrm{var}(y) = [e_2^2 s_1^2 + e_1^2 s_2^2] / (e_1-e_2)^2 \qquad (2)
     """
     # An uncertain emissivity is a noise of dz/de = u(x) - u(y): s_m^2 + (x - y)^2 var(e_m).
-    contrast = temperatures[0] - temperatures[1]
-    first, second = (
-        std**2 + (contrast * deviation) ** 2
-        for std, deviation in zip(noise, emissivity_std, strict=True)
-    )
-    # var = J^-1 diag(first, second) J^-T, with J^-1 = ((d, -b), (-c, a)) / det J.
+    squared = (temperatures[0] - temperatures[1]) ** 2
+    first, second = (noise[m] ** 2 + squared * covariance[m, m] for m in range(2))
+    both = squared * covariance[0, 1]
+    # var = J^-1 C J^-T, with J^-1 = ((d, -b), (-c, a)) / det J.
     ((a, b), (c, d)) = jacobian
     determinant = a * d - b * c
-    energy = np.stack([d**2 * first + b**2 * second, c**2 * first + a**2 * second])
+    energy = np.stack(
+        [
+            d**2 * first + b**2 * second - 2.0 * b * d * both,
+            c**2 * first + a**2 * second - 2.0 * a * c * both,
+        ]
+    )
     return np.asarray(energy / determinant**2)
 
 
