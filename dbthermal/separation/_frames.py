@@ -29,7 +29,7 @@ _STEP: Final = 0.05
 _GROWTH: Final = 1.5
 _AGREE: Final = 1.5
 # Variance that is stated over that of the noise: the rest is what a window bends [1].
-_BENT: Final = 1.35
+_BENT: Final = 1.6
 # Half-width from which the polynomial is a parabola, and a line below [frame].
 _PARABOLA: Final = 4
 

@@ -61,7 +61,7 @@ class Inputs:
     pattern: Array | None  # deviation of what the correction leaves, constant in time (band) [K]
     bands: list[int]  # places of the bands in the order of their noise
     emissivity: Array | None  # known beforehand (band, y, x) [1]
-    emissivity_std: Array | None
+    emissivity_covariance: Array | None  # of its errors (band, band, y, x)
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
     displacement: Displacement | None  # of the second camera's reflections
     difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `_joint.Joint`
@@ -84,8 +84,9 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     emissivity_std: xr.DataArray | None,
     mask: xr.DataArray | None,
     pool: xr.DataArray | None,
-    reflection_shift: xr.Dataset | None,
     response_kind: str,
+    emissivity_covariance: xr.DataArray | None = None,
+    reflection_shift: xr.Dataset | None = None,
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
     settings = _checked_settings(method, name, settings)
@@ -106,7 +107,9 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         capture = capture.assign(mask=_checked_mask(capture, mask))
     noise = _noise(capture, response, curves)
     _check_clock(capture, method, curves, noise)
-    value, std = _known_emissivity(corrected, emissivity, emissivity_std)
+    value, covariance = _known_emissivity(
+        corrected, emissivity, emissivity_std, emissivity_covariance
+    )
     order = [int(band) for band in np.argsort(noise, kind="stable")]
     return Inputs(
         method=method,
@@ -118,7 +121,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         pattern=_pattern(capture, curves),
         bands=order,
         emissivity=value,
-        emissivity_std=std,
+        emissivity_covariance=covariance,
         labels=_labels(corrected, pool),
         displacement=_displacement(corrected, reflection_shift, method, name, order[0]),
     )
@@ -257,13 +260,19 @@ def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array | None:
 
 
 def _known_emissivity(
-    corrected: xr.Dataset, emissivity: xr.DataArray | None, std: xr.DataArray | None
+    corrected: xr.Dataset,
+    emissivity: xr.DataArray | None,
+    std: xr.DataArray | None,
+    covariance: xr.DataArray | None,
 ) -> tuple[Array, Array] | tuple[None, None]:
-    """Emissivity and standard deviation (band, y, x) [1], from (band) or (band, y, x)."""
+    """Emissivity (band, y, x) [1] and the covariance of its errors (band, band, y, x)."""
     if emissivity is None:
-        if std is not None:
-            raise ValueError("Invalid emissivity_std without an emissivity. Give both.")
+        for name, given in (("emissivity_std", std), ("emissivity_covariance", covariance)):
+            if given is not None:
+                raise ValueError(f"Invalid {name} without an emissivity. Give both.")
         return None, None
+    if std is not None and covariance is not None:
+        raise ValueError("Invalid emissivity_std beside emissivity_covariance. Give one of them.")
     values = _over_image(corrected, emissivity, "emissivity")
     bad = ~((values > 0) & (values < 1))
     if np.any(bad):
@@ -272,17 +281,47 @@ def _known_emissivity(
             f"Invalid emissivity {values[band, y, x]} in band "
             f"'{corrected['band'].values[band]}', pixel ({y}, {x}). Must lie in (0, 1)."
         )
-    if np.all(values[0] == values[1]):
+    if np.all(values == values[0]):
         raise ValueError(
             f"Invalid emissivities {values[:, 0, 0]}: the same in both bands. Must differ; "
             "a gray body cannot be separated."
         )
-    if std is None:
-        return values, np.zeros_like(values)
-    deviations = _over_image(corrected, std, "emissivity_std")
+    if covariance is not None:
+        return values, _covariance(corrected, covariance)
+    deviations = np.zeros_like(values)
+    if std is not None:
+        deviations = _over_image(corrected, std, "emissivity_std")
     if not np.all(deviations >= 0):
         raise ValueError("Invalid emissivity_std. Must be zero or positive, not NaN.")
-    return values, deviations
+    return values, np.eye(len(values))[..., np.newaxis, np.newaxis] * deviations**2
+
+
+def _covariance(corrected: xr.Dataset, covariance: xr.DataArray) -> Array:
+    """Covariance (band, band, y, x), symmetric and not negative, in the order of the capture."""
+    label, dims = "emissivity_covariance", ("band", "other_band")
+    schema.check_numbers(covariance, label, "1")
+    if covariance.dims not in (dims, (*dims, "y", "x")):
+        rule = f"Must be {dims} or {(*dims, 'y', 'x')}."
+        raise ValueError(f"Invalid dims {covariance.dims} of {label}. {rule}")
+    covariance = laid_on(covariance, corrected, label, "the capture")
+    if "other_band" in covariance.coords:
+        names = [str(name) for name in corrected["band"].values]
+        other = covariance["other_band"].rename(other_band="band")
+        place = schema.band_positions(other.assign_coords(band=other.values), names, label)
+        covariance = covariance.isel(other_band=place)
+    values = covariance.values.astype(np.float64)
+    if values.shape[1] != values.shape[0]:
+        raise ValueError(
+            f"Invalid sizes {values.shape} of {label}. Must be the bands by the bands."
+        )
+    matrices = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
+    if not np.all(np.isfinite(values)) or not np.allclose(matrices, np.swapaxes(matrices, 1, 2)):
+        raise ValueError(f"Invalid {label}. Must be symmetric and finite.")
+    lowest, largest = np.linalg.eigvalsh(matrices)[:, [0, -1]].T
+    if np.any(lowest < -1e-6 * np.abs(largest)):
+        raise ValueError(f"Invalid {label} of eigenvalue {lowest.min():.3g}. Must not be negative.")
+    shape = (*values.shape[:2], corrected.sizes["y"], corrected.sizes["x"])
+    return np.broadcast_to(values.reshape(*values.shape[:2], *values.shape[2:] or (1, 1)), shape)
 
 
 def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str) -> Array:

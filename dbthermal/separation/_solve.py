@@ -24,13 +24,19 @@ from dbthermal.separation._tiles import Array, Estimate, Mask, Material, Survey
 
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
+    from dbthermal.separation._baselines.calibrated import CalibratedSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
     from dbthermal.separation._baselines.pyrometry import RatioSettings
     from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
     Settings: TypeAlias = (
-        SubspaceSettings | DbvtSettings | NaiveSettings | RatioSettings | BcpSettings
+        SubspaceSettings
+        | CalibratedSettings
+        | DbvtSettings
+        | NaiveSettings
+        | RatioSettings
+        | BcpSettings
     )
 
 _MODULES: Final = {
@@ -57,6 +63,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     settings: "Settings | None" = None,
     emissivity: xr.DataArray | None = None,
     emissivity_std: xr.DataArray | None = None,
+    emissivity_covariance: xr.DataArray | None = None,
     mask: xr.DataArray | None = None,
     pool: xr.DataArray | None = None,
     reflection_shift: xr.Dataset | None = None,
@@ -81,8 +88,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         corrected first. `pattern_std` (band) [count], an error of each pixel that is constant in
         time, widens the bars of "subspace". Samples that are NaN are left out, and frames that
         repeat the one before in a band. May be lazy, as from `store.open_dataset`: it is read a few
-        rows at a time, and never whole. "subspace" takes two bands or more, and at least 32 frames;
-        the other methods two bands.
+        rows at a time, and never whole. "subspace" and "calibrated" take two bands or more, and the
+        former at least 32 frames; the other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
         where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture;
@@ -93,11 +100,14 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         own reading.
     settings : Settings, optional
         Record of the method's options, such as `SubspaceSettings`; its defaults if not given.
-        "calibrated" and "apparent" have none.
+        "apparent" has none.
     emissivity : DataArray, optional
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional
         Its standard deviation, same dims.
+    emissivity_covariance : DataArray, optional
+        In place of it the covariance of its errors, (band, other_band) or (band, other_band, y, x)
+        [1], as "subspace" gives it: ratios of reflectivities are often known better than either.
     mask : DataArray, optional
         Samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
@@ -198,6 +208,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         seed=seed,
         emissivity=emissivity,
         emissivity_std=emissivity_std,
+        emissivity_covariance=emissivity_covariance,
         mask=mask,
         pool=pool,
         reflection_shift=reflection_shift,

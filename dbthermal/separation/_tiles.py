@@ -107,7 +107,7 @@ class Tile:
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
     emissivity: Array | None = None  # known beforehand (band, pixel) [1]
-    emissivity_std: Array | None = None  # its standard deviation (band, pixel) [1]
+    emissivity_covariance: Array | None = None  # its errors' (band, band, pixel) [1]
 
     @property
     def reference(self) -> float:
@@ -142,7 +142,7 @@ class Tile:
         """Return the tile of the selected pixels (pixel) alone, as one row."""
         known: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[..., selected]
-            for name in ("emissivity", "emissivity_std")
+            for name in ("emissivity", "emissivity_covariance")
         }
         material = None if self.material is None else self.material.select_pixels(selected)
         signals = self.signals[..., selected]
@@ -290,10 +290,14 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        emissivity, std = (
-            None if known is None else known[(slice(None), *window)].reshape(len(bands), -1)[bands]
-            for known in (inputs.emissivity, inputs.emissivity_std)
-        )
+        emissivity = covariance = None
+        if inputs.emissivity is not None and inputs.emissivity_covariance is not None:
+            emissivity, covariance = (
+                known[(..., *window)].reshape(*known.shape[:-2], -1)[
+                    np.ix_(*[bands] * (known.ndim - 2))
+                ]
+                for known in (inputs.emissivity, inputs.emissivity_covariance)
+            )
         tile = Tile(
             # The linearised signals (see `response`), less the reference temperature.
             signals=np.stack(
@@ -311,7 +315,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             segment=segment,
             material=None if material is None else material.select_pixels(places),
             emissivity=emissivity,
-            emissivity_std=std,
+            emissivity_covariance=covariance,
         )
         if inputs.difference is not None:
             tile.signals[1:] -= inputs.difference(window[0])

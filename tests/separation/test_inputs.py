@@ -47,7 +47,7 @@ def test_emissivity_is_spread_over_the_image(dims: tuple[str, ...]) -> None:
     assert inputs.emissivity is not None
     assert inputs.emissivity.shape == (2, 3, 4)
     np.testing.assert_array_equal(inputs.emissivity[:, 0, 0], [0.8, 0.7])
-    np.testing.assert_array_equal(inputs.emissivity_std, 0.0)
+    np.testing.assert_array_equal(inputs.emissivity_covariance, 0.0)
 
 
 def test_labels_are_numbered_without_gaps() -> None:
