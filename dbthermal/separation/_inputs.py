@@ -28,6 +28,8 @@ _CLOCK_PIXELS: Final = 256
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
+# Negative eigenvalue of a covariance that is rounding [1].
+_ROUNDED: Final = 1e-6
 _MASK_DIMS: Final = (("time",), ("y", "x"), ("time", "y", "x"))
 
 
@@ -61,7 +63,7 @@ class Inputs:
     pattern: Array | None  # deviation of what the correction leaves, constant in time (band) [K]
     bands: list[int]  # places of the bands in the order of their noise
     emissivity: Array | None  # known beforehand (band, y, x) [1]
-    emissivity_covariance: Array | None  # of its errors (band, band, y, x)
+    emissivity_covariance: Array | None  # (band, band, y, x) [1]
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
     displacement: Displacement | None  # of the second camera's reflections
     difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `_joint.Joint`
@@ -265,14 +267,14 @@ def _known_emissivity(
     std: xr.DataArray | None,
     covariance: xr.DataArray | None,
 ) -> tuple[Array, Array] | tuple[None, None]:
-    """Emissivity (band, y, x) [1] and the covariance of its errors (band, band, y, x)."""
+    """Emissivity (band, y, x) [1] and its covariance (band, band, y, x), of one pixel or of all."""
     if emissivity is None:
-        for name, given in (("emissivity_std", std), ("emissivity_covariance", covariance)):
-            if given is not None:
-                raise ValueError(f"Invalid {name} without an emissivity. Give both.")
+        if std is not None or covariance is not None:
+            name = "emissivity_std" if covariance is None else "emissivity_covariance"
+            raise ValueError(f"Invalid {name} without an emissivity. Give both.")
         return None, None
     if std is not None and covariance is not None:
-        raise ValueError("Invalid emissivity_std beside emissivity_covariance. Give one of them.")
+        raise ValueError("Invalid emissivity_std beside an emissivity_covariance. Give one.")
     values = _over_image(corrected, emissivity, "emissivity")
     bad = ~((values > 0) & (values < 1))
     if np.any(bad):
@@ -287,7 +289,10 @@ def _known_emissivity(
             "a gray body cannot be separated."
         )
     if covariance is not None:
-        return values, _covariance(corrected, covariance)
+        together = _over_image(corrected, covariance, "emissivity_covariance", "other_band")
+        if not np.all(np.linalg.eigvalsh(np.moveaxis(together, (0, 1), (-2, -1))) >= -_ROUNDED):
+            raise ValueError("Invalid emissivity_covariance. Must have no negative eigenvalue.")
+        return values, together
     deviations = np.zeros_like(values)
     if std is not None:
         deviations = _over_image(corrected, std, "emissivity_std")
@@ -296,44 +301,23 @@ def _known_emissivity(
     return values, np.eye(len(values))[..., np.newaxis, np.newaxis] * deviations**2
 
 
-def _covariance(corrected: xr.Dataset, covariance: xr.DataArray) -> Array:
-    """Covariance (band, band, y, x), symmetric and not negative, in the order of the capture."""
-    label, dims = "emissivity_covariance", ("band", "other_band")
-    schema.check_numbers(covariance, label, "1")
-    if covariance.dims not in (dims, (*dims, "y", "x")):
-        rule = f"Must be {dims} or {(*dims, 'y', 'x')}."
-        raise ValueError(f"Invalid dims {covariance.dims} of {label}. {rule}")
-    covariance = laid_on(covariance, corrected, label, "the capture")
-    if "other_band" in covariance.coords:
-        names = [str(name) for name in corrected["band"].values]
-        other = covariance["other_band"].rename(other_band="band")
-        place = schema.band_positions(other.assign_coords(band=other.values), names, label)
-        covariance = covariance.isel(other_band=place)
-    values = covariance.values.astype(np.float64)
-    if values.shape[1] != values.shape[0]:
-        raise ValueError(
-            f"Invalid sizes {values.shape} of {label}. Must be the bands by the bands."
-        )
-    matrices = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
-    if not np.all(np.isfinite(values)) or not np.allclose(matrices, np.swapaxes(matrices, 1, 2)):
-        raise ValueError(f"Invalid {label}. Must be symmetric and finite.")
-    lowest, largest = np.linalg.eigvalsh(matrices)[:, [0, -1]].T
-    if np.any(lowest < -1e-6 * np.abs(largest)):
-        raise ValueError(f"Invalid {label} of eigenvalue {lowest.min():.3g}. Must not be negative.")
-    shape = (*values.shape[:2], corrected.sizes["y"], corrected.sizes["x"])
-    return np.broadcast_to(values.reshape(*values.shape[:2], *values.shape[2:] or (1, 1)), shape)
-
-
-def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str) -> Array:
-    """Values (band, y, x) of an array (band) or (band, y, x), in the capture's order of bands."""
+def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *other: str) -> Array:
+    """Values (band, ..., y, x) of an array over the bands, of one pixel or of all."""
     schema.check_numbers(array, name, "1")
-    if array.dims not in (("band",), ("band", "y", "x")):
-        raise ValueError(
-            f"Invalid dims {array.dims} of {name}. Must be ('band',) or ('band', 'y', 'x')."
+    allowed = ("band", *other), ("band", *other, "y", "x")
+    if array.dims not in allowed:
+        raise ValueError(f"Invalid dims {array.dims} of {name}. Must be one of {allowed}.")
+    if other and "other_band" in array.coords:
+        places = schema.band_positions(
+            array["other_band"].rename(other_band="band"), corrected["band"].values.tolist(), name
         )
+        array = array.isel(other_band=places)
     values = laid_on(array, corrected, name, "the capture").values.astype(np.float64)
-    shape = tuple(corrected.sizes[dim] for dim in ("band", "y", "x"))
-    return np.broadcast_to(values.reshape(shape[0], *values.shape[1:] or (1, 1)), shape)
+    image = (corrected.sizes["y"], corrected.sizes["x"])
+    leading = values.shape[: 1 + len(other)]
+    return np.broadcast_to(
+        values.reshape(*leading, *values.shape[len(leading) :] or (1, 1)), (*leading, *image)
+    )
 
 
 def _displacement(

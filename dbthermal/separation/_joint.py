@@ -25,7 +25,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import gaussian_filter1d, uniform_filter
 from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
@@ -34,6 +34,7 @@ from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation._displaced import without
 from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._subspace import residuals
 from dbthermal.separation._subspace.reflection_ratio import null_combination
 
 Array = npt.NDArray[np.floating[Any]]
@@ -46,11 +47,13 @@ _CONVERGED: Final = 1e-3
 # Rounds of the emissivities and the object, and the change that ends them [1].
 _ROUNDS: Final = 20
 _SETTLED: Final = 1e-3
+# Change of the object [K] below which its emissivity is not told.
+_LEAST_CHANGE: Final = 0.1
 # Frames that are solved together.
 _FRAMES: Final = 8
 # Frames from which it is told whether the object's gradient matters, and the share of the object's
 # deviation from which it does, in more than a few of the samples.
-_LOOKED_AT: Final = 12
+_LOOKED_AT: Final = 32
 _MATTERS: Final = 0.2
 _MOST: Final = 0.99
 # Draws of noise by which the deviations are propagated.
@@ -112,9 +115,17 @@ class Joint:
 
     def finish(self) -> None:
         """Give the object its deviation, in place, when all is solved; flag what is unsettled."""
-        status = self.result["status"].values
+        displacement, status = self.inputs.displacement, self.result["status"].values
+        assert displacement is not None
+        # A reflection resampled off by dd: dq = sum_m w_m (1 - e_m) grad(y) . dd, in the mean.
+        background = self.result["background_temperature"].values.mean(axis=0, dtype=np.float64)
+        slopes = [gaussian_filter1d(background, 1.0, axis=axis, order=1) for axis in (0, 1)]
+        weight = ((1.0 - self.emissivity[1:]) * _weights(self.inputs, self.emissivity)[1:]).sum(0)
+        off = weight * np.reshape(slopes, (2, -1)) * displacement.std
+        off = np.nan_to_num(np.sqrt((off**2).sum(axis=0)))
         std = self.result["object_temperature_std"].values
         std *= np.sqrt(self.factor).reshape(status.shape)
+        np.hypot(std, off.reshape(status.shape).astype(std.dtype), out=std)
         unsettled = self.unsettled.reshape(status.shape) & (status == 0)
         status[unsettled] |= np.uint32(Status.NOT_CONVERGED)
 
@@ -199,39 +210,45 @@ def solve(
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         film, there = (_flat(result[f"{one}_temperature"]) for one in ("object", "background"))
         raw = _emissivity(inputs, result)
-        solved = np.isfinite(raw[0]) & (_finite(film) > 1)
+        solved = np.all(np.isfinite(raw), axis=0) & (_finite(film) > 1)
         emissivity = _inside(raw)
         equations = _equations(inputs, emissivity, solved)
         change, variance = _changes(inputs, equations)
         curve = inputs.curves[inputs.bands[0]]
         _, shares = _coefficients(inputs, raw, solved)
 
-        def both(alone: Array, change: Array) -> tuple[Array, Array, Array, Array]:
+        def both(alone: Array, change: Array) -> tuple[Array, Array, Array]:
             signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
             signal = np.ascontiguousarray(signal.T, dtype=np.float32)
-            return signal, *equations.solve(equations.target(shares, signal), signal, change)
+            return equations.solve(equations.target(shares, signal), signal, change)
 
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
         looked_at = _bridge(film[some], solved)
-        known = np.isfinite(result["emissivity"].values[inputs.bands[0]]).ravel()
-        for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
-            alone, here, _, _ = both(looked_at, change[:, some])
-            # z_1 has the slope e_1 on u_1(x), of which it had another before.
-            factor = np.where(known, _slope(here, alone), 1.0)
-            before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - raw[0] * factor))
-            equations = equations.of(*_coefficients(inputs, emissivity, solved))
-            if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
-                break
-        _, here, beside, _ = both(looked_at, change[:, some])
+        first = _first_band(inputs, some)
+        here, beside, _ = both(looked_at, change[:, some])
         std = _flat(result["object_temperature_std"])[some].astype(np.float64)
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
         if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
             return None
+        for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
+            # A gradient as steep as the object's own change turns the step round: divide by it.
+            line = residuals.regress(
+                here.T.astype(np.float64), first, inputs.noise[inputs.bands[0]]
+            )
+            steep = np.maximum(_slope(here, beside), 1.0)
+            slope = emissivity[0] + (line.slope - emissivity[0]) / steep
+            known = line.energy > _LEAST_CHANGE**2 * len(some)
+            slope = np.where(known, slope, emissivity[0])
+            before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - slope))
+            equations = equations.of(*_coefficients(inputs, emissivity, solved))
+            here, beside, _ = both(looked_at, change[:, some])
+            if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
+                break
         _bridge(film, solved)
         unsettled = np.zeros(solved.size, dtype=bool)
         parts = [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
         results = threads.map(lambda part: both(film[part], change[:, part]), parts)
-        for part, (_, *pair, step) in zip(parts, results, strict=True):
+        for part, (*pair, step) in zip(parts, results, strict=True):
             film[part], there[part] = (
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
             )
@@ -252,6 +269,7 @@ def _emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
         result[name].values[inputs.bands].reshape(len(inputs.bands), -1).astype(np.float64)
         for name in ("emissivity", "reflection_ratio")
     )
+    ratio = np.where(np.isfinite(ratio), ratio, _ratio(emissivity))
     # That of a constant object is taken from the middle of what its ratios leave.
     middle = 1.0 - ratio * (0.5 / np.maximum(ratio.max(axis=0), 1.0))
     return np.where(np.isfinite(emissivity), emissivity, middle)
@@ -271,13 +289,26 @@ def _inside(emissivity: Array) -> Array:
     return np.asarray(1.0 - ratio * most * place)
 
 
+def _weights(inputs: Inputs, emissivity: Array) -> Array:
+    """Weights w of eq. 5 (band, pixel) [1], of the bands without background."""
+    noise = inputs.noise[inputs.bands]
+    return null_combination(_ratio(emissivity).astype(np.float64), noise)[0]
+
+
 def _coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> tuple[Array, Array]:
     """First emissivity (pixel) [1] and coefficients c (band, pixel) [1] of eq. 6, of sum 1."""
-    weights, _ = null_combination(_ratio(emissivity).astype(np.float64), inputs.noise[inputs.bands])
-    shares = np.where(solved, weights * emissivity, 0.0)
+    shares = np.where(solved, _weights(inputs, emissivity) * emissivity, 0.0)
     shares[0, ~solved] = 1.0
     first = np.where(solved, emissivity[0], 1.0)
     return first.astype(np.float32), shares.astype(np.float32)
+
+
+def _first_band(inputs: Inputs, frames: Whole) -> npt.NDArray[np.float64]:
+    """Signal (frame, pixel) [K] of the reference band; 0, an outlier, where it is not measured."""
+    band = inputs.bands[0]
+    counts = inputs.capture["counts"].isel(band=band, time=frames).values.astype(np.float64)
+    signal = inputs.curves[band].linearise(counts) - inputs.curves[band].reference
+    return np.where(schema.measured(counts), signal, 0.0).reshape(len(frames), -1)
 
 
 def _slope(abscissa: Array, ordinate: Array) -> Array:
@@ -405,7 +436,7 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
         uniform_filter(np.reshape(one, displacement.shape), 3).ravel()
-        for one in ((signal.astype(np.float64) ** 2).mean(axis=1), size**2)
+        for one in (np.nan_to_num(signal.astype(np.float64) ** 2).mean(axis=1), size**2)
     )
     own = size[:, 0] > 0  # elsewhere the running sums are rounding
     return np.where(own, energy / np.where(own, total, 1.0), 1.0)

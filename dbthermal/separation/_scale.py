@@ -46,9 +46,11 @@ def frame_errors(change: Array, mean: Array, pixels: Mask) -> Array:
 
     The change (time, pixel) is that from the true curve, the mean (pixel) that over time.
     """
-    design = np.stack([np.ones_like(mean), mean], axis=1)
-    errors, *_ = np.linalg.lstsq(design[pixels], change[:, pixels].T, rcond=None)
-    return np.asarray(errors)
+    centre = mean[pixels].mean()
+    spread = np.where(pixels, mean - centre, 0.0)
+    gain = change @ spread / np.maximum(np.sum(spread**2), np.finfo(np.float64).tiny)
+    offset = change @ pixels / pixels.sum() - gain * centre
+    return np.stack([offset, gain])
 
 
 def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
@@ -126,15 +128,17 @@ def _scale(values: Array) -> tuple[Array, Array, float]:
     """Offset (time), gain (time) and explained share of still pixels (time, pixel)."""
     mean = values.mean(axis=0)
     change = values - mean
+    squares = np.einsum("tp,tp->p", change, change)
     kept = np.ones(mean.size, dtype=bool)
     for _ in range(_ROUNDS):
         # Exact: o + g s - mean is linear in the mean, as mean = mean(o) + mean(g) s.
         offset, error = frame_errors(change, mean, kept)
-        residual = change - offset[:, np.newaxis] - error[:, np.newaxis] * mean
-        power = np.einsum("tp,tp->p", residual, residual)
+        # sum_t (c - o - e m)^2, from products over time alone.
+        power = squares - 2.0 * (offset @ change + mean * (error @ change))
+        power += offset @ offset + mean * (2.0 * (offset @ error) + mean * (error @ error))
         before, kept = kept, power <= np.median(power)
         if np.array_equal(before, kept):
             break
-    total = float(np.sum(change[:, kept] ** 2))
+    total = float(squares[kept].sum())
     explained = 1.0 - float(power[kept].sum()) / total if total > 0 else 0.0
     return offset, 1.0 + error, explained

@@ -106,8 +106,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     emissivity_std : DataArray, optional
         Its standard deviation, same dims.
     emissivity_covariance : DataArray, optional
-        In place of it the covariance of its errors, (band, other_band) or (band, other_band, y, x)
-        [1], as "subspace" gives it: ratios of reflectivities are often known better than either.
+        In its place the covariance, (band, other_band) or (band, other_band, y, x), as of a result.
     mask : DataArray, optional
         Samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
@@ -217,7 +216,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     height, width = corrected.sizes["y"], corrected.sizes["x"]
     variables = dict(schema.STAGES["separated"])
     if inputs.method.survey:
-        variables |= schema.OPTIONAL["separated"]
+        name = "emissivity_covariance"
+        variables[name] = schema.OPTIONAL["separated"][name]
     result = _allocate(corrected, variables)
     with (
         threadpool_limits(limits=1, user_api="blas"),
@@ -295,16 +295,19 @@ def _solve_jointly(
     both = joint.solve(inputs, result, threads)
     if inputs.labels is not None:
         apart = inputs if both is None else replace(inputs, difference=both.difference)
-        material = _materials(apart, threads, bar)
+        material = _materials(apart, threads, bar, every=True)
         _separate_all(inputs, material, result, threads, bar)
         both = joint.solve(inputs, result, threads, pooled=True)
     if both is not None:
         apart = replace(inputs, difference=both.difference)
+        material = _materials(apart, threads, bar)
         _separate_all(apart, material, result, threads, bar)
         both.finish()
 
 
-def _materials(inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]") -> Material | None:
+def _materials(
+    inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]", *, every: bool = False
+) -> Material | None:
     """Ratios and emissivity of the material of each pixel of the image; None if none are told."""
     if inputs.labels is None:
         return None
@@ -313,7 +316,8 @@ def _materials(inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]") ->
     found = [part for survey in surveys for part in survey]
     material = _pool(inputs, found)
     told = sum(np.isfinite(part.emissivity).sum() for _, part in found)
-    if material is None or told > _MOST_TOLD * sum((part.frames > 0).sum() for _, part in found):
+    every |= told > _MOST_TOLD * sum((part.frames > 0).sum() for _, part in found)
+    if material is None or every:
         return material
     # Emissivities of the few pixels with a ratio of their own are those of a selection by it.
     ratio = replace(material, emissivity=np.full_like(material.emissivity, np.nan))

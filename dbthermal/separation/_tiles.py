@@ -6,9 +6,9 @@ cache. A tile's bands are in the order of their noise, the quietest first: the r
 emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -67,6 +67,18 @@ class _Pixels:
         return replace(self, **parts)
 
 
+Record = TypeVar("Record", bound=_Pixels)
+
+
+def join(parts: Sequence[Record]) -> Record:
+    """Record of the pixels of all parts, one after another."""
+    values = (([getattr(part, one.name) for part in parts], one.name) for one in fields(parts[0]))
+    joined: dict[str, Any] = {
+        name: None if value[0] is None else np.concatenate(value, axis=-1) for value, name in values
+    }
+    return replace(parts[0], **joined)
+
+
 @dataclass(frozen=True)
 class Material(_Pixels):
     """Reflection ratios and emissivity that the pixels of one material share; NaN for others."""
@@ -107,7 +119,7 @@ class Tile:
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
     emissivity: Array | None = None  # known beforehand (band, pixel) [1]
-    emissivity_covariance: Array | None = None  # its errors' (band, band, pixel) [1]
+    emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
 
     @property
     def reference(self) -> float:
@@ -290,14 +302,12 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        emissivity = covariance = None
-        if inputs.emissivity is not None and inputs.emissivity_covariance is not None:
-            emissivity, covariance = (
-                known[(..., *window)].reshape(*known.shape[:-2], -1)[
-                    np.ix_(*[bands] * (known.ndim - 2))
-                ]
-                for known in (inputs.emissivity, inputs.emissivity_covariance)
-            )
+        emissivity, covariance = (
+            None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)
+            for known in (inputs.emissivity, inputs.emissivity_covariance)
+        )
+        if emissivity is not None and covariance is not None:
+            emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
         tile = Tile(
             # The linearised signals (see `response`), less the reference temperature.
             signals=np.stack(

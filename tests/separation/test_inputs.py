@@ -22,7 +22,8 @@ def capture() -> xr.Dataset:
 
 def checked(method: str = "subspace", **known: object) -> _inputs.Inputs:
     """Inputs of a method."""
-    none = dict.fromkeys(("settings", "emissivity", "emissivity_std", "mask", "pool"))
+    omitted = ("settings", "emissivity", "emissivity_std", "mask", "pool", "reflection_shift")
+    none = dict.fromkeys(omitted)
     given: dict[str, object] = {**none, "seed": 0, "response_kind": "exact", **known}
     record = separation.get_method(method)
     return _inputs.check(capture(), RIG.response(), record, method, **given)  # type: ignore[arg-type]

@@ -245,7 +245,8 @@ def find_level(scene: Scene) -> Level:
     # A posterior of precision 1 / after holds the prior's 1 / before.
     variance = 1.0 / np.maximum(1.0 / after - 1.0 / before, _NOTHING)
     room, wide = float(np.mean(scene.level.signal)), float(np.mean(np.square(scene.level.std)))
-    value = room + (mean - room) * variance / after
+    with np.errstate(over="ignore"):  # of pixels that tell nothing
+        value = room + (mean - room) * variance / after
     seen = np.isfinite(value) & (variance < before)
     if not np.any(seen):
         return level
