@@ -34,11 +34,9 @@ _REGISTERED: Final = 200
 _ROUNDS: Final = 3
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
-# Memory of the rows that are separated together, and what a sample of an image takes there [byte].
-_MEMORY: Final = 2**31
-_SAMPLE: Final = 80
-# Rows around them, at least, and in multiples of the shift.
-_HALO, _SHIFTS = 8, 4.0
+# Memory of the rows that are separated together, what a sample of a pixel takes there [byte], and
+# fewest rows; rows around them, in multiples of the shift.
+_MEMORY, _SAMPLE, _FEWEST, _SHIFTS = 2_500_000_000, 120, 8, 4.0
 _BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 
@@ -134,10 +132,12 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
     kept = ("clock", "time_offset", "frames_lost", "transform")
     attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
+    halo = _halo(field)
 
     def separated(rows: slice) -> xr.Dataset:
         """Some rows of the result."""
-        around, own = _around(rows, aligned, field)
+        around = slice(max(0, rows.start - halo), rows.stop + halo)
+        own = slice(rows.start - around.start, rows.stop - around.start)
         shift = None if field is None else field.isel(y=around)
         part = aligned.isel(y=around).load()
         result = separate(part, response, **{"reflection_shift": shift, **separating})
@@ -146,7 +146,9 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
 
     if target is None:
         return separated(slice(0, aligned.sizes["y"]))
-    store.save_rows(map(separated, _blocks(aligned)), target, provenance or store.provenance({}))
+    store.save_rows(
+        map(separated, _blocks(aligned, halo)), target, provenance or store.provenance({})
+    )
     return store.open_dataset(target)
 
 
@@ -251,18 +253,17 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(values, coords={"axis": field["axis"], **here}, attrs=field.attrs)
 
 
-def _blocks(aligned: xr.Dataset) -> Iterator[slice]:
-    """Rows that are separated together."""
+def _blocks(aligned: xr.Dataset, halo: int) -> Iterator[slice]:
+    """Rows that are separated together, with a halo on both sides."""
     height = aligned.sizes["y"]
-    rows = max(1, _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"]))
+    together = _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"])
+    rows = max(_FEWEST, together - 2 * halo)
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
 
 
-def _around(rows: slice, aligned: xr.Dataset, field: xr.Dataset | None) -> tuple[slice, slice]:
-    """Rows with those around them that they are separated with, and their own among these."""
-    halo = _HALO
-    if field is not None:
-        halo += int(np.ceil(_SHIFTS * np.nanmax(np.abs(field["shift"].sel(axis="y").values))))
-    first, last = max(0, rows.start - halo), min(aligned.sizes["y"], rows.stop + halo)
-    return slice(first, last), slice(rows.start - first, rows.stop - first)
+def _halo(field: xr.Dataset | None) -> int:
+    """Rows around others from which their object is told, if the cameras see reflections apart."""
+    if field is None:
+        return 1
+    return 1 + int(np.ceil(_SHIFTS * np.nanmax(np.abs(field["shift"].sel(axis="y").values))))
