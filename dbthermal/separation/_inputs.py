@@ -84,11 +84,11 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     seed: int,
     emissivity: xr.DataArray | None,
     emissivity_std: xr.DataArray | None,
-    emissivity_covariance: xr.DataArray | None = None,
     mask: xr.DataArray | None,
     pool: xr.DataArray | None,
-    reflection_shift: xr.Dataset | None,
     response_kind: str,
+    emissivity_covariance: xr.DataArray | None = None,
+    reflection_shift: xr.Dataset | None = None,
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
     settings = _checked_settings(method, name, settings)
@@ -283,7 +283,7 @@ def _known_emissivity(
             f"Invalid emissivity {values[band, y, x]} in band "
             f"'{corrected['band'].values[band]}', pixel ({y}, {x}). Must lie in (0, 1)."
         )
-    if np.all(values[0] == values[1]):
+    if np.all(values == values[0]):
         raise ValueError(
             f"Invalid emissivities {values[:, 0, 0]}: the same in both bands. Must differ; "
             "a gray body cannot be separated."

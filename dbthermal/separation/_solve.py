@@ -24,13 +24,19 @@ from dbthermal.separation._tiles import Array, Estimate, Mask, Material, Survey
 
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
+    from dbthermal.separation._baselines.calibrated import CalibratedSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
     from dbthermal.separation._baselines.pyrometry import RatioSettings
     from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
     Settings: TypeAlias = (
-        SubspaceSettings | DbvtSettings | NaiveSettings | RatioSettings | BcpSettings
+        SubspaceSettings
+        | CalibratedSettings
+        | DbvtSettings
+        | NaiveSettings
+        | RatioSettings
+        | BcpSettings
     )
 
 _MODULES: Final = {
@@ -82,8 +88,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         corrected first. `pattern_std` (band) [count], an error of each pixel that is constant in
         time, widens the bars of "subspace". Samples that are NaN are left out, and frames that
         repeat the one before in a band. May be lazy, as from `store.open_dataset`: it is read a few
-        rows at a time, and never whole. "subspace" takes two bands or more, and at least 32 frames;
-        the other methods two bands.
+        rows at a time, and never whole. "subspace" and "calibrated" take two bands or more, and the
+        former at least 32 frames; the other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
         where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture;
@@ -94,7 +100,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         own reading.
     settings : Settings, optional
         Record of the method's options, such as `SubspaceSettings`; its defaults if not given.
-        "calibrated" and "apparent" have none.
+        "apparent" has none.
     emissivity : DataArray, optional
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional

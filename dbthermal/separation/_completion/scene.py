@@ -9,8 +9,8 @@ import xarray as xr
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
+from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
-from dbthermal.separation import _smoothing as smoothing
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import prior as priors
 from dbthermal.separation._completion.posterior import Level
@@ -97,6 +97,7 @@ class Scene:
             noise=tuple(float(inputs.noise[band]) for band in inputs.bands),
             shape=(1, valid.shape[1]),
             rng=np.random.default_rng(0),
+            pattern=None if inputs.pattern is None else tuple(inputs.pattern[inputs.bands]),
         ), valid
 
     def sample(self) -> tuple[Tile, Mask, Whole]:
@@ -201,15 +202,16 @@ def solve(
         static = posterior.moments(tile, data, scene.mixture(source, places), level)
         variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
         variance = np.maximum(variance, _LEAST[1] ** 2)
-        frames = posterior.solve_frames(tile, static, variance, apart=scene.apart)
-        signal, left = smoothing.smooth(frames.signal, frames.white, valid, tile.time)
-        left = left + frames.shared + posterior.through(frames.sensitivity, static.covariance)
-        behind = static.mean[-1] + frames.fluctuation
-        around = frames.fluctuation_variance + posterior.through(
-            frames.background_sensitivity, static.covariance
+        found = frames.solve(tile, static.point, static.level, variance, apart=scene.apart)
+        signal, left = frames.smooth(found.signal, found.white, valid, tile.time)
+        left = left + found.shared + frames.through(found.sensitivity, static.covariance)
+        around = found.background_variance + frames.through(
+            found.background_sensitivity, static.covariance
         )
         values: Values = {}
-        for name, mean, spread in zip(FILMS, (signal, behind), (left, around), strict=True):
+        for name, mean, spread in zip(
+            FILMS, (signal, found.background), (left, around), strict=True
+        ):
             temperature = tile.temperature(0, np.where(valid, mean, np.nan))
             values[name] = temperature
             values[f"{name}_std"] = np.sqrt(spread) / tile.curves[0].slope(temperature)
@@ -218,8 +220,8 @@ def solve(
         for name, (mean, covariance) in zip(MAPS, pairs, strict=True):
             values[name] = mean
             values[f"{name}_std"] = np.sqrt(np.einsum("bbp->bp", covariance))
-    found = (static.mean[-1], static.covariance[-1, -1], np.square(level.std), variance)
-    return values, np.array(np.broadcast_arrays(*found))
+    told = (static.level, static.covariance[-1, -1], np.square(level.std), variance)
+    return values, np.array(np.broadcast_arrays(*told))
 
 
 def find_level(scene: Scene) -> Level:
