@@ -1,4 +1,4 @@
-"""Objects that heat rapidly: followed with true error bars, or flagged; several scenes and seeds."""
+"""Objects that heat rapidly: followed with true error bars, or flagged, in several scenes."""
 
 from typing import Any
 
@@ -102,3 +102,14 @@ def test_a_pour_before_the_capture_is_followed(name: str) -> None:
     assert scored["good"] >= 0.8
     assert 0.92 <= scored["cover"] <= 0.98
     assert scored["first"] > 0.85
+
+
+def test_rapid_pixels_of_one_material_are_pooled() -> None:
+    """Known to be of one material, rapid pixels nearly all lose their flags, and err by less."""
+    rng = np.random.default_rng(4)
+    scene = Picture((16, 24), rise=(0.5, 2.0)).draw(TIME, GLASS, rng)
+    one = xr.zeros_like(scene["object_temperature"].isel(time=0, drop=True), dtype=np.int64)
+    alone = judge("alone", scene, np.random.default_rng(5))
+    pooled = judge("pooled", scene, np.random.default_rng(5), pool=one)
+    assert pooled["good"] > max(0.9, alone["good"])
+    assert pooled["rmse"] < 0.8 * alone["rmse"]
