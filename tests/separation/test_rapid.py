@@ -55,7 +55,7 @@ def judge(name: str, scene: xr.Dataset, rng: np.random.Generator, **options: Any
     }
     scored = {key: float(value.mean()) for key, value in shares.items()}
     scored["good"] = float(good.sum() / moving.sum())
-    scored["rmse"] = float(np.sqrt((error**2).mean("time")).median())
+    scored["rmse"] = float(((error**2).mean("time") ** 0.5).median())
     print(name, {key: round(value, 3) for key, value in scored.items()})
     return scored
 
