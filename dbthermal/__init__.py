@@ -27,6 +27,7 @@ __all__ = [
     "planck",
     "readers",
     "response",
+    "scene",
     "schema",
     "separation",
     "simulation",

@@ -1,16 +1,21 @@
 """The smooth subspace of time: every curve that a slowly changing object temperature can take.
 
 An orthonormal basis of polynomials over the capture's own time stamps. The bases are nested, so
-the fit of every order follows from one set of coefficients.
+the fit of every order follows from one set of coefficients. An object that changes rapidly now and
+then has polynomials in pieces of the time.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+PIECE_ORDER: Final = 5
+"""Number of polynomials in a piece of time."""
 
 # Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
 _ROUNDED: Final = 1e-6
@@ -23,6 +28,7 @@ class Subspace:
     functions: Array  # (time, steps + order), orthonormal: constant, steps, rising polynomials
     object_part: Array  # the same columns less the steps of the camera in them
     steps: int  # columns of every order, beside the constant
+    rising: Array  # polynomials (time, degree) from 1 up, less the steps of the camera
 
     @property
     def orders(self) -> int:
@@ -40,14 +46,10 @@ class Subspace:
 
 
 def subspace(
-    time: npt.ArrayLike,
-    order: int,
-    *,
-    segment: npt.NDArray[np.integer] | None = None,
-    jump: int | None = None,
+    time: npt.ArrayLike, order: int, *, segment: npt.NDArray[np.integer] | None = None
 ) -> Subspace:
     """
-    Smooth functions over given times, with steps of the camera or a jump of the object.
+    Smooth functions over given times, with steps of the camera.
 
     Parameters
     ----------
@@ -58,8 +60,6 @@ def subspace(
     segment : ndarray of int, shape (time,), optional
         Number of shutter events before each frame. At each change every signal has a step of its
         own, which is not the object's.
-    jump : int, optional
-        First frame after a jump of the object, in value and in slope.
 
     Returns
     -------
@@ -71,30 +71,61 @@ def subspace(
     ValueError
         As `polynomial_basis`, or if there are more functions than times.
     """
-    plain = polynomial_basis(time, order)
-    steps = []
-    if segment is not None:
-        steps += [np.where(segment >= one, 1.0, 0.0) for one in np.unique(segment)[1:]]
-    of_camera = len(steps)
-    if jump is not None:
-        after = np.arange(len(plain)) >= jump
-        times = np.asarray(time, dtype=np.float64)
-        since = (times - times[jump]) / (times[-1] - times[0])
-        steps += [np.where(after, 1.0, 0.0), np.where(after, since, 0.0)]
+    plain, steps = polynomial_basis(time, order), camera_steps(segment)
     if not steps:
-        return Subspace(plain, plain, 0)
+        return Subspace(plain, plain, 0, plain[:, 1:])
     if order + len(steps) > len(plain):
         raise ValueError(
             f"Invalid order {order} with {len(steps)} steps over {len(plain)} frames. "
             "Must not be more functions than frames."
         )
+    functions, object_part = _without_steps(plain[:, :1], steps, plain[:, 1:])
+    return Subspace(functions, object_part, len(steps), functions[:, len(steps) + 1 :])
+
+
+def piecewise(
+    time: npt.ArrayLike,
+    first: npt.NDArray[np.bool_],
+    order: int,
+    *,
+    segment: npt.NDArray[np.integer] | None = None,
+) -> Subspace:
+    """
+    Polynomials in pieces of the time that begin with some frames (time,), of one order together.
+
+    The rising polynomials are those of `subspace` of an order. A shutter event must not be the
+    first frame of a piece: its step would be the object's as well.
+    """
+    time, rising = np.asarray(time, dtype=np.float64), subspace(time, order, segment=segment).rising
+    edges = [*np.flatnonzero(first), time.size]
+    blocks = []
+    for start, stop in pairwise(edges):
+        inside = slice(start, stop)
+        events = len(camera_steps(None if segment is None else segment[inside]))
+        block = np.zeros((time.size, min(PIECE_ORDER, stop - start - events)))
+        block[inside] = polynomial_basis(time[inside], block.shape[1])
+        blocks.append(block)
+    functions, object_part = _without_steps(
+        np.hstack(blocks), camera_steps(segment), np.empty((time.size, 0))
+    )
+    return Subspace(functions, object_part, functions.shape[1] - 1, rising)
+
+
+def camera_steps(segment: npt.NDArray[np.integer] | None) -> list[Array]:
+    """Steps (time,) of the camera, one for each shutter event between the frames."""
+    if segment is None:
+        return []
+    return [np.where(segment >= one, 1.0, 0.0) for one in np.unique(segment)[1:]]
+
+
+def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Array, Array]:
+    """Columns made orthonormal with steps of the camera among them, and the object's part."""
+    together = np.column_stack([before, *steps, after])
     # QR makes the columns orthonormal, F = Q R; the object's part of Q is F R^-1 with the camera's
     # columns of F set to zero.
-    together = np.column_stack([plain[:, 0], *steps, plain[:, 1:]])
     functions, triangle = np.linalg.qr(together)
-    together[:, 1 : 1 + of_camera] = 0.0
-    object_part = np.linalg.solve(triangle.T, together.T).T
-    return Subspace(functions, object_part, len(steps))
+    together[:, before.shape[1] : before.shape[1] + len(steps)] = 0.0
+    return functions, np.linalg.solve(triangle.T, together.T).T
 
 
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:

@@ -258,7 +258,7 @@ class Status(Flags):
     DEAD_PIXEL = 1 << 10, "bad pixel, marked by the correction"
     FROZEN_FRAMES = 1 << 11, "the same counts in a band for several frames in a row"
     NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
-    OBJECT_JUMP = 1 << 13, "one step of the object, taken into its curve; the values hold"
+    OBJECT_JUMP = 1 << 13, "sudden steps of the object, taken into its curve; the values hold"
     BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
     ROLES_MAY_BE_SWAPPED = 1 << 15, "mean emissivity below 1/2: object and background exchanged"
     COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity of the same material"

@@ -74,23 +74,20 @@ def segmented(frames: int, *events: int) -> np.ndarray:
     return np.searchsorted(events, np.arange(frames), side="right")
 
 
-@given(TIMES, st.integers(2, 4), st.data())
-def test_steps_and_a_jump_are_in_the_subspace(
-    time: smooth.Array, order: int, data: st.DataObject
-) -> None:
-    """Steps of the camera and a jump of the object are their own projection."""
-    event, jump = (data.draw(st.integers(2, time.size - 3)) for _ in range(2))
-    if abs(event - jump) < 2:
-        return
-    functions = smooth.subspace(time, order, segment=segmented(time.size, event), jump=jump)
-    assert (functions.orders, functions.steps) == (order, 3)
-    after = np.arange(time.size) >= jump
-    signal = 2.0 * segmented(time.size, event) + after * (3.0 + time - time[jump]) + 1.0
-    smoothed = functions.functions @ (functions.functions.T @ signal)
-    np.testing.assert_allclose(smoothed, signal, rtol=0, atol=1e-9 * np.abs(signal).max())
+def test_steps_and_pieces_are_in_the_subspace() -> None:
+    """Steps of the camera and a polynomial in each piece are their own projection."""
+    time = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, 60))
+    first = np.isin(np.arange(60), [0, 20, 23, 41])
+    functions = smooth.piecewise(time, first, 6, segment=segmented(60, 30))
+    assert (functions.orders, functions.steps) == (1, 3 * smooth.PIECE_ORDER + 3)
+    piece = np.cumsum(first)
+    curve = piece * (3.0 + 0.1 * (time - time[35]) ** 3) + np.sin(7.0 * time) * (piece == 2)
+    fit = functions.functions.T @ (curve + 2.0 * segmented(60, 30))
     np.testing.assert_allclose(
-        functions.functions.T @ functions.functions, np.eye(order + 3), rtol=0, atol=1e-12
+        functions.object_part @ fit, curve, rtol=0, atol=1e-8 * np.ptp(curve)
     )
+    identity = functions.functions.T @ functions.functions
+    np.testing.assert_allclose(identity, np.eye(functions.steps + 1), rtol=0, atol=1e-12)
 
 
 @given(
@@ -107,23 +104,14 @@ def test_own_part_is_without_the_steps_of_the_camera(height: float, events: list
     np.testing.assert_allclose(own, curve, rtol=0, atol=1e-9)
 
 
-def test_own_part_keeps_a_jump() -> None:
-    """The object's part holds its jump, and not the camera's step."""
-    time = np.arange(60.0)
-    jump, shutter = 5.0 * (time >= 40), 3.0 * (time >= 15)
-    functions = smooth.subspace(time, 3, segment=segmented(60, 15), jump=40)
-    own = functions.object_part @ (functions.functions.T @ (0.1 * time + jump + shutter))
-    np.testing.assert_allclose(own, 0.1 * time + jump, rtol=0, atol=1e-9)
-
-
 def test_leverage_with_steps_is_the_variance_of_the_object_part() -> None:
     """White noise through the fit scatters as the leverage says, at every order."""
     rng = np.random.default_rng(5)
     time, noise = np.arange(80.0), rng.standard_normal((80, 4000))
-    functions = smooth.subspace(time, 5, segment=segmented(80, 30), jump=60)
+    functions = smooth.subspace(time, 5, segment=segmented(80, 30))
     for order in (1, 3, 5):
         used = functions.columns(np.array([order]))[:, 0]
-        assert used.sum() == order + 3
+        assert used.sum() == order + 1
         own = functions.object_part[:, used] @ (functions.functions[:, used].T @ noise)
         np.testing.assert_allclose(
             own.var(axis=1), functions.leverage()[:, order - 1], rtol=0.15, atol=0
@@ -131,7 +119,7 @@ def test_leverage_with_steps_is_the_variance_of_the_object_part() -> None:
 
 
 def test_without_steps_the_subspace_is_the_basis() -> None:
-    """No event and no jump: the polynomials, all of them the object's own."""
+    """No event: the polynomials, all of them the object's own."""
     time = np.arange(30.0)
     for segment in (None, np.zeros(30, int), np.full(30, 7)):
         found = smooth.subspace(time, 5, segment=segment)
@@ -144,15 +132,6 @@ def test_more_steps_than_frames() -> None:
     """More functions than frames raise an error with both numbers."""
     with pytest.raises(ValueError, match="Invalid order 6 with 19 steps over 20 frames"):
         smooth.subspace(np.arange(20.0), 6, segment=np.arange(20))
-
-
-def test_jump_in_slope_over_uneven_times() -> None:
-    """A new slope after the jump is straight in time, over a gap in the frames as well."""
-    time = np.concatenate([np.arange(150), np.arange(250, 350)]) / 10.0
-    bent = np.maximum(time - time[80], 0.0) + 5.0 * (time >= time[80])
-    functions = smooth.subspace(time, 4, jump=80)
-    own = functions.object_part @ (functions.functions.T @ bent)
-    np.testing.assert_allclose(own, bent, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("pause", [3.6e3, 1e9])

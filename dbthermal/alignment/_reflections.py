@@ -294,10 +294,12 @@ def _noise(corrected: xr.Dataset, response: xr.Dataset, names: list[str], slopes
 
 
 def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
-    """Frames in which most pixels of every band are measured."""
+    """Frames in which most of the pixels that every band ever measures are measured."""
     step = max(1, int(np.sqrt(counts[0, 0].size / 4096)))
     some = schema.measured(counts[:, :, ::step, ::step].values)
-    used = np.flatnonzero(some.mean(axis=(2, 3)).min(axis=0) > _COMMON)
+    ever = some.any(axis=1).all(axis=0)  # a view may show the object alone
+    share = some[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(some.shape[1])
+    used = np.flatnonzero(share > _COMMON)
     if used.size < noises.MINIMUM_FRAMES:
         raise ValueError(
             f"Invalid capture of {used.size} frames that all bands have. Must be at least "

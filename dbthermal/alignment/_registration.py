@@ -1,5 +1,7 @@
 """Registration of several views of one object, by the enhanced correlation coefficient."""
 
+from contextlib import suppress
+from operator import itemgetter
 from typing import Final, Literal
 
 import numpy as np
@@ -52,9 +54,10 @@ def register(
     Estimate the transform from the pixels of the first view to those of the others.
 
     Compared are means over time of smooth curves fitted robustly to each pixel, in which what
-    passes by in the reflection hardly counts. The transform maximises their correlation, which
-    neither gain nor offset of a view changes [1]_, at blurs from coarse to fine, and then minimises
-    their difference by splines, to some hundredths of a pixel.
+    passes by in the reflection hardly counts; and by how much each pixel rises steadily, as only a
+    heated object does. What correlates better is used. The transform maximises their correlation,
+    which neither gain nor offset of a view changes [1]_, at blurs from coarse to fine, and then
+    minimises their difference by splines, to some hundredths of a pixel.
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
@@ -66,7 +69,7 @@ def register(
     ----------
     corrected : Dataset
         Stage `corrected` of `schema`: views of one object, displaced by at most about a tenth of
-        the image.
+        the image. Of a capture with a `segment` the longest is used.
     model : {"translation", "affine", "homography"}
         Kind of transform. An affine one fits cameras that look the same way.
 
@@ -109,15 +112,23 @@ def register(
     if model not in _MODELS:
         raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")
     counts = schema.check(corrected, "corrected")["counts"]
+    if "segment" in corrected:  # the longest: a new pattern would be detail that does not move
+        numbers, frames = np.unique(corrected["segment"], return_counts=True)
+        longest = corrected["segment"].values == numbers[np.argmax(frames)]
+        counts = counts.isel(time=longest)
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
         raise ValueError(
             f"Invalid image of {counts.sizes['y']} by {counts.sizes['x']} pixels to be registered. "
             f"Must be at least {_SMALLEST} either way."
         )
-    means = [_object_image(view) for view in counts]
+    bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
+    (mean, rise), *others = [_object_images(view, bad) for view in counts]
     matrices = [np.eye(3)]
-    for view, mean in zip(counts[1:], means[1:], strict=True):
-        matrices.append(_transform(means[0], mean, model, str(view["band"].item())))
+    for view, images in zip(counts[1:], others, strict=True):
+        found = [_transform(mean, images[0], model, str(view["band"].item()))]
+        with suppress(ValueError):  # where the object is constant
+            found.append(_transform(rise, images[1], model, str(view["band"].item())))
+        matrices.append(max(found, key=itemgetter(0))[1])
     return xr.DataArray(
         np.stack(matrices),
         dims=TRANSFORM.dims,
@@ -127,8 +138,8 @@ def register(
     )
 
 
-def _object_image(view: xr.DataArray) -> Array:
-    """Mean over time of what changes smoothly (y, x), of mean 0 and standard deviation 1."""
+def _object_images(view: xr.DataArray, bad: npt.NDArray[np.bool_] | np.bool_) -> list[Array]:
+    """Mean over time of what changes smoothly, and its rise (y, x), see `_scaled`."""
     frames = np.asarray(view.values)
     present = np.flatnonzero(~clocks.missing(frames))
     chosen = np.unique(np.linspace(0, present.size - 1, min(present.size, _FRAMES)).astype(int))
@@ -139,18 +150,24 @@ def _object_image(view: xr.DataArray) -> Array:
             f"{np.sum(~np.isfinite(frames).all(axis=0))} pixels are not finite. Must be finite in "
             "every frame that is not missing."
         )
-    image = np.stack([_smooth_mean(row) for row in frames.swapaxes(0, 1)])
-    around = median_filter(image, size=_MEDIAN_WINDOW)
-    away = abs(image - around)
-    # A bad pixel stays where it is in every view, and would pull the transform to the identity.
-    image = np.where(away > _OUTLYING * MAD * np.median(away), around, image)
-    contrast = image.std()
-    if not contrast > 0:
+    mean = np.stack([_smooth_mean(row) for row in frames.swapaxes(0, 1)])
+    line = polynomial_basis(np.arange(len(frames)), min(2, len(frames)))[:, -1]
+    rise = np.tensordot(line, frames, axes=1)
+    if not mean.std() > 0:
         raise ValueError(
             f"Invalid view in band '{view['band'].item()}': all pixels are alike. Must show an "
             "object."
         )
-    return np.asarray((image - image.mean()) / contrast)
+    return [_scaled(mean, bad), _scaled(rise, bad)]
+
+
+def _scaled(image: Array, bad: npt.NDArray[np.bool_] | np.bool_) -> Array:
+    """Image (y, x) of mean 0 and standard deviation 1, bad pixels as those around them."""
+    around = median_filter(image, size=_MEDIAN_WINDOW)
+    away = abs(image - around)
+    # A bad pixel stays where it is in every view, and would pull the transform to the identity.
+    image = np.where(bad | (away > _OUTLYING * MAD * np.median(away)), around, image)
+    return np.asarray((image - image.mean()) / (image.std() or 1.0))
 
 
 def _smooth_mean(signal: Array) -> Array:
@@ -173,8 +190,8 @@ def _smooth_mean(signal: Array) -> Array:
     return np.asarray(curve.mean(axis=0))
 
 
-def _transform(first: Array, other: Array, model: str, band: str) -> Array:
-    """Homography (3, 3) from pixels of the first mean image (y, x) to those of the other."""
+def _transform(first: Array, other: Array, model: str, band: str) -> tuple[float, Array]:
+    """Correlation of two images (y, x), by the homography (3, 3) from the first to the other."""
     matrix, correlation = np.eye(3), 0.0
     stages = [(share * first.shape[0], "affine") for share in _BLURS]
     stages[0] = (stages[0][0], "translation")
@@ -196,13 +213,16 @@ def _transform(first: Array, other: Array, model: str, band: str) -> Array:
             f"Invalid view in band '{band}': it shares {shared:.0%} of the image with the first. "
             f"Must be at least {_LEAST_OVERLAP:.0%}."
         )
-    return _refined([gaussian_filter(image, _FINEST) for image in (first, other)], matrix, model)
+    pair = [gaussian_filter(image, _FINEST) for image in (first, other)]
+    return correlation, _refined(pair, matrix, model)
 
 
 def _refined(pair: list[Array], matrix: Array, model: str) -> Array:
     r"""
     Transform that minimises :math:`\sum (g I_1(p) + o - I_2(H p))^2`, by Gauss-Newton steps.
 
+    Of :math:`I_2` over the mean and deviation of what is compared, for else places where it varies
+    little would be the best: the correlation is largest there, which :math:`g` and :math:`o` leave.
     The enhanced correlation interpolates by lines, and is off by some hundredths of a pixel.
     """
     (rows, columns), spline = pair[0].shape, spline_filter(pair[1])
@@ -216,7 +236,8 @@ def _refined(pair: list[Array], matrix: Array, model: str) -> Array:
 
         def other(change: Array, inside: Mask = inside, start: Array = matrix) -> Array:
             where = positions(start + change, pair[0].shape)[:, inside]
-            return np.asarray(map_coordinates(spline, where, prefilter=False))
+            values = map_coordinates(spline, where, prefilter=False)
+            return np.asarray((values - values.mean()) / values.std())
 
         steps = [place * unit * _STEP for place in _FREE[model]]
         slopes = [(other(-step) - other(step)) / (2 * _STEP) for step in steps]

@@ -11,6 +11,7 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import _rows, schema
 from dbthermal import noise as noises
+from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
 from dbthermal.noise import MAD
@@ -45,6 +46,7 @@ def align(
     offset: float | xr.DataArray | None = None,
     transform: xr.DataArray | None = None,
     clock: str | None = None,
+    reflection_shift: xr.Dataset | None = None,
     lazy: bool = False,
 ) -> xr.Dataset:
     """
@@ -79,6 +81,9 @@ def align(
         lines. Pixels outside a view, or without a place in it (NaN), are NaN.
     clock : str, optional
         Band whose samples are not touched in time.
+    reflection_shift : Dataset, optional
+        From the function of this name: the time offset is found of places that show the same
+        reflection. It changes nothing else.
     lazy : bool
         Compute the counts when they are read, some rows at a time and each time anew, as
         `correction.correct_capture` does: the capture may be lazy, too.
@@ -125,7 +130,10 @@ def align(
         if "row" in transform.dims:
             places = schema.band_positions(transform, names, "the transform")
             recorded["transform"] = transform.values[places].ravel().tolist()
-    counts, offsets = corrected["counts"], _offsets(corrected, offset, names)
+    counts, alike = corrected["counts"], corrected
+    if reflection_shift is not None and offset is None:
+        alike, _ = _registered(corrected, _reflected(reflection_shift, corrected), lazy=lazy)
+    offsets = _offsets(alike, offset, names)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     signals = sample(corrected)
     for band in () if offset is None else range(1, len(names)):  # `time_offset` has done it
@@ -199,7 +207,7 @@ def interpolation(places: Array, taps: int) -> csr_array:
 
 
 def _weights(places: Array, bad: npt.NDArray[np.bool_]) -> csr_array:
-    """Weights as `interpolation` does, lines near the border, and near bad pixels."""
+    """Weights as `interpolation`, of lines near the border and near bad pixels."""
     if np.array_equal(places, np.indices(bad.shape)):
         return eye_array(bad.size, dtype=np.float32, format="csr")
     fine = interpolation(places, _TAPS)
@@ -266,6 +274,16 @@ def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
             f"Invalid transform of shape {values.shape}. Must be 3x3 and finite in each band."
         )
     return [positions(matrix, shape) for matrix in values.astype(np.float64)]
+
+
+def _reflected(field: xr.Dataset, corrected: xr.Dataset) -> list[Array]:
+    """Rows and columns (2, y, x) in each band of one reflection; NaN where it is not known."""
+    schema.check(field, "reflection_shift")
+    field = laid_on(field, corrected, "the reflection shift", "the capture")
+    here = np.indices(corrected["counts"].shape[2:], dtype=np.float64)
+    moved = here + field["shift"].where(field["known"]).transpose("axis", "y", "x").values
+    reference = str(field.attrs["reference_band"])
+    return [moved if str(band) == reference else here for band in corrected["band"].values]
 
 
 def _place(clock: str, names: list[str]) -> int:

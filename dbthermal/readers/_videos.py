@@ -4,7 +4,6 @@ Such a video is what its authors show: 8 bit, compressed, each frame scaled betw
 extremes. Its values are positions in a palette, not radiometric, and its attributes say so.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -19,13 +18,13 @@ from dbthermal.readers._decoding import MEMORY, Film, decode
 
 Floats = NDArray[np.float64]
 
-# Palettes in which thermal pictures are drawn: the one that is asked for must fit as well as any.
+# Palettes in which thermal pictures are drawn, compared in so many pixels; another is better only
+# if it is nearer by a step of 8 bit.
 _COMPARED: Final = (
     *("plasma", "inferno", "magma", "viridis", "cividis"),
     *("turbo", "jet", "hot", "coolwarm", "gray"),
 )
-_SAMPLE: Final = 4096  # pixels in which palettes are compared
-_STEP: Final = 1.0  # of 8 bit, by which another palette must be nearer to be the better one [0-255]
+_SAMPLE, _STEP = 4096, 1.0
 
 _YCC: Final = np.array(
     [
@@ -54,9 +53,8 @@ def palette_video(
     7-15 % (turbo) below that of the nearest of 256 colours in RGB. Luma alone is no better, and not
     unique in turbo. A palette and its reverse fit alike and cannot be told apart.
 
-    How far the pixels lie from the palette is a quality, which noise and the codec worsen: up to 9
-    of 255 in the authors' videos that are at hand, 21 in a noisy one. Only a video that another of
-    the common palettes fits better is refused.
+    Noise takes pixels off the palette: how far is stated, and only a video that another common
+    palette fits better is refused.
 
     A frame that its decoder marks as damaged, a frame too few or a length other than the declared
     one is an error. H.264 carries no checksum, though: of 200 files with one flipped bit, a block
@@ -80,8 +78,8 @@ def palette_video(
     DataArray
         Positions (time, y, x), float32 in [0, 1]; time [s] since the first frame, from the stream's
         timestamps. Attributes: ``radiometric`` = 0, ``palette``, ``palette_residual`` (RMS distance
-        of the pixels from the palette in RGB, 0-255), ``palettes_compared`` (those distances of a
-        sample of the pixels, nearest palette first), ``source`` and a ``note``.
+        of the pixels from the palette in RGB, 0-255), ``palettes_compared`` (median
+        distances from each of them), ``source`` and a ``note``.
 
     Raises
     ------
@@ -113,7 +111,7 @@ def palette_video(
     video = _distinct(decode(path, None, memory, sha256))
     position, _, distance = _nearest(video.colours, colours)
     residual = float(np.sqrt(np.average(distance**2, weights=video.share)))
-    attrs = _attrs(path, palette, residual, _fits(path, palette, video.colours, video.share, _rms))
+    attrs = _attrs(path, palette, residual, video.colours, video.share)
     return xr.DataArray(position[video.index], video.coords, attrs=attrs, name="movie")
 
 
@@ -180,8 +178,8 @@ def masked_palette_video(
     share = video.share[coloured]
     residual = np.quantile(distance[coloured], 0.5, weights=share, method="inverted_cdf")
     valid = from_palette < np.linalg.norm(_ycc(video.colours)[:, 1:], axis=1)
-    fits = _fits(path, palette, video.colours[coloured], share, np.median)
-    dims, attrs = tuple(video.coords), _attrs(path, palette, float(residual), fits)
+    attrs = _attrs(path, palette, float(residual), video.colours[coloured], share)
+    dims = tuple(video.coords)
     mask_attrs = {"units": "1", "long_name": "nearer to the palette than to gray"}
     return xr.Dataset(
         {
@@ -247,43 +245,27 @@ def _nearest(colours: Floats, palette: Floats) -> tuple[NDArray[np.float32], Flo
     return position, distance, np.linalg.norm(colours - palette[nearest], axis=1)
 
 
-def _rms(distance: Floats) -> float:
-    return float(np.sqrt(np.mean(distance**2)))
-
-
-def _fits(
-    path: Path,
-    palette: str,
-    colours: Floats,
-    share: Floats,
-    average: Callable[[Floats], Any],
-) -> str:
-    """Average distance of a sample of pixels from each palette; ValueError if another is nearer."""
+def _attrs(
+    path: Path, palette: str, residual: float, colours: Floats, share: Floats
+) -> dict[str, Any]:
+    """Attributes of positions in a palette; ValueError if another fits the colours better."""
     summed = np.cumsum(share)
     levels = (np.arange(_SAMPLE) + 0.5) / _SAMPLE * summed[-1]
-    sample = colours[np.searchsorted(summed, levels)]
-    names = dict.fromkeys((palette, *_COMPARED))
-    residuals = {name: float(average(_nearest(sample, _palette(name))[2])) for name in names}
-    best = min(residuals, key=lambda name: residuals[name])
-    if residuals[best] < residuals[palette] - _STEP:
+    sample, names = colours[np.searchsorted(summed, levels)], {palette, *_COMPARED}
+    fits = {name: float(np.median(_nearest(sample, _palette(name))[2])) for name in names}
+    order = sorted(fits, key=lambda name: fits[name])
+    if fits[order[0]] < fits[palette] - _STEP:
         raise ValueError(
-            f"Palette '{palette}' does not fit '{path.name}': its pixels are "
-            f"{residuals[palette]:.1f} from it, but {residuals[best]:.1f} from '{best}' (0-255). "
-            f"Must fit as well as any of {[*names]}."
+            f"Palette '{palette}' does not fit '{path.name}': its pixels are {fits[palette]:.1f} "
+            f"from it, but {fits[order[0]]:.1f} from '{order[0]}' (0-255). Must be the nearest."
         )
-    nearest_first = sorted(residuals.items(), key=lambda fit: fit[1])
-    return ", ".join(f"{name} {residual:.1f}" for name, residual in nearest_first)
-
-
-def _attrs(path: Path, palette: str, residual: float, fits: str) -> dict[str, Any]:
-    """Attributes of positions in a palette."""
     return {
         "units": "1",
         "long_name": f"position in the palette {palette}",
         "radiometric": 0,
         "palette": palette,
         "palette_residual": residual,
-        "palettes_compared": fits,
+        "palettes_compared": ", ".join(f"{name} {fits[name]:.1f}" for name in order),
         "source": path.name,
         "note": "not radiometric: 8 bit, compressed, scaled per frame",
     }

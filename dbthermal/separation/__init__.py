@@ -9,12 +9,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
-from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection
-from dbthermal.separation._scale import unscaled
+from dbthermal.separation._reflection import (
+    reflected_change,
+    uncalibrated_reflection,
+    unscaled,
+)
+from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
 
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
+    from dbthermal.separation._baselines.calibrated import CalibratedSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
     from dbthermal.separation._baselines.pyrometry import RatioSettings
     from dbthermal.separation._dbvt import DbvtSettings
@@ -23,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "METHODS",
     "BcpSettings",
+    "CalibratedSettings",
     "DbvtSettings",
     "NaiveSettings",
     "RatioSettings",
@@ -31,6 +37,7 @@ __all__ = [
     "get_method",
     "materials",
     "reflected_change",
+    "separate",
     "solve",
     "uncalibrated_reflection",
     "unscaled",
@@ -39,6 +46,7 @@ __all__ = [
 # The settings are imported with their method when they are first used: one needs torch.
 _SETTINGS: Final = {
     "BcpSettings": "_baselines.bcp",
+    "CalibratedSettings": "_baselines.calibrated",
     "DbvtSettings": "_dbvt",
     "NaiveSettings": "_baselines.naive",
     "RatioSettings": "_baselines.pyrometry",

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
-from scipy.sparse import csr_array, kron
+from scipy.sparse import csr_array
 
 from dbthermal import _samples as samples
 from dbthermal import schema
@@ -30,8 +30,8 @@ Mask = npt.NDArray[np.bool_]
 _ROUNDS: Final = 100
 _SOLVED: Final = 1e-3
 _UNSOLVED: Final = 1e-2
-# A place so far outside of the image is still extrapolated [pixel].
-_OUTSIDE: Final = 0.5
+# A place so far outside of the image is still at its border [pixel].
+_OUTSIDE: Final = 0.1
 # Weight of pixels without a value that the others may take over [1].
 _LOST_WEIGHT: Final = 0.25
 # Weight below which a pixel's flags do not count [1].
@@ -165,44 +165,32 @@ def _inside(place: Array, shape: tuple[int, ...]) -> Mask:
 
 def _interpolation(place: Array, used: Mask) -> csr_array:
     """Weights (pixel, pixel) of an image at places (2, y, x) [pixel]; 0 where they are not used."""
-    height, width = used.shape
+    width = used.shape[1]
     (row, down), (column, right) = (
         _keys(one[used], size) for one, size in zip(place, used.shape, strict=True)
     )
-    # On the image with a line more on each side, extrapolated: a plane stays one at the border.
-    index = (row[:, np.newaxis] * (width + 2) + column).reshape(16, -1).T
+    index = (row[:, np.newaxis] * width + column).reshape(16, -1).T
     weight = (down[:, np.newaxis] * right).reshape(16, -1).T
     start = np.concatenate([[0], np.cumsum(16 * used.ravel())])
-    padded = csr_array(
-        (weight.ravel(), index.ravel(), start), shape=(used.size, (height + 2) * (width + 2))
-    )
-    result = csr_array(padded @ kron(_extension(height), _extension(width), format="csr"))
+    result = csr_array((weight.ravel(), index.ravel(), start), shape=(used.size, used.size))
+    result.sum_duplicates()
     result.eliminate_zeros()
-    result.sort_indices()
     return result
 
 
 def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
-    """Index in the extended line and weight (4, place) of cubic convolution, linear outside."""
-    first = np.clip(np.floor(place), 0, max(size - 2, 0))
+    """Indices and weights (4, place) of cubic convolution along a line, held at its ends."""
+    place = np.clip(place, 0.0, size - 1.0)
+    first = np.floor(place)
     t = place - first
-    cubic = [
+    weight = [
         ((-0.5 * t + 1.0) * t - 0.5) * t,
         (1.5 * t - 2.5) * t**2 + 1.0,
         ((-1.5 * t + 2.0) * t + 0.5) * t,
         (0.5 * t - 0.5) * t**2,
     ]
-    none = np.zeros_like(t)
-    weight = np.where((t >= 0) & (t <= 1), cubic, [none, 1.0 - t, t, none])
-    return first.astype(np.intp) + np.arange(4)[:, np.newaxis], weight
-
-
-def _extension(size: int) -> csr_array:
-    """Matrix (size + 2, size) that adds a sample on each side of a line, extrapolated."""
-    matrix = np.eye(size + 2, size, k=-1)
-    matrix[0, : min(size, 2)] = (2.0, -1.0) if size > 1 else 1.0
-    matrix[-1, -min(size, 2) :] = (-1.0, 2.0) if size > 1 else 1.0
-    return csr_array(matrix)
+    index = first.astype(np.intp) + np.arange(-1, 3)[:, np.newaxis]
+    return np.clip(index, 0, size - 1), np.stack(weight)
 
 
 def read(

@@ -28,6 +28,8 @@ _CLOCK_PIXELS: Final = 256
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
+# Negative eigenvalue of a covariance that is rounding [1].
+_ROUNDED: Final = 1e-6
 _MASK_DIMS: Final = (("time",), ("y", "x"), ("time", "y", "x"))
 
 
@@ -61,7 +63,7 @@ class Inputs:
     pattern: Array | None  # deviation of what the correction leaves, constant in time (band) [K]
     bands: list[int]  # places of the bands in the order of their noise
     emissivity: Array | None  # known beforehand (band, y, x) [1]
-    emissivity_std: Array | None
+    emissivity_covariance: Array | None  # (band, band, y, x) [1]
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
     displacement: Displacement | None  # of the second camera's reflections
     difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `_joint.Joint`
@@ -84,8 +86,9 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     emissivity_std: xr.DataArray | None,
     mask: xr.DataArray | None,
     pool: xr.DataArray | None,
-    reflection_shift: xr.Dataset | None,
     response_kind: str,
+    emissivity_covariance: xr.DataArray | None = None,
+    reflection_shift: xr.Dataset | None = None,
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
     settings = _checked_settings(method, name, settings)
@@ -106,7 +109,9 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         capture = capture.assign(mask=_checked_mask(capture, mask))
     noise = _noise(capture, response, curves)
     _check_clock(capture, method, curves, noise)
-    value, std = _known_emissivity(corrected, emissivity, emissivity_std)
+    value, covariance = _known_emissivity(
+        corrected, emissivity, emissivity_std, emissivity_covariance
+    )
     order = [int(band) for band in np.argsort(noise, kind="stable")]
     return Inputs(
         method=method,
@@ -118,7 +123,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         pattern=_pattern(capture, curves),
         bands=order,
         emissivity=value,
-        emissivity_std=std,
+        emissivity_covariance=covariance,
         labels=_labels(corrected, pool),
         displacement=_displacement(corrected, reflection_shift, method, name, order[0]),
     )
@@ -257,13 +262,19 @@ def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array | None:
 
 
 def _known_emissivity(
-    corrected: xr.Dataset, emissivity: xr.DataArray | None, std: xr.DataArray | None
+    corrected: xr.Dataset,
+    emissivity: xr.DataArray | None,
+    std: xr.DataArray | None,
+    covariance: xr.DataArray | None,
 ) -> tuple[Array, Array] | tuple[None, None]:
-    """Emissivity and standard deviation (band, y, x) [1], from (band) or (band, y, x)."""
+    """Emissivity (band, y, x) [1] and its covariance (band, band, y, x), of one pixel or of all."""
     if emissivity is None:
-        if std is not None:
-            raise ValueError("Invalid emissivity_std without an emissivity. Give both.")
+        if std is not None or covariance is not None:
+            name = "emissivity_std" if covariance is None else "emissivity_covariance"
+            raise ValueError(f"Invalid {name} without an emissivity. Give both.")
         return None, None
+    if std is not None and covariance is not None:
+        raise ValueError("Invalid emissivity_std beside an emissivity_covariance. Give one.")
     values = _over_image(corrected, emissivity, "emissivity")
     bad = ~((values > 0) & (values < 1))
     if np.any(bad):
@@ -272,29 +283,39 @@ def _known_emissivity(
             f"Invalid emissivity {values[band, y, x]} in band "
             f"'{corrected['band'].values[band]}', pixel ({y}, {x}). Must lie in (0, 1)."
         )
-    if np.all(values[0] == values[1]):
+    if np.all(values == values[0]):
         raise ValueError(
             f"Invalid emissivities {values[:, 0, 0]}: the same in both bands. Must differ; "
             "a gray body cannot be separated."
         )
-    if std is None:
-        return values, np.zeros_like(values)
-    deviations = _over_image(corrected, std, "emissivity_std")
+    if covariance is not None:
+        together = _over_image(corrected, covariance, "emissivity_covariance", "other_band")
+        if not np.all(np.linalg.eigvalsh(np.moveaxis(together, (0, 1), (-2, -1))) >= -_ROUNDED):
+            raise ValueError("Invalid emissivity_covariance. Must have no negative eigenvalue.")
+        return values, together
+    deviations = np.zeros_like(values)
+    if std is not None:
+        deviations = _over_image(corrected, std, "emissivity_std")
     if not np.all(deviations >= 0):
         raise ValueError("Invalid emissivity_std. Must be zero or positive, not NaN.")
-    return values, deviations
+    return values, np.eye(len(values))[..., np.newaxis, np.newaxis] * deviations**2
 
 
-def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str) -> Array:
-    """Values (band, y, x) of an array (band) or (band, y, x), in the capture's order of bands."""
+def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *other: str) -> Array:
+    """Values (band, ..., y, x) of an array over the bands, of one pixel or of all."""
     schema.check_numbers(array, name, "1")
-    if array.dims not in (("band",), ("band", "y", "x")):
-        raise ValueError(
-            f"Invalid dims {array.dims} of {name}. Must be ('band',) or ('band', 'y', 'x')."
-        )
-    values = laid_on(array, corrected, name, "the capture").values.astype(np.float64)
-    shape = tuple(corrected.sizes[dim] for dim in ("band", "y", "x"))
-    return np.broadcast_to(values.reshape(shape[0], *values.shape[1:] or (1, 1)), shape)
+    allowed = ("band", *other), ("band", *other, "y", "x")
+    if array.dims not in allowed:
+        raise ValueError(f"Invalid dims {array.dims} of {name}. Must be one of {allowed}.")
+    array = laid_on(array, corrected, name, "the capture")
+    for one in other:  # the same bands
+        exchanged = array.rename({"band": one, one: "band"})
+        array = laid_on(exchanged, corrected, name, "the capture")
+    leading = array.shape[: 1 + len(other)]
+    values = array.values.astype(np.float64).reshape(
+        *leading, *array.shape[len(leading) :] or (1, 1)
+    )
+    return np.broadcast_to(values, (*leading, corrected.sizes["y"], corrected.sizes["x"]))
 
 
 def _displacement(

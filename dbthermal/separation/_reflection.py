@@ -9,13 +9,17 @@ import xarray as xr
 from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
-from dbthermal.separation import _scale as scale
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-# Magnitude of the correlation below which a pixel shows noise alone.
+# Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
 _UNCORRELATED: Final = 0.1
+_FEWEST: Final = 100
+# Share of the variance of still surroundings over time that their scale must explain.
+_EXPLAINED: Final = 0.9
+_ROUNDS: Final = 20
+_TINY: Final = np.finfo(np.float64).tiny
 
 
 def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
@@ -146,7 +150,11 @@ def uncalibrated_reflection(
     >>> round(reflection.attrs["pooled_ratio"], 1), reflection.attrs["correlated_pixels"]
     (2.0, 150)
     """
-    inside = _check(signal, mask, correlated)
+    _check_signal(signal)
+    if not 0 < correlated < 1:
+        raise ValueError(f"Invalid correlation {correlated}. Must lie in (0, 1).")
+    everywhere = np.ones(signal.sizes["y"] * signal.sizes["x"], dtype=bool)
+    inside = everywhere if mask is None else _pixels(mask, signal, "the mask")
     frames, image = signal.sizes["time"], signal.shape[2:]
     values = signal.values.reshape(2, frames, -1).astype(np.float64)
     weight = _frame_weight(signal)
@@ -187,14 +195,111 @@ def uncalibrated_reflection(
     return xr.Dataset(variables, coords=coords, attrs=attrs)
 
 
-def _check(signal: xr.DataArray, mask: xr.DataArray | None, correlated: float) -> Mask:
-    """Refuse all but two movies; return the pixels (pixel) to take the statistics from."""
-    scale.check_signal(signal)
-    if not 0 < correlated < 1:
-        raise ValueError(f"Invalid correlation {correlated}. Must lie in (0, 1).")
-    if mask is None:
-        return np.ones(signal.sizes["y"] * signal.sizes["x"], dtype=bool)
-    return scale.pixels_of(mask, signal)
+def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
+    r"""
+    Undo the scale of each frame of two pictures, from surroundings that do not change.
+
+    A picture that is scaled anew in each frame, as between its extremes, shows still surroundings
+    :math:`s(p)` as :math:`o(t) + g(t) s(p)`. Offset and gain are fitted robustly, with Cauchy's
+    weights [1]_ by each pixel's residual over time. A band is undone only where they explain 90 %
+    of the weighted variance over time; else its scale is nearly constant, or the surroundings
+    change themselves, and it stays as it is.
+
+    Parameters
+    ----------
+    signal : DataArray
+        (band, time, y, x), two bands in units of their own.
+    still : DataArray of bool
+        Pixels (y, x) off the object; a third of them may change after all.
+
+    Returns
+    -------
+    DataArray
+        The signal, in units of its mean over time; the coordinate `gain` (band, time) [1], by which
+        the noise was divided, 1 in a band that is not undone. Attributes `scale_undone`, the bands
+        that are, and `scale_explained`, each band's explained share.
+
+    Raises
+    ------
+    ValueError
+        If dims or bands are wrong, a value is not finite, or fewer than 200 pixels are still.
+
+    References
+    ----------
+    .. [1] Holland, Welsch (1977), doi:10.1080/03610927708827533
+
+    Examples
+    --------
+    A still picture whose contrast is scaled down to a tenth:
+
+    >>> gain, wall = np.linspace(1, 0.1, 50)[:, np.newaxis, np.newaxis], np.ones((20, 40))
+    >>> wall[:, :20] = 2.0
+    >>> signal = xr.DataArray([gain * wall] * 2, dims=("band", "time", "y", "x"))
+    >>> undone = unscaled(signal, xr.ones_like(signal[0, 0], dtype=bool))
+    >>> bool(undone.std("time").max() < 1e-9)
+    True
+    """
+    _check_signal(signal)
+    chosen = _pixels(still, signal, "the still pixels")
+    if chosen.sum() < 2 * _FEWEST:
+        raise ValueError(
+            f"Invalid still pixels: {chosen.sum()} of them. Must be at least {2 * _FEWEST}."
+        )
+    result = signal.astype(np.promote_types(signal.dtype, np.float32))
+    gains, shares, bands = np.ones(signal.shape[:2]), [], []
+    for place, picture in enumerate(signal.values):
+        offset, gain, explained = _scale(picture.reshape(len(picture), -1)[:, chosen].astype(float))
+        shares.append(round(explained, 4))
+        if explained >= _EXPLAINED and gain.min() > 0:
+            gains[place] = gain
+            bands.append(str(signal["band"].values[place]))
+            result[place] = ((picture.T - offset) / gain).T
+    result = result.assign_coords(gain=(("band", "time"), gains, {"units": "1"}))
+    return result.assign_attrs(scale_undone=bands, scale_explained=shares)
+
+
+def _scale(values: Array) -> tuple[Array, Array, float]:
+    """Offset (time), gain (time) and explained share of still pixels (time, pixel)."""
+    mean = values.mean(axis=0)
+    change = values - mean
+    squares = np.einsum("tp,tp->p", change, change)
+    weight = np.ones(mean.size)
+    for _ in range(_ROUNDS):
+        # Exact: o + g s - mean is linear in the mean, as mean = mean(o) + mean(g) s.
+        offset, error = _frame_errors(change, mean, weight)
+        # sum_t (c - o - e m)^2, from products over time alone
+        power = squares - 2.0 * (offset @ change + mean * (error @ change))
+        power += offset @ offset + mean * (2.0 * (offset @ error) + mean * (error @ error))
+        weight = 1.0 / (1.0 + np.maximum(power, 0.0) / max(np.median(power), _TINY))
+    explained = 1.0 - float(weight @ power) / max(float(weight @ squares), _TINY)
+    return offset, 1.0 + error, explained
+
+
+def _frame_errors(change: Array, mean: Array, weight: Array | Mask) -> Array:
+    """Offset and gain error (2, time) of frames that are the change (time, pixel) of some."""
+    centre = weight @ mean / weight.sum()
+    contrast = weight * (mean - centre)
+    gain = change @ contrast / max(contrast @ (mean - centre), _TINY)
+    return np.stack([change @ weight / weight.sum() - gain * centre, gain])
+
+
+def _check_signal(signal: xr.DataArray) -> None:
+    """Refuse all but two movies."""
+    if signal.dims != ("band", "time", "y", "x") or signal.sizes["band"] != 2:
+        raise ValueError(
+            f"Invalid signal {dict(signal.sizes)}. Must be (band, time, y, x) of two bands."
+        )
+    if not np.all(schema.measured(signal.values)):
+        raise ValueError(
+            f"Invalid signal: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
+        )
+
+
+def _pixels(mask: xr.DataArray, signal: xr.DataArray, label: str) -> Mask:
+    """Pixels (pixel) of a map of the signal's."""
+    if mask.dims != ("y", "x"):
+        raise ValueError(f"Invalid dims {mask.dims} of {label}. Must be ('y', 'x').")
+    return np.asarray(laid_on(mask, signal, label, "the signal").values.astype(bool).ravel())
 
 
 def _frame_weight(signal: xr.DataArray) -> Array:
@@ -209,9 +314,9 @@ def _frame_weight(signal: xr.DataArray) -> Array:
 
 
 def _require(pixels: Mask, rule: str) -> None:
-    if pixels.sum() < scale.FEWEST:
+    if pixels.sum() < _FEWEST:
         raise ValueError(
-            f"Invalid signal: {pixels.sum()} pixels have a {rule}. Must be at least {scale.FEWEST}."
+            f"Invalid signal: {pixels.sum()} pixels have a {rule}. Must be at least {_FEWEST}."
         )
 
 
@@ -224,7 +329,7 @@ def _correlation(rapid: Array) -> Array:
 
 def _scaling(rapid: Array, mean: Array, quiet: Mask) -> Array:
     """Gain and offset errors (time, pixel) of each frame, fitted to the quiet pixels."""
-    offset, gain = scale.frame_errors(rapid, mean, quiet)
+    offset, gain = _frame_errors(rapid, mean, quiet)
     return np.asarray(offset[:, np.newaxis] + gain[:, np.newaxis] * mean)
 
 

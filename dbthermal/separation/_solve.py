@@ -24,13 +24,19 @@ from dbthermal.separation._tiles import Array, Estimate, Mask, Material, Survey
 
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
+    from dbthermal.separation._baselines.calibrated import CalibratedSettings
     from dbthermal.separation._baselines.naive import NaiveSettings
     from dbthermal.separation._baselines.pyrometry import RatioSettings
     from dbthermal.separation._dbvt import DbvtSettings
     from dbthermal.separation._subspace.method import SubspaceSettings
 
     Settings: TypeAlias = (
-        SubspaceSettings | DbvtSettings | NaiveSettings | RatioSettings | BcpSettings
+        SubspaceSettings
+        | CalibratedSettings
+        | DbvtSettings
+        | NaiveSettings
+        | RatioSettings
+        | BcpSettings
     )
 
 _MODULES: Final = {
@@ -57,6 +63,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     settings: "Settings | None" = None,
     emissivity: xr.DataArray | None = None,
     emissivity_std: xr.DataArray | None = None,
+    emissivity_covariance: xr.DataArray | None = None,
     mask: xr.DataArray | None = None,
     pool: xr.DataArray | None = None,
     reflection_shift: xr.Dataset | None = None,
@@ -81,8 +88,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         corrected first. `pattern_std` (band) [count], an error of each pixel that is constant in
         time, widens the bars of "subspace". Samples that are NaN are left out, and frames that
         repeat the one before in a band. May be lazy, as from `store.open_dataset`: it is read a few
-        rows at a time, and never whole. "subspace" takes two bands or more, and at least 32 frames;
-        the other methods two bands.
+        rows at a time, and never whole. "subspace" and "calibrated" take two bands or more, and the
+        former at least 32 frames; the other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
         where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture;
@@ -93,11 +100,13 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         own reading.
     settings : Settings, optional
         Record of the method's options, such as `SubspaceSettings`; its defaults if not given.
-        "calibrated" and "apparent" have none.
+        "apparent" has none.
     emissivity : DataArray, optional
         Known emissivity, (band) or (band, y, x) [1] in (0, 1); for "calibrated" only.
     emissivity_std : DataArray, optional
         Its standard deviation, same dims.
+    emissivity_covariance : DataArray, optional
+        In its place the covariance, (band, other_band) or (band, other_band, y, x), as of a result.
     mask : DataArray, optional
         Samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
@@ -198,6 +207,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         seed=seed,
         emissivity=emissivity,
         emissivity_std=emissivity_std,
+        emissivity_covariance=emissivity_covariance,
         mask=mask,
         pool=pool,
         reflection_shift=reflection_shift,
@@ -206,7 +216,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     height, width = corrected.sizes["y"], corrected.sizes["x"]
     variables = dict(schema.STAGES["separated"])
     if inputs.method.survey:
-        variables |= schema.OPTIONAL["separated"]
+        name = "emissivity_covariance"
+        variables[name] = schema.OPTIONAL["separated"][name]
     result = _allocate(corrected, variables)
     with (
         threadpool_limits(limits=1, user_api="blas"),
@@ -228,6 +239,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     ratios = () if inputs.method.survey else ("reflection_ratio", "reflection_ratio_std")
     return result.assign_attrs(
         method=method,
+        pooled=int(pool is not None),
         response_kind=response_kind,
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
@@ -283,16 +295,19 @@ def _solve_jointly(
     both = joint.solve(inputs, result, threads)
     if inputs.labels is not None:
         apart = inputs if both is None else replace(inputs, difference=both.difference)
-        material = _materials(apart, threads, bar)
+        material = _materials(apart, threads, bar, every=True)
         _separate_all(inputs, material, result, threads, bar)
         both = joint.solve(inputs, result, threads, pooled=True)
     if both is not None:
         apart = replace(inputs, difference=both.difference)
+        material = _materials(apart, threads, bar)
         _separate_all(apart, material, result, threads, bar)
         both.finish()
 
 
-def _materials(inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]") -> Material | None:
+def _materials(
+    inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]", *, every: bool = False
+) -> Material | None:
     """Ratios and emissivity of the material of each pixel of the image; None if none are told."""
     if inputs.labels is None:
         return None
@@ -301,7 +316,8 @@ def _materials(inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]") ->
     found = [part for survey in surveys for part in survey]
     material = _pool(inputs, found)
     told = sum(np.isfinite(part.emissivity).sum() for _, part in found)
-    if material is None or told > _MOST_TOLD * sum((part.frames > 0).sum() for _, part in found):
+    every |= told > _MOST_TOLD * sum((part.frames > 0).sum() for _, part in found)
+    if material is None or every:
         return material
     # Emissivities of the few pixels with a ratio of their own are those of a selection by it.
     ratio = replace(material, emissivity=np.full_like(material.emissivity, np.nan))

@@ -6,9 +6,9 @@ cache. A tile's bands are in the order of their noise, the quietest first: the r
 emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -67,6 +67,18 @@ class _Pixels:
         return replace(self, **parts)
 
 
+Record = TypeVar("Record", bound=_Pixels)
+
+
+def join(parts: Sequence[Record]) -> Record:
+    """Record of the pixels of all parts, one after another."""
+    values = (([getattr(part, one.name) for part in parts], one.name) for one in fields(parts[0]))
+    joined: dict[str, Any] = {
+        name: None if value[0] is None else np.concatenate(value, axis=-1) for value, name in values
+    }
+    return replace(parts[0], **joined)
+
+
 @dataclass(frozen=True)
 class Material(_Pixels):
     """Reflection ratios and emissivity that the pixels of one material share; NaN for others."""
@@ -107,7 +119,7 @@ class Tile:
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
     emissivity: Array | None = None  # known beforehand (band, pixel) [1]
-    emissivity_std: Array | None = None  # its standard deviation (band, pixel) [1]
+    emissivity_covariance: Array | None = None  # (band, band, pixel) [1]
 
     @property
     def reference(self) -> float:
@@ -142,7 +154,7 @@ class Tile:
         """Return the tile of the selected pixels (pixel) alone, as one row."""
         known: dict[str, Any] = {
             name: None if getattr(self, name) is None else getattr(self, name)[..., selected]
-            for name in ("emissivity", "emissivity_std")
+            for name in ("emissivity", "emissivity_covariance")
         }
         material = None if self.material is None else self.material.select_pixels(selected)
         signals = self.signals[..., selected]
@@ -290,10 +302,12 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        emissivity, std = (
-            None if known is None else known[(slice(None), *window)].reshape(len(bands), -1)[bands]
-            for known in (inputs.emissivity, inputs.emissivity_std)
+        emissivity, covariance = (
+            None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)
+            for known in (inputs.emissivity, inputs.emissivity_covariance)
         )
+        if emissivity is not None and covariance is not None:
+            emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
         tile = Tile(
             # The linearised signals (see `response`), less the reference temperature.
             signals=np.stack(
@@ -311,7 +325,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             segment=segment,
             material=None if material is None else material.select_pixels(places),
             emissivity=emissivity,
-            emissivity_std=std,
+            emissivity_covariance=covariance,
         )
         if inputs.difference is not None:
             tile.signals[1:] -= inputs.difference(window[0])

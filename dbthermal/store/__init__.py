@@ -1,9 +1,9 @@
 """Files on disk: results with their provenance, and recordings while they grow.
 
-`save` and `open_dataset` keep datasets as zarr; `save_numbers`, `save_figure`, `save_text` and
-`save_video` keep the rest of a result, each with the record from `provenance`. `Recording` grows in
-chunks and survives a kill or a power loss; a `HeldFolder` is found wherever it is moved. No other
-package opens or writes zarr.
+`save` and `open_dataset` keep datasets as zarr, `save_rows` one that is made row by row;
+`save_numbers`, `save_figure`, `save_text` and `save_video` keep the rest of a result, each with the
+record from `provenance`. `Recording` grows in chunks and survives a kill or a power loss; a
+`HeldFolder` is found wherever it is moved. No other package opens or writes zarr.
 """
 
 from dbthermal.store._durable import HeldFolder, to_disk
@@ -16,6 +16,7 @@ from dbthermal.store._results import (
     save,
     save_figure,
     save_numbers,
+    save_rows,
     save_text,
     save_video,
 )
@@ -31,6 +32,7 @@ __all__ = [
     "save",
     "save_figure",
     "save_numbers",
+    "save_rows",
     "save_text",
     "save_video",
     "to_disk",

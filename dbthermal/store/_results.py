@@ -49,12 +49,13 @@ _ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str
 """FFmpeg's encoder of each codec of a film, with its options."""
 
 
-def _chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
+def _chunks(variable: xr.Variable | xr.DataArray, *, even: bool = False) -> tuple[int, ...]:
     """
     Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
 
     Every stage works pixel by pixel on all frames and bands, so a chunk holds the full story of a
-    nearly square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression.
+    nearly square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression; `even`
+    tiles divide the rows, so that rows that follow begin with a tile.
     """
     sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
     if not {"y", "x"} <= sizes.keys():
@@ -62,8 +63,10 @@ def _chunks(variable: xr.Variable | xr.DataArray) -> tuple[int, ...]:
     pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
     pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
     height = min(sizes["y"], math.ceil(math.sqrt(pixels)))
+    if even:
+        height = next(rows for rows in range(height, 0, -1) if sizes["y"] % rows == 0)
     width = min(sizes["x"], math.ceil(pixels / height))
-    sizes |= {"y": min(sizes["y"], math.ceil(pixels / width)), "x": width}
+    sizes |= {"y": height if even else min(sizes["y"], math.ceil(pixels / width)), "x": width}
     return tuple(sizes.values())
 
 
@@ -109,6 +112,56 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
             write_empty_chunks=True,
         )
         (part / SUMS).write_bytes(last_sums(part))
+
+
+def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
+    """
+    Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
+
+    Parameters
+    ----------
+    parts : iterable of Dataset
+        Rows from the first to the last, made when they are asked for: no more than one is held.
+        What has no y, and the attributes, are those of the first.
+    path : str or Path
+        Folder ``*.zarr``; see `save`.
+    provenance : mapping
+        See `save`.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> rows = (xr.Dataset({"status": (("y", "x"), [[row, 0]])}) for row in range(3))
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save_rows(rows, f"{folder}/wall.zarr", store.provenance({}))
+    ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
+    [[0, 0], [1, 0], [2, 0]]
+    """
+    with _whole(path, ".zarr") as folder:
+        folder.mkdir()
+        for number, part in enumerate(parts):
+            plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
+            options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
+            if number == 0:
+                plain.attrs = {**MARK, **part.attrs, "provenance": json.loads(_json(provenance))}
+                encoding = {
+                    name: {"chunks": _chunks(variable, even=True), "compressors": _COMPRESSORS}
+                    for name, variable in plain.variables.items()
+                }
+                options = {"mode": "w-", "encoding": encoding}
+            else:
+                rest = [name for name, one in plain.variables.items() if "y" not in one.dims]
+                plain = plain.drop_vars(rest).drop_attrs(deep=False)
+            plain.to_zarr(
+                SummedStore(folder),
+                zarr_format=3,
+                consolidated=False,
+                write_empty_chunks=True,
+                **options,
+            )
+        (folder / SUMS).write_bytes(last_sums(folder))
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:

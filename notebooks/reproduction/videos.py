@@ -1,44 +1,88 @@
-"""The authors' published videos of two scenes, and their own separation to compare with.
+"""The authors' published videos of their scenes, and their own separation to compare with.
 
 They are pictures: 8 bit, compressed, each frame scaled on its own. Nothing here is radiometric,
 and every result says so. Source: the project page of Narayanan et al. (2026),
-doi:10.48550/arXiv.2509.11334, listed as `scenes` in the data manifest.
+doi:10.48550/arXiv.2509.11334, listed as `scenes` and `other_scenes` in the data manifest.
 """
 
+import itertools
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_dilation, gaussian_filter
 
-from dbthermal import metrics, readers
+from dbthermal import metrics, readers, separation
+from reproduction import parallax
+
+Array = npt.NDArray[np.float64]
 
 BANDS: Final = {"8-14": 0, "9.5": 1}
 """Band and the number in its video's name; the second is published as 9.25-9.75 um."""
 
+KINDS: Final = ("uncalib", "calib")
+"""The authors' results, by estimated and by calibrated emissivities."""
+
 SMOOTHING: Final = 1.0
 """Standard deviation of the smoothing of a map before it is compared [pixel]."""
 
+MARGIN: Final = 6
+"""Pixels beyond the object's outline that are not taken as still surroundings."""
 
-def inputs(files: Mapping[str, Path], name: str, first: int, last: int) -> xr.DataArray:
+_CHANGE: Final = 2  # frames over which pictures are compared to find out which ones they are
+
+
+WAYS: Final = {
+    "as published": (False, False),
+    "scale undone": (True, False),
+    "displacement undone": (False, True),
+    "both undone": (True, True),
+}
+"""Name of a separation, and whether the frames' scale and the reflections' displacement are
+undone before it."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A published scene: its inputs, and the authors' results for the frames that these show."""
+
+    movie: xr.DataArray  # (band, time, y, x) [1], the frames that the results show
+    theirs: Mapping[str, xr.Dataset]  # kind -> `value`, `valid` (time, y, x)
+    outline: xr.DataArray  # (y, x): the object, by the results
+    first: int  # input frame that is the results' first
+    margin: float  # by which that one stands out, in median deviations; infinite if all are shown
+
+
+def scene(files: Mapping[str, Path], inputs_name: str, results_name: str) -> Scene:
+    """
+    Read a scene of `manifest.local`, such as "incan-bulb" with the results' name "incan".
+
+    Where the results have fewer frames than the inputs, their first frame is found by `first_frame`
+    on the authors' reflection. The object is what their results draw in more than half of the
+    frames. Raises as `inputs`, and a ValueError if results and inputs do not fit together.
+    """
+    movie = inputs(files, inputs_name)
+    width = movie.sizes["x"]
+    theirs = {kind: authors_reflection(files, results_name, kind, width) for kind in KINDS}
+    outline = theirs["uncalib"]["valid"].mean("time") > 0.5
+    first, margin = first_frame(movie, theirs["uncalib"]["value"], outline)
+    shown = movie.isel(time=slice(first, first + theirs["uncalib"].sizes["time"]))
+    return Scene(shown, theirs, outline, first, margin)
+
+
+def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
     """
     Both bands (band, time, y, x) of a scene, in [0, 1], with `radiometric = 0`.
 
-    Of the files of `manifest.local("scenes")`, the scene "coffeepot" or "glass-plate", from the
-    first frame to the one before the last. Raises a FileNotFoundError without such a video, a
-    ValueError if the two videos differ in shape or are too short.
+    Raises a FileNotFoundError without such a video, a ValueError if the two differ in shape.
     """
-    movies = []
-    for number in BANDS.values():
-        movie = readers.palette_video(_file(files, f"{name}-{number}-bg.mp4"))
-        if not 0 <= first < last <= movie.sizes["time"]:
-            raise ValueError(
-                f"Invalid frames {first} to {last} of scene '{name}'. "
-                f"Must lie in [0, {movie.sizes['time']}], first before last."
-            )
-        movies.append(movie.isel(time=slice(first, last)))
+    movies = [
+        readers.palette_video(_file(files, f"{name}-{number}-bg.mp4")) for number in BANDS.values()
+    ]
     if movies[0].shape != movies[1].shape:
         raise ValueError(
             f"Invalid shapes {movies[0].shape}, {movies[1].shape} of scene '{name}'. Must agree."
@@ -46,28 +90,85 @@ def inputs(files: Mapping[str, Path], name: str, first: int, last: int) -> xr.Da
     movies[1] = movies[1].assign_coords(time=movies[0]["time"])
     band = xr.DataArray(list(BANDS), dims="band", name="band")
     together = xr.concat(movies, band, combine_attrs="drop_conflicts")
-    return together.assign_attrs(radiometric=0, scene=name, origin="published video")
+    fits = [movie.attrs["palette_residual"] for movie in movies]
+    return together.assign_attrs(
+        radiometric=0, scene=name, origin="published video", palette_residual=fits
+    )
 
 
 def authors_reflection(files: Mapping[str, Path], name: str, kind: str, width: int) -> xr.Dataset:
     """
     Magnitude of the background's change as published by the authors.
 
-    `kind` is "uncalib" or "calib", by estimated or calibrated emissivities; beyond the width of the
-    input video [pixel] lies a printed bar. `value` (time, y, x) in [0, 1], in units of the frame's
-    own bar, and `valid`.
+    `kind` is one of `KINDS`; beyond the width of the input video [pixel] may lie a printed bar.
+    `value` (time, y, x) in [0, 1], in units of the frame's own bar, and `valid`.
     """
     path = _file(files, f"{name}_{kind}_Tbdiff_video.mp4")
     return readers.masked_palette_video(path, "turbo", width)
 
 
-def agreement(reflection: xr.DataArray, theirs: xr.Dataset, strongest: int) -> xr.DataArray:
+def first_frame(
+    movie: xr.DataArray, theirs: xr.DataArray, outline: xr.DataArray
+) -> tuple[int, float]:
     """
-    Correlation (time) [1] of our reflection's magnitude with the authors', where it is strongest.
+    First frame of the inputs (band, time, y, x) that the results show, and how it stands out.
 
-    Our reflection (time, y, x), smoothed by `SMOOTHING`, is compared over the pixels that the
-    authors' map covers in all of the frames in which its mean square on the object is strongest.
-    Raises a ValueError if the frames differ in number or size.
+    Changes of both over two frames, of pictures without their own scale, are correlated over the
+    object, in magnitude, for theirs have no sign; the median over time is largest where the frames
+    are the same ones, in the band of the larger one: the other band shows what moves displaced, and
+    so at another time. It stands out by that less the median over all first frames, in the scaled
+    median deviations of these. Raises a ValueError if the results have more frames or other sizes.
+    """
+    extra = movie.sizes["time"] - theirs.sizes["time"]
+    if extra < 0 or movie.shape[2:] != theirs.shape[1:]:
+        raise ValueError(
+            f"Invalid results of {theirs.shape} frames, rows and columns. "
+            f"Must be at most the inputs' {movie.shape[1:]}."
+        )
+    results = _changes(theirs.values, outline.values)
+    scores = np.empty((len(movie), extra + 1))
+    for place, band in enumerate(movie.values):
+        ours = _changes(band, outline.values)
+        for first in range(extra + 1):
+            part = ours[first : first + len(results)]
+            scores[place, first] = np.median(np.abs(np.einsum("tp,tp->t", results, part)))
+    best = scores[np.argmax(scores.max(axis=1))]
+    above = best - np.median(best)
+    deviation = 1.4826 * float(np.median(np.abs(above)))
+    return int(np.argmax(best)), float(above.max()) / deviation if extra else np.inf
+
+
+def _changes(movie: npt.NDArray[np.floating], inside: npt.NDArray[np.bool_]) -> Array:
+    """Changes (time, pixel) over two frames of pictures without gain and offset, of norm 1."""
+    smoothed = gaussian_filter(movie.astype(np.float64), (0, SMOOTHING, SMOOTHING))[:, inside]
+    frames = _normalised(smoothed)
+    return _normalised(frames[_CHANGE:] - frames[:-_CHANGE])
+
+
+def _normalised(rows: Array) -> Array:
+    """Rows less their means, of norm 1, or 0 where a row is constant."""
+    rows = rows - rows.mean(axis=1, keepdims=True)
+    norm = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(np.divide(rows, norm, out=np.zeros_like(rows), where=norm > 0))
+
+
+def still(outline: xr.DataArray) -> xr.DataArray:
+    """Surroundings (y, x): pixels more than `MARGIN` off the object."""
+    return outline.copy(data=~binary_dilation(outline.values, iterations=MARGIN))
+
+
+def agreement(
+    reflection: xr.DataArray,
+    theirs: xr.Dataset,
+    frames: npt.NDArray[np.intp],
+    pixels: xr.DataArray,
+) -> xr.DataArray:
+    """
+    Correlation (time) [1] of our reflection's magnitude with the authors', in some frames.
+
+    Our reflection (time, y, x), smoothed by `SMOOTHING`, is compared over those of the pixels that
+    the authors' map covers in all of these frames. Raises a ValueError if the frames differ in
+    number or size.
     """
     if theirs["value"].shape != reflection.shape:
         raise ValueError(
@@ -75,15 +176,121 @@ def agreement(reflection: xr.DataArray, theirs: xr.Dataset, strongest: int) -> x
             f"Must be {reflection.shape}."
         )
     theirs = theirs.assign_coords({dim: reflection[dim] for dim in ("time", "y", "x")})
+    ours, theirs = reflection.isel(time=frames), theirs.isel(time=frames)
     # Smoothed within the object alone: its surroundings neither enter nor dim its edge.
     inside, width = theirs["valid"].values.astype(np.float64), (0.0, SMOOTHING, SMOOTHING)
-    smoothed = gaussian_filter(reflection.values * inside, width)
+    smoothed = gaussian_filter(ours.values * inside, width)
     weight = gaussian_filter(inside, width)
-    ours = reflection.copy(data=np.abs(np.divide(smoothed, weight, where=inside > 0, out=inside)))
-    power = (reflection**2).where(theirs["valid"]).mean(("y", "x"))
-    chosen = np.sort(np.argsort(power.values)[-strongest:])
-    ours, theirs = ours.isel(time=chosen), theirs.isel(time=chosen)
-    return metrics.correlation(ours, theirs["value"], theirs["valid"].all("time"))
+    ours = ours.copy(data=np.abs(np.divide(smoothed, weight, where=inside > 0, out=inside)))
+    return metrics.correlation(ours, theirs["value"], theirs["valid"].all("time") & pixels)
+
+
+def strongest(reflection: xr.DataArray, outline: xr.DataArray, number: int) -> npt.NDArray[np.intp]:
+    """Frames, in their order, in which a reflection's mean square on the object is largest."""
+    power = (reflection**2).where(outline).mean(("y", "x"))
+    return np.asarray(np.sort(np.argsort(power.values)[-number:]))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A scene separated in several ways, each beside the authors' maps."""
+
+    undone: xr.DataArray  # inputs (band, time, y, x) without the frames' scale, where it allows
+    separated: xr.Dataset  # from `separation.uncalibrated_reflection` of that
+    scores: xr.DataArray  # its agreement (time) [1] with the authors' first map
+    edges: xr.Dataset  # from `parallax.edges_shift`
+    reflections: xr.Dataset  # from `parallax.reflections_shift`
+    table: xr.DataArray  # median agreement (way, map, pixels) [1], NaN where left out
+    left_out: Mapping[str, str]  # way -> why
+
+
+def compare(scene: Scene, number: int) -> Comparison:
+    """
+    Separate a scene in all `WAYS`, and compare each with the authors' maps.
+
+    All are compared in the same frames, the `number` in which the reflection is strongest, and at
+    the same pixels: all that show the object in both bands, and those of them where the bands
+    change together (correlation above 0.5), by the separation with the scale undone. A way in which
+    the scene cannot be separated is left out, and said why; a ValueError if it is all of them.
+    """
+    undone = separation.unscaled(scene.movie, still(scene.outline))
+    reflections = parallax.reflections_shift(undone, scene.outline)
+    shared = parallax.shared_outline(scene.outline, reflections)
+    found: dict[str, xr.Dataset] = {}
+    left_out = {}
+    for way in sorted(WAYS, key=lambda way: -WAYS[way][0]):  # the scale undone first
+        of_scale, of_reflections = WAYS[way]
+        movie = undone if of_scale else scene.movie
+        try:
+            movie = parallax.moved(movie, reflections) if of_reflections else movie
+            parts = separation.uncalibrated_reflection(movie)
+        except ValueError as error:
+            left_out[way] = str(error)
+        else:
+            found[way] = parts.drop_vars("emission") if found else parts
+    if not found:
+        raise ValueError(f"Inseparable scene: {left_out}. Must be separable in one way.")
+    first = found[next(iter(found))]
+    pixels = {"object": shared, "moving": shared & (first["correlation"] > 0.5)}
+    frames = strongest(first["reflection"], shared, number)
+    coords = {"way": list(WAYS), "map": list(KINDS), "pixels": list(pixels)}
+    table = xr.DataArray(np.full((len(WAYS), 2, 2), np.nan), coords, attrs={"units": "1"})
+    for way, kind, where in itertools.product(found, KINDS, pixels):
+        reflection = found[way]["reflection"]
+        score = agreement(reflection, scene.theirs[kind], frames, pixels[where]).median()
+        table.loc[{"way": way, "map": kind, "pixels": where}] = score
+    scores = agreement(first["reflection"], scene.theirs[KINDS[0]], frames, shared)
+    edges = parallax.edges_shift(undone)
+    return Comparison(undone, first, scores, edges, reflections, table, left_out)
+
+
+def compare_all(
+    scenes: Mapping[str, Scene], number: int
+) -> tuple[dict[str, Comparison], dict[str, str]]:
+    """Compare all scenes, see `compare`; and why those that cannot be separated are left out."""
+    compared, left_out = {}, {}
+    for name, one in scenes.items():
+        try:
+            compared[name] = compare(one, number)
+        except ValueError as error:
+            left_out[name] = str(error)
+    return compared, left_out
+
+
+def report(compared: Mapping[str, Comparison]) -> str:
+    """Tables in Markdown of the displacements and of the agreement, a row a scene and way."""
+    lines = [
+        "Published videos, not radiometric. Displacements: the second band shows at p the first's",
+        "p + d, to the right; range of five parts, and 10 to 90 % of the strongest neighbourhoods.",
+        "",
+        "| scene | still edges [pixel] | reflections [pixel] | their correlation, at 0 |",
+        "|---|--:|--:|--:|",
+    ]
+    for name, one in compared.items():
+        both = " | ".join(_range(part.sel(axis="x")) for part in (one.edges, one.reflections))
+        peak, at_0 = (one.reflections.attrs[key] for key in ("correlation", "correlation_at_0"))
+        lines.append(f"| {name} | {both} | {peak:.2f}, {at_0:.2f} |")
+    columns = [f"{kind}, {where}" for kind in KINDS for where in ("object", "moving")]
+    lines += [
+        "",
+        "Correlation of the reflection's map with the authors', median of the frames.",
+        "",
+    ]
+    lines += [f"| scene | way | {' | '.join(columns)} |", "|---|---|" + "--:|" * len(columns)]
+    for name, one in compared.items():
+        for way in WAYS:
+            cells = [f"{value:.3f}" for value in one.table.sel(way=way).values.ravel()]
+            lines.append(f"| {name} | {way} | {' | '.join(cells)} |")
+        undone = one.undone.attrs["scale_undone"] or "no band"
+        shares = ", ".join(f"{share:.2f}" for share in one.undone.attrs["scale_explained"])
+        note = f"{name}: scale undone in {undone}; it explains {shares} of the surroundings' change"
+        reasons = "".join(f"; {way} left out: {why}" for way, why in one.left_out.items())
+        lines.append(f"| {note}{reasons} |" + " |" * (len(columns) + 1))
+    return "\n".join(lines) + "\n"
+
+
+def _range(part: xr.Dataset) -> str:
+    return "{:.2f} ({:.2f} to {:.2f})".format(*(float(part[k]) for k in ("shift", "low", "high")))
 
 
 def _file(files: Mapping[str, Path], name: str) -> Path:

@@ -283,7 +283,7 @@ def test_parallax_is_that_of_a_mirror_image() -> None:
 def resampled(scene: xr.Dataset, rig: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Band 2's reflection at the object's points, and band 1's at the true shift (time, pixel)."""
     seen = scene.assign(emissivity=0.0 * scene["emissivity"] + 1e-6)
-    views = twins.observe(seen, rig.assign(noise=0.0 * rig["noise"]), rng())
+    views = twins.registered(seen, twins.observe(seen, rig.assign(noise=0.0 * rig["noise"]), rng()))
     kelvin = response.apparent_temperature(rig, views["counts"]).values
     known = (scene["shift"].notnull().all("axis") & scene["on_object"]).values
     moved = np.indices(known.shape) + scene["shift"].values
@@ -321,7 +321,8 @@ def test_a_surface_is_registered(rig: xr.Dataset) -> None:
     """By the geometry both bands show the same point of the surface; hidden ones are missing."""
     capture = Capture(GLASS, shape=(72, 96), time=clock(3), baseline=0.04)
     scene = twins.twin("coffee_pot", capture, rng())
-    views = twins.observe(scene.assign(emissivity=0 * scene["emissivity"] + 0.999999), rig, rng())
+    seen = scene.assign(emissivity=0 * scene["emissivity"] + 0.999999)
+    views = twins.registered(seen, twins.observe(seen, rig, rng()))
     kelvin = response.apparent_temperature(rig, views["counts"])
     apart = (kelvin[1] - kelvin[0]).where(scene["on_object"]).mean("time")
     assert float(abs(apart).quantile(0.9)) < 1.0  # [K], of 40 K from level to rim, in noise

@@ -1,5 +1,7 @@
 """Separation with known emissivities: exact without noise, and at its closed-form variance."""
 
+import functools
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -7,12 +9,12 @@ from captures import emissivity_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dbthermal import mixing, schema, separation
+from dbthermal import mixing, schema, separation, simulation
 from dbthermal import response as responses
-from dbthermal.separation._baselines.calibrated import temperature_variance
 from dbthermal.simulation import Rig
 
 RIG = Rig()
+FRAMES = separation.CalibratedSettings(smooth=False)
 
 
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
@@ -54,7 +56,7 @@ def test_calibrated_noise_is_the_bound(glass: Glass) -> None:
     """Known emissivities: errors are those of the closed form, 0.35 K and 2.1 K for glass."""
     scene, capture, response = glass
     known = emissivity_of(0.86, 0.72)
-    result = separation.solve(capture, response, "calibrated", emissivity=known)
+    result = separation.solve(capture, response, "calibrated", emissivity=known, settings=FRAMES)
     for name in ("object_temperature", "background_temperature"):
         scores = (result[name] - scene[name]) / result[f"{name}_std"]
         assert float(scores.std()) == pytest.approx(1.0, abs=0.05)
@@ -68,7 +70,7 @@ def test_rounding_is_in_the_deviations(glass: Glass, step: float) -> None:
     whole = step * (capture["counts"] / step).round()
     coarse = capture.assign(counts=whole.where(whole["band"] == "9.5", capture["counts"]))
     known = emissivity_of(0.86, 0.72)
-    result = separation.solve(coarse, response, "calibrated", emissivity=known)
+    result = separation.solve(coarse, response, "calibrated", emissivity=known, settings=FRAMES)
     scores = (result["object_temperature"] - scene["object_temperature"]) / result[
         "object_temperature_std"
     ]
@@ -108,9 +110,108 @@ def test_nonsense_in_one_pixel_stays_there(glass: Glass) -> None:
     assert not np.any(result["status"].values[1:])
 
 
-def test_linear_variances_are_the_closed_form() -> None:
-    """The design's figures for glass with noise (0.04, 0.4) K: 0.40 K and 2.4 K a frame."""
-    mixed = mixing.matrix([0.86, 0.72])
-    none = np.zeros(2)
-    variance = temperature_variance(mixed, (0.04, 0.4), np.array([300.0, 300.0]), none)
-    np.testing.assert_allclose(np.sqrt(variance), [0.40, 2.4], rtol=0, atol=0.07)  # [K]
+def test_emissivities_whose_errors_go_together(glass: Glass) -> None:
+    """With the ratio known far better than the emissivities, their covariance makes it solvable.
+
+    By two deviations alone each pixel would be gray; the intervals hold with the covariance, which
+    is laid on the bands by their names.
+    """
+    scene, capture, response = glass
+    rng, shape = np.random.default_rng(5), scene["emissivity"].shape[1:]
+    shared, own = 0.02 * rng.standard_normal(shape), 0.004 * rng.standard_normal(shape)
+    known = scene["emissivity"] + xr.DataArray(
+        [shared, 2.0 * shared + own], dims=("band", "y", "x")
+    )
+    together = 0.02**2 * np.array([[1.0, 2.0], [2.0, 4.0]]) + np.diag([0.0, 0.004**2])
+    names = list(RIG.bands)
+    covariance = xr.DataArray(
+        together[::-1, ::-1],
+        {"band": names[::-1], "other_band": names[::-1]},
+        ("band", "other_band"),
+    )
+    solve = functools.partial(separation.solve, capture, response, "calibrated", emissivity=known)
+    result = solve(emissivity_covariance=covariance)
+    apart = solve(
+        emissivity_std=xr.DataArray(np.sqrt(np.diag(together)), {"band": names}, ("band",))
+    )
+    assert float(schema.has_flag(apart["status"], "gray").mean()) > 0.9
+    assert not np.any(schema.has_flag(result["status"], "gray"))
+    error = abs(result["object_temperature"] - scene["object_temperature"])
+    share = float((error < 1.96 * result["object_temperature_std"]).where(error.notnull()).mean())
+    print(f"object: 95 % intervals hold in {share:.3f}")
+    assert 0.92 < share < 0.98
+    with pytest.raises(ValueError, match="no negative eigenvalue"):
+        solve(emissivity_covariance=covariance - 0.1)
+    with pytest.raises(ValueError, match="beside an emissivity_covariance"):
+        solve(emissivity_covariance=covariance, emissivity_std=abs(known))
+
+
+def test_bars_are_the_closed_form(glass: Glass) -> None:
+    """Equation 2 for glass before a background near it: 0.35 K and 2.1 K a frame."""
+    _, capture, response = glass
+    result = separation.solve(
+        capture, response, "calibrated", emissivity=emissivity_of(0.86, 0.72), settings=FRAMES
+    )
+    s = [RIG.noise[0], RIG.noise[1]]
+    for name, share in (("object_temperature", 1.0), ("background_temperature", 0.0)):
+        weights = [abs(share - e) for e in (0.72, 0.86)]
+        expected = np.hypot(weights[0] * s[0], weights[1] * s[1]) / (0.86 - 0.72)
+        # At first both are as warm as the reference, where the responses' slopes are 1.
+        first = float(result[f"{name}_std"].isel(time=0).median())
+        assert first == pytest.approx(expected, rel=0.05)
+
+
+def test_smoothed_as_far_as_the_curve_allows(glass: Glass) -> None:
+    """The object's error falls fourfold at least, its intervals hold; the background stays."""
+    scene, capture, response = glass
+    known = emissivity_of(0.86, 0.72)
+    smooth, frames = (
+        separation.solve(capture, response, "calibrated", emissivity=known, settings=settings)
+        for settings in (None, FRAMES)
+    )
+    name = "object_temperature"
+    errors = [part[name] - scene[name] for part in (smooth, frames)]
+    rmse = [float(np.sqrt((error**2).mean())) for error in errors]
+    within = float((abs(errors[0]) < 1.96 * smooth[f"{name}_std"]).mean())
+    print(f"{rmse[0]:.3f} K, frame by frame {rmse[1]:.3f} K; intervals hold {within:.3f}")
+    assert rmse[0] < 0.25 * rmse[1]
+    assert 0.92 <= within <= 0.98
+    xr.testing.assert_equal(smooth["background_temperature"], frames["background_temperature"])
+
+
+@pytest.mark.parametrize("rise", [0.3, 2.0, 8.0])
+def test_a_rapid_object_is_not_smoothed_away(rise: float) -> None:
+    """Rises of 0.3 to 8 s come out within their intervals, also while they last."""
+    time, rng = np.arange(300) / 10.0, np.random.default_rng(4)
+    step = 0.5 * (1.0 + np.tanh(2.0 * np.log(3.0) / rise * (time - 15.0)))
+    warm = np.broadcast_to(295.0 + 30.0 * step[:, None, None], (300, 8, 10))
+    cold = 295.0 + 3.0 * rng.standard_normal((300, 8, 10))
+    scene = simulation.scene(time, warm, cold, emissivity_of(0.86, 0.72))
+    capture = simulation.observe(scene, RIG.response(), rng)
+    known = emissivity_of(0.86, 0.72)
+    result = separation.solve(capture, RIG.response(), "calibrated", emissivity=known)
+    score = abs(result["object_temperature"] - warm) / result["object_temperature_std"]
+    steep = abs(time - 15.0) < rise
+    within = [float((score.isel(time=part) < 1.96).mean()) for part in (slice(None), steep)]
+    print(f"rise {rise} s: intervals hold {within[0]:.3f}, in the rise {within[1]:.3f}")
+    assert 0.9 <= within[0] <= 0.99
+    assert within[1] >= 0.75
+
+
+def test_a_third_band_lessens_the_noise() -> None:
+    """Three bands give what two give, with less noise, and true deviations."""
+    rig = Rig(bands=("8-14", "9.5", "10.6"), noise=(0.03, 0.35, 0.15))
+    known, rng = emissivity_of(0.86, 0.72, 0.93, bands=rig.bands), np.random.default_rng(6)
+    scene = simulation.walkers(np.arange(100) / 10.0, (8, 10), known, rng)
+    capture, response = simulation.observe(scene, rig.response(), rng), rig.response()
+    results = [
+        separation.solve(
+            part, response, "calibrated", emissivity=known.sel(band=part["band"]), settings=FRAMES
+        )
+        for part in (capture, capture.isel(band=[0, 1]))
+    ]
+    stds = [float(part["object_temperature_std"].mean()) for part in results]
+    score = results[0]["object_temperature"] - scene["object_temperature"]
+    score = score / results[0]["object_temperature_std"]
+    assert stds[0] < 0.95 * stds[1]
+    assert float(score.std()) == pytest.approx(1.0, abs=0.05)

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal import schema, separation, simulation
-from dbthermal.separation._subspace import residuals
 from dbthermal.simulation import Rig
 from reproduction import experiments
 
@@ -34,30 +33,42 @@ def rms(error: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(mean))
 
 
-@pytest.mark.parametrize("jump", [SUDDEN, SLOW], ids=["sudden", "over 1 s"])
-def test_jump_is_found_and_modelled(jump: dict[str, Any]) -> None:
+def test_jump_is_found_and_modelled() -> None:
     """Nine pixels in ten are as good before and after as nine in ten without a jump, within half
-    and two thirds; they are flagged, and have no value at the jump.
+    and two thirds; they are flagged as jumping, and 95 % intervals hold at the jump itself.
     """
     clean, plain = experiments.run_case(GLASS, RIG, TIME, 400, seed=1)
-    scene, result = experiments.run_case({**GLASS, "jump": jump}, RIG, TIME, 400, seed=1)
+    scene, result = experiments.run_case({**GLASS, "jump": SUDDEN}, RIG, TIME, 400, seed=1)
     step = (scene["object_temperature"] - clean["object_temperature"]).values[:, 0]
+    number = np.argmax(np.abs(np.diff(step, axis=0)), axis=0) + np.array([[0], [1]])
+    far = np.abs(TIME[:, np.newaxis] - TIME[number[1]]) > 1.0
     # After a jump the object is 6 K further from the background: the ratio's error counts for more.
     for name, side, limit in (("before", step < 0.01, 1.5), ("after", step > 5.99, 1.7)):
         without, found = (
-            np.quantile(rms(np.where(side, part, np.nan)), 0.9, method="higher")
+            np.quantile(rms(np.where(side & far, part, np.nan)), 0.9, method="higher")
             for part in (errors(clean, plain), errors(scene, result))
         )
-        print(f"{jump}, {name}: 90 % below {found:.3f} K, without a jump below {without:.3f} K")
+        print(f"{name}: 90 % below {found:.3f} K, without a jump below {without:.3f} K")
         assert found < limit * without
     flagged = result["status"].values[0] & JUMP != 0
-    number = np.argmax(np.abs(np.diff(step, axis=0)), axis=0) + np.array([[0], [1]])
-    beside = errors(scene, result)[number, np.arange(400)]  # the frames before and after
-    print(f"{jump}: {100 * flagged.mean():.1f} % flagged")
-    assert flagged.mean() > 0.99
-    assert np.all(result["status"] != 0)
-    assert np.mean(np.isnan(beside).any(axis=0)) > 0.98
-    assert np.isfinite(errors(scene, result)).mean() > 0.9
+    score = np.abs(errors(scene, result)) / result["object_temperature_std"].values[:, 0]
+    beside = score[number, np.arange(400)]  # the frames before and after
+    print(
+        f"{100 * flagged.mean():.1f} % flagged; intervals at the jump {np.mean(beside < 1.96):.3f}"
+    )
+    assert flagged.mean() > 0.98
+    assert np.mean(beside < 1.96) > 0.92
+    assert np.isfinite(errors(scene, result)).mean() > 0.98
+
+
+def test_what_takes_a_second_is_no_jump() -> None:
+    """An object that changes by 6 K in 1 s has true intervals, mostly without a flag."""
+    scene, result = experiments.run_case({**GLASS, "jump": SLOW}, RIG, TIME, 400, seed=1)
+    good = result["status"].values[0] == 0
+    within = np.abs(errors(scene, result)) < 1.96 * result["object_temperature_std"].values[:, 0]
+    print(f"{good.mean():.3f} without a flag; intervals hold in {within[:, good].mean():.3f}")
+    assert good.mean() > 0.95
+    assert 0.92 <= within[:, good].mean() <= 0.98
 
 
 def test_intervals_hold_beside_a_jump() -> None:
@@ -101,19 +112,6 @@ def test_a_jump_needs_no_least_length(frames: int, rate: float, seed: int) -> No
     assert np.all(np.isfinite(result["object_temperature"].values[:, good]))
 
 
-def test_candidates_leave_room() -> None:
-    """Candidate frames of a jump leave enough frames on both sides."""
-    time = np.arange(120) / 20.0
-    inside = residuals.candidates(time)
-    assert inside.size > 0
-    for jump in (inside[0], inside[-1]):
-        kept = residuals.beside_jump(time, int(jump))
-        assert min(kept[:jump].sum(), kept[jump:].sum()) == 24
-        between = time[jump] - 0.5 / 20.0
-        assert np.abs(time[kept] - between).min() > residuals.AROUND
-    assert residuals.candidates(time[:60]).size == 0
-
-
 @pytest.mark.parametrize("height", [0, 30])
 def test_jump_beside_a_shutter_event(height: int) -> None:
     """A jump 0.3 s after a shutter event is flagged, and its values have calibrated uncertainty."""
@@ -132,7 +130,8 @@ def test_jump_beside_a_shutter_event(height: int) -> None:
     error = errors(moved, result)
     within = np.abs(error) < 1.96 * result["object_temperature_std"].values[:, 0]
     share = float(within[np.isfinite(error)].mean())
-    print(f"camera's step {height} counts: intervals {share:.3f}")
-    assert np.all(result["status"] != 0)
+    jumping = result["status"].values[0] & JUMP != 0
+    print(f"camera's step {height} counts: {jumping.mean():.3f} flagged, intervals {share:.3f}")
+    assert jumping.mean() > 0.9
     assert share >= 0.92
     assert np.isfinite(error).mean() > 0.3

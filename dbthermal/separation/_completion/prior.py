@@ -13,9 +13,6 @@ from dbthermal.separation._tiles import Array, Mask, Whole
 SAMPLE_STD: Final = 0.02
 """Deviation of the emissivity of one sample of a material from that of the table [1]."""
 
-# Least deviation of an emissivity [1].
-_LEAST: Final = 1e-4
-
 # Grid of the first emissivity for a wide prior, finer towards 1; its points for a narrow one, and
 # how far these go.
 _GRID: Final = np.concatenate(
@@ -69,69 +66,21 @@ class Mixture:
         return Mixture(self.weight, self.mean[..., places], self.covariance[..., places])
 
 
-def own(value: Array, std: Array, ratio: Array, ratio_std: Array) -> Mixture:
-    """Estimates of each pixel (band, pixel): the first emissivity's error and the ratios' own."""
-    covariance = _covariance(value[0], std[0] ** 2, ratio, ratio_std**2)
-    # The stated deviations hold: the shared part gives the correlations alone.
-    total = np.sqrt(np.einsum("bbp->bp", covariance))
-    scale = np.maximum(std, _LEAST) / np.maximum(total, 1e-12)
-    return Mixture(
-        np.ones(1), value[np.newaxis], (covariance * scale[:, np.newaxis] * scale)[np.newaxis]
-    )
-
-
-def of_materials(measured: tuple[Array, ...], status: Bits, labels: Whole) -> tuple[Mixture, Mask]:
-    r"""
-    Emissivities of each label from its pixels without a flag, and which labels have any.
-
-    The errors of the ratios are independent between pixels, those of the first emissivity may be
-    the same in all (the background's drift): its mean is no surer than the surest pixel. Both
-    carry the scatter between pixels that the deviations do not explain.
-    """
-    value, std, ratio, ratio_std = measured
+def of_materials(
+    value: Array, covariance: Array, status: Bits, labels: Whole
+) -> tuple[Mixture, Mask]:
+    """Pooled emissivities of each label, as in its pixels without a flag, and the labels of any."""
     count = int(labels.max(initial=-1)) + 1
-    bands = len(value)
-    mean, covariance = np.full((bands, count + 1), 0.5), np.zeros((bands, bands, count + 1))
-    covariance += np.eye(bands)[..., np.newaxis]
+    mean = np.full((len(value), count + 1), 0.5)
+    spread = np.repeat(np.eye(len(value))[..., np.newaxis], count + 1, axis=2)
     known = np.zeros(count + 1, dtype=bool)
-    good = (status == 0) & np.all(
-        np.isfinite(value) & (std > 0) & (value > 0) & (value < 1), axis=0
-    )
-    good &= np.all(np.isfinite(ratio_std), axis=0)
+    good = (status == 0) & np.all((value > 0) & (value < 1), axis=0)
     for label in np.unique(labels[good & (labels >= 0)]):
         here = good & (labels == label)
-        first, first_variance = _pooled(value[0, here], std[0, here] ** 2, shared=True)
-        pairs = [
-            _pooled(ratio[m, here], ratio_std[m, here] ** 2, shared=False) for m in range(1, bands)
-        ]
-        ratios, variances = (
-            np.array([one, *others])[:, np.newaxis]
-            for one, others in zip((1.0, 0.0), zip(*pairs, strict=True), strict=True)
-        )
-        mean[:, label] = 1.0 - ratios[:, 0] * (1.0 - first)
-        covariance[..., label] = _covariance(
-            np.array([first]), np.array([first_variance]), ratios, variances
-        )[..., 0]
-        known[label] = bool(np.all((mean[:, label] > 0) & (mean[:, label] < 1)))
-    return Mixture(np.ones(1), mean[np.newaxis], covariance[np.newaxis]), known
-
-
-def _pooled(value: Array, variance: Array, *, shared: bool) -> tuple[float, float]:
-    """Robust mean of the pixels, and the variance of one more pixel's value."""
-    mean = float(np.median(value))
-    scatter = (1.4826 * float(np.median(np.abs(value - mean)))) ** 2
-    between = max(scatter - float(np.median(variance)), 0.0)
-    own = (
-        float(variance.min()) if shared else float(np.median(variance)) * np.pi / (2.0 * value.size)
-    )
-    return mean, own + between
-
-
-def _covariance(first: Array, variance: Array, ratio: Array, ratio_variance: Array) -> Array:
-    """Covariance (band, band, pixel) of e_m = 1 - kappa_m (1 - e_1), of independent e_1, kappa."""
-    direct = (1.0 - first) ** 2 * ratio_variance + _LEAST**2
-    shared = ratio[:, np.newaxis] * ratio * variance
-    return np.asarray(shared + np.eye(len(ratio))[..., np.newaxis] * direct)
+        mean[:, label] = np.median(value[:, here], axis=1)
+        spread[..., label] = np.median(covariance[..., here], axis=-1)
+        known[label] = True
+    return Mixture(np.ones(1), mean[np.newaxis], spread[np.newaxis]), known
 
 
 def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> Mixture:

@@ -9,8 +9,8 @@ import xarray as xr
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
+from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
-from dbthermal.separation import _smoothing as smoothing
 from dbthermal.separation._completion import posterior
 from dbthermal.separation._completion import prior as priors
 from dbthermal.separation._completion.posterior import Level
@@ -38,6 +38,8 @@ _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
 # Median of the absolute deviations of a normal distribution, inverse; variance of its median.
 _MAD: Final = 1.4826
 _MEDIAN: Final = np.pi / 2.0
+# Precision of a level that a pixel does not show [1/K^2].
+_NOTHING: Final = 1e-9
 
 Values = dict[str, Array]
 """Completed values of some pixels by their names in the stage `separated`."""
@@ -49,25 +51,28 @@ class Scene:
 
     inputs: Inputs
     status: Array  # of the result (pixel)
-    measured: tuple[Array, ...]  # emissivity, ratio and their deviations (band, pixel); see `MAPS`
+    emissivity: Array  # as measured (band, pixel) [1], NaN where not
+    covariance: Array  # (band, band, pixel) [1]
     labels: Whole  # material (pixel), -1 for none
     material: Mixture  # of each label, and of none
     material_known: Mask  # (label + 1,)
     general: Mixture  # of any pixel
     offset: Array  # deviation of a pixel's offset against the others, of the other bands [K]
     level: Level
+    apart: bool  # the cameras do not see the same reflection in a pixel
 
     def sources(self, places: Whole) -> Whole:
         """Source of the emissivities of pixels (pixel)."""
-        emissivity, std, _, ratio_std = (one[:, places] for one in self.measured)
-        known = (emissivity > 0) & (emissivity < 1) & np.isfinite(std) & np.isfinite(ratio_std)
+        value, covariance = self.emissivity[:, places], self.covariance[..., places]
+        known = (value > 0) & (value < 1) & np.isfinite(covariance).all(axis=0)
         by_material = self.material_known[self.labels[places]]
         return np.where(known.all(axis=0), OWN, np.where(by_material, MATERIAL, PRIOR))
 
     def mixture(self, source: int, places: Whole) -> Mixture:
         """Prior on the emissivities of pixels of one source."""
         if source == OWN:
-            return priors.own(*(one[:, places] for one in self.measured))
+            value, covariance = self.emissivity[:, places], self.covariance[..., places]
+            return Mixture(np.ones(1), value[np.newaxis], covariance[np.newaxis])
         if source == MATERIAL:
             return self.material.at(self.labels[places])
         return self.general.at(np.zeros_like(places))
@@ -92,6 +97,7 @@ class Scene:
             noise=tuple(float(inputs.noise[band]) for band in inputs.bands),
             shape=(1, valid.shape[1]),
             rng=np.random.default_rng(0),
+            pattern=None if inputs.pattern is None else tuple(inputs.pattern[inputs.bands]),
         ), valid
 
     def sample(self) -> tuple[Tile, Mask, Whole]:
@@ -102,34 +108,44 @@ class Scene:
         return *self.tile(capture.isel(y=every, x=every).load()), numbers[every, every].ravel()
 
 
-def gather(inputs: Inputs, result: xr.Dataset, corrected: xr.Dataset, prior: Any) -> Scene:
+def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -> Scene:
     """Gather what is known of the emissivities; the background is a room of any temperature."""
-    bands, pixels = inputs.bands, result["status"].size
-    measured = tuple(
-        result[name + ending].values.astype(np.float64).reshape(-1, pixels)[bands]
-        for name in MAPS
-        for ending in ("", "_std")
-    )
-    labels = np.full(pixels, -1) if inputs.labels is None else inputs.labels
+    bands = inputs.bands
+    value, shared = (_flat(one["emissivity"])[bands] for one in (result, pooled))
+    covariance, shared_covariance = (_covariance(one, bands) for one in (result, pooled))
     status = result["status"].values.ravel()
-    material, known = priors.of_materials(measured, status, labels)
-    names = [str(corrected["band"].values[band]) for band in bands]
-    slopes = np.array([inputs.curves[band].reference_slope for band in bands])
-    pattern = np.zeros(len(bands))
-    if "pattern_std" in corrected:
-        pattern = corrected["pattern_std"].values.astype(np.float64)[bands] / slopes
+    labels = np.full(status.size, -1) if inputs.labels is None else inputs.labels
+    flags = pooled["status"].values.ravel()
+    material, known = priors.of_materials(shared, shared_covariance, flags, labels)
+    names = [str(result["band"].values[band]) for band in bands]
+    pattern = (np.zeros(len(bands)) if inputs.pattern is None else inputs.pattern)[bands]
     curve = inputs.curves[bands[0]]
     return Scene(
         inputs=inputs,
         status=status,
-        measured=measured,
+        emissivity=value,
+        covariance=covariance,
         labels=labels,
         material=material,
         material_known=known,
         general=priors.stated(prior, names),
         offset=np.hypot(pattern[1:], pattern[0]),
         level=Level(float(curve.signal(_ROOM[0])) - curve.reference, _ROOM[1], _FLUCTUATION),
+        apart=inputs.displacement is not None,
     )
+
+
+def _flat(array: xr.DataArray) -> Array:
+    """Values (..., pixel) of maps."""
+    return array.values.astype(np.float64).reshape(*array.shape[:-2], -1)
+
+
+def _covariance(result: xr.Dataset, bands: list[int]) -> Array:
+    """Covariance of the emissivities (band, band, pixel), in the order of the bands."""
+    if "emissivity_covariance" in result:
+        return _flat(result["emissivity_covariance"])[np.ix_(bands, bands)]
+    variance = _flat(result["emissivity_std"])[bands] ** 2
+    return variance * np.eye(len(bands))[..., np.newaxis]
 
 
 def require_same_capture(scene: Scene, result: xr.Dataset) -> None:
@@ -137,7 +153,7 @@ def require_same_capture(scene: Scene, result: xr.Dataset) -> None:
     tile, valid, places = scene.sample()
     films = [result[name].values.reshape(len(valid), -1)[:, places] for name in FILMS]
     with np.errstate(all="ignore"):
-        mixed = tile.mixed(scene.measured[0][:, places], np.array(films, dtype=np.float64))
+        mixed = tile.mixed(scene.emissivity[:, places], np.array(films, dtype=np.float64))
         score = np.abs(tile.signals - mixed) / np.array(tile.noise)[:, np.newaxis, np.newaxis]
     score = score[:, valid & (scene.status[places] == 0) & np.isfinite(score).all(axis=0)]
     if score.size and np.median(score) > _STRANGE:
@@ -186,25 +202,26 @@ def solve(
         static = posterior.moments(tile, data, scene.mixture(source, places), level)
         variance = posterior.fluctuation(tile, static, means, valid, level.fluctuation)
         variance = np.maximum(variance, _LEAST[1] ** 2)
-        frames = posterior.solve_frames(tile, static, variance)
-        signal, left = smoothing.smooth(frames.signal, frames.white, valid, tile.time)
-        left = left + frames.shared + posterior.through(frames.sensitivity, static.covariance)
-        behind = static.mean[-1] + frames.fluctuation
-        around = frames.fluctuation_variance + posterior.through(
-            frames.background_sensitivity, static.covariance
+        found = frames.solve(tile, static.point, static.level, variance, apart=scene.apart)
+        signal, left = frames.smooth(found.signal, found.white, valid, tile.time)
+        left = left + found.shared + frames.through(found.sensitivity, static.covariance)
+        around = found.background_variance + frames.through(
+            found.background_sensitivity, static.covariance
         )
         values: Values = {}
-        for name, mean, spread in zip(FILMS, (signal, behind), (left, around), strict=True):
+        for name, mean, spread in zip(
+            FILMS, (signal, found.background), (left, around), strict=True
+        ):
             temperature = tile.temperature(0, np.where(valid, mean, np.nan))
             values[name] = temperature
             values[f"{name}_std"] = np.sqrt(spread) / tile.curves[0].slope(temperature)
         pairs = ((static.emissivity, static.emissivity_covariance), static.reflection_ratio())
+        values["emissivity_covariance"] = static.emissivity_covariance
         for name, (mean, covariance) in zip(MAPS, pairs, strict=True):
             values[name] = mean
             values[f"{name}_std"] = np.sqrt(np.einsum("bbp->bp", covariance))
-        values["emissivity_covariance"] = static.emissivity_covariance
-    found = (static.mean[-1], static.covariance[-1, -1], np.square(level.std), variance)
-    return values, np.array(np.broadcast_arrays(*found))
+    told = (static.level, static.covariance[-1, -1], np.square(level.std), variance)
+    return values, np.array(np.broadcast_arrays(*told))
 
 
 def find_level(scene: Scene) -> Level:
@@ -226,9 +243,10 @@ def find_level(scene: Scene) -> Level:
     mean, after, before, fluctuation = np.concatenate(parts, axis=1)
     level = replace(scene.level, fluctuation=max(float(np.sqrt(np.median(fluctuation))), _LEAST[1]))
     # A posterior of precision 1 / after holds the prior's 1 / before.
-    variance = 1.0 / np.maximum(1.0 / after - 1.0 / before, np.finfo(np.float64).tiny)
+    variance = 1.0 / np.maximum(1.0 / after - 1.0 / before, _NOTHING)
     room, wide = float(np.mean(scene.level.signal)), float(np.mean(np.square(scene.level.std)))
-    value = room + (mean - room) * variance / after
+    with np.errstate(over="ignore"):  # of pixels that tell nothing
+        value = room + (mean - room) * variance / after
     seen = np.isfinite(value) & (variance < before)
     if not np.any(seen):
         return level

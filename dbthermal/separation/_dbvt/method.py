@@ -241,7 +241,8 @@ def _report(tile: Tile, minimum: Minimum, kept: Tensor, settings: DbvtSettings) 
     if settings.temperatures_from == "corrected":
         signals = signals - _array(unknowns.noise)
     solution = calibrated.separate(
-        replace(tile, signals=signals, emissivity=emissivity, emissivity_std=None)
+        replace(tile, signals=signals, emissivity=emissivity, emissivity_covariance=None),
+        calibrated.CalibratedSettings(smooth=False),
     )
     unfinished: Mask = lost | ~minimum.converged[kept].cpu().numpy()
     return replace(

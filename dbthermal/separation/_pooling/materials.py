@@ -15,6 +15,7 @@ A material is connected: two bodies that do not touch are never pooled, however 
 pooling is a bias that no deviation covers, while a body in two parts costs a little noise.
 """
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -154,6 +155,34 @@ def materials(
     regions.join_in_order(linked, steps)
     regions.join_alike(pairs, resolution)
     return _labelled(cells, regions, result)
+
+
+def regions(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
+    """Materials (y, x), and connected pixels of none of them as further labels."""
+    free = (labels.values < 0) & ((result["status"].values & int(_UNUSABLE)) == 0)
+    others = feature_maps.connected(free.astype(np.intp)) * free
+    sizes = np.bincount(others.ravel())
+    others[sizes[others] < _SMALLEST] = 0
+    numbers = np.unique(others, return_inverse=True)[1].reshape(others.shape)
+    return labels.copy(data=np.where(numbers > 0, labels.values.max() + numbers, labels))
+
+
+def joined(labels: xr.DataArray, pooled: xr.Dataset, *, resolution: float = 0.1) -> xr.DataArray:
+    """
+    Regions (y, x) joined with those they touch, if what was pooled over each agrees.
+
+    A material is cut where ratios of single pixels are biased by what their order leaves of the
+    object; pooled ratios are not.
+    """
+    reference = [str(name) for name in pooled["band"].values].index(pooled.attrs["reference_band"])
+    cells = np.asarray(labels.values + 1, dtype=np.intp)
+    _, features = _features(
+        pooled, [reference, *np.delete(np.arange(pooled.sizes["band"]), reference)]
+    )
+    features = replace(features, common=np.ones_like(features.common))
+    found = Regions(cells, features, 0.01)
+    found.join_alike(region_merging.neighbours(cells), resolution)
+    return _labelled(cells, found, pooled)
 
 
 def _checked(

@@ -68,11 +68,11 @@ def estimate(
     line, first, noise = fit.line, fit.emissivity, np.array(tile.noise)
     # Eq. 6 by implicit differentiation: dx/deps = (dh/deps - dq/deps) / h', var x = var q / h'^2.
     sensitivity = (fit.partial - functions.object_part @ ratios.coefficients[0]) / fit.steepness
-    leverage = functions.leverage()[:, ratios.order - 1]
+    leverage, used = functions.leverage()[:, ratios.order - 1], ratios.order + functions.steps
     smooth_variance = leverage * ratios.null_variance / fit.steepness**2
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
-    omitted = smooth_variance * np.log(tile.time.size) / ratios.order
+    omitted = smooth_variance * np.log(tile.time.size) / used
     # The slope is sum k z_1, with k = w u / sum w u^2 of the curve u about its mean. Its variance:
     # of the ordinate's noise, and of the abscissa's.
     kernel = line.weights * fit.emitted
@@ -80,7 +80,7 @@ def estimate(
     kernel /= line.energy
     noise_variance = line.variance + first**2 * _curve_variance(kernel, functions, ratios)
     curve_std = first * np.sqrt(ratios.null_variance)
-    walk, upper = walk_variance(line, fit.emitted, functions, noise[0], curve_std, ratios.order)
+    walk, upper = walk_variance(line, fit.emitted, functions, noise[0], curve_std, used)
     # A uniform distribution in [-d, d] has the variance d^2 / 3.
     limit = (1.0 - first) * background_drift / np.sqrt(3.0)
     linear = _linear_variance(tile, functions, ratios, fit, limit)
@@ -141,7 +141,8 @@ def _alternate(tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio) 
     for _ in range(_ROUNDS):
         emitted = tile.blackbody(0, temperature)
         line = residuals.regress(emitted, tile.signals[0], tile.noise[0], start=line)
-        constant = line.energy < _OBJECT_TO_NOISE * ratios.order * ratios.null_variance
+        functions_used = ratios.order + functions.steps
+        constant = line.energy < _OBJECT_TO_NOISE * functions_used * ratios.null_variance
         emissivity = np.where(constant, middle, line.slope)
         if tile.material is not None:
             known = ratios.pooled & np.isfinite(tile.material.emissivity)
@@ -240,7 +241,7 @@ def walk_variance(
 
     The residual holds the `noise` of the signal and, below the `order`, that of the object's curve.
     """
-    columns = functions.functions[:, functions.steps + 1 :]
+    columns = functions.rising
     degree = np.arange(1.0, columns.shape[1] + 1)[:, np.newaxis]
     # Spectra of the residual, over the share of frames that the weights keep, and of the curve.
     share = line.weights.mean(axis=0)
@@ -274,7 +275,7 @@ def _linear_variance(
 
     .. math:: \gamma^2 k (k d^2 + v), \quad k = D / (D + v)
     """
-    drift = functions.functions[:, functions.steps + 1]
+    drift = functions.rising[:, 0]
     slope, size, kernel = _drift_beside(fit.line, fit.emitted, drift)
     variance = tile.noise[0] ** 2 * np.einsum("tp,tp->p", kernel, kernel)
     variance += fit.emissivity**2 * _curve_variance(kernel, functions, ratios)

@@ -38,8 +38,12 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
    them apart (11) is taken out, and steps 1 to 4 are done again, on the exact model. It is known
    as well as the background's mean temperature, whose error the ratios carry. Near a gray body,
    whose ratios it makes alone, it is not known at all: such ratios are flagged.
-5. Where the residual is not noise, one jump of the object is looked for (`residuals`), and taken
-   into the subspace.
+5. Where the residual is not noise, or as many polynomials as there are hardly follow, the object
+   is taken to change rapidly now and then. Its curve is then a polynomial in each of some pieces of
+   the time, and steps 1 to 4 are done with these. Pieces and ratios are sought together, by the
+   least description length (12) (`pieces`): one of the bands' rapid changes lie along the
+   reflection ratios, others along the emissivities, and the object's are those that fewer pieces
+   describe. Of the two best explanations the one without a flag is taken, if both are likely.
 
 Every output carries a standard deviation, propagated from the noise. Second-order blind source
 separation in the sense of Belouchrani et al. (1997), doi:10.1109/78.554307, for the image
@@ -57,11 +61,11 @@ from dbthermal import _smooth as smooth
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._subspace import clock, reflection_ratio, residuals
+from dbthermal.separation._subspace import clock, pieces, reflection_ratio, residuals
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace.emission import Emission
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
-from dbthermal.separation._tiles import Array, Estimate, Mask, Survey, Tile
+from dbthermal.separation._tiles import Array, Estimate, Mask, Survey, Tile, join
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -69,14 +73,25 @@ _CHI2_SIGMAS: Final = 8.0
 _CORRELATION_SIGMAS: Final = 3.5
 _DELAY_SIGMAS: Final = 4.0
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
-# Flags of pixels in which a jump of the object is looked for.
-_SUSPECT: Final = np.uint32(
-    Status.OBJECT_NOT_SMOOTH
-    | Status.GRAY
-    | Status.NONPHYSICAL_EMISSIVITY
-    | Status.ROLES_MAY_BE_SWAPPED
-    | Status.BACKGROUND_NEVER_RESTS
+# Set beside the flags, within this module, where pieces of time are asked for.
+_PIECES: Final = np.uint32(1 << 31)
+# Last orders of the smooth curve at which its polynomials may be too few.
+_LAST: Final = 6
+# Flags of pixels in which rapid changes of the object are looked for.
+_SUSPECT: Final = (
+    np.uint32(
+        Status.OBJECT_NOT_SMOOTH
+        | Status.GRAY
+        | Status.CONSTANT_OBJECT
+        | Status.NONPHYSICAL_EMISSIVITY
+        | Status.ROLES_MAY_BE_SWAPPED
+        | Status.BACKGROUND_NEVER_RESTS
+    )
+    | _PIECES
 )
+# Cost of an explanation over that of the best, up to which it is preferred if it has no flag.
+_LIKELY: Final = 40.0
+_NEVER: Final = 1e9
 # Energy of the bend between the two responses, in units of the second band's noise, from which it
 # is worth taking out: it moves no linear function of the signal by more standard deviations.
 _BEND: Final = 0.2
@@ -126,19 +141,26 @@ class _Solution:
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of two bands or more."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _with_jumps(tile, settings)
+        return _followed(tile, settings)[0]
 
 
 def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
     """Scatter and emissivity of the pixels of a tile, each alone; of those without a flag."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         # Together the pixels see a bend that is too small to be seen in each.
-        return _exact(tile, _functions(tile), settings, _survey, least=0.0)
+        result = _exact(tile, _functions(tile), settings, _survey, least=0.0)
+        first = _followed(tile, settings)[1]
+        divided = np.asarray(first.any(axis=0))
+        if np.any(divided):
+            part = tile.select_pixels(divided)
+            again = _divided(part, first[:, divided], settings, _survey, least=0.0)
+            result = result.replace_pixels(divided, again)
+        return result
 
 
-def _functions(tile: Tile, jump: int | None = None) -> smooth.Subspace:
+def _functions(tile: Tile) -> smooth.Subspace:
     order = min(reflection_ratio.HIGHEST_ORDER, tile.time.size // 4)
-    return smooth.subspace(tile.time, order, segment=tile.segment, jump=jump)
+    return smooth.subspace(tile.time, order, segment=tile.segment)
 
 
 def _exact(
@@ -219,6 +241,17 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Esti
     return result.undefine(undefined, unidentified, no_background).check_range(tile.curves[0])
 
 
+def _report_asking(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Estimate:
+    """As `_report`, and whether pieces of time are asked for."""
+    result, ratios = _report(tile, functions, solution), solution.ratios
+    residual = residuals.null_residual(solution.straight.signals, functions, ratios)
+    smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
+    curve, used = functions.object_part @ smoothed, ratios.order + functions.steps
+    asked = pieces.asked(residual, curve, tile.time, ratios.null_variance, used)
+    asked |= ratios.order > functions.orders - _LAST
+    return replace(result, status=result.status | np.where(asked, _PIECES, np.uint32(0)))
+
+
 def _survey(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Survey:
     """
     Survey of a solution, without the pixels whose model is broken.
@@ -232,7 +265,8 @@ def _survey(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Surv
     rapid, freedom = reflection_ratio.rapid_scatter(solution.straight.signals, functions, noise)
     return Survey(
         scatter=np.where(sound, ratios.scatter, 0.0),
-        frames=sound * np.asarray(tile.time.size - ratios.order, dtype=np.float64),
+        frames=sound
+        * np.asarray(tile.time.size - ratios.order - functions.steps, dtype=np.float64),
         rapid_scatter=np.where(sound, rapid, 0.0),
         rapid_frames=sound * freedom,
         ratio=ratios.ratio,
@@ -261,8 +295,13 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     nonphysical = defined & np.any((emission.emissivity <= 0) | (emission.emissivity >= 1), axis=0)
     swapped = defined & ~nonphysical & (emission.emissivity.mean(axis=0) < 0.5)
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
-    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * (frames - ratios.order))
+    free = frames - ratios.order - functions.steps
+    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * free)
     rough = (correlation > _CORRELATION_SIGMAS) | (ratios.reduced_chi2 > 1.0 + excess)
+    rapid = signals[0] - functions.functions @ ratios.coefficients[0]
+    free_part = 1.0 - functions.leverage()[:, ratios.order - 1]
+    common = ratios.null_weights[0] * tile.noise[0] ** 2 * free_part
+    rough |= residuals.unexplained(residual, rapid, ratios.null_variance, common)
     return {
         Status.NO_BACKGROUND_MOTION: still,
         Status.GRAY: gray,
@@ -275,30 +314,60 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     }
 
 
-def _with_jumps(tile: Tile, settings: SubspaceSettings) -> Estimate:
-    """All steps: pixels that do not fit are solved anew with a jump in the subspace."""
-    functions = _functions(tile)
-    result = _exact(tile, functions, settings, _report)
-    inside = residuals.candidates(tile.time)
-    if inside.size == 0:
-        return result
-    isolated = residuals.isolated_change(tile.signals[0], tile.time, functions)
-    suspect = ((result.status & _SUSPECT) != 0) | isolated
-    if not np.any(suspect):
-        return result
-    noise, signals = np.array(tile.noise), tile.signals[..., suspect]
-    frame, gain = residuals.find_jump(signals, tile.time, functions, noise, inside)
-    first = np.full(suspect.shape, -1)
-    first[suspect] = np.where(gain > 0, frame, -1)
-    for jump in np.unique(first[first >= 0]):
-        kept = residuals.beside_jump(tile.time, int(jump), tile.segment)
-        before = int(kept[:jump].sum())
-        part = tile.select_pixels(first == jump).select_frames(kept)
-        functions = _functions(part, jump=before if 0 < before < part.time.size else None)
-        again = _exact(part, functions, settings, _report)
-        again = replace(again, status=again.status | np.uint32(Status.OBJECT_JUMP))
-        result = result.replace_pixels(first == jump, again.expand_frames(kept))
-    return result
+def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
+    """
+    All steps: pixels that do not fit are solved anew with polynomials in pieces of the time.
+
+    And the frames that pieces begin with (time, pixel), none where one curve is smooth.
+    """
+    functions, noise = _functions(tile), np.array(tile.noise)
+    result = _exact(tile, functions, settings, _report_asking)
+    suspect = np.flatnonzero(result.status & _SUSPECT)
+    result = replace(result, status=result.status & ~_PIECES)
+    first = np.zeros(tile.signals.shape[1:], dtype=bool)
+    if suspect.size == 0:
+        return result, first
+    part, best = tile.select_pixels(suspect), result.select_pixels(suspect)
+    ratios = reflection_ratio.estimate(part.signals, functions, noise, part.material)
+    used, others = ratios.order + functions.steps, len(noise) - 1
+    cost = others * (ratios.reduced_chi2 * (tile.time.size - used) + pieces.COST * used)
+    known = None if part.material is None else part.material.ratio
+    divisions = pieces.divide(part.signals, tile.time, noise, tile.segment, known)
+    lowest = np.min([cost, *(one.cost for one in divisions)], axis=0)
+    for division in divisions:
+        # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
+        flagged = (best.status != 0) | (cost > lowest + _LIKELY)
+        tried = (division.cost < cost) | (flagged & (division.cost < lowest + _LIKELY))
+        places = np.flatnonzero(tried)
+        if places.size == 0:
+            continue
+        again = _divided(part.select_pixels(places), division.first[:, places], settings, _report)
+        cheaper = division.cost[places] < cost[places] - _LIKELY
+        better = (again.status == 0) | (flagged[places] & cheaper)
+        places, again = places[better], again.select_pixels(better)
+        best = best.replace_pixels(places, again)
+        cost[places] = division.cost[places]
+        first[:, suspect[places]] = division.first[:, places]
+    jumping = first[:, suspect].any(axis=0) & residuals.sudden(
+        best.object_temperature, best.object_temperature_std, tile.time
+    )
+    status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
+    return result.replace_pixels(suspect, replace(best, status=status)), first
+
+
+def _divided(
+    tile: Tile,
+    first: Mask,
+    settings: SubspaceSettings,
+    finish: Callable[[Tile, smooth.Subspace, _Solution], Record],
+    least: float = _BEND,
+) -> Record:
+    """Result with pieces that begin with some frames (time, pixel), same pieces together."""
+    order, groups, parts = _functions(tile).orders, pieces.alike(first), []
+    for places in groups:
+        functions = smooth.piecewise(tile.time, first[:, places[0]], order, segment=tile.segment)
+        parts.append(_exact(tile.select_pixels(places), functions, settings, finish, least))
+    return join(parts).select_pixels(np.argsort(np.concatenate(groups)))
 
 
 METHOD: Final = Method(

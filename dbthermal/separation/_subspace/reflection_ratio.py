@@ -209,6 +209,8 @@ def may_be_gray(ratios: ReflectionRatio, noise: Array, slopes: Array) -> Mask:
 
 def choose_order(null_energy: Array, frames: int) -> Whole:
     """Order less one (pixel) of the lowest information criterion of an energy (order, pixel)."""
+    if len(null_energy) == 1:
+        return np.zeros(null_energy.shape[1], dtype=np.intp)
     orders = np.arange(1, null_energy.shape[0] + 1)[:, np.newaxis]
     tiny = np.finfo(np.float64).tiny
     criterion = frames * np.log(np.maximum(null_energy, tiny)) + orders * np.log(frames)

@@ -10,11 +10,12 @@ from typing import Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ndtri
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.special import chdtri, ndtri
 
 from dbthermal import _smooth as smooth
-from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
-from dbthermal.separation._tiles import Array, Mask, Whole
+from dbthermal.separation._subspace.reflection_ratio import CHANCE, ReflectionRatio
+from dbthermal.separation._tiles import Array, Mask
 
 Precision = TypeVar("Precision", np.float32, np.float64)
 
@@ -25,7 +26,7 @@ LAGS: Final = 5
 """Frames over which `autocorrelation` looks for a correlation."""
 
 AROUND: Final = 1.0
-"""Time before and after a jump that is left out [s]: the part of it that is not sudden."""
+"""Time in which a step of the object is most of its change [s]."""
 
 # Share of the points that must lie on the line: the scale is taken from their deviation, as an
 # absolute deviation of that rank -> standard deviation of a normal distribution.
@@ -37,18 +38,10 @@ _STARTING_POINTS: Final = 100
 _STEPS: Final = 3
 # Deviations of noise from which a difference between frames is a change.
 _CHANGE: Final = 5.0
-# Smooth functions beside which a jump is sought.
-_ORDER: Final = 7
-# A change from frame to frame is isolated if it is so many times the third largest.
-_ISOLATED: Final = 3.0
-# Fewest frames before and after a jump.
-_MARGIN: Final = 24
-# Steps, at most, on one side of the middle of a ramp.
-_RAMP: Final = 250
-# Share of a step's energy outside the smooth functions, below which it is rounding [1].
-_HELD: Final = 1e-6
-# Decimals to which a time is rounded before it is counted in whole lengths.
-_DIGITS: Final = 9
+# Share of the change within a second that a sudden step makes.
+_MOST: Final = 2.0 / 3.0
+# Frames of the shortest blocks of a residual.
+_BLOCK: Final = 9
 
 
 @dataclass(frozen=True)
@@ -155,109 +148,51 @@ def interband_delay(
     return np.asarray(np.maximum(score, _excess(residual, change, ratios.null_variance, noise)))
 
 
-def find_jump(
-    signals: Array, time: Array, functions: smooth.Subspace, noise: Array, inside: Whole
-) -> tuple[Whole, Array]:
+def unexplained(residual: Array, rapid: Array, null_variance: Array, common: Array) -> Mask:
     r"""
-    Change point (pixel): first frame after the step that lowers the energy across the axis most.
+    Pixels of which the null residual r (time, pixel) [K] is not white noise in some part of time.
 
-    Sought in signals (band, time, pixel) [K] of `noise` (band) [K], among the frames `inside` from
-    `candidates`, for a sudden step and one spread evenly over the `ramp` beside it.
-    With the smooth functions projected out, a step at frame t takes from the whitened scatter
-    :math:`S` the part :math:`g g^T / n`, with g the sum of the residuals from t on, and n the
-    energy of the step orthogonal to the functions. The second value is by how much the information
-    criterion falls (pixel): positive where a step explains more than chance.
+    Its sum over some block, of those of repeated halving, is beyond that of noise: a change of the
+    object that the smooth functions do not follow. Or blocks differ in its correlation with the
+    `rapid` part of the first band's signal h (time, pixel) [K]: these changes have not one ratio,
+
+    .. math:: \sum_b \frac{(\sum_t r h - n \, w_1 s_1^2)^2}{\sigma^2 \sum_t h^2}
+
+    which is a chi-square variable; its last term is `common` (time, pixel) [K^2] in each frame.
     """
-    frames = signals.shape[1]
-    basis = functions.functions[:, : functions.steps + _ORDER]
-    residual = signals / noise[:, np.newaxis, np.newaxis]
-    residual = residual - np.einsum("tc,bcp->btp", basis, np.einsum("tc,btp->bcp", basis, residual))
-    # Inner products of a step at each frame with the residual, with the functions and with itself.
-    after = np.cumsum(residual[:, ::-1], axis=1)[:, ::-1]
-    held = np.cumsum(basis[::-1], axis=0)[::-1]
-    norm = np.arange(frames, 0.0, -1.0)
-    scatter = np.einsum("btp,ctp->pbc", residual, residual)
-    before = np.linalg.eigvalsh(scatter)[..., :-1].sum(axis=-1)
-    first, lowest = np.zeros(before.size, dtype=np.intp), np.full(before.size, np.inf)
-    between = 0.5 * (time[inside] + time[inside - 1])
-    for shifts in (np.zeros(1), ramp(time)):
-        # A running mean: side by side, the steps of a fast film would need a gigabyte.
-        mean = np.zeros((len(after), inside.size, after.shape[2]))
-        of_functions = np.zeros((inside.size, basis.shape[1]))
-        energy = np.zeros(inside.size)
-        for number, shift in enumerate(shifts):
-            places = np.searchsorted(time, between + shift)
-            mean += after[:, places] / shifts.size
-            of_functions += held[places] / shifts.size
-            # Of the steps i and j the later counts: the mean of N - max(p_i, p_j).
-            energy += norm[places] / shifts.size
-            energy -= places * ((2 * number + 1 - shifts.size) / shifts.size**2)
-        energy -= np.sum(of_functions**2, axis=1)
-        # In a gap of the clock the smooth functions hold a step already: it explains nothing.
-        free = energy > _HELD * np.minimum(inside, norm[inside])
-        part = np.einsum("btp,ctp->tpbc", mean, mean)[free] / energy[free, None, None, None]
-        null_energy = np.broadcast_to(before, (inside.size, before.size)).copy()
-        null_energy[free] = np.linalg.eigvalsh(scatter - part)[..., :-1].sum(axis=-1)
-        best = np.argmin(null_energy, axis=0)
-        least = null_energy[best, np.arange(best.size)]
-        first = np.where(least < lowest, inside[best], first)
-        lowest = np.minimum(least, lowest)
-    gain = frames * np.log(before / np.maximum(lowest, np.finfo(np.float64).tiny))
-    return first, gain - 4.0 * np.log(frames)
+    levels = int(np.log2(len(residual) / _BLOCK))
+    edges = np.round(np.linspace(0, len(residual), 2**levels + 1)).astype(np.intp)
+    length = np.diff(edges)[:, np.newaxis]
+    product, square = residual * rapid - common, rapid**2
+    sums, products, squares = (
+        np.add.reduceat(part, edges[:-1], axis=0) for part in (residual, product, square)
+    )
+    variance = np.where(null_variance > 0, null_variance, np.inf)
+    together = (products**2 / np.where(squares > 0, squares, np.inf)).sum(axis=0) / variance
+    result = together > chdtri(len(length), CHANCE)
+    limit = chdtri(1.0, CHANCE / (2 * len(length)))
+    for _ in range(levels):
+        result |= np.any(sums**2 > limit * variance * length, axis=0)
+        sums, length = sums[::2] + sums[1::2], length[::2] + length[1::2]
+    return np.asarray(result)
 
 
-def isolated_change(signal: Array, time: Array, functions: smooth.Subspace) -> Mask:
+def sudden(curve: Array, std: Array, time: Array) -> Mask:
     """
-    Pixels of a signal (time, pixel) with one change far larger than all others.
+    Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
 
-    From frame to frame, or from one mean over the length of a `ramp` to the next. A background
-    comes and goes: its largest changes come in pairs at least.
+    By more than most of its change within a second, and beyond its standard deviations; not over a
+    pause of the frames.
     """
-    basis = functions.functions[:, : functions.steps + _ORDER]
-    residual = signal - basis @ (basis.T @ signal)
-    shifts = ramp(time)
-    if shifts.size == 1:
-        return _outstanding(residual)
-    # Lengths of a ramp before each frame; rounded, so that an even clock gives even blocks.
-    step = shifts[1] - shifts[0]
-    since = np.round((time - time[0]) / (shifts.size * step), _DIGITS)
-    whole = np.floor(np.round((time[-1] - time[0] + step) / (shifts.size * step), _DIGITS))
-    block = np.floor(since[since < whole])
-    starts = np.flatnonzero(np.diff(block, prepend=-1.0))
-    number = np.diff(starts, append=block.size)[:, np.newaxis]
-    slow = np.add.reduceat(residual[: block.size], starts, axis=0) / number
-    return _outstanding(residual) | _outstanding(slow)
-
-
-def candidates(time: Array) -> Whole:
-    """Frames that may be the first after a jump: with enough others before and after."""
-    between = 0.5 * (time[1:] + time[:-1])
-    before = np.searchsorted(time, between - AROUND)
-    after = np.searchsorted(time, between + AROUND, side="right")
-    good = np.minimum(before, time.size - after) >= _MARGIN
-    return np.asarray(1 + np.flatnonzero(good))
-
-
-def ramp(time: Array) -> Array:
-    """Times [s], from its middle, of the steps of a jump that takes as long as `AROUND`."""
-    step = max(float(np.median(np.diff(time))), 0.5 * AROUND / _RAMP)
-    half = int(0.5 * AROUND / step)
-    return np.asarray(step * np.arange(-half, half + 1.0))
-
-
-def beside_jump(time: Array, jump: int, segment: Whole | None = None) -> Mask:
-    """
-    Frames (time) to use, before and after a jump but not close to it.
-
-    Where a shutter event as close, by `segment`, hides the height of the jump: the more numerous
-    of the two.
-    """
-    between = 0.5 * (time[jump - 1] + time[jump])
-    kept = np.abs(time - between) > AROUND
-    before, after = kept & (time < between), kept & (time > between)
-    if segment is not None and segment[before].max() != segment[after].min():
-        return np.asarray(before if before.sum() >= after.sum() else after)
-    return np.asarray(kept)
+    interval = np.diff(time)
+    usual = float(np.median(interval))
+    frames = max(3, 2 * int(np.ceil(0.5 * AROUND / usual)))
+    step = np.abs(np.diff(curve, axis=0))
+    size = (frames, 1)
+    around = maximum_filter(curve, size)[1:] - minimum_filter(curve, size)[1:]
+    noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
+    jumps = (step > _CHANGE * noise) & (step > _MOST * around)
+    return np.asarray(np.any(jumps[interval < 2.0 * usual], axis=0))
 
 
 def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
@@ -350,12 +285,3 @@ def _excess(residual: Array, change: Array, null_variance: Array, noise: float) 
     # The cube root of a chi-square over its n degrees has the mean 1 - v and the variance v.
     variance = 2.0 / (9.0 * np.maximum(count, 1))
     return np.asarray((np.cbrt(mean) - (1.0 - variance)) / np.sqrt(variance))
-
-
-def _outstanding(signal: Array) -> Mask:
-    """Pixels of which the largest change is several times the third largest."""
-    change = np.abs(np.diff(signal.T, axis=1)).astype(np.float32)
-    if change.shape[1] < 3:
-        return np.zeros(change.shape[0], dtype=bool)
-    largest = np.partition(change, -3, axis=1)[:, -3:]
-    return np.asarray(largest.max(axis=1) > _ISOLATED * largest[:, 0])

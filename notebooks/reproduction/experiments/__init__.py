@@ -2,10 +2,17 @@
 
 from reproduction.experiments.cases import efficiency, run_case, score, simulate, sweep
 from reproduction.experiments.comparison import compare, judge, medians
-from reproduction.experiments.twins import at_thermocouple, judge_twin, share
+from reproduction.experiments.twins import (
+    at_thermocouple,
+    capture_of,
+    judge_twin,
+    separate_twin,
+    share,
+)
 
 __all__ = [
     "at_thermocouple",
+    "capture_of",
     "compare",
     "efficiency",
     "judge",
@@ -13,6 +20,7 @@ __all__ = [
     "medians",
     "run_case",
     "score",
+    "separate_twin",
     "share",
     "simulate",
     "sweep",

@@ -21,6 +21,7 @@ from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.world import World
 from dbthermal.response import Curve
 from dbthermal.simulation import Rig, digitise
+from dbthermal.simulation.rays import Camera
 
 Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.uint16]
@@ -115,10 +116,29 @@ def _bench(
     return look
 
 
+def parallax(places: Mapping[str, float], shape: tuple[int, int]) -> Array:
+    r"""
+    Shift (2, y, x) [pixel] between what two cameras see mirrored in a flat plate.
+
+    .. math:: d = f b \left( \frac{1}{z} - \frac{1}{z + L} \right)
+
+    The places [m] are the `baseline` b between the cameras, the distance z from them to the
+    `plate`, and L from there to the `people`; f is the focal length of `rays.Camera` [pixel].
+    """
+    baseline, plate, people = (places[name] for name in ("baseline", "plate", "people"))
+    camera = Camera((0.0, -plate, 0.0), (0.0, 0.0, 0.0), shape)
+    points = np.array([[0.0, 0.0, 0.0], [0.0, people, 0.0]]) - (baseline, 0.0, 0.0)
+    seen = camera.project(points)[:, 1]
+    return np.stack([np.zeros(shape), np.full(shape, seen[1] - seen[0])])
+
+
 def _shown(scene: xr.Dataset, curve: Curve, band: str) -> Look:
     """Counts of a movie at a time, on the line between the frames before and after."""
     emitted = curve.counts(scene["object_temperature"].values)
-    reflected = curve.counts(scene["background_temperature"].values)
+    background = scene["background_temperature"]
+    if "band" in background.dims:  # of cameras side by side
+        background = background.sel(band=band)
+    reflected = curve.counts(background.values)
     emissivity = scene["emissivity"].sel(band=band).values
     movie = mixing.leaving(emissivity, emitted, reflected).astype(np.float32)
     rate = 1.0 / float(scene["time"][1] - scene["time"][0])
@@ -140,7 +160,8 @@ def shown(scene: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
     """
     Truth of a scene at the times of a capture, linear between its frames.
 
-    The scene as for `Views.movie`, with attribute ``began``, its time 0 on the host's clock [s].
+    The scene as for `Views.movie`, with attribute ``began``, its time 0 on the host's clock [s]; of
+    cameras side by side, as the first one sees it.
     Raises a ValueError if the capture begins before the scene, or goes on after it.
     """
     times = capture["time"] + (capture.attrs["clock_origin"] - scene.attrs["began"])
@@ -150,6 +171,8 @@ def shown(scene: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
             f"Invalid times {float(times[0])} to {float(times[-1])} s of the scene. "
             f"Must lie in {float(scene['time'][0])} to {float(scene['time'][-1])} s."
         )
+    if "band" in truth["background_temperature"].dims:
+        truth["background_temperature"] = truth["background_temperature"].isel(band=0, drop=True)
     return truth
 
 

@@ -7,15 +7,23 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.ndimage import map_coordinates
 
-from dbthermal import correction, schema, separation, simulation
+from dbthermal import correction, separation, simulation
+from dbthermal.schema import Status
 from reproduction.experiments import cases, stress
+from reproduction.experiments.pictures import Picture, smooth_shift
 
+Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Change = Callable[[xr.Dataset, Mask, np.random.Generator], xr.Dataset]
 
 FAR: Final = 5.0
 """Standard deviations of error from which a value is wrong [1]."""
+
+PICTURED: Final = frozenset({"bad", "lost", "shift", "still"})
+"""Keys of scenes that are pictures: shift of the reflections, at its middle and varying by [pixel];
+share at rest; share of the samples lost in every second column; and of bad pixels in a band [1]."""
 
 _SHARES: Final = ("without_it", "without_any", "wrong")
 _COUNTED: Final = ("pixels", *_SHARES)
@@ -25,9 +33,12 @@ _CLIPPED: Final = 0.1
 # Share of the frames that repeat the one before, in runs of so many frames.
 _FROZEN: Final = 0.3
 _RUN: Final = 10
-_BAD: Final = 0.1  # share of the pixels that are bad in a band
 _HIGHEST: Final = 313.15  # of a response that was calibrated too little [K]
 _FLICKER: Final = 2.0  # of an object, standard deviation [K]
+_SHAPE: Final = (36, 48)  # of a picture
+_MOVING: Final = 0.3  # least standard deviation of a reflection that moves [K]
+_KNOWN: Final = 0.03  # deviation of a shift that is known [pixel]
+_ITERATIONS: Final = 20
 
 
 def rates(
@@ -46,7 +57,8 @@ def rates(
     ----------
     expected : mapping
         Flag, in lower case, to the scenes in which it should come: what differs from the `base`,
-        see `cases.simulate`. Flags of damaged samples (`FAULTS`) should come in every second pixel.
+        see `cases.simulate`, or a picture's (`PICTURED`). Where it should come in some pixels
+        alone, the others count as false alarms; damaged samples (`FAULTS`) are in every second one.
     clean : mapping
         Scenes by name in which none should come.
     base : mapping
@@ -66,7 +78,7 @@ def rates(
         and, without any, `wrong`: an object temperature or emissivity beyond `FAR` deviations. The
         flag "any" has the false alarms of all together. NaN where there is no pixel.
     """
-    names = [*schema.Status.bits(), "any"]
+    names = [*Status.bits(), "any"]
     counts = xr.Dataset(
         {name: ("flag", np.zeros(len(names))) for name in (*_COUNTED, "clean_pixels", "alarms")},
         coords={"flag": names},
@@ -103,26 +115,78 @@ def _solved(
 ) -> tuple[xr.Dataset, xr.Dataset, Mask]:
     """Truth, separation, and pixels (y, x) in which the flag should come, of one scene."""
     rig, time = simulation.Rig(), np.arange(int(clock[0])) / clock[1]
+    if PICTURED & case.keys():
+        return _pictured(case, flag, rig, time, seed)
     truth, capture, response = cases.simulate(case, rig, time, pixels, seed)
     rng = np.random.default_rng([seed, pixels])
     holds: Mask = np.ones((1, pixels), dtype=bool)
     if flag in FAULTS:
         holds[:, ::2] = False
         capture = FAULTS[flag](capture, holds, rng)
-    elif flag == schema.Status.OBJECT_NOT_SMOOTH.label:
+    elif flag == Status.OBJECT_NOT_SMOOTH.label:
         walk = simulation.Background(kind="random walk", correlation_time=1.0, amplitude=_FLICKER)
         flicker = walk.draw(time, pixels, rng)[:, np.newaxis] - walk.level
         warm = truth["object_temperature"]
         truth = truth.assign(object_temperature=warm.copy(data=warm.values + flicker))
         capture = simulation.observe(truth, response, rng)
-    elif flag == schema.Status.DEAD_PIXEL.label:
-        spoiled = simulation.spoil_pixels(capture, _BAD, rng)
-        holds &= (spoiled["spoiled"].values > 0).any(axis=0)
-        capture = correction.mark_bad(spoiled)
-    elif flag == schema.Status.OUTSIDE_RESPONSE.label:
+    elif flag == Status.OUTSIDE_RESPONSE.label:
         response = replace(rig, highest=_HIGHEST).response()
         holds &= truth["object_temperature"].max("time").values > _HIGHEST + 1.0
     return truth, separation.solve(capture, response), holds
+
+
+def _pictured(
+    case: Mapping[str, Any], flag: str, rig: simulation.Rig, time: Array, seed: int
+) -> tuple[xr.Dataset, xr.Dataset, Mask]:
+    """As `_solved`, of a picture (`PICTURED`)."""
+    rng, response, shift = np.random.default_rng(seed), rig.response(), None
+    pair = xr.DataArray(case["emissivity"], dims="band", coords={"band": list(rig.bands)})
+    if "shift" in case:
+        shift = smooth_shift(_SHAPE, *case["shift"])
+    drawn = Picture(shape=_SHAPE, still=case.get("still", 0.0)).draw(time, pair, rng, shift)
+    capture = simulation.observe(drawn, response, rng)
+    if "lost" in case:
+        lost = xr.zeros_like(capture["counts"][0], dtype=bool)
+        lost.values[...] = rng.random(lost.shape) < case["lost"]
+        lost[:, :, ::2] = False
+        capture = capture.assign(counts=capture["counts"].where(~lost))
+    if "bad" in case:
+        capture = simulation.spoil_pixels(capture, case["bad"], rng)
+        spoiled = np.asarray((capture["spoiled"] > 0).any("band"))
+        return drawn, separation.solve(correction.mark_bad(capture), response), spoiled
+    if shift is None:
+        alone = separation.solve(capture, response)
+        labels = xr.zeros_like(alone["status"], dtype=int)
+        known = flag == Status.COMPLETED_FROM_MATERIAL.label
+        parts = (labels, None, None) if known else (None, None, pair)
+        whole = separation.complete(alone, capture, response, *parts)
+        missing = alone["object_temperature"].isnull()
+        some = flag == Status.COMPLETED_FRAMES.label
+        holds = missing.any("time") & ~missing.all("time") if some else missing.all("time")
+        return drawn, whole, holds.values
+    if flag == Status.BANDS_APART.label:
+        moving = drawn["background_temperature"].std("time").max("band") > _MOVING
+        return drawn, separation.solve(capture, response), moving.values
+    field = xr.Dataset(
+        {
+            "shift": (("axis", "y", "x"), shift, {"units": "pixel"}),
+            "shift_std": (("axis", "y", "x"), np.full(shift.shape, _KNOWN), {"units": "pixel"}),
+            "known": (("y", "x"), np.ones(_SHAPE, dtype=bool), {"units": "1"}),
+        },
+        {"axis": ["y", "x"], "y": capture["y"], "x": capture["x"]},
+    )
+    result = separation.solve(capture, response, reflection_shift=field)
+    return drawn, result, _unpaired(shift)
+
+
+def _unpaired(shift: Array) -> Mask:
+    """Pixels r (y, x) whose p, with p + d(p) = r, lies outside the image."""
+    grid = np.indices(_SHAPE, dtype=np.float64)
+    place = grid.copy()
+    for _ in range(_ITERATIONS):
+        place = grid - [map_coordinates(one, place, order=1, mode="nearest") for one in shift]
+    size = np.reshape(_SHAPE, (2, 1, 1))
+    return np.asarray(((place < -0.5) | (place > size - 0.5)).any(axis=0))
 
 
 def _invalid(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
@@ -165,17 +229,17 @@ def _frozen(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.D
 
 
 FAULTS: Final[Mapping[str, Change]] = {
-    schema.Status.INVALID_SAMPLES.label: _invalid,
-    schema.Status.CONSTANT_SIGNAL.label: _constant,
-    schema.Status.SATURATED.label: _saturated,
-    schema.Status.FROZEN_FRAMES.label: _frozen,
+    Status.INVALID_SAMPLES.label: _invalid,
+    Status.CONSTANT_SIGNAL.label: _constant,
+    Status.SATURATED.label: _saturated,
+    Status.FROZEN_FRAMES.label: _frozen,
 }
 """Flag -> what damages the samples of a capture at some pixels (y, x), so that it should come."""
 
 
 def _count_alarms(counts: xr.Dataset, status: npt.NDArray[np.uint32]) -> None:
     """Add the flags of pixels in which none should come, in place."""
-    bits = np.array(list(schema.Status.bits().values()), dtype=status.dtype)
+    bits = np.array(list(Status.bits().values()), dtype=status.dtype)
     alarms = ((status.ravel()[:, np.newaxis] & bits) != 0).sum(axis=0)
     counts["alarms"].values += np.append(alarms, np.count_nonzero(status))
     counts["clean_pixels"].values += status.size
@@ -186,11 +250,14 @@ def _count_misses(
 ) -> None:
     """Add the pixels in which a flag should come, and what became of them, in place."""
     status, place = result["status"].values, list(counts["flag"].values).index(flag)
+    apart = ~holds & (status & Status.bits()[flag] != 0)
+    counts["alarms"].values[place] += np.count_nonzero(apart)
+    counts["clean_pixels"].values[place] += np.count_nonzero(~holds)
     none = holds & (status == 0)
     wrong = stress.wrong(truth, result, FAR).values
     parts = {
         "pixels": holds,
-        "without_it": holds & ((status & schema.Status.bits()[flag]) == 0),
+        "without_it": holds & ((status & Status.bits()[flag]) == 0),
         "without_any": none,
         "wrong": none & wrong,
     }

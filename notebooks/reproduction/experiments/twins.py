@@ -7,12 +7,22 @@ import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import calibration, emissivity, metrics, separation, simulation
+from dbthermal import alignment, calibration, emissivity, metrics, separation, simulation
+from dbthermal import correction as corrections
+from dbthermal import response as responses
 from reproduction import twins
 from reproduction.experiments.comparison import MOVING, arguments
+from reproduction.experiments.stress import INTERVAL
+from reproduction.twins.views import Registration
 
 BEAD: Final = 3
 """Pixels along a side of the square that a thermocouple's bead covers."""
+
+SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
+"""Methods that take the shift of the reflections."""
+
+REACH: Final = 5
+"""Pixels around a bead that they get: of some shifts, by which they pair the pixels."""
 
 _STRAY: Final = 0.01
 
@@ -24,50 +34,112 @@ def judge_twin(
     *,
     material: str,
     shape: Sequence[int],
-    frames: int,
-    rate: float,
+    clock: Sequence[float],
     baseline: float = 0.0,
+    registration: Registration = "perfect",
 ) -> xr.Dataset:
     """
     Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
 
-    One of `twins.TWINS`, of a material of `emissivity.embedded_table`, of rows and columns, frames
-    and their rate [Hz], by two cameras a baseline apart [m]. Of the variants (see
-    `at_thermocouple`), "calibrated" gets the emissivities that the bench finds for a piece of the
-    same material, with their deviations.
+    One of `twins.TWINS`, of a material of `emissivity.embedded_table`, of rows and columns, a
+    number of frames and their rate [Hz], by two cameras a baseline apart [m], whose views are
+    registered perfectly or as found (`twins.registered`), and by two at the first one's place. Of
+    the variants (see `at_thermocouple`), "calibrated" gets the emissivities that the bench finds
+    for a piece of the same material, with their deviations.
 
     Returns
     -------
     Dataset
-        Variables of `at_thermocouple`; `emissivity_difference` (band) [1], mean magnitude of the
-        default method's emissivity less the calibrated one over the pixels without a flag; `good`
-        [1], the share without a flag of the object's pixels in which the background moves.
+        Over `cameras`, "side by side" (with a baseline) and "one place": variables of
+        `at_thermocouple` and `over_the_image`; `emissivity_difference` (band) [1], mean magnitude
+        of the default method's emissivity less the calibrated one over the pixels without a flag.
     """
-    rng, rig = np.random.default_rng(seed), simulation.Rig()
-    response = rig.response()
-    table = emissivity.embedded_table()["emissivity"]
-    true = table.sel(material=material, band=list(rig.bands), drop=True)
-    time = np.arange(frames) / rate
-    setting = twins.Capture(true, (shape[0], shape[1]), time, baseline)
-    scene = twins.twin(name, setting, rng)
-    corrected = simulation.observe(scene, response, rng)
+    rng, response = np.random.default_rng(seed), simulation.Rig().response()
+    scene = twins.twin(name, capture_of(material, shape, clock, baseline), rng)
     fit = on_bench(response, material, rng)
     known = {"emissivity": fit["emissivity"], "emissivity_std": fit["emissivity_std"]}
     informed = {
         label: {**options, **(known if options["method"] == "calibrated" else {})}
         for label, options in variants.items()
     }
-    separated = separation.solve(corrected, response)
-    good = (separated["status"] == 0) & scene["on_object"]
-    apart = abs(separated["emissivity"] - fit["emissivity"]).where(good).mean(("y", "x"))
-    background = scene["background_temperature"]
-    first = background.isel(band=0) if "band" in background.dims else background
-    moving = (first.std("time") > MOVING) & scene["on_object"]
-    result = at_thermocouple(scene, corrected, response, informed, rng)
-    return result.assign(
-        emissivity_difference=apart.assign_attrs(units="1"),
-        good=((good & moving).sum() / moving.sum()).assign_attrs(units="1"),
-    )
+    views = {"one place": simulation.observe(scene, response, rng)}
+    if baseline:
+        apart = twins.registered(scene, twins.observe(scene, response, rng), registration)
+        views = {"side by side": apart} | views
+    parts = []
+    for cameras, corrected in views.items():
+        shift = alignment.reflection_shift(corrected, response) if cameras != "one place" else None
+        separated = separation.solve(corrected, response, reflection_shift=shift)
+        good = (separated["status"] == 0) & scene["on_object"]
+        away = abs(separated["emissivity"] - fit["emissivity"]).where(good).mean(("y", "x"))
+        read = at_thermocouple(scene, corrected, response, informed, rng, reflection_shift=shift)
+        both = {**over_the_image(scene, separated).data_vars, "emissivity_difference": away}
+        parts.append(read.assign(both))
+    label = xr.DataArray(list(views), dims="cameras", name="cameras")
+    return xr.concat(parts, label, combine_attrs="override")
+
+
+def capture_of(
+    material: str, shape: Sequence[int], clock: Sequence[float], baseline: float
+) -> twins.Capture:
+    """Capture of a twin of a material, see `judge_twin`, in the bands of the default rig."""
+    table = emissivity.embedded_table()["emissivity"]
+    true = table.sel(material=material, band=list(simulation.Rig().bands), drop=True)
+    time = np.arange(int(clock[0])) / clock[1]
+    return twins.Capture(true, (shape[0], shape[1]), time, baseline)
+
+
+def separate_twin(
+    name: str,
+    seed: int,
+    capture: twins.Capture,
+    detector: xr.Dataset,
+    correction: xr.Dataset,
+    response: xr.Dataset,
+    **options: Any,
+) -> xr.Dataset:
+    """
+    Separate a twin, seen by the default rig with a fixed pattern, by the default method.
+
+    The detector is from `simulation.pattern`, correction and response are calibrated; options are
+    those of `twins.twin`. Returns the result of `separation.solve`, and in addition
+    `apparent_temperature` (band, time, y, x), of the registered views; `true_object_temperature`
+    and `true_background_temperature` (time, y, x) [K], of the first camera.
+    """
+    rng = np.random.default_rng(seed)
+    scene = twins.twin(name, capture, rng, **options)
+    counts = twins.observe(scene, simulation.Rig().response(), rng)
+    raw = simulation.capture(counts, detector)
+    corrected = twins.registered(scene, corrections.correct(raw, correction))
+    shift = alignment.reflection_shift(corrected, response) if capture.baseline else None
+    result = separation.solve(corrected, response, reflection_shift=shift)
+    seen = responses.apparent_temperature(response, corrected["counts"]).astype("float32")
+    films = {
+        f"true_{part}_temperature": scene[f"{part}_temperature"].astype("float32")
+        for part in ("object", "background")
+    }
+    films["apparent_temperature"] = seen
+    return result.assign(films).assign_attrs(corrected.attrs)
+
+
+def over_the_image(scene: xr.Dataset, separated: xr.Dataset) -> xr.Dataset:
+    """
+    Errors of a separation over the object's pixels in which the background moves.
+
+    `good` [1], the share without a flag; of these `object_temperature_rmse` [K], root mean square
+    over time, median; and `covered` [1], the share of samples whose 95 % interval holds the truth.
+    """
+    background, status = scene["background_temperature"], separated["status"]
+    moving = (background.std("time") > MOVING) & scene["on_object"]
+    good = moving & (status == 0)
+    error = (separated["object_temperature"] - scene["object_temperature"]).where(good)
+    inside = abs(error) < INTERVAL * separated["object_temperature_std"]
+    values = {
+        "good": (good.sum() / moving.sum(), "1"),
+        "object_temperature_rmse": (((error**2).mean("time") ** 0.5).median(), "K"),
+        "covered": (inside.where(good).mean(), "1"),
+    }
+    return xr.Dataset({name: ((), float(part), {"units": u}) for name, (part, u) in values.items()})
 
 
 def on_bench(response: xr.Dataset, material: str, rng: np.random.Generator) -> xr.Dataset:
@@ -86,6 +158,7 @@ def at_thermocouple(
     variants: Mapping[str, Mapping[str, Any]],
     rng: np.random.Generator,
     *,
+    reflection_shift: xr.Dataset | None = None,
     probes: int = 20,
 ) -> xr.Dataset:
     """
@@ -95,7 +168,8 @@ def at_thermocouple(
     probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
     number of probes, so that the result does not depend on one probe's error. Variants are label ->
     `method` of `separation.solve` and its arguments; methods that treat each pixel alone get the
-    bead's pixels only.
+    bead's pixels only, and, of those that take it, with the shift of the reflections those around
+    it as well.
 
     Returns
     -------
@@ -112,7 +186,7 @@ def at_thermocouple(
     ]
     seed = int(rng.integers(2**32))  # of random starts: each capture has its own
     estimates = [
-        _mean(corrected, response, square, {"seed": seed, **variant})
+        _mean(corrected, response, square, {"seed": seed, **variant}, reflection_shift)
         for variant in variants.values()
     ]
     label = xr.DataArray(list(variants), dims="variant", name="variant")
@@ -142,14 +216,24 @@ def _mean(
     response: xr.Dataset,
     square: Mapping[str, slice],
     variant: Mapping[str, Any],
+    shift: xr.Dataset | None,
 ) -> xr.DataArray:
     """Object temperature (time) [K] of one method, mean over the bead's pixels."""
-    seen = corrected
+    seen, options = corrected, arguments(variant)
     if not separation.get_method(variant["method"]).whole_image:
-        seen = corrected.isel(square)
-    estimates = separation.solve(seen, response, **arguments(variant))["object_temperature"]
-    part = estimates.isel(square) if estimates.sizes == corrected["counts"][0].sizes else estimates
-    return part.mean(("y", "x"), skipna=False)
+        reach = 0
+        if shift is not None and variant["method"] in SHIFTED:
+            reach = REACH
+        around = {
+            dim: slice(max(0, part.start - reach), part.stop + reach)
+            for dim, part in square.items()
+        }
+        seen = corrected.isel(around)
+        if shift is not None and reach:
+            options["reflection_shift"] = shift.isel(around)
+    estimates = separation.solve(seen, response, **options)["object_temperature"]
+    bead = {dim: corrected[dim][part] for dim, part in square.items()}
+    return estimates.sel(bead).mean(("y", "x"), skipna=False)
 
 
 def share(estimate: xr.DataArray, cause: xr.DataArray) -> float:

@@ -16,9 +16,18 @@ from reproduction.twins.panes import fingerprint, fingers, glass_plate
 from reproduction.twins.solids import bulb, bunny
 from reproduction.twins.stage import Capture, Stage, take, thermocouple_readings
 from reproduction.twins.vessels import coffee_pot, wineglass
-from reproduction.twins.views import observe
+from reproduction.twins.views import observe, registered
 
-__all__ = ["TWINS", "Capture", "Stage", "observe", "take", "thermocouple_readings", "twin"]
+__all__ = [
+    "TWINS",
+    "Capture",
+    "Stage",
+    "observe",
+    "registered",
+    "take",
+    "thermocouple_readings",
+    "twin",
+]
 
 TWINS: Final[MappingProxyType[str, Callable[..., Stage]]] = MappingProxyType(
     {

@@ -10,20 +10,8 @@ from dbthermal import alignment, simulation
 Registration = Literal["perfect", "found"]
 
 
-def observe(
-    scene: xr.Dataset,
-    response: xr.Dataset,
-    rng: np.random.Generator,
-    registration: Registration = "perfect",
-) -> xr.Dataset:
-    """
-    Capture of a twin, the stage `corrected`: noise at each camera's own pixels, then registration.
-
-    A registration is "perfect", by the surface's geometry: each pixel shows the same point of the
-    surface in both bands, NaN where the second camera does not see it, or beside the object; or
-    "found" from the pictures, by `alignment.register` and `align`. A scene of one place is that of
-    `simulation.observe`.
-    """
+def observe(scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator) -> xr.Dataset:
+    """Capture of a twin, as `simulation.observe`: each band at the pixels of its own camera."""
     if not scene.attrs["baseline"]:
         return simulation.observe(scene, response, rng)
     second = scene.assign(
@@ -36,9 +24,24 @@ def observe(
         simulation.observe(view, response.isel(band=[band]), rng)
         for band, view in enumerate((scene, second))
     ]
-    apart = xr.concat(views, "band", combine_attrs="override")
-    transform = alignment.register(apart) if registration == "found" else _by_geometry(scene)
-    return alignment.align(apart, offset=0.0, transform=transform)
+    return xr.concat(views, "band", combine_attrs="override")
+
+
+def registered(
+    scene: xr.Dataset, corrected: xr.Dataset, registration: Registration = "perfect"
+) -> xr.Dataset:
+    """
+    Capture with all views on the first camera's grid, by `alignment.align`.
+
+    A registration is "perfect", by the surface's geometry: each pixel shows the same point of the
+    surface in both bands, NaN where the second camera does not see it, and beside the object; or
+    "found" from the pictures, by `alignment.register`. The views of one place stay as they are.
+    """
+    if not scene.attrs["baseline"]:
+        return corrected
+    by_geometry = registration == "perfect"
+    transform = _by_geometry(scene) if by_geometry else alignment.register(corrected)
+    return alignment.align(corrected, offset=0.0, transform=transform)
 
 
 def _by_geometry(scene: xr.Dataset) -> xr.DataArray:

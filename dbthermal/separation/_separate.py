@@ -1,0 +1,124 @@
+"""The default way through a capture: all steps of the separation, in one call."""
+
+from functools import partial
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import alignment
+from dbthermal.schema import Status
+from dbthermal.separation._completion.complete import complete
+from dbthermal.separation._pooling import materials as pooling
+from dbthermal.separation._solve import solve
+
+if TYPE_CHECKING:
+    from dbthermal.separation._subspace.method import SubspaceSettings
+
+# Share of the pixels with moving reflections whose bands are apart, from which a shift is sought.
+_APART: Final = 0.02
+
+
+def separate(  # noqa: PLR0913 - all but the first two by name
+    corrected: xr.Dataset,
+    response: xr.Dataset,
+    *,
+    reflection_shift: xr.Dataset | None = None,
+    materials: xr.DataArray | None = None,
+    surroundings: float | xr.DataArray | None = None,
+    surroundings_std: float = 2.0,
+    prior: str | xr.DataArray | xr.Dataset | None = None,
+    settings: "SubspaceSettings | None" = None,
+    workers: int = 2,
+    progress: bool = False,
+) -> xr.Dataset:
+    """
+    Separate emission and reflection in a capture, with an answer at every pixel.
+
+    Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
+    reflections move, once more with the shift between the two cameras' reflections
+    (`alignment.reflection_shift`), which is kept if fewer are apart with it; then with the pixels
+    of each material pooled (`materials`); last, what is still unknown is completed (`complete`).
+
+    Parameters
+    ----------
+    corrected, response : Dataset
+        As in `solve`.
+    reflection_shift : Dataset, optional
+        From `alignment.reflection_shift`; found if it is needed and not given.
+    materials : DataArray, optional
+        Labels (y, x) of the materials, -1 for none; found if not given and scikit-image is
+        installed (extra "materials").
+    surroundings, surroundings_std, prior
+        As in `complete`.
+    settings : SubspaceSettings, optional
+        Options of the method "subspace".
+    workers : int
+        Number of threads.
+    progress : bool
+        Show a bar for each separation.
+
+    Returns
+    -------
+    Dataset
+        As from `complete`, and `material` (y, x). Attribute `reflection_shift` says whether one was
+        "given", "found" or "none".
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `solve` and `complete`.
+
+    Examples
+    --------
+    Plate glass that warms up while people walk by, simulated:
+
+    >>> import numpy as np, xarray as xr
+    >>> from dbthermal import simulation
+    >>> rig, rng = simulation.Rig(), np.random.default_rng(1)
+    >>> glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    >>> scene = simulation.walkers(np.arange(200) / 10, (16, 24), glass, rng)
+    >>> result = separate(simulation.observe(scene, rig.response(), rng), rig.response())
+    >>> error = result["object_temperature"] - scene["object_temperature"]
+    >>> bool(error.notnull().all()), bool(abs(error).median() < 0.1)  # K
+    (True, True)
+    """
+    one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
+    source = "none" if reflection_shift is None else "given"
+    alone = one(reflection_shift=reflection_shift)
+    if reflection_shift is None and _share_apart(alone) > _APART:
+        shift = alignment.reflection_shift(corrected, response)
+        if bool(shift["known"].any()):
+            displaced = one(reflection_shift=shift)
+            if _share_apart(displaced) < _share_apart(alone):
+                alone, reflection_shift, source = displaced, shift, "found"
+    result, pooled = alone, None
+    if materials is None and find_spec("skimage") is not None:
+        pooled = pooling.regions(pooling.materials(alone, corrected, response), alone)
+        result = one(pool=pooled, reflection_shift=reflection_shift)
+        materials = pooling.joined(pooled, result)
+    if materials is not None and (pooled is None or not materials.equals(pooled)):
+        result = one(pool=materials, reflection_shift=reflection_shift)
+    result = complete(
+        result,
+        corrected,
+        response,
+        materials,
+        surroundings,
+        prior,
+        surroundings_std=surroundings_std,
+        reflection_shift=reflection_shift,
+        workers=workers,
+    )
+    if materials is not None:
+        result["material"] = materials
+    return result.assign_attrs(reflection_shift=source)
+
+
+def _share_apart(result: xr.Dataset) -> float:
+    """Share of the pixels with moving reflections whose bands are not simultaneous."""
+    status = result["status"].values
+    moving = (status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0
+    apart = (status & np.uint32(Status.BANDS_APART)) != 0
+    return float((apart & moving).sum() / max(moving.sum(), 1))

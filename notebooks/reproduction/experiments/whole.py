@@ -1,0 +1,103 @@
+"""One scene with everything that a rig of two cameras does to it, and the same scene without."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import gaussian_filter
+
+from dbthermal import correction, simulation
+from dbthermal.calibration import fit_response
+from dbthermal.simulation import Rig
+from reproduction.experiments.nuisances import GLASS
+from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
+
+# Heating that differs from place to place, by so much [1], over so many pixels: the detail.
+_UNEVEN, _DETAIL = 0.1, 2.0
+_STEPS: Final = 2  # of the scene's clock in a frame
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was recorded, raw; the same scene by a perfect rig; and the truth."""
+
+    capture: xr.Dataset  # raw counts of the scene
+    movies: xr.Dataset  # raw counts of the blackbody
+    clean: xr.Dataset  # counts of the stage `corrected`
+    scene: xr.Dataset
+
+
+def record(  # noqa: PLR0913 - all that is done to the scene, by name
+    shape: Sequence[int],
+    clock: Sequence[float],
+    seed: int,
+    *,
+    shift: Sequence[float],
+    view: Sequence[int],
+    late: int,
+    lost: float,
+    shutter: Sequence[float],
+    spoiled: float,
+    steps: int,
+    frames: int,
+) -> Recording:
+    """
+    Record people mirrored in unevenly heated glass, `pictures.Picture`, by two cameras.
+
+    The clock is the number of frames and their rate [Hz]. The cameras stand apart, so that the
+    second sees the reflections at a `shift` that varies, see `pictures.smooth_shift` [pixel]; it
+    looks by `view` to the right and down [pixel], and is exposed `late` halves of a frame later.
+    Of each band's frames a share `lost` is replaced by the one before, both shutters close at
+    `shutter`, shares of the capture, and a share `spoiled` of the pixels is bad. The blackbody has
+    so many `steps` of temperature, of so many `frames` each. The clean capture is of one place and
+    one clock, with the same noise. All is simulated.
+    """
+    rng, rig, (count, rate) = np.random.default_rng(seed), Rig(), (int(clock[0]), clock[1])
+    right, down = view
+    wide = (shape[0] + abs(down), shape[1] + abs(right))
+    time = np.arange(_STEPS * (count - 1) + late + 1) / (_STEPS * rate)
+    glass = xr.DataArray(list(GLASS), dims="band", coords={"band": list(rig.bands)})
+    picture = Picture(shape=wide, walkers=round(0.3 * time[-1]))
+    scene = picture.draw(time, glass, rng, smooth_shift(wide, *shift))
+    detail = gaussian_filter(rng.standard_normal(wide), _DETAIL)
+    heated = xr.DataArray(1.0 + _UNEVEN * detail / detail.std(), dims=("y", "x"))
+    scene["object_temperature"] = ROOM + (scene["object_temperature"] - ROOM) * heated
+    response = rig.response()
+    seen = simulation.expose(
+        scene, response, rng, every=_STEPS, offsets=(0, late), frames=count
+    ).drop_vars("exposure_time")
+    # The first view begins at the first whole pixel that the second has, too.
+    top, left = max(-down, 0), max(-right, 0)
+    views = [
+        seen.isel(band=[band], y=slice(y, y + shape[0]), x=slice(x, x + shape[1]))
+        for band, (y, x) in enumerate([(top, left), (top + down, left + right)])
+    ]
+    views = [one.assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1])) for one in views]
+    seen = xr.concat(views, "band", combine_attrs="override")
+    truth = scene.isel(
+        time=slice(0, _STEPS * count, _STEPS),
+        y=slice(top, top + shape[0]),
+        x=slice(left, left + shape[1]),
+    ).assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
+    seen = simulation.spoil_pixels(seen, spoiled, rng).drop_vars("spoiled")
+    last = float(seen["time"][-1])
+    seen = simulation.fire_shutter(seen, last * np.array(shutter), rng)
+    seen = simulation.lose_frames(seen, lost, rng).drop_vars("repeated")
+    detector = simulation.pattern(rig, (shape[0], shape[1]), rng)
+    kelvin = np.linspace(rig.lowest + 10.0, rig.highest - 5.0, steps)
+    one_place = truth.assign(background_temperature=truth["background_temperature"].isel(band=0))
+    return Recording(
+        capture=simulation.capture(seen, detector),
+        movies=simulation.blackbody_movies(rig, kelvin, frames, detector, rng),
+        clean=simulation.observe(one_place, response, rng),
+        scene=one_place,
+    )
+
+
+def calibrate(movies: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """Correction and response of the movies of a blackbody."""
+    statistics = correction.blackbody_statistics(movies)
+    fitted = correction.fit_correction(statistics)
+    return fitted, fit_response(fitted["level"], statistics["noise"])
