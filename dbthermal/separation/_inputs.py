@@ -307,17 +307,15 @@ def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *other: s
     allowed = ("band", *other), ("band", *other, "y", "x")
     if array.dims not in allowed:
         raise ValueError(f"Invalid dims {array.dims} of {name}. Must be one of {allowed}.")
-    if other and "other_band" in array.coords:
-        places = schema.band_positions(
-            array["other_band"].rename(other_band="band"), corrected["band"].values.tolist(), name
-        )
-        array = array.isel(other_band=places)
-    values = laid_on(array, corrected, name, "the capture").values.astype(np.float64)
-    image = (corrected.sizes["y"], corrected.sizes["x"])
-    leading = values.shape[: 1 + len(other)]
-    return np.broadcast_to(
-        values.reshape(*leading, *values.shape[len(leading) :] or (1, 1)), (*leading, *image)
+    array = laid_on(array, corrected, name, "the capture")
+    for one in other:  # the same bands
+        exchanged = array.rename({"band": one, one: "band"})
+        array = laid_on(exchanged, corrected, name, "the capture")
+    leading = array.shape[: 1 + len(other)]
+    values = array.values.astype(np.float64).reshape(
+        *leading, *array.shape[len(leading) :] or (1, 1)
     )
+    return np.broadcast_to(values, (*leading, corrected.sizes["y"], corrected.sizes["x"]))
 
 
 def _displacement(
