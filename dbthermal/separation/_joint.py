@@ -12,10 +12,9 @@ together, frame by frame, each for the term of the larger coefficient:
 .. math:: u_1(x(r)) \leftarrow \Big[q(r) - \sum_{m > 1} c_m u_m(x(p))\Big] / c_1
 
 contracts by :math:`g = |\sum_{m > 1} c_m / c_1|` a step, for two bands
-:math:`(e_2 / e_1) / \kappa`, where the reflection is the stronger one in the second camera;
-elsewhere the same equation, solved for x(p), contracts by 1/g. Both fail for a gray body alone.
-Errors of single pixels are averaged along the chain of places, with the weights
-:math:`(1 - g) g^j`.
+:math:`(e_2 / e_1) / \kappa`; where that is above 1 the equation solved for x(p) contracts by 1/g.
+Both fail for a gray body alone. Errors of single pixels are averaged along the chain of places,
+with the weights :math:`(1 - g) g^j`.
 """
 
 from concurrent.futures import Executor
