@@ -12,10 +12,9 @@ together, frame by frame, each for the term of the larger coefficient:
 .. math:: u_1(x(r)) \leftarrow \Big[q(r) - \sum_{m > 1} c_m u_m(x(p))\Big] / c_1
 
 contracts by :math:`g = |\sum_{m > 1} c_m / c_1|` a step, for two bands
-:math:`(e_2 / e_1) / \kappa`, where the reflection is the stronger one in the second camera;
-elsewhere the same equation, solved for x(p), contracts by 1/g. Both fail for a gray body alone.
-Errors of single pixels are averaged along the chain of places, with the weights
-:math:`(1 - g) g^j`.
+:math:`(e_2 / e_1) / \kappa`; where that is above 1 the equation solved for x(p) contracts by 1/g.
+Both fail for a gray body alone. Errors of single pixels are averaged along the chain of places,
+with the weights :math:`(1 - g) g^j`.
 """
 
 from concurrent.futures import Executor
@@ -25,6 +24,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from numpy.polynomial import Polynomial
 from scipy.ndimage import gaussian_filter1d, uniform_filter
 from scipy.sparse import csr_array, diags_array
 
@@ -40,6 +40,7 @@ from dbthermal.separation._subspace.reflection_ratio import null_combination
 Array = npt.NDArray[np.floating[Any]]
 Mask = npt.NDArray[np.bool_]
 Whole = npt.NDArray[np.intp]
+Signal = npt.NDArray[np.float64]
 
 # Steps of the iteration, and the change that ends it [K].
 _STEPS: Final = 60
@@ -65,28 +66,7 @@ _ROWS: Final = 32
 # Smooth functions of the change beside a pixel that is not solved.
 _ORDER: Final = 14
 # Degree of the polynomial that the bend between two responses is.
-_DEGREE: Final = 5
-
-
-@dataclass(frozen=True)
-class _Bend:
-    """Polynomials of u_m(x) - u_1(x) in u_1(x), for all bands but the first."""
-
-    coefficients: Array  # (band - 1, degree + 1), of the position in the calibrated range
-    lowest: float  # [K]
-    highest: float
-
-    def __call__(self, shares: Array, signal: Array) -> Array:
-        """Sum over the bands of shares (band - 1, pixel) times u_m(x) (pixel, frame) [K]."""
-        middle, half = 0.5 * (self.highest + self.lowest), 0.5 * (self.highest - self.lowest)
-        position = np.clip((signal - middle) / half, -1.0, 1.0)
-        # One polynomial for each pixel, by Horner's rule.
-        together = np.asarray(self.coefficients.T @ shares, dtype=signal.dtype)
-        bend = np.broadcast_to(together[-1][:, np.newaxis], signal.shape).copy()
-        for one in together[-2::-1]:
-            bend *= position
-            bend += one[:, np.newaxis]
-        return np.asarray(bend + shares.sum(axis=0)[:, np.newaxis] * signal)
+_DEGREE: Final = 4
 
 
 @dataclass(frozen=True)
@@ -141,11 +121,7 @@ class _Equations:
     forward: Whole  # pixels solved for x(r)
     backward: Whole  # pixels solved for x(p)
     loose: Whole  # solved pixels without such neighbours
-    bend: _Bend | None
-
-    def of(self, first: Array, shares: Array) -> "_Equations":
-        """Return the equations of other emissivities."""
-        return replace(self, first=first, shares=shares)
+    bends: list[Polynomial]  # u_m(x) - u_1(x) of u_1(x), for all bands but the first
 
     def _there(self, signal: Array, change: Array) -> Array:
         """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
@@ -155,14 +131,8 @@ class _Equations:
 
     def other_bands(self, shares: Array, signal: Array) -> Array:
         """Sum of shares (band - 1, pixel) times u_m(x), of u_1(x) (pixel, frame) [K]."""
-        if self.bend is None:
-            return np.asarray(shares.sum(axis=0)[:, np.newaxis] * signal)
-        return self.bend(shares, signal)
-
-    def target(self, shares: Array, alone: Array) -> Array:
-        """Combination q (pixel, frame) [K], of the u_1(x) that it gives with x(p) = x(r)."""
-        own = shares[0][:, np.newaxis] * alone
-        return np.asarray(own + self.other_bands(shares[1:], alone))
+        parts = zip(shares, self.bends, strict=True)
+        return np.asarray(sum(one[:, np.newaxis] * (signal + bend(signal)) for one, bend in parts))
 
     def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array, Array]:
         """
@@ -208,25 +178,28 @@ def solve(
     None, and nothing is written, where the object hardly differs between the two places.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film, there = (_flat(result[f"{one}_temperature"]) for one in ("object", "background"))
+        film, there, stds = (
+            result[name].values.reshape(result.sizes["time"], -1)
+            for name in ("object_temperature", "background_temperature", "object_temperature_std")
+        )
         raw = _emissivity(inputs, result)
-        solved = np.all(np.isfinite(raw), axis=0) & (_finite(film) > 1)
+        solved = np.all(np.isfinite(raw), axis=0) & np.isfinite(np.fmax.reduce(film, axis=0))
         emissivity = _inside(raw)
         equations = _equations(inputs, emissivity, solved)
-        change, variance = _changes(inputs, equations)
+        some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
+        first, change, variance = _first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
-        _, shares = _coefficients(inputs, raw, solved)
+        shares = _coefficients(inputs, raw, solved)
 
         def both(alone: Array, change: Array) -> tuple[Array, Array, Array]:
             signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
             signal = np.ascontiguousarray(signal.T, dtype=np.float32)
-            return equations.solve(equations.target(shares, signal), signal, change)
+            target = shares[0][:, np.newaxis] * signal + equations.other_bands(shares[1:], signal)
+            return equations.solve(target, signal, change)
 
-        some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
         looked_at = _bridge(film[some], solved)
-        first = _first_band(inputs, some)
         here, beside, _ = both(looked_at, change[:, some])
-        std = _flat(result["object_temperature_std"])[some].astype(np.float64)
+        std = stds[some].astype(np.float64)
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
         if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
             return None
@@ -240,7 +213,8 @@ def solve(
             known = line.energy > _LEAST_CHANGE**2 * len(some)
             slope = np.where(known, slope, emissivity[0])
             before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - slope))
-            equations = equations.of(*_coefficients(inputs, emissivity, solved))
+            coefficients, own = _coefficients(inputs, emissivity, solved), emissivity[0]
+            equations = replace(equations, first=np.where(solved, own, 1.0), shares=coefficients)
             here, beside, _ = both(looked_at, change[:, some])
             if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
                 break
@@ -256,11 +230,6 @@ def solve(
         size = np.sqrt(np.mean(np.where(np.isfinite(std), std, 0.0) ** 2, axis=0))
         factor = _factor(inputs, equations, size, variance)
     return Joint(inputs, result, emissivity, factor, unsettled)
-
-
-def _flat(film: xr.DataArray) -> Array:
-    """View (time, pixel) of a film of the result."""
-    return film.values.reshape(film.shape[0], -1)
 
 
 def _emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
@@ -295,20 +264,11 @@ def _weights(inputs: Inputs, emissivity: Array) -> Array:
     return null_combination(_ratio(emissivity).astype(np.float64), noise)[0]
 
 
-def _coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> tuple[Array, Array]:
-    """First emissivity (pixel) [1] and coefficients c (band, pixel) [1] of eq. 6, of sum 1."""
+def _coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> Array:
+    """Coefficients c of eq. 6 (band, pixel) [1], of sum 1."""
     shares = np.where(solved, _weights(inputs, emissivity) * emissivity, 0.0)
     shares[0, ~solved] = 1.0
-    first = np.where(solved, emissivity[0], 1.0)
-    return first.astype(np.float32), shares.astype(np.float32)
-
-
-def _first_band(inputs: Inputs, frames: Whole) -> npt.NDArray[np.float64]:
-    """Signal (frame, pixel) [K] of the reference band; 0, an outlier, where it is not measured."""
-    band = inputs.bands[0]
-    counts = inputs.capture["counts"].isel(band=band, time=frames).values.astype(np.float64)
-    signal = inputs.curves[band].linearise(counts) - inputs.curves[band].reference
-    return np.where(schema.measured(counts), signal, 0.0).reshape(len(frames), -1)
+    return shares.astype(np.float32)
 
 
 def _slope(abscissa: Array, ordinate: Array) -> Array:
@@ -318,18 +278,10 @@ def _slope(abscissa: Array, ordinate: Array) -> Array:
     return np.where(np.isfinite(slope), slope, 1.0)
 
 
-def _finite(film: Array) -> Whole:
-    """Frames (pixel) of a film (time, pixel) with a number."""
-    number = np.zeros(film.shape[1], dtype=np.intp)
-    for frame in film:
-        number += np.isfinite(frame)
-    return number
-
-
 def _bridge(film: Array, solved: Mask) -> Array:
     """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
     frames = np.arange(len(film))
-    for pixel in np.flatnonzero(solved & (_finite(film) < len(film))):
+    for pixel in np.flatnonzero(solved & ~np.isfinite(film.sum(axis=0))):
         known = np.isfinite(film[:, pixel])
         if known.any():
             film[~known, pixel] = np.interp(frames[~known], frames[known], film[known, pixel])
@@ -340,21 +292,21 @@ def _equations(inputs: Inputs, emissivity: Array, solved: Mask) -> _Equations:
     """Equations of the solved pixels: each for the place with the larger coefficient."""
     displacement = inputs.displacement
     assert displacement is not None
-    first, shares = _coefficients(inputs, emissivity, solved)
+    shares = _coefficients(inputs, emissivity, solved)
     there, linked = _among(displacement.resample, solved, displacement.shape[1])
     onward, reached = _among(displacement.onward, solved, displacement.shape[1])
     strong = np.abs(shares[1:].sum(axis=0)) < np.abs(shares[0])
     linked &= strong | reached
     backward = np.flatnonzero(linked & ~strong)
     return _Equations(
-        first=first,
+        first=np.where(solved, emissivity[0], 1.0),
         shares=shares,
-        there=_rows(there, linked),
+        there=csr_array(diags_array(linked.astype(np.float32)) @ there.astype(np.float32)),
         onward=csr_array(onward[backward].astype(np.float32)),
         forward=np.flatnonzero(linked & strong),
         backward=backward,
         loose=np.flatnonzero(solved & ~linked),
-        bend=_bend([inputs.curves[band] for band in inputs.bands]),
+        bends=_bends([inputs.curves[band] for band in inputs.bands]),
     )
 
 
@@ -366,36 +318,30 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
 
 
-def _rows(weights: csr_array, used: Mask) -> csr_array:
-    """Weights in single precision, with the rows that are not used set to 0."""
-    result = csr_array(diags_array(used.astype(np.float32)) @ weights.astype(np.float32))
-    result.eliminate_zeros()
-    return result
-
-
-def _changes(inputs: Inputs, equations: _Equations) -> tuple[Array, Array]:
+def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Array, Array]:
     """
-    Change of e_1 u_1(x) from r to p (loose, time) [K], of the loose pixels; its variance (loose).
+    Signal (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
 
-    From the reference band, which shows both places: smoothed over time, the difference between
-    its signals holds little of that between their reflections.
+    The change from r to p (loose, time) [K] and its variance (loose): smoothed over time, it is
+    that of e_1 u_1(x) and holds little of that of the reflection.
     """
-    displacement, capture, loose = inputs.displacement, inputs.capture, equations.loose
+    displacement, capture = inputs.displacement, inputs.capture
     assert displacement is not None
-    width, height, band = capture.sizes["x"], capture.sizes["y"], displacement.reference
-    curve = inputs.curves[band]
-    change = np.zeros((loose.size, capture.sizes["time"]), dtype=np.float32)
+    (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
+    change = np.zeros((loose.size, capture.sizes["time"]))
+    first = np.empty((frames.size, height * width))
     for top in range(0, height, _ROWS):
         rows = slice(top, min(top + _ROWS, height))
-        chosen = (loose >= rows.start * width) & (loose < rows.stop * width)
-        if not np.any(chosen):
-            continue
-        source = displacement.source(rows)
-        counts = capture["counts"].isel(band=band, y=source).values.astype(np.float64)
-        signal = _bridged(curve.linearise(counts).reshape(len(counts), -1)).T
-        local = loose[chosen]
-        at = displacement.weights(rows, source)[local - rows.start * width]
-        change[chosen] = at @ signal - signal[local - source.start * width]
+        source, chosen = displacement.source(rows), (loose // width >= top)
+        chosen &= loose // width < rows.stop
+        counts = capture["counts"].isel(band=displacement.reference, y=source).values
+        counts = np.where(schema.measured(counts), counts, np.nan).reshape(len(counts), -1)
+        signal = curve.linearise(counts) - curve.reference
+        inside = slice((top - source.start) * width, (rows.stop - source.start) * width)
+        first[:, top * width : rows.stop * width] = signal[frames, inside]
+        both = np.nan_to_num(_bridge(signal, np.ones(signal.shape[1], dtype=bool))).T
+        at = displacement.weights(rows, source)[loose[chosen] - top * width]
+        change[chosen] = at @ both - both[loose[chosen] - source.start * width]
     basis = smooth.polynomial_basis(capture["time"].values, min(_ORDER, change.shape[1] // 4))
     smoothed = (change @ basis) @ basis.T
     # The mean of correlated errors: K / N, times (1 + rho) / (1 - rho).
@@ -403,25 +349,15 @@ def _changes(inputs: Inputs, equations: _Equations) -> tuple[Array, Array]:
     energy = (error**2).sum(axis=1)
     lagged = np.clip((error[:, 1:] * error[:, :-1]).sum(axis=1) / energy, 0.0, 0.98)
     variance = energy * basis.shape[1] / change.shape[1] ** 2 * (1.0 + lagged) / (1.0 - lagged)
-    return smoothed.astype(np.float32), np.asarray(variance, dtype=np.float64)
-
-
-def _bridged(signal: Array) -> Array:
-    """Signal (time, pixel), straight over samples that are no measurement; 0 without any."""
-    measured = schema.measured(signal)
-    frames = np.arange(len(signal))
-    for pixel in np.flatnonzero(~measured.all(axis=0)):
-        known = measured[:, pixel]
-        values = np.interp(frames, frames[known], signal[known, pixel]) if known.any() else 0.0
-        signal[:, pixel] = values
-    return signal
+    # A sample that is no measurement is an outlier of the regression.
+    return np.nan_to_num(first), smoothed, np.nan_to_num(variance)
 
 
 def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) -> Array:
     """
     Variance (pixel) [1] of the object over that of a pixel alone, by draws of the noise.
 
-    The `std` (pixel) [K] is that of a pixel alone; the `variance` (loose) [K^2] that of `_changes`.
+    The `std` (pixel) [K] is that of a pixel alone; the `variance` (loose) [K^2] that of the change.
     """
     displacement = inputs.displacement
     assert displacement is not None
@@ -431,8 +367,8 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
     gain = np.sqrt(np.asarray((displacement.resample**2).sum(axis=1)).ravel())[:, np.newaxis]
     alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
-    linear = replace(equations, bend=None)
-    signal, _, _ = linear.solve(alone, alone, change.astype(np.float32))
+    linear = replace(equations, bends=[Polynomial([0.0])] * len(equations.bends))
+    signal, _, _ = linear.solve(alone, alone, change)
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
         uniform_filter(np.reshape(one, displacement.shape), 3).ravel()
@@ -442,12 +378,10 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
     return np.where(own, energy / np.where(own, total, 1.0), 1.0)
 
 
-def _bend(curves: list[Curve]) -> _Bend:
-    """Bend between the responses of some bands, over the calibrated range."""
+def _bends(curves: list[Curve]) -> list[Polynomial]:
+    """Polynomials of u_m(x) - u_1(x) in u_1(x), over the calibrated range, for bands m > 1."""
     first = curves[0]
-    lowest, highest = (float(first.signal(t)) for t in (first.lowest, first.highest))
-    nodes = np.cos(np.pi * (np.arange(64) + 0.5) / 64)
-    signal = 0.5 * (highest + lowest) + 0.5 * (highest - lowest) * nodes
-    parts = [curve.signal(first.temperature(signal)) - signal for curve in curves[1:]]
-    coefficients = np.polynomial.polynomial.polyfit(nodes, np.transpose(parts), _DEGREE)
-    return _Bend(coefficients.T, lowest - first.reference, highest - first.reference)
+    temperature = np.linspace(first.lowest, first.highest, 64)
+    own = first.signal(temperature)
+    place = own - first.reference
+    return [Polynomial.fit(place, one.signal(temperature) - own, _DEGREE) for one in curves[1:]]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 # Share of the pixels with moving reflections whose bands are apart, from which a shift is sought.
-_APART: Final = 0.1
+_APART: Final = 0.02
 
 
 def separate(  # noqa: PLR0913 - all but the first two by name
@@ -36,7 +36,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     """
     Separate emission and reflection in a capture, with an answer at every pixel.
 
-    Each pixel alone (`solve`); where bands are apart in more than a tenth of the pixels whose
+    Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
     reflections move, once more with the shift between the two cameras' reflections
     (`alignment.reflection_shift`), which is kept if fewer are apart with it; then with the pixels
     of each material pooled (`materials`); last, what is still unknown is completed (`complete`).

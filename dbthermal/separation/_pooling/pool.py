@@ -59,8 +59,11 @@ def estimate(labels: Labels, count: int, survey: Survey, noise: Array) -> Materi
     than four standard deviations is left out. The noise is that of the bands (band,) [K]; NaN for a
     material without information.
     """
-    used = labels
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        # A pixel that takes a rapid object for the background has an energy beyond all others'.
+        sound = np.where(np.isfinite(survey.emissivity), labels, -1)
+        outliers = _outliers(labels, _ratios(sound, count, survey, noise), survey, noise)
+        used = np.where(outliers, -1, labels)
         for _ in range(_ROUNDS):
             found = _ratios(used, count, survey, noise)
             outliers = _outliers(used, found, survey, noise)

@@ -76,7 +76,7 @@ _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Set beside the flags, within this module, where pieces of time are asked for.
 _PIECES: Final = np.uint32(1 << 31)
 # Last orders of the smooth curve at which its polynomials may be too few.
-_LAST: Final = 3
+_LAST: Final = 6
 # Flags of pixels in which rapid changes of the object are looked for.
 _SUSPECT: Final = (
     np.uint32(
@@ -141,14 +141,21 @@ class _Solution:
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of two bands or more."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _followed(tile, settings)
+        return _followed(tile, settings)[0]
 
 
 def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
     """Scatter and emissivity of the pixels of a tile, each alone; of those without a flag."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         # Together the pixels see a bend that is too small to be seen in each.
-        return _exact(tile, _functions(tile), settings, _survey, least=0.0)
+        result = _exact(tile, _functions(tile), settings, _survey, least=0.0)
+        first = _followed(tile, settings)[1]
+        divided = np.asarray(first.any(axis=0))
+        if np.any(divided):
+            part = tile.select_pixels(divided)
+            again = _divided(part, first[:, divided], settings, _survey, least=0.0)
+            result = result.replace_pixels(divided, again)
+        return result
 
 
 def _functions(tile: Tile) -> smooth.Subspace:
@@ -307,20 +314,25 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     }
 
 
-def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
-    """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
+def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
+    """
+    All steps: pixels that do not fit are solved anew with polynomials in pieces of the time.
+
+    And the frames that pieces begin with (time, pixel), none where one curve is smooth.
+    """
     functions, noise = _functions(tile), np.array(tile.noise)
     result = _exact(tile, functions, settings, _report_asking)
     suspect = np.flatnonzero(result.status & _SUSPECT)
     result = replace(result, status=result.status & ~_PIECES)
+    first = np.zeros(tile.signals.shape[1:], dtype=bool)
     if suspect.size == 0:
-        return result
+        return result, first
     part, best = tile.select_pixels(suspect), result.select_pixels(suspect)
     ratios = reflection_ratio.estimate(part.signals, functions, noise, part.material)
     used, others = ratios.order + functions.steps, len(noise) - 1
     cost = others * (ratios.reduced_chi2 * (tile.time.size - used) + pieces.COST * used)
-    divided = np.zeros(suspect.shape, dtype=bool)
-    divisions = pieces.divide(part.signals, tile.time, noise, tile.segment)
+    known = None if part.material is None else part.material.ratio
+    divisions = pieces.divide(part.signals, tile.time, noise, tile.segment, known)
     lowest = np.min([cost, *(one.cost for one in divisions)], axis=0)
     for division in divisions:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
@@ -329,25 +341,32 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
         places = np.flatnonzero(tried)
         if places.size == 0:
             continue
-        again = _divided(part.select_pixels(places), division.first[:, places], settings)
+        again = _divided(part.select_pixels(places), division.first[:, places], settings, _report)
         cheaper = division.cost[places] < cost[places] - _LIKELY
         better = (again.status == 0) | (flagged[places] & cheaper)
         places, again = places[better], again.select_pixels(better)
         best = best.replace_pixels(places, again)
-        cost[places], divided[places] = division.cost[places], True
-    jumping = divided & residuals.sudden(
+        cost[places] = division.cost[places]
+        first[:, suspect[places]] = division.first[:, places]
+    jumping = first[:, suspect].any(axis=0) & residuals.sudden(
         best.object_temperature, best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
-    return result.replace_pixels(suspect, replace(best, status=status))
+    return result.replace_pixels(suspect, replace(best, status=status)), first
 
 
-def _divided(tile: Tile, first: Mask, settings: SubspaceSettings) -> Estimate:
-    """Estimate with pieces that begin with some frames (time, pixel), same pieces together."""
+def _divided(
+    tile: Tile,
+    first: Mask,
+    settings: SubspaceSettings,
+    finish: Callable[[Tile, smooth.Subspace, _Solution], Record],
+    least: float = _BEND,
+) -> Record:
+    """Result with pieces that begin with some frames (time, pixel), same pieces together."""
     order, groups, parts = _functions(tile).orders, pieces.alike(first), []
     for places in groups:
         functions = smooth.piecewise(tile.time, first[:, places[0]], order, segment=tile.segment)
-        parts.append(_exact(tile.select_pixels(places), functions, settings, _report))
+        parts.append(_exact(tile.select_pixels(places), functions, settings, finish, least))
     return join(parts).select_pixels(np.argsort(np.concatenate(groups)))
 
 

@@ -57,11 +57,14 @@ class Division:
     cost: Array  # eq. 12 (pixel); infinite for none
 
 
-def divide(signals: Array, time: Array, noise: Array, segment: Whole | None) -> list[Division]:
+def divide(
+    signals: Array, time: Array, noise: Array, segment: Whole | None, known: Array | None = None
+) -> list[Division]:
     """
     Divisions by which two different axes explain the signals (band, time, pixel) best.
 
-    The second one is that of the other line, if there is one, and costs more.
+    The second one is that of the other line, if there is one, and costs more. Reflection ratios of
+    a material may be `known` (band, pixel), NaN for others.
     """
     edges, levels = _tree(time.tobytes(), None if segment is None else segment.tobytes())
     white = signals / noise[:, np.newaxis, np.newaxis]
@@ -69,6 +72,10 @@ def divide(signals: Array, time: Array, noise: Array, segment: Whole | None) -> 
     prices = [COST * (len(noise) - 1) * np.array([p[2] for p in level]) for level in levels]
     starts = [_axis(scatters[level][0]) for level in _STARTS if level < len(scatters)]
     axes = np.concatenate(starts)
+    if known is not None:
+        along = (known / noise[:, np.newaxis]).T
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        axes = np.concatenate([axes, np.where(np.isfinite(along), along, axes[0])[np.newaxis]])
     costs = np.concatenate(
         [_best(scatters, prices, some)[0] for some in np.array_split(axes, _PARTS)]
     )
