@@ -5,22 +5,22 @@ step. With a target on disk it works by rows, in the memory of some of them.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, TypedDict
+from types import MappingProxyType
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import distance_transform_edt, grey_dilation, grey_erosion, map_coordinates
+from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dbthermal import schema, store
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
-from dbthermal.separation import SubspaceSettings, complete, materials, solve
+from dbthermal.separation import separate
 
-__all__ = ["Aligning", "Completing", "Correcting", "separate_capture"]
+__all__ = ["separate_capture"]
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -34,39 +34,10 @@ _REGISTERED: Final = 200
 _ROUNDS: Final = 3
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
-# Memory of the rows that are separated together, and what a sample of an image takes there [byte].
-_MEMORY: Final = 2**31
-_SAMPLE: Final = 80
-# Rows around them, at least, and in multiples of the shift.
-_HALO, _SHIFTS = 8, 4.0
+# Memory of the rows that are separated together, what a sample of a pixel takes there [byte], and
+# fewest rows; rows around them, in multiples of the shift.
+_MEMORY, _SAMPLE, _FEWEST, _SHIFTS = 2_500_000_000, 220, 4, 4.0
 _BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
-
-
-class Correcting(TypedDict, total=False):
-    """Options of `correction.correct_capture`."""
-
-    flat: xr.DataArray
-    flat_after: xr.DataArray
-    shutter: bool
-    time_constant: float | xr.DataArray
-    bad_pixels: float | None
-    drift_reference: xr.DataArray
-
-
-class Aligning(TypedDict, total=False):
-    """Options of `alignment.align`."""
-
-    offset: float | xr.DataArray
-    transform: xr.DataArray
-    clock: str
-
-
-class Completing(TypedDict, total=False):
-    """Options of `separation.complete`."""
-
-    surroundings: float | xr.DataArray
-    surroundings_std: float
-    prior: str | xr.DataArray | xr.Dataset
 
 
 def __dir__() -> list[str]:
@@ -79,13 +50,11 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     response: xr.Dataset,
     *,
     registration: Literal["translation", "affine", "homography"] | None = "homography",
-    correcting: Correcting | None = None,
-    aligning: Aligning | None = None,
-    settings: SubspaceSettings | None = None,
-    completing: Completing | None = None,
-    workers: int = 2,
+    correcting: Mapping[str, Any] = MappingProxyType({}),
+    aligning: Mapping[str, Any] = MappingProxyType({}),
+    separating: Mapping[str, Any] = MappingProxyType({}),
     target: str | Path | None = None,
-    provenance: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] = MappingProxyType({}),
 ) -> xr.Dataset:
     """
     Raw counts of two cameras to temperatures, emissivities and reflections: every step in order.
@@ -93,12 +62,10 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     1. `correction.correct_capture`.
     2. `alignment.register`, `align` and `reflection_shift`. Where the cameras stand apart, the
        clocks are compared where both see the same reflection, and its shift is then found anew.
-    3. `separation.solve`, of a small picture first, `materials` of that, and `solve` of the capture
-       pooled over them, with the reflections' shift.
-    4. `separation.complete`.
+    3. `separation.separate`.
 
-    What is of the whole image (time offset, transform, shift, materials, surroundings) is found in
-    a reduced picture, of means over some pixels and frames, if the capture is large.
+    Clocks and shift are found in a reduced picture, of means over some pixels and frames, if the
+    capture is large.
 
     Parameters
     ----------
@@ -112,30 +79,27 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     registration : {"translation", "affine", "homography"}, optional
         Kind of transform between the views, see `alignment.register`; None if they are on one grid
         already. A `transform` in `aligning` takes its place.
-    correcting, aligning, completing : dict, optional
-        Options of these steps by name.
-    settings : SubspaceSettings, optional
-        Options of the separation.
-    workers : int
-        Number of threads.
+    correcting, aligning, separating : mapping, optional
+        Options by name of `correction.correct_capture`, `alignment.align` and
+        `separation.separate`, such as ``{"offset": 0.0}`` [s] for cameras with one clock.
     target : str or Path, optional
-        Folder ``*.zarr`` for the result. It is separated and written by blocks of rows, in about
-        3 GB however long the capture is. Materials are then pooled within a block.
+        Folder ``*.zarr`` for the result. It is then separated and written by blocks of rows, in
+        some 3 GB beside the raw counts; materials are found, and pooled, within a block, of 6 rows
+        for 2100 frames of 640 columns.
     provenance : mapping, optional
         For the `target`, see `store.save`.
 
     Returns
     -------
     Dataset
-        Stage `separated`, as from `separation.complete`, on the first band's grid, with
-        `reflection_shift` (axis, y, x) [pixel] where the cameras see reflections apart. Attributes
-        of the alignment: `clock`, `time_offset` [s], `frames_lost`, `transform`; `reflections`,
-        "apart", "together", or why their shift is not known. From a `target` it is lazy.
+        As from `separation.separate`, on the first band's grid, and `reflection_shift`
+        (axis, y, x) [pixel] where the cameras see reflections apart. Attributes of the alignment:
+        `clock`, `time_offset` [s], `frames_lost`, `transform`. From a `target` it is lazy.
 
     Raises
     ------
     ImportError
-        If OpenCV, for a registration, or scikit-image is not installed.
+        If OpenCV, for a registration, is not installed.
     TypeError, ValueError
         As the steps do.
 
@@ -161,96 +125,64 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     True
     """
     lazy = target is not None
-    corrected = correct_capture(capture, correction, lazy=lazy, **correcting or {})
-    options = Aligning(**aligning or {})
-    if registration is not None and "transform" not in options:
+    corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
+    if registration is not None and "transform" not in aligning:
         some = slice(None, None, max(1, corrected.sizes["time"] // _REGISTERED))
-        options["transform"] = register(corrected.isel(time=some), model=registration)
-    plan = _planned(corrected, response, options, settings, workers, lazy=lazy)
+        transform = register(corrected.isel(time=some), model=registration)
+        aligning = {**aligning, "transform": transform}
+    aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
+    kept = ("clock", "time_offset", "frames_lost", "transform")
+    attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
+    halo = _halo(field)
 
     def separated(rows: slice) -> xr.Dataset:
         """Some rows of the result."""
-        around, own = _around(rows, plan)
-        part = plan.aligned.isel(y=around).load()
-        labels = plan.labels.isel(y=around)
-        result = solve(
-            part,
-            response,
-            settings=settings,
-            pool=labels if bool((labels >= 0).any()) else None,
-            reflection_shift=None if plan.field is None else plan.field.isel(y=around),
-            workers=workers,
-        )
-        result = complete(result, part, response, labels, workers=workers, **completing or {})
-        return result.isel(y=own).assign(plan.maps(rows)).assign_attrs(plan.attrs)
+        around = slice(max(0, rows.start - halo), rows.stop + halo)
+        own = slice(rows.start - around.start, rows.stop - around.start)
+        shift = None if field is None else field.isel(y=around)
+        part = aligned.isel(y=around).load()
+        result = separate(part, response, **{"reflection_shift": shift, **separating})
+        maps = {} if shift is None else {"reflection_shift": shift["shift"]}
+        return result.assign(maps).isel(y=own).assign_attrs(attrs)
 
     if target is None:
-        return separated(slice(0, plan.aligned.sizes["y"]))
-    parts = (separated(rows) for rows in _blocks(plan.aligned))
-    store.save_rows(parts, target, store.provenance({}) if provenance is None else provenance)
+        return separated(slice(0, aligned.sizes["y"]))
+    store.save_rows(
+        map(separated, _blocks(aligned, halo)), target, provenance or store.provenance({})
+    )
     return store.open_dataset(target)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Aligned capture, and what is of the whole image."""
-
-    aligned: xr.Dataset
-    field: xr.Dataset | None  # shift of the reflections, where it matters
-    labels: xr.DataArray  # materials (y, x)
-    attrs: dict[str, Any]
-
-    def maps(self, rows: slice) -> dict[str, xr.DataArray]:
-        """Maps of some rows for the result."""
-        if self.field is None:
-            return {}
-        return {"reflection_shift": self.field["shift"].isel(y=rows)}
-
-
-def _planned(
-    corrected: xr.Dataset,
-    response: xr.Dataset,
-    options: Aligning,
-    settings: SubspaceSettings | None,
-    workers: int,
-    *,
-    lazy: bool,
-) -> _Plan:
-    """Align a capture, and find what is of the whole image."""
+def _aligned(
+    corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
+) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """Capture on one clock, and the shift of its reflections; None where they are not apart."""
     names = corrected["band"].values
     together = xr.DataArray(np.zeros(names.size), dims="band", coords={"band": names})
-    first: Aligning = {"offset": together, **options}
-    aligned = align(corrected, **first, lazy=lazy)
-    small, known = _reduced(aligned, response)
-    field, found = _shift(small, known)
+    aligned = align(corrected, **{"offset": together, **options})
+    field = _shift(aligned, response)
     if "offset" not in options:
         # What moves one way is seen earlier by one of two cameras apart, as by an earlier clock:
         # the clocks are compared at places of the same reflection, whose shift is then found anew.
         for _ in range(_ROUNDS - 1 if field is not None else 1):
-            wide = None if field is None else _enlarged(field, aligned)
-            aligned = align(corrected, **options, reflection_shift=wide, lazy=lazy)
-            small, known = _reduced(aligned, response)
-            field, found = _shift(small, known)
-    apart = field if found == "apart" else None
-    alone = solve(small, known, settings=settings, reflection_shift=apart, workers=workers)
-    labels = _labels(materials(alone, small, known), aligned)
-    wide = None if apart is None else _enlarged(apart, aligned)
-    kept = ("clock", "time_offset", "frames_lost", "transform")
-    attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
-    return _Plan(aligned, wide, labels, {**attrs, "reflections": found})
-
-
-def _shift(small: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | None, str]:
-    """Shift of the reflections, None where it is not found; whether they are apart, or why not."""
-    try:
-        field = reflection_shift(small, response)
-    except ValueError as error:  # as where nothing moves, or the image is too small
-        return None, str(error)
+            aligned = align(corrected, reflection_shift=field, **options)
+            field = _shift(aligned, response)
+    if field is None:
+        return aligned, None
     shift, std = (
         np.hypot(*field[name].values[:, field["known"].values]) for name in ("shift", "shift_std")
     )
     apart = np.median(shift) > max(_SIGMAS * np.median(std), _LEAST_SHIFT)
-    return field, "apart" if apart else "together"
+    return aligned, field if apart else None
+
+
+def _shift(aligned: xr.Dataset, response: xr.Dataset) -> xr.Dataset | None:
+    """Shift of the reflections over all pixels; None where nothing tells it."""
+    try:
+        field = reflection_shift(*_reduced(aligned, response))
+    except ValueError:  # as where nothing moves, or the image is too small
+        return None
+    return _enlarged(field, aligned) if bool(field["known"].any()) else None
 
 
 def _reduced(aligned: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
@@ -322,30 +254,17 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(values, coords={"axis": field["axis"], **here}, attrs=field.attrs)
 
 
-def _labels(small: xr.DataArray, aligned: xr.Dataset) -> xr.DataArray:
-    """Materials of the whole capture from those of a reduced one; none where two of them meet."""
-    side, values = _reduction(aligned)[0], small.values
-    if side > 1:
-        alike = grey_erosion(values, 3) == grey_dilation(values, 3)
-        values = np.where(alike, values, -1).repeat(side, axis=0).repeat(side, axis=1)
-        beyond = [(0, aligned.sizes[d] - n) for d, n in zip("yx", values.shape, strict=True)]
-        values = np.pad(values, beyond, mode="edge")
-    here = {dim: aligned[dim] for dim in ("y", "x") if dim in aligned.coords}
-    return xr.DataArray(values, dims=("y", "x"), coords=here, attrs=small.attrs)
-
-
-def _blocks(aligned: xr.Dataset) -> Iterator[slice]:
-    """Rows that are separated together."""
+def _blocks(aligned: xr.Dataset, halo: int) -> Iterator[slice]:
+    """Rows that are separated together, with a halo on both sides."""
     height = aligned.sizes["y"]
-    rows = max(1, _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"]))
+    together = _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"])
+    rows = max(_FEWEST, together - 2 * halo)
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
 
 
-def _around(rows: slice, plan: _Plan) -> tuple[slice, slice]:
-    """Rows with those around them that they are separated with, and their own among these."""
-    halo = _HALO
-    if plan.field is not None:
-        halo += int(np.ceil(_SHIFTS * np.nanmax(np.abs(plan.field["shift"].sel(axis="y").values))))
-    first, last = max(0, rows.start - halo), min(plan.aligned.sizes["y"], rows.stop + halo)
-    return slice(first, last), slice(rows.start - first, rows.stop - first)
+def _halo(field: xr.Dataset | None) -> int:
+    """Rows around others from which their object is told, if the cameras see reflections apart."""
+    if field is None:
+        return 1
+    return 1 + int(np.ceil(_SHIFTS * np.nanmax(np.abs(field["shift"].sel(axis="y").values))))

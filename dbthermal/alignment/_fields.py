@@ -5,10 +5,9 @@ differences q of neighbouring nodes, and a wide prior make
 
 .. math:: (A + \lambda Q^T W Q + R) c = A c_0 + b
 
-whose inverse matrix is the covariance. The penalty follows from the field (MacKay 1992,
-doi:10.1162/neco.1992.4.3.415), :math:`\lambda = \gamma / c^T P c` with the number of parameters
-:math:`\gamma` that the data determine; W lets it bend sharply in few places, as from one body to
-the next: differences follow Student's distribution, not a normal one.
+whose inverse matrix is the covariance. The penalty has the largest marginal likelihood (Patterson,
+Thompson 1971, doi:10.1093/biomet/58.3.545); W lets the field bend sharply in few places, as from
+one body to the next: differences follow Student's distribution, not a normal one.
 """
 
 from dataclasses import dataclass
@@ -18,19 +17,18 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 Array = npt.NDArray[np.float64]
 
 # Pixels between two nodes, at least, and nodes along the longer side, at most.
 _SPACING: Final = 6.0
-_NODES: Final = 28
+_NODES: Final = 18
 # Degrees of freedom of a bending's distribution.
 _FREEDOM: Final = 3.0
-_UPDATES: Final = 3  # of the penalty for each solution
-# Penalty over the mean information of a node: where it begins, and its limits.
-_PENALTY: Final = 1.0
-_PENALTIES: Final = (1e-6, 1e6)
+# Penalties that are tried, over the mean information of a node; and over the last one.
+_PENALTIES: Final = 10.0 ** np.arange(-3.0, 5.0)
+_STEPS: Final = np.array([0.4, 1.0, 2.5])
 
 
 def weights(offset: Array) -> tuple[Array, Array]:
@@ -97,28 +95,27 @@ class Spline:
         values = self.values(centres)
         matrix = _normal(data.tensor, values)
         target = np.concatenate([_projected(part, values) for part in data.gradient])
-        scale = np.trace(matrix) / len(matrix)
         bends = self.bending
-        penalty, sharp = scale * _PENALTY, np.ones((2, bends.shape[0]))
+        sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
         if around is not None:
             target += matrix @ around.nodes
-            penalty, sharp = around.penalty, around.sharpness
+            sharp, trials = around.sharpness, around.penalty * _STEPS
         ridge = np.eye(len(matrix)) / self.prior**2
-        for _ in range(_UPDATES):
-            blocks = [(bends.T @ (bends * part[:, np.newaxis])).toarray() for part in sharp]
-            bending = np.kron(np.diag([1.0, 0.0]), blocks[0]) + np.kron(
-                np.diag([0.0, 1.0]), blocks[1]
-            )
-            factor = cho_factor(matrix + penalty * bending + ridge)
-            nodes = cho_solve(factor, target)
-            covariance = cho_solve(factor, np.eye(len(matrix)))
-            result = Field(self, nodes, covariance, penalty, sharp)
-            squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])
-            determined = len(matrix) - 6.0 - penalty * np.sum(bending * covariance)
-            penalty = max(determined, 0.1) / max(np.sum(sharp * squares), 1e-12)
-            penalty = float(np.clip(penalty, *(limit * scale for limit in _PENALTIES)))
-            sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
-        return result
+        blocks = [(bends.T @ (bends * part[:, np.newaxis])).toarray() for part in sharp]
+        bending, best = block_diag(*blocks), -np.inf
+        for trial in trials:
+            # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
+            trial_factor = cho_factor(matrix + trial * bending + ridge)
+            trial_nodes = cho_solve(trial_factor, target)
+            before = np.linalg.cholesky(trial * bending + ridge)
+            logs = [2.0 * np.sum(np.log(np.diag(part))) for part in (before, trial_factor[0])]
+            likelihood = logs[0] - logs[1] + target @ trial_nodes
+            if likelihood > best:
+                best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
+        squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])
+        sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
+        covariance = cho_solve(factor, np.eye(len(matrix)))
+        return Field(self, nodes, covariance, float(penalty), sharp)
 
 
 @dataclass(frozen=True)

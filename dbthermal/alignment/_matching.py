@@ -24,12 +24,13 @@ BLUR: Final = 1.2
 """Deviation of the blur of all movies before they are matched, that nothing aliases [pixel]."""
 
 _ROUNDS: Final = 12
-_CONVERGED: Final = 2e-3  # change of the field at its end, in standard deviations of it or pixels
+_CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
 _ROWS: Final = 32  # that are resampled at a time
 _MISFIT: Final = 0.7  # by how much a residual's variance exceeds noise at half weight, relative
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 _TAIL: Final = 4.0  # variances of the residual at which a sample has half its weight
+_COLOUR: Final = 0.05  # least variance of coloured noise over that of white noise
 _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 _TEXTURED: Final = 0.3  # least information over that which noise pretends, of a pixel that counts
 # Rough matches count as if each were known so well [pixel].
@@ -133,7 +134,9 @@ def whole_pixels(movies: Movies, reach: tuple[int, int]) -> tuple[Array, Array]:
             better = gain > best
             best[better], where[0][better], where[1][better] = gain[better], down, right
     share = best / np.maximum(energy, 1e-9) * movies.valid
-    return where, np.where(best * window > _SIGNIFICANT, share, 0.0)
+    # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
+    chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2
+    return where, np.where(best * window > chance, share, 0.0)
 
 
 def _overlap(
@@ -200,13 +203,13 @@ def _moments(
     movies: Movies, coefficients: Movie, places: Array, matches: list[_Match] | None
 ) -> Array:
     """
-    Products (other, 12, y, x), summed over time, of moved, its slopes, and another movie.
+    Products (other, 14, y, x), summed over time, of moved, its slopes, and another movie.
 
-    The last two are the number of samples, and their smoothed residuals squared; all are weighted
-    by how well they matched.
+    Weighted by how well samples match; then the number of samples, their residual's variance, and
+    the slopes' products with the residual of another time.
     """
     frames = coefficients.shape[1]
-    result = np.zeros((len(movies.others), 12, *movies.shape))
+    result = np.zeros((len(movies.others), 14, *movies.shape))
     pairs = [(i, j) for i in range(4) for j in range(i, 4)]
     for start in range(0, movies.shape[0], _ROWS):
         rows = slice(start, start + _ROWS)
@@ -218,9 +221,15 @@ def _moments(
                 weight = _moderate(four[0]) * _moderate(four[3])
             else:
                 ratio = matches[number].ratio[rows, :, np.newaxis].astype(np.float32)
-                square = uniform_filter((four[3] - ratio * four[0]) ** 2, movies.around)
+                residual = four[3] - ratio * four[0]
+                square = uniform_filter(residual**2, movies.around)
                 weight = matches[number].trust(square, rows)
                 out[11, rows] = np.median(square, axis=2)
+                other_time = np.roll(weight * residual, frames // 2, axis=2)
+                for place in (1, 2):
+                    out[11 + place, rows] = np.einsum(
+                        "yxt,yxt,yxt->yx", weight, four[place], other_time
+                    )
             out[10, rows] = weight.sum(axis=2)
             weighted = [weight * one for one in four]
             for place, (i, j) in enumerate(pairs):
@@ -246,11 +255,11 @@ def information(
     value_noise, slope_noise = _blur_noise()
     noise = movies.noise[0] * value_noise
     tensor, gradient = np.zeros((3, *used.shape)), np.zeros((2, *used.shape))
-    chance, found = np.zeros(used.shape), []
+    chance, found, scatter, white = np.zeros(used.shape), [], 0.0, 0.0
     for moments, level in zip(
         _moments(movies, coefficients, places, matches) * used, movies.noise[1:], strict=True
     ):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh, samples, squares = moments
+        mm, my, mx, mh, yy, yx, yh, xx, xh, hh, samples, squares, null_y, null_x = moments
         samples *= movies.freedom / coefficients.shape[1]
         number = np.maximum(gaussian_filter(samples, WINDOW), 1e-9)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
@@ -268,11 +277,18 @@ def information(
         tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
         gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
         chance += weight * ratio**2 * less
+        # Noise that both filters have coloured: its products with the slopes, over white noise's.
+        for null, energy in ((null_y, yy), (null_x, xx)):
+            scatter += np.sum(gaussian_filter(weight * ratio * null, WINDOW) ** 2)
+            white += np.sum((weight * ratio) ** 2 * variance * energy) / (4.0 * np.pi * WINDOW**2)
     tensor, gradient = (
         np.stack([gaussian_filter(one, WINDOW) for one in part]) for part in (tensor, gradient)
     )
-    textured = tensor[0] + tensor[2] > _TEXTURED * gaussian_filter(chance, WINDOW)
-    tensor, gradient = _positive(tensor) * textured, gradient * textured
+    # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
+    total, less = tensor[0] + tensor[2], gaussian_filter(chance, WINDOW)
+    share = np.where(total > _TEXTURED * less, total / np.maximum(total + less, 1e-300), 0.0)
+    share /= max(scatter / white, _COLOUR) if scatter > 0 else 1.0
+    tensor, gradient = _positive(tensor) * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor), found
 
 
@@ -297,9 +313,16 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
     rough, share = whole_pixels(clipped(movies), reach)
     if not share.any():
         return None
+    at_end = np.any(np.abs(rough) == np.reshape(reach, (2, 1, 1)), axis=0)
+    if np.sum(share * at_end) > 0.5 * np.sum(share):
+        raise ValueError(
+            f"Invalid shift of the reflections: most match best {reach[0] * movies.factor} rows or "
+            f"{reach[1] * movies.factor} columns away, the end of the search. Must be less than a "
+            "third of the image."
+        )
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
     field = None
-    for _ in range(12):
+    for _ in range(8):
         off = 0.0 if field is None else np.sum((field.on(movies.centres()) - target) ** 2, axis=0)
         kept = weight / (1.0 + off / (1.0 * movies.factor) ** 2) ** 2
         tensor = np.stack([kept, 0.0 * kept, kept])
@@ -321,6 +344,6 @@ def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
         data, matches = information(movies, coefficients, shift, matches)
         field = field.spline.fitted(data, movies.centres(), field)
         change = np.abs(field.on(movies.centres()) - shift)
-        if change.max() < _CONVERGED * movies.factor:
+        if change.mean() < _CONVERGED * movies.factor:
             break
     return field, data

@@ -240,7 +240,7 @@ def _coarse(
 
 def _told(data: Information, factor: int = 1) -> Mask:
     """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
-    down, both, right = data.tensor * (4.0 * np.pi * (matching.WINDOW / factor) ** 2)
+    down, both, right = data.tensor * (4.0 * np.pi * (matching.WINDOW * factor) ** 2)
     largest = 0.5 * (down + right) + np.hypot(0.5 * (down - right), both)
     return np.asarray(largest > 1.0 / _KNOWN**2)
 

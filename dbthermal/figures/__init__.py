@@ -11,6 +11,7 @@ from dbthermal.figures._emissivity import condition_matrix, emissivity_bars, emi
 from dbthermal.figures._limits import plan
 from dbthermal.figures._live import LiveFigure, Panel
 from dbthermal.figures._scenes import (
+    reflection_shift,
     separated_film,
     separated_frames,
     separated_temperatures,
@@ -29,6 +30,7 @@ __all__ = [
     "first_reason",
     "gain_offset_maps",
     "plan",
+    "reflection_shift",
     "response_fit",
     "separated_film",
     "separated_frames",

@@ -159,6 +159,39 @@ def separated_temperatures(
     return separated_frames(inputs, emission - zero_Celsius, change, title=title, labels=labels)
 
 
+def reflection_shift(field: xr.Dataset) -> Figure:
+    """
+    Shift of the reflections between two cameras: its components and their standard deviations.
+
+    Parameters
+    ----------
+    field : Dataset
+        From `alignment.reflection_shift`, (axis, y, x) [pixel].
+
+    Returns
+    -------
+    Figure
+        Rows down above, columns to the right below. Extrapolated pixels are hatched, such without
+        a value gray.
+    """
+    figure, axes = canvas(2, 2, (7.4, 5.6))
+    extrapolated = field["shift"].isel(axis=0).notnull() & ~field["known"]
+    for row, axis, side in zip(axes, field["axis"].values, ("down", "right"), strict=True):
+        parts = {"shift": f"shift {side}", "shift_std": "standard deviation"}
+        for place, (name, title) in zip(row, parts.items(), strict=True):
+            image = field[name].sel(axis=axis)
+            scale = limits_of(image) if name == "shift" else (0.0, limits_of(image)[1])
+            draw_image(
+                figure, place, image, title, f"{title} [pixel]", cmap="viridis", limits=scale
+            )
+            if extrapolated.any():
+                place.contourf(extrapolated.values, [0.5, 1.5], colors="none", hatches=["///"])
+    bands = ", ".join(band_label(name) for name in np.atleast_1d(field.attrs["bands"]))
+    reference = band_label(field.attrs["reference_band"])
+    figure.suptitle(f"Reflection of {bands} in the picture of {reference}" + provenance_note(field))
+    return figure
+
+
 def separated_film(
     apparent: xr.DataArray, emission: xr.DataArray, change: xr.DataArray, *, title: str
 ) -> Iterator[npt.NDArray[np.uint8]]:

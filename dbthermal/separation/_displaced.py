@@ -47,9 +47,7 @@ class Displacement:
     others: list[int]  # of the second camera's bands
     resample: csr_array  # weights at p of the pixels around, p + d(p) = r (r, pixel); 0 without p
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
-    paired: Mask  # the second camera sees what is reflected at r (pixel)
-    distance: Array  # rows and columns from p to r (2, pixel) [pixel]
-    std: Array  # its standard deviation (2, pixel) [pixel]
+    std: Array  # standard deviation of the shift (2, pixel) [pixel]
 
     def source(self, rows: slice) -> slice:
         """Rows of the image that hold some rows, and what the second camera shows of them."""
@@ -98,51 +96,32 @@ def check(field: object, corrected: xr.Dataset, reference: int) -> Displacement:
             f"Invalid {label[4:]} of {largest.max():g} pixel. Must be less than the image, "
             f"{size[0]} rows and {size[1]} columns."
         )
-    return displacement(shift, std, finite, reference, len(names))
+    # Beyond where it is known the nearest shift leads on; p is where d(p) itself is known.
+    nearest = distance_transform_edt(~finite, return_distances=False, return_indices=True)
+    shift = shift[:, nearest[0], nearest[1]]
+    there = np.indices(finite.shape, dtype=np.float64)
+    place, solved = _inverse(shift, there)
+    solved &= map_coordinates(finite.astype(np.float64), place, order=0, mode="nearest") > 0
+    return Displacement(
+        shape=(shift.shape[1], shift.shape[2]),
+        reference=reference,
+        others=[band for band in range(len(names)) if band != reference],
+        resample=_interpolation(place, solved),
+        onward=_interpolation(there + shift, finite),
+        std=np.nan_to_num(std).reshape(2, -1),
+    )
 
 
 def _check_bands(field: xr.Dataset, names: list[str], reference: str) -> None:
     """Check the bands that the field says it is of, where it does."""
-    others = sorted(name for name in names if name != reference)
-    stated = str(field.attrs.get("reference_band", reference))
-    if stated != reference:
-        raise ValueError(
-            f"Invalid reference band '{stated}' of the reflection shift. "
-            f"Must be the quietest of the capture, '{reference}'."
-        )
-    bands = sorted(map(str, np.atleast_1d(field.attrs.get("bands", others))))
-    if bands != others:
-        raise ValueError(
-            f"Invalid bands {bands} of the reflection shift. Must be all but the reference, "
-            f"{others}."
-        )
-
-
-def displacement(
-    shift: Array, std: Array, finite: Mask, reference: int, bands: int
-) -> Displacement:
-    """Displacement by a shift (2, y, x) [pixel] with a deviation, where it is finite (y, x)."""
-    shape = finite.shape
-    nearest = distance_transform_edt(~finite, return_distances=False, return_indices=True)
-    shift = shift[:, nearest[0], nearest[1]]
-    there = np.indices(shape, dtype=np.float64)
-    place, solved = _inverse(shift, there)
-    at = tuple(
-        np.clip(np.rint(one), 0, size - 1).astype(np.intp)
-        for one, size in zip(place, shape, strict=True)
-    )
-    paired = solved & _inside(place, shape) & finite[at]
-    onward = there + shift
-    return Displacement(
-        shape=(shape[0], shape[1]),
-        reference=reference,
-        others=[band for band in range(bands) if band != reference],
-        resample=_interpolation(place, paired),
-        onward=_interpolation(onward, _inside(onward, shape) & finite),
-        paired=paired.ravel(),
-        distance=(there - place).reshape(2, -1),
-        std=np.where(finite, std, 0.0)[:, at[0], at[1]].reshape(2, -1),
-    )
+    others = [name for name in names if name != reference]
+    for key, rule in (("reference_band", [reference]), ("bands", others)):
+        stated = [str(name) for name in np.atleast_1d(field.attrs.get(key, rule))]
+        if sorted(stated) != sorted(rule):
+            raise ValueError(
+                f"Invalid {key} {stated} of the reflection shift. Must be {rule}: the quietest "
+                "of the capture is the reference, all others are of the second camera."
+            )
 
 
 def _inverse(shift: Array, there: Array) -> tuple[Array, Mask]:
@@ -157,18 +136,11 @@ def _inverse(shift: Array, there: Array) -> tuple[Array, Mask]:
     return place, step < _UNSOLVED
 
 
-def _inside(place: Array, shape: tuple[int, ...]) -> Mask:
-    """Return which places (2, y, x) [pixel] lie in the image, or hardly outside."""
-    last = np.array(shape)[:, np.newaxis, np.newaxis] - 1
-    return np.asarray(np.all((place >= -_OUTSIDE) & (place <= last + _OUTSIDE), axis=0))
-
-
 def _interpolation(place: Array, used: Mask) -> csr_array:
-    """Weights (pixel, pixel) of an image at places (2, y, x) [pixel]; 0 where they are not used."""
-    width = used.shape[1]
-    (row, down), (column, right) = (
-        _keys(one[used], size) for one, size in zip(place, used.shape, strict=True)
-    )
+    """Weights (pixel, pixel) of an image at its places (2, y, x) [pixel] that are used; else 0."""
+    (height, width), (last, end) = used.shape, np.array(used.shape) - 1 + _OUTSIDE
+    used = used & np.all(place >= -_OUTSIDE, axis=0) & (place[0] <= last) & (place[1] <= end)
+    (row, down), (column, right) = _keys(place[0][used], height), _keys(place[1][used], width)
     index = (row[:, np.newaxis] * width + column).reshape(16, -1).T
     weight = (down[:, np.newaxis] * right).reshape(16, -1).T
     start = np.concatenate([[0], np.cumsum(16 * used.ravel())])
@@ -226,8 +198,7 @@ def read(
     if not measured.all():  # a sample that was bridged does not count where its weight is small
         valid = valid & ((share @ ~usable.T).T <= 0.0)
         valid &= (share @ ~measured.T).T <= _LOST_WEIGHT
-    first_pixel = rows.start * displacement.shape[1]
-    unpaired = ~displacement.paired[first_pixel : first_pixel + status.size]
+    unpaired = np.diff(weights.indptr) == 0
     status |= quality.status_bits(
         {
             Status.NO_REFLECTION_PAIR: unpaired,

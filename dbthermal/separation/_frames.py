@@ -120,46 +120,36 @@ def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Ar
     """
     Smooth curves (time, pixel) of white noise of a variance (time, pixel), at valid samples.
 
-    Returns the curves and the variances that are left; a sample that is not valid is given what the
-    narrowest window that holds enough others gives, or NaN.
+    Returns the curves and the variances that are left.
     """
-    frames = len(values)
-    level = np.where(valid, values, 0.0).sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
+    count = np.maximum(valid.sum(axis=0), 1)
+    level = np.where(valid, values, 0.0).sum(axis=0) / count
+    noise = np.where(valid, variance, 0.0).sum(axis=0) / count
     centred = np.where(valid, values - level, 0.0)
-    noise = np.where(valid, variance, 0.0).sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
-    position = (time - time[0]) / max(time[-1] - time[0], 1e-300) if frames > 1 else np.zeros(1)
-    weight = valid.astype(np.float64)
+    position = (time - time[0]) / max(time[-1] - time[0], 1e-300)
     powers = position[:, np.newaxis] ** np.arange(5)
-    sums = [_cumulative(weight * powers[:, [i]]) for i in range(5)]
+    sums = [_cumulative(valid * powers[:, [i]]) for i in range(5)]
     values_sums = [_cumulative(centred * powers[:, [i]]) for i in range(3)]
-    result = np.where(valid, centred, np.nan)
-    left = np.where(valid, variance, np.inf)
+    result, left = centred, variance
     lower, upper = np.full_like(result, -np.inf), np.full_like(result, np.inf)
-    going = np.ones_like(valid)
-    previous = (result.copy(), left.copy())
+    going = valid
+    narrower = (result, left)
     half = 1
-    while half < frames:
+    while half < len(values) and np.any(going):
         estimate, share = _fit(sums, values_sums, position, half)
         deviation = np.sqrt(share * noise)
-        known = np.isfinite(estimate)
-        lower = np.where(known, np.maximum(lower, estimate - _AGREE * deviation), lower)
-        upper = np.where(known, np.minimum(upper, estimate + _AGREE * deviation), upper)
-        going &= lower <= upper
+        lower = np.fmax(lower, estimate - _AGREE * deviation)
+        upper = np.fmin(upper, estimate + _AGREE * deviation)
+        going = going & (lower <= upper)
         # One window narrower than the widest that agrees: its bias is small beside its noise.
-        better = going & np.isfinite(previous[0]) & (previous[1] <= left)
-        result, left = np.where(better, previous[0], result), np.where(better, previous[1], left)
-        first = known & ~np.isfinite(result)
-        result, left = np.where(first, estimate, result), np.where(first, share * noise, left)
-        previous = (
-            np.where(known, estimate, previous[0]),
-            np.where(known, share * noise, previous[1]),
+        better = going & (narrower[1] <= left)
+        result, left = (
+            np.where(better, *one) for one in zip(narrower, (result, left), strict=True)
         )
-        if not np.any(going):
-            break
+        narrower = (estimate, share * noise)
         half = max(half + 1, int(half * _GROWTH))
-    return result + level, np.where(
-        np.isfinite(left) & (left < variance), np.minimum(_BENT * left, variance), left
-    )
+    left = np.where(left < variance, np.minimum(_BENT * left, variance), variance)
+    return np.where(valid, result + level, np.nan), left
 
 
 def _cumulative(values: Array) -> Array:

@@ -12,10 +12,9 @@ together, frame by frame, each for the term of the larger coefficient:
 .. math:: u_1(x(r)) \leftarrow \Big[q(r) - \sum_{m > 1} c_m u_m(x(p))\Big] / c_1
 
 contracts by :math:`g = |\sum_{m > 1} c_m / c_1|` a step, for two bands
-:math:`(e_2 / e_1) / \kappa`, where the reflection is the stronger one in the second camera;
-elsewhere the same equation, solved for x(p), contracts by 1/g. Both fail for a gray body alone.
-Errors of single pixels are averaged along the chain of places, with the weights
-:math:`(1 - g) g^j`.
+:math:`(e_2 / e_1) / \kappa`; where that is above 1 the equation solved for x(p) contracts by 1/g.
+Both fail for a gray body alone. Errors of single pixels are averaged along the chain of places,
+with the weights :math:`(1 - g) g^j`.
 """
 
 from concurrent.futures import Executor
@@ -179,9 +178,12 @@ def solve(
     None, and nothing is written, where the object hardly differs between the two places.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        film, there = (_flat(result[f"{one}_temperature"]) for one in ("object", "background"))
+        film, there, stds = (
+            result[name].values.reshape(result.sizes["time"], -1)
+            for name in ("object_temperature", "background_temperature", "object_temperature_std")
+        )
         raw = _emissivity(inputs, result)
-        solved = np.all(np.isfinite(raw), axis=0) & (_finite(film) > 1)
+        solved = np.all(np.isfinite(raw), axis=0) & np.isfinite(np.fmax.reduce(film, axis=0))
         emissivity = _inside(raw)
         equations = _equations(inputs, emissivity, solved)
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
@@ -197,7 +199,7 @@ def solve(
 
         looked_at = _bridge(film[some], solved)
         here, beside, _ = both(looked_at, change[:, some])
-        std = _flat(result["object_temperature_std"])[some].astype(np.float64)
+        std = stds[some].astype(np.float64)
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
         if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
             return None
@@ -228,11 +230,6 @@ def solve(
         size = np.sqrt(np.mean(np.where(np.isfinite(std), std, 0.0) ** 2, axis=0))
         factor = _factor(inputs, equations, size, variance)
     return Joint(inputs, result, emissivity, factor, unsettled)
-
-
-def _flat(film: xr.DataArray) -> Array:
-    """View (time, pixel) of a film of the result."""
-    return film.values.reshape(film.shape[0], -1)
 
 
 def _emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
@@ -281,18 +278,10 @@ def _slope(abscissa: Array, ordinate: Array) -> Array:
     return np.where(np.isfinite(slope), slope, 1.0)
 
 
-def _finite(film: Array) -> Whole:
-    """Frames (pixel) of a film (time, pixel) with a number."""
-    number = np.zeros(film.shape[1], dtype=np.intp)
-    for frame in film:
-        number += np.isfinite(frame)
-    return number
-
-
 def _bridge(film: Array, solved: Mask) -> Array:
     """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
     frames = np.arange(len(film))
-    for pixel in np.flatnonzero(solved & (_finite(film) < len(film))):
+    for pixel in np.flatnonzero(solved & ~np.isfinite(film.sum(axis=0))):
         known = np.isfinite(film[:, pixel])
         if known.any():
             film[~known, pixel] = np.interp(frames[~known], frames[known], film[known, pixel])
@@ -312,7 +301,7 @@ def _equations(inputs: Inputs, emissivity: Array, solved: Mask) -> _Equations:
     return _Equations(
         first=np.where(solved, emissivity[0], 1.0),
         shares=shares,
-        there=_rows(there, linked),
+        there=csr_array(diags_array(linked.astype(np.float32)) @ there.astype(np.float32)),
         onward=csr_array(onward[backward].astype(np.float32)),
         forward=np.flatnonzero(linked & strong),
         backward=backward,
@@ -327,13 +316,6 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     weights.eliminate_zeros()
     used = np.diff(weights.indptr) > 0
     return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
-
-
-def _rows(weights: csr_array, used: Mask) -> csr_array:
-    """Weights in single precision, with the rows that are not used set to 0."""
-    result = csr_array(diags_array(used.astype(np.float32)) @ weights.astype(np.float32))
-    result.eliminate_zeros()
-    return result
 
 
 def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Array, Array]:

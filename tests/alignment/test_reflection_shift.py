@@ -10,28 +10,102 @@ from reproduction.experiments.pictures import Picture, smooth_shift
 RIG = simulation.Rig()
 RESPONSE = RIG.response()
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
-TIME = np.arange(300) / 10.0
+SHIFTS = [(0.0, 0.0), (0.7, 0.0), (2.4, 1.2), (6.0, 2.0)]
 
 
 def drawn(
-    seed: int, shift: tuple[float, float], picture: Picture | None = None
+    seed: int, shift: tuple[float, float], picture: Picture | None = None, frames: int = 300
 ) -> tuple[xr.Dataset, np.ndarray]:
     """Capture of people mirrored in glass, and the true shift (2, y, x) [pixel]."""
     picture, rng = picture or Picture(), np.random.default_rng(seed)
     true = smooth_shift(picture.shape, *shift)
-    scene = picture.draw(TIME, GLASS, rng, true)
+    scene = picture.draw(np.arange(frames) / 10.0, GLASS, rng, true)
     return simulation.observe(scene, RESPONSE, rng), true
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (2.4, 1.2)])
-def test_finds_a_smooth_field(shift: tuple[float, float]) -> None:
-    """Along the baseline the field is right to a few hundredths of a pixel."""
-    capture, true = drawn(21, shift)
-    field = alignment.reflection_shift(capture, RESPONSE)
-    schema.check(field, "reflection_shift")
-    error = np.abs(field["shift"].values - true)[1][field["known"].values]
-    print(f"shift {shift}: median error {np.median(error):.3f} pixel, {error.size} pixels")
-    assert error.size > 0.8 * true[0].size
-    assert np.median(error) < 0.03
+def errors(field: xr.Dataset, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors (2, pixel) [pixel] where the shift is known, and those in standard deviations."""
+    error = (field["shift"].values - true)[:, field["known"].values]
+    return error, error / field["shift_std"].values[:, field["known"].values]
+
+
+def test_finds_a_smooth_field() -> None:
+    """Along the baseline the field is right to a few hundredths of a pixel, beside bad samples."""
+    capture, true = drawn(21, (2.4, 1.2))
+    status = np.zeros(true[0].shape, dtype=np.uint32)
+    status[30, 40:44] = schema.Status.DEAD_PIXEL
+    capture["counts"][:, :, 30, 40:44] = 1e6
+    capture["counts"][1, 50] = np.nan
+    capture["counts"][0, 70:73, 10, 10] = np.nan
+    capture["status"] = ("y", "x"), status, schema.status_attrs()
+    field = schema.check(alignment.reflection_shift(capture, RESPONSE), "reflection_shift")
+    error, _ = errors(field, true)
+    print(f"median error {np.median(np.abs(error[1])):.3f} pixel of {error.shape[1]} pixels")
+    assert error.shape[1] > 0.8 * true[0].size
+    assert np.median(np.abs(error[1])) < 0.03
     assert field.attrs["reference_band"] == "8-14"
     assert field.attrs["bands"] == ["9.5"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shift", SHIFTS)
+def test_error_is_what_it_is_said_to_be(shift: tuple[float, float]) -> None:
+    """Over seeds, errors along the baseline are small, and as large as their deviation."""
+    found = [errors(alignment.reflection_shift(c, RESPONSE), t) for c, t in drawings(shift)]
+    error, score = (np.concatenate(part, axis=1) for part in zip(*found, strict=True))
+    print(f"{shift}: median {np.median(np.abs(error[1])):.3f}, score {np.std(score[1]):.2f}")
+    assert np.median(np.abs(error[1])) < 0.03
+    assert 0.6 < np.sqrt(np.mean(score[1] ** 2)) < 1.6
+
+
+def drawings(shift: tuple[float, float]) -> list[tuple[xr.Dataset, np.ndarray]]:
+    """Three captures of a shift."""
+    return [drawn(seed, shift) for seed in (41, 42, 43)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rise", [(0.5, 2.0), (2.0, 6.0)])
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (2.4, 1.2), (6.0, 2.0)])
+def test_rapid_object_does_not_pull_the_field(
+    rise: tuple[float, float], shift: tuple[float, float]
+) -> None:
+    """Emission that changes rapidly is at one place in both bands, and still no shift of 0."""
+    capture, true = drawn(44, shift, Picture(rise=rise))
+    error, _ = errors(alignment.reflection_shift(capture, RESPONSE), true)
+    print(f"{rise} s, {shift}: median {np.median(np.abs(error), axis=1)} pixel")
+    assert error.shape[1] > 0.7 * true[0].size
+    assert np.median(np.abs(error[1])) < 0.03
+
+
+@pytest.mark.slow
+def test_large_field() -> None:
+    """Tens of pixels are found from coarse pictures to fine ones."""
+    capture, true = drawn(45, (45.0, 8.0), Picture(shape=(160, 240)), frames=150)
+    error, _ = errors(alignment.reflection_shift(capture, RESPONSE), true)
+    print(f"median {np.median(np.abs(error), axis=1)} pixel of {error.shape[1]}")
+    assert error.shape[1] > 0.5 * true[0].size
+    assert np.median(np.abs(error[1])) < 0.05
+
+
+def test_refuses_what_tells_no_shift() -> None:
+    """Still pictures, one band, few rows and few frames are errors that say so."""
+    rng = np.random.default_rng(1)
+    counts = rng.normal(20000.0, 4.0, (2, 60, 30, 32)).astype(np.float32)
+    places = {"band": list(RIG.bands), "time": np.arange(60) / 10.0}
+    still = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)}, places)
+    with pytest.raises(ValueError, match="Missing texture"):
+        alignment.reflection_shift(still, RESPONSE)
+    with pytest.raises(ValueError, match="Must be two or more"):
+        alignment.reflection_shift(still.isel(band=[0]), RESPONSE)
+    with pytest.raises(ValueError, match="20 rows"):
+        alignment.reflection_shift(still.isel(y=slice(20)), RESPONSE)
+    with pytest.raises(ValueError, match="10 frames"):
+        alignment.reflection_shift(still.isel(time=slice(10)), RESPONSE)
+
+
+@pytest.mark.slow
+def test_refuses_a_shift_beyond_a_third_of_the_image() -> None:
+    """What matches at the end of the search is no shift."""
+    capture, _ = drawn(46, (22.0, 0.0), Picture(shape=(40, 48)), frames=150)
+    with pytest.raises(ValueError, match="less than a third of the image"):
+        alignment.reflection_shift(capture, RESPONSE)

@@ -95,6 +95,16 @@ def draw_reasons(**attrs: object) -> Figure:
     return figures.status(xr.Dataset(flags, attrs=attrs))
 
 
+def draw_shift(fill: float = 1.0, **attrs: object) -> Figure:
+    """Draw a shift that is known at all pixels but one, where it is extrapolated."""
+    shift = (fill * array("axis y x", 2, 5, 6)).assign_coords(axis=["y", "x"])
+    known = xr.ones_like(shift[0], dtype=bool)
+    known[1, 2] = False
+    field = {"shift": shift, "shift_std": abs(0.1 * shift), "known": known}
+    bands = {"reference_band": BANDS[0], "bands": list(BANDS[1:])}
+    return figures.reflection_shift(xr.Dataset(field, attrs={**attrs, **bands}))
+
+
 DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     "gain_offset_maps": (
         lambda fill=1.0, **attrs: figures.gain_offset_maps(correction(fill, **attrs)),
@@ -120,6 +130,10 @@ DRAWN: dict[str, tuple[Callable[..., Figure], set[str]]] = {
     "separated_temperatures": (
         draw_temperatures,
         {f"apparent [{DEGREE}]", f"object [{DEGREE}]", "background change [K]"},
+    ),
+    "reflection_shift": (
+        draw_shift,
+        {"shift down [pixel]", "shift right [pixel]", "standard deviation [pixel]"},
     ),
     "plan": (
         draw_plan,

@@ -195,7 +195,7 @@ def _complete_rows(scene: Scene, rows: slice, completed: xr.Dataset) -> None:
         places = tiles.numbers(window, block.sizes["x"])
         tile, valid = scene.tile(block.isel(y=local[0], x=local[1]), grains)
         wanted = valid.any(axis=0) & lacking[local].ravel()
-        sources = np.where(wanted, scene.sources(places), -1)
+        sources = np.where(wanted, scene.source[places], -1)
         for source in np.unique(sources[wanted]):
             here = sources == source
             part = (tile.select_pixels(here), valid[:, here])

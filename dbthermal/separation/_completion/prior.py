@@ -7,8 +7,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import emissivity, schema
-from dbthermal.separation._quality import Bits
-from dbthermal.separation._tiles import Array, Mask, Whole
+from dbthermal.separation._tiles import Array, Whole
 
 SAMPLE_STD: Final = 0.02
 """Deviation of the emissivity of one sample of a material from that of the table [1]."""
@@ -64,23 +63,6 @@ class Mixture:
     def at(self, places: Whole | int) -> "Mixture":
         """Return the mixture of some pixels, or of labels (pixel,)."""
         return Mixture(self.weight, self.mean[..., places], self.covariance[..., places])
-
-
-def of_materials(
-    value: Array, covariance: Array, status: Bits, labels: Whole
-) -> tuple[Mixture, Mask]:
-    """Pooled emissivities of each label, as in its pixels without a flag, and the labels of any."""
-    count = int(labels.max(initial=-1)) + 1
-    mean = np.full((len(value), count + 1), 0.5)
-    spread = np.repeat(np.eye(len(value))[..., np.newaxis], count + 1, axis=2)
-    known = np.zeros(count + 1, dtype=bool)
-    good = (status == 0) & np.all((value > 0) & (value < 1), axis=0)
-    for label in np.unique(labels[good & (labels >= 0)]):
-        here = good & (labels == label)
-        mean[:, label] = np.median(value[:, here], axis=1)
-        spread[..., label] = np.median(covariance[..., here], axis=-1)
-        known[label] = True
-    return Mixture(np.ones(1), mean[np.newaxis], spread[np.newaxis]), known
 
 
 def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> Mixture:

@@ -50,32 +50,20 @@ class Scene:
     """All that is known of a scene; bands in the order of their noise, pixels of the image flat."""
 
     inputs: Inputs
-    status: Array  # of the result (pixel)
-    emissivity: Array  # as measured (band, pixel) [1], NaN where not
+    source: Whole  # of the emissivities (pixel)
+    emissivity: Array  # measured, in the pixel or in its material (band, pixel) [1]
     covariance: Array  # (band, band, pixel) [1]
-    labels: Whole  # material (pixel), -1 for none
-    material: Mixture  # of each label, and of none
-    material_known: Mask  # (label + 1,)
-    general: Mixture  # of any pixel
+    general: Mixture  # prior on the emissivities of any pixel
     offset: Array  # deviation of a pixel's offset against the others, of the other bands [K]
     level: Level
     apart: bool  # the cameras do not see the same reflection in a pixel
 
-    def sources(self, places: Whole) -> Whole:
-        """Source of the emissivities of pixels (pixel)."""
-        value, covariance = self.emissivity[:, places], self.covariance[..., places]
-        known = (value > 0) & (value < 1) & np.isfinite(covariance).all(axis=0)
-        by_material = self.material_known[self.labels[places]]
-        return np.where(known.all(axis=0), OWN, np.where(by_material, MATERIAL, PRIOR))
-
     def mixture(self, source: int, places: Whole) -> Mixture:
         """Prior on the emissivities of pixels of one source."""
-        if source == OWN:
-            value, covariance = self.emissivity[:, places], self.covariance[..., places]
-            return Mixture(np.ones(1), value[np.newaxis], covariance[np.newaxis])
-        if source == MATERIAL:
-            return self.material.at(self.labels[places])
-        return self.general.at(np.zeros_like(places))
+        if source == PRIOR:
+            return self.general.at(np.zeros_like(places))
+        value, covariance = self.emissivity[:, places], self.covariance[..., places]
+        return Mixture(np.ones(1), value[np.newaxis], covariance[np.newaxis])
 
     def kelvin(self, signal: Any) -> Array:
         """Temperature [K] of signals of the quietest band, less its reference."""
@@ -103,8 +91,8 @@ class Scene:
     def sample(self) -> tuple[Tile, Mask, Whole]:
         """Tile of evenly spaced pixels, their valid samples, and their numbers in the image."""
         capture = self.inputs.capture
-        numbers = np.arange(self.labels.size).reshape(capture.sizes["y"], capture.sizes["x"])
-        every = slice(None, None, max(1, int(np.sqrt(self.labels.size / _SAMPLE))))
+        numbers = np.arange(self.source.size).reshape(capture.sizes["y"], capture.sizes["x"])
+        every = slice(None, None, max(1, int(np.sqrt(self.source.size / _SAMPLE))))
         return *self.tile(capture.isel(y=every, x=every).load()), numbers[every, every].ravel()
 
 
@@ -113,21 +101,23 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
     bands = inputs.bands
     value, shared = (_flat(one["emissivity"])[bands] for one in (result, pooled))
     covariance, shared_covariance = (_covariance(one, bands) for one in (result, pooled))
-    status = result["status"].values.ravel()
-    labels = np.full(status.size, -1) if inputs.labels is None else inputs.labels
-    flags = pooled["status"].values.ravel()
-    material, known = priors.of_materials(shared, shared_covariance, flags, labels)
+    known = np.all((value > 0) & (value < 1) & np.isfinite(covariance).all(axis=0), axis=0)
+    source = np.where(known, OWN, PRIOR)
+    labels = np.full(source.size, -1) if inputs.labels is None else inputs.labels
+    told = (pooled["status"].values.ravel() == 0) & np.all((shared > 0) & (shared < 1), axis=0)
+    for label in np.unique(labels[told & (labels >= 0)]):
+        here, wanted = told & (labels == label), ~known & (labels == label)
+        value[:, wanted] = np.median(shared[:, here], axis=-1)[..., np.newaxis]
+        covariance[..., wanted] = np.median(shared_covariance[..., here], axis=-1)[..., np.newaxis]
+        source[wanted] = MATERIAL
     names = [str(result["band"].values[band]) for band in bands]
     pattern = (np.zeros(len(bands)) if inputs.pattern is None else inputs.pattern)[bands]
     curve = inputs.curves[bands[0]]
     return Scene(
         inputs=inputs,
-        status=status,
+        source=source,
         emissivity=value,
         covariance=covariance,
-        labels=labels,
-        material=material,
-        material_known=known,
         general=priors.stated(prior, names),
         offset=np.hypot(pattern[1:], pattern[0]),
         level=Level(float(curve.signal(_ROOM[0])) - curve.reference, _ROOM[1], _FLUCTUATION),
@@ -155,7 +145,8 @@ def require_same_capture(scene: Scene, result: xr.Dataset) -> None:
     with np.errstate(all="ignore"):
         mixed = tile.mixed(scene.emissivity[:, places], np.array(films, dtype=np.float64))
         score = np.abs(tile.signals - mixed) / np.array(tile.noise)[:, np.newaxis, np.newaxis]
-    score = score[:, valid & (scene.status[places] == 0) & np.isfinite(score).all(axis=0)]
+    sound = (result["status"].values.ravel()[places] == 0) & (scene.source[places] == OWN)
+    score = score[:, valid & sound & np.isfinite(score).all(axis=0)]
     if score.size and np.median(score) > _STRANGE:
         raise ValueError(
             f"Invalid result: its values are {np.median(score):.0f} times the noise off the "
@@ -232,7 +223,7 @@ def find_level(scene: Scene) -> Level:
     scatter that they do not explain, which is how much pixels differ.
     """
     tile, valid, places = scene.sample()
-    sources = np.where(valid.any(axis=0), scene.sources(places), -1)
+    sources = np.where(valid.any(axis=0), scene.source[places], -1)
     parts = [
         solve(scene, tile.select_pixels(here), valid[:, here], int(source), places[here])[1]
         for source in np.unique(sources[sources >= 0])

@@ -10,12 +10,14 @@ from scipy.ndimage import gaussian_filter
 
 from dbthermal import correction, simulation
 from dbthermal.calibration import fit_response
+from dbthermal.schema import Status
 from dbthermal.simulation import Rig
 from reproduction.experiments.nuisances import GLASS
 from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
+from reproduction.experiments.stress import INTERVAL
 
 # Heating that differs from place to place, by so much [1], over so many pixels: the detail.
-_UNEVEN, _DETAIL = 0.1, 2.0
+_UNEVEN, _DETAIL = 0.05, 3.0
 _STEPS: Final = 2  # of the scene's clock in a frame
 
 
@@ -37,9 +39,8 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     shift: Sequence[float],
     view: Sequence[int],
     late: int,
-    lost: float,
+    lost: Sequence[float],
     shutter: Sequence[float],
-    spoiled: float,
     steps: int,
     frames: int,
 ) -> Recording:
@@ -49,8 +50,8 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     The clock is the number of frames and their rate [Hz]. The cameras stand apart, so that the
     second sees the reflections at a `shift` that varies, see `pictures.smooth_shift` [pixel]; it
     looks by `view` to the right and down [pixel], and is exposed `late` halves of a frame later.
-    Of each band's frames a share `lost` is replaced by the one before, both shutters close at
-    `shutter`, shares of the capture, and a share `spoiled` of the pixels is bad. The blackbody has
+    Both shutters close at `shutter`, shares of the capture; `lost` are the shares of each band's
+    frames that are replaced by the one before, and of the pixels that are bad. The blackbody has
     so many `steps` of temperature, of so many `frames` each. The clean capture is of one place and
     one clock, with the same noise. All is simulated.
     """
@@ -81,10 +82,10 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
         y=slice(top, top + shape[0]),
         x=slice(left, left + shape[1]),
     ).assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
-    seen = simulation.spoil_pixels(seen, spoiled, rng).drop_vars("spoiled")
+    seen = simulation.spoil_pixels(seen, lost[1], rng).drop_vars("spoiled")
     last = float(seen["time"][-1])
     seen = simulation.fire_shutter(seen, last * np.array(shutter), rng)
-    seen = simulation.lose_frames(seen, lost, rng).drop_vars("repeated")
+    seen = simulation.lose_frames(seen, lost[0], rng).drop_vars("repeated")
     detector = simulation.pattern(rig, (shape[0], shape[1]), rng)
     kelvin = np.linspace(rig.lowest + 10.0, rig.highest - 5.0, steps)
     one_place = truth.assign(background_temperature=truth["background_temperature"].isel(band=0))
@@ -96,8 +97,40 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     )
 
 
+def registration(view: Sequence[int]) -> xr.DataArray:
+    """Transform of the second view, see `record`, as measured on a target with detail."""
+    matrices = np.stack([np.eye(3), np.eye(3)])
+    matrices[1, :2, 2] = -view[0], -view[1]
+    bands = {"band": list(Rig().bands)}
+    return xr.DataArray(matrices, dims=("band", "row", "column"), coords=bands)
+
+
 def calibrate(movies: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
     """Correction and response of the movies of a blackbody."""
     statistics = correction.blackbody_statistics(movies)
     fitted = correction.fit_correction(statistics)
     return fitted, fit_response(fitted["level"], statistics["noise"])
+
+
+def score(scene: xr.Dataset, result: xr.Dataset) -> dict[str, float]:
+    """
+    Errors of a result of a scene, by name with unit.
+
+    Of the pixels that are measured, which a bridged frame leaves them, the median over pixels of
+    the object's RMSE and the share of 95 % intervals that hold it; these of all that have a value,
+    completed or flagged ones too; and the shares of pixels that are measured, and that have one.
+    """
+    times = {"time": result["time"].values}
+    truth = scene["object_temperature"].interp(times, kwargs={"fill_value": "extrapolate"})
+    error = result["object_temperature"] - truth.assign_coords(time=result["time"])
+    inside = (abs(error) < INTERVAL * result["object_temperature_std"]).where(error.notnull())
+    rmse = (error**2).mean("time") ** 0.5
+    measured = (result["status"] & ~np.uint32(Status.COMPLETED_FRAMES)) == 0
+    return {
+        "object RMSE, measured [K]": float(rmse.where(measured).median()),
+        "object RMSE, all [K]": float(rmse.median()),
+        "95 % intervals hold, measured [1]": float(inside.where(measured).mean()),
+        "95 % intervals hold, all [1]": float(inside.mean()),
+        "pixels measured [1]": float(measured.mean()),
+        "pixels with a value [1]": float(error.notnull().any("time").mean()),
+    }
