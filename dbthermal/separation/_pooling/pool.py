@@ -67,9 +67,8 @@ def estimate(labels: Labels, count: int, survey: Survey, noise: Array) -> Materi
         sound = np.where(told > 0, labels, -1)
         outliers = _outliers(labels, _ratios(sound, count, survey, noise), survey, noise)
         # Near black the few that have an emissivity alone are selected by their own ratio.
-        most = _sum(labels, told, count) > _MAJORITY * _sum(
-            labels, (survey.frames > 0) * 1.0, count
-        )
+        surveyed = np.where(survey.frames > 0, 1.0, 0.0)
+        most = _sum(labels, told, count) > _MAJORITY * _sum(labels, surveyed, count)
         outliers &= np.append(most, False)[labels]
         used = np.where(outliers, -1, labels)
         for _ in range(_ROUNDS):
