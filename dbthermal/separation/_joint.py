@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from numpy.polynomial import Polynomial
-from scipy.ndimage import gaussian_filter1d, uniform_filter
+from scipy.ndimage import convolve, gaussian_filter1d
 from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
@@ -191,6 +191,7 @@ def solve(
         curve = inputs.curves[inputs.bands[0]]
         shares = _coefficients(inputs, raw, solved)
 
+        @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread it runs in
         def both(alone: Array, change: Array) -> tuple[Array, Array, Array]:
             signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
             signal = np.ascontiguousarray(signal.T, dtype=np.float32)
@@ -199,9 +200,10 @@ def solve(
 
         looked_at = _bridge(film[some], solved)
         here, beside, _ = both(looked_at, change[:, some])
-        std = stds[some].astype(np.float64)
+        # In units of the deviation or, of a method without one, of the noise.
+        std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
-        if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
+        if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
         for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
             # A gradient as steep as the object's own change turns the step round: divide by it.
@@ -227,7 +229,7 @@ def solve(
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
             )
             unsettled |= step > 10.0 * _CONVERGED
-        size = np.sqrt(np.mean(np.where(np.isfinite(std), std, 0.0) ** 2, axis=0))
+        size = np.where(solved, np.sqrt(np.mean(std**2, axis=0)), 0.0)
         factor = _factor(inputs, equations, size, variance)
     return Joint(inputs, result, emissivity, factor, unsettled)
 
@@ -362,7 +364,7 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
     displacement = inputs.displacement
     assert displacement is not None
     rng = np.random.default_rng(inputs.seed)
-    size = np.where(np.isfinite(std), std, 0.0)[:, np.newaxis]
+    size = std[:, np.newaxis]
     drawn = displacement.resample @ rng.standard_normal((size.size, _DRAWS))
     gain = np.sqrt(np.asarray((displacement.resample**2).sum(axis=1)).ravel())[:, np.newaxis]
     alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
@@ -371,11 +373,10 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
     signal, _, _ = linear.solve(alone, alone, change)
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
-        uniform_filter(np.reshape(one, displacement.shape), 3).ravel()
+        convolve(np.reshape(one, displacement.shape), np.ones((3, 3))).ravel()
         for one in (np.nan_to_num(signal.astype(np.float64) ** 2).mean(axis=1), size**2)
     )
-    own = size[:, 0] > 0  # elsewhere the running sums are rounding
-    return np.where(own, energy / np.where(own, total, 1.0), 1.0)
+    return np.divide(energy, total, out=np.ones_like(energy), where=size[:, 0] > 0)
 
 
 def _bends(curves: list[Curve]) -> list[Polynomial]:
