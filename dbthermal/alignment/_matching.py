@@ -313,6 +313,13 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
     rough, share = whole_pixels(clipped(movies), reach)
     if not share.any():
         return None
+    at_end = np.any(np.abs(rough) == np.reshape(reach, (2, 1, 1)), axis=0)
+    if np.sum(share * at_end) > 0.5 * np.sum(share):
+        raise ValueError(
+            f"Invalid shift of the reflections: most match best {reach[0] * movies.factor} rows or "
+            f"{reach[1] * movies.factor} columns away, the end of the search. Must be less than a "
+            "third of the image."
+        )
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
     field = None
     for _ in range(8):

@@ -101,3 +101,11 @@ def test_refuses_what_tells_no_shift() -> None:
         alignment.reflection_shift(still.isel(y=slice(20)), RESPONSE)
     with pytest.raises(ValueError, match="10 frames"):
         alignment.reflection_shift(still.isel(time=slice(10)), RESPONSE)
+
+
+@pytest.mark.slow
+def test_refuses_a_shift_beyond_a_third_of_the_image() -> None:
+    """What matches at the end of the search is no shift."""
+    capture, _ = drawn(46, (22.0, 0.0), Picture(shape=(40, 48)), frames=150)
+    with pytest.raises(ValueError, match="less than a third of the image"):
+        alignment.reflection_shift(capture, RESPONSE)

@@ -39,9 +39,8 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     shift: Sequence[float],
     view: Sequence[int],
     late: int,
-    lost: float,
+    lost: Sequence[float],
     shutter: Sequence[float],
-    spoiled: float,
     steps: int,
     frames: int,
 ) -> Recording:
@@ -51,8 +50,8 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     The clock is the number of frames and their rate [Hz]. The cameras stand apart, so that the
     second sees the reflections at a `shift` that varies, see `pictures.smooth_shift` [pixel]; it
     looks by `view` to the right and down [pixel], and is exposed `late` halves of a frame later.
-    Of each band's frames a share `lost` is replaced by the one before, both shutters close at
-    `shutter`, shares of the capture, and a share `spoiled` of the pixels is bad. The blackbody has
+    Both shutters close at `shutter`, shares of the capture; `lost` are the shares of each band's
+    frames that are replaced by the one before, and of the pixels that are bad. The blackbody has
     so many `steps` of temperature, of so many `frames` each. The clean capture is of one place and
     one clock, with the same noise. All is simulated.
     """
@@ -83,10 +82,10 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
         y=slice(top, top + shape[0]),
         x=slice(left, left + shape[1]),
     ).assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
-    seen = simulation.spoil_pixels(seen, spoiled, rng).drop_vars("spoiled")
+    seen = simulation.spoil_pixels(seen, lost[1], rng).drop_vars("spoiled")
     last = float(seen["time"][-1])
     seen = simulation.fire_shutter(seen, last * np.array(shutter), rng)
-    seen = simulation.lose_frames(seen, lost, rng).drop_vars("repeated")
+    seen = simulation.lose_frames(seen, lost[0], rng).drop_vars("repeated")
     detector = simulation.pattern(rig, (shape[0], shape[1]), rng)
     kelvin = np.linspace(rig.lowest + 10.0, rig.highest - 5.0, steps)
     one_place = truth.assign(background_temperature=truth["background_temperature"].isel(band=0))
