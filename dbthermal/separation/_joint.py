@@ -193,6 +193,7 @@ def solve(
         curve = inputs.curves[inputs.bands[0]]
         shares = _coefficients(inputs, raw, solved)
 
+        @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread it runs in
         def both(alone: Array, change: Array) -> tuple[Array, Array, Array]:
             signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
             signal = np.ascontiguousarray(signal.T, dtype=np.float32)
@@ -201,9 +202,10 @@ def solve(
 
         looked_at = _bridge(film[some], solved)
         here, beside, _ = both(looked_at, change[:, some])
-        std = stds[some].astype(np.float64)
+        # In units of the deviation or, of a method without one, of the noise.
+        std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
-        if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
+        if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
         for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
             # A gradient as steep as the object's own change turns the step round: divide by it.
@@ -229,7 +231,7 @@ def solve(
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
             )
             unsettled |= step > 10.0 * _CONVERGED
-        size = np.sqrt(np.mean(np.where(np.isfinite(std), std, 0.0) ** 2, axis=0))
+        size = np.where(solved, np.sqrt(np.mean(std**2, axis=0)), 0.0)
         factor = _factor(inputs, equations, size, variance)
         unsettled |= np.isnan(factor)
     return Joint(inputs, result, emissivity, factor, unsettled)
@@ -365,7 +367,7 @@ def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) 
     displacement = inputs.displacement
     assert displacement is not None
     rng = np.random.default_rng(inputs.seed)
-    size = np.where(np.isfinite(std), std, 0.0)[:, np.newaxis]
+    size = std[:, np.newaxis]
     drawn = displacement.resample @ rng.standard_normal((size.size, _DRAWS))
     gain = np.sqrt(np.asarray((displacement.resample**2).sum(axis=1)).ravel())[:, np.newaxis]
     alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
