@@ -61,6 +61,8 @@ _MOST: Final = 0.99
 # from which the iteration is taken to grow.
 _DRAWS: Final = 64
 _GROWN: Final = 1e3
+# Share of an error that a step may leave.
+_LARGEST: Final = 0.95
 # Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
 _MARGIN: Final = 0.02
 # Rows of the capture that are read at once.
@@ -301,7 +303,10 @@ def _equations(inputs: Inputs, emissivity: Array, solved: Mask) -> _Equations:
     there, linked = _among(displacement.resample, solved, displacement.shape[1])
     onward, reached = _among(displacement.onward, solved, displacement.shape[1])
     strong = np.abs(shares[1:].sum(axis=0)) < np.abs(shares[0])
-    linked &= strong | reached
+    # The error of a step: only where it contracts, with the weights' signs, are places linked.
+    gain = np.abs(shares[1:].sum(axis=0) / shares[0])
+    forward, back = (np.asarray(abs(one).sum(axis=1)).ravel() for one in (there, onward))
+    linked &= np.where(strong, gain * forward < _LARGEST, reached & (back < _LARGEST * gain))
     backward = np.flatnonzero(linked & ~strong)
     return _Equations(
         first=np.where(solved, emissivity[0], 1.0),
