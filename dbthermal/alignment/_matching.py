@@ -52,7 +52,6 @@ _SIGNIFICANT: Final = 40.0
 _TAIL: Final = 4.0  # variances of the residual at which a sample has half its weight
 _COLOUR: Final = 0.05  # least variance of coloured noise over that of white noise
 _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
-_TEXTURED: Final = 0.3  # least information over that which noise pretends, of a pixel that counts
 # Rough matches count as if each were known so well [pixel].
 _ROUGH: Final = 0.5
 # Pixels between two nodes, at least, and nodes along the longer side, at most.
@@ -90,15 +89,11 @@ class Spline:
     @cached_property
     def bending(self) -> sparse.csr_array:
         """Second differences of the nodes: down, right, and twice the mixed one."""
-        first, second = (
-            [np.diff(np.eye(n), order, axis=0) for n in self.nodes] for order in (1, 2)
+        (row, *rows), (column, *columns) = (
+            [np.diff(np.eye(n), order, axis=0) for order in (0, 1, 2)] for n in self.nodes
         )
-        one = [np.eye(n) for n in self.nodes]
-        parts = [
-            np.kron(second[0], one[1]),
-            np.kron(one[0], second[1]),
-            np.sqrt(2.0) * np.kron(first[0], first[1]),
-        ]
+        mixed = np.sqrt(2.0) * np.kron(rows[0], columns[0])
+        parts = [np.kron(rows[1], column), np.kron(row, columns[1]), mixed]
         return sparse.csr_array(np.concatenate(parts))
 
     def values(self, centres: list[Array]) -> list[Array]:
@@ -114,9 +109,8 @@ class Spline:
         self, data: Information, centres: list[Array], around: "Field | None" = None
     ) -> "Field":
         """Field of information at places, which is on steps from another field, or from 0."""
-        values = self.values(centres)
-        matrix = _normal(data.tensor, values)
-        rows, columns = values
+        rows, columns = self.values(centres)
+        matrix = _normal(data.tensor, rows, columns)
         target = np.concatenate([(rows.T @ part @ columns).ravel() for part in data.gradient])
         bends = self.bending
         sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
@@ -158,18 +152,12 @@ class Field:
         return np.stack([rows @ part @ columns.T for part in parts])
 
     def variances(self, centres: list[Array]) -> Array:
-        """Covariance (3, y, x) of the displacement at each place [pixel^2]."""
+        """Variance (2, y, x) of the displacement at each place [pixel^2]."""
         rows, columns = (_pairs(part) for part in self.spline.values(centres))
         height, width = self.spline.nodes
-        half = height * width
-        parts = [(0, 0), (0, half), (half, half)]
-        result = []
-        for i, j in parts:
-            square = self.covariance[i : i + half, j : j + half]
-            block = square.reshape(height, width, height, width).transpose(0, 2, 1, 3)
-            pairs = block.reshape(height**2, width**2)
-            result.append(rows @ pairs @ columns.T)
-        return np.stack(result)
+        blocks = self.covariance.reshape(2, height, width, 2, height, width)
+        parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
+        return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in parts])
 
 
 def _pairs(values: Array) -> Array:
@@ -177,13 +165,11 @@ def _pairs(values: Array) -> Array:
     return (values[:, :, np.newaxis] * values[:, np.newaxis]).reshape(len(values), -1)
 
 
-def _normal(tensor: Array, values: list[Array]) -> Array:
+def _normal(tensor: Array, rows: Array, columns: Array) -> Array:
     """Normal matrix of the nodes, of rows and then of columns, from the tensors of the pixels."""
-    rows, columns = (_pairs(part) for part in values)
-    height, width = (part.shape[1] for part in values)
-    blocks = []
+    (height, width), blocks = (rows.shape[1], columns.shape[1]), []
     for part in tensor:
-        sums = (rows.T @ part @ columns).reshape(height, height, width, width)
+        sums = (_pairs(rows).T @ part @ _pairs(columns)).reshape(height, height, width, width)
         blocks.append(sums.transpose(0, 2, 1, 3).reshape(height * width, -1))
     return np.block([[blocks[0], blocks[1]], [blocks[1], blocks[2]]])
 
@@ -389,7 +375,7 @@ def _information(
     )
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
     total = tensor[0] + tensor[2]
-    share = np.where(total > _TEXTURED * less, total / np.maximum(total + less, 1e-300), 0.0)
+    share = np.maximum(total, 0.0) / np.maximum(total + less, 1e-300)
     share /= max(scatter / white, _COLOUR) if scatter > 0 else 1.0
     tensor, gradient = _positive(tensor) * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor), found

@@ -215,7 +215,7 @@ def _told(data: Information, factor: int = 1) -> Mask:
 def _agree(robust: Field, other: Field, centres: list[Array]) -> bool:
     """Return whether a field lies within the deviation of another one that is more robust."""
     apart = (robust.on(centres) - other.on(centres)) ** 2
-    return bool(np.mean(apart / robust.variances(centres)[[0, 2]]) < _AGREE**2)
+    return bool(np.mean(apart / robust.variances(centres)) < _AGREE**2)
 
 
 def _freedom(frames: int, period: float) -> float:
@@ -274,7 +274,7 @@ def _result(
     """Field as a dataset, NaN far from where it is known."""
     shape = capture.valid.shape
     centres = [np.arange(size, dtype=np.float64) for size in shape]
-    shift, variance = field.on(centres), field.variances(centres)[[0, 2]]
+    shift, variance = field.on(centres), field.variances(centres)
     reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
     known = _told(data) & reached
     distance = np.asarray(distance_transform_edt(~known))
