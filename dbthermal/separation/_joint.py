@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from numpy.polynomial import Polynomial
-from scipy.ndimage import gaussian_filter1d, uniform_filter
+from scipy.ndimage import convolve, gaussian_filter1d
 from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
@@ -57,8 +57,10 @@ _FRAMES: Final = 8
 _LOOKED_AT: Final = 32
 _MATTERS: Final = 0.2
 _MOST: Final = 0.99
-# Draws of noise by which the deviations are propagated.
+# Draws of noise by which the deviations are propagated, and the variance over that of a pixel alone
+# from which the iteration is taken to grow.
 _DRAWS: Final = 64
+_GROWN: Final = 1e3
 # Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
 _MARGIN: Final = 0.02
 # Rows of the capture that are read at once.
@@ -191,6 +193,7 @@ def solve(
         curve = inputs.curves[inputs.bands[0]]
         shares = _coefficients(inputs, raw, solved)
 
+        @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread it runs in
         def both(alone: Array, change: Array) -> tuple[Array, Array, Array]:
             signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
             signal = np.ascontiguousarray(signal.T, dtype=np.float32)
@@ -199,9 +202,10 @@ def solve(
 
         looked_at = _bridge(film[some], solved)
         here, beside, _ = both(looked_at, change[:, some])
-        std = stds[some].astype(np.float64)
+        # In units of the deviation or, of a method without one, of the noise.
+        std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
-        if not np.any(share > 0) or np.nanquantile(share, _MOST) <= _MATTERS:
+        if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
         for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
             # A gradient as steep as the object's own change turns the step round: divide by it.
@@ -227,8 +231,9 @@ def solve(
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
             )
             unsettled |= step > 10.0 * _CONVERGED
-        size = np.sqrt(np.mean(np.where(np.isfinite(std), std, 0.0) ** 2, axis=0))
+        size = np.where(solved, np.sqrt(np.mean(std**2, axis=0)), 0.0)
         factor = _factor(inputs, equations, size, variance)
+        unsettled |= np.isnan(factor)
     return Joint(inputs, result, emissivity, factor, unsettled)
 
 
@@ -355,27 +360,29 @@ def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Ar
 
 def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) -> Array:
     """
-    Variance (pixel) [1] of the object over that of a pixel alone, by draws of the noise.
+    Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
 
     The `std` (pixel) [K] is that of a pixel alone; the `variance` (loose) [K^2] that of the change.
     """
     displacement = inputs.displacement
     assert displacement is not None
     rng = np.random.default_rng(inputs.seed)
-    size = np.where(np.isfinite(std), std, 0.0)[:, np.newaxis]
+    size = std[:, np.newaxis]
     drawn = displacement.resample @ rng.standard_normal((size.size, _DRAWS))
     gain = np.sqrt(np.asarray((displacement.resample**2).sum(axis=1)).ravel())[:, np.newaxis]
     alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
     linear = replace(equations, bends=[Polynomial([0.0])] * len(equations.bends))
     signal, _, _ = linear.solve(alone, alone, change)
+    own, power = size[:, 0] > 0, (signal.astype(np.float64) ** 2).mean(axis=1)
+    settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     energy, total = (
-        uniform_filter(np.reshape(one, displacement.shape), 3).ravel()
-        for one in (np.nan_to_num(signal.astype(np.float64) ** 2).mean(axis=1), size**2)
+        convolve(np.where(settled, one, 0.0).reshape(displacement.shape), np.ones((3, 3))).ravel()
+        for one in (power, size[:, 0] ** 2)
     )
-    own = size[:, 0] > 0  # elsewhere the running sums are rounding
-    return np.where(own, energy / np.where(own, total, 1.0), 1.0)
+    factor = np.divide(energy, total, out=np.full_like(energy, np.nan), where=settled)
+    return np.where(own, factor, 1.0)
 
 
 def _bends(curves: list[Curve]) -> list[Polynomial]:

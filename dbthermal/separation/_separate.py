@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # Share of the pixels with moving reflections whose bands are apart, from which a shift is sought.
 _APART: Final = 0.02
+# Rows and columns, at least, in which a shift can be found.
+_WIDE: Final = 24
 
 
 def separate(  # noqa: PLR0913 - all but the first two by name
@@ -87,7 +89,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     source = "none" if reflection_shift is None else "given"
     alone = one(reflection_shift=reflection_shift)
-    if reflection_shift is None and _share_apart(alone) > _APART:
+    wide = min(corrected.sizes["y"], corrected.sizes["x"]) >= _WIDE
+    if reflection_shift is None and wide and _share_apart(alone) > _APART:
         shift = alignment.reflection_shift(corrected, response)
         if bool(shift["known"].any()):
             displaced = one(reflection_shift=shift)

@@ -20,10 +20,12 @@ COMPLETED: Final = sum(1 << bit for bit in (16, 17, 18, 19))
 
 
 @cache
-def _picture(seed: int, shift: float, still: float = 0.0) -> tuple[Scene, xr.Dataset]:
+def _picture(
+    seed: int, shift: float, still: float = 0.0, shape: tuple[int, int] = (36, 48)
+) -> tuple[Scene, xr.Dataset]:
     """People mirrored in glass, seen by cameras apart, and the true shift of the reflections."""
-    rng, time, bands = np.random.default_rng(seed), clock(160), ("8-14", "9.5")
-    shape, noise = (36, 48), SLOPE * np.array([0.03, 0.35])
+    rng, time, bands = np.random.default_rng(seed), clock(110), ("8-14", "9.5")
+    noise = SLOPE * np.array([0.03, 0.35])
     field = smooth_shift(shape, shift, 0.2 * shift)
     pair = xr.DataArray(GLASS, dims="band", coords={"band": list(bands)})
     drawn = Picture(shape=shape, walkers=7, still=still).draw(time, pair, rng, field)
@@ -35,7 +37,7 @@ def _picture(seed: int, shift: float, still: float = 0.0) -> tuple[Scene, xr.Dat
     counts += noise[:, None, None, None] * rng.standard_normal((2, *warm.shape))
     emissivity = np.broadcast_to(GLASS[:, None, None], (2, *shape)).copy()
     made = Scene(bands, time, warm, cold[0], emissivity, noise)
-    place = {"y": np.arange(36.0) + 3, "x": np.arange(48.0) + 7}
+    place = {"y": np.arange(shape[0]) + 3.0, "x": np.arange(shape[1]) + 7.0}
     film = (("band", "time", "y", "x"), np.asarray(counts, np.float32), {"units": "count"})
     coordinates = {"band": list(bands), "time": ("time", time, {"units": "s"}), **place}
     made.capture = xr.Dataset({"counts": film}, coordinates, {"origin": "simulated"})
@@ -94,7 +96,7 @@ _FIELDS: Final[Mapping[str, Callable[[Rng, xr.Dataset], Any]]] = {
 
 def shifts(rng: Rng) -> Attack:
     """`solve` with a field of the reflections' shift that is damaged in each of its parts."""
-    made, field = _picture(int(rng.integers(1, 4)), 2.4)
+    made, field = _picture(int(rng.integers(1, 4)), 2.4, shape=(20, 32))
     what = pick(rng, sorted(_FIELDS))
     spoilt, response = _FIELDS[what](rng, field), response_of(made)
     method = pick(rng, ["subspace"] * 5 + ["apparent"])

@@ -95,13 +95,10 @@ def test_other_rapid_curves_are_followed(kind: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["wineglass", "coffee_pot"])
 def test_a_pour_before_the_capture_is_followed(name: str) -> None:
-    """Simulated twins whose curves begin steeply hold 92 to 98 %, and 85 % in the first second."""
+    """Simulated twins whose curves begin steeply, as rises; also in the first second."""
     rng = np.random.default_rng(21)
     scene = twins.twin(name, twins.Capture(GLASS, shape=(48, 64)), rng)
-    scored = judge(name, scene, rng)
-    assert scored["good"] >= 0.8
-    assert 0.92 <= scored["cover"] <= 0.98
-    assert scored["first"] > 0.85
+    assert_true(judge(name, scene, rng))
 
 
 def test_rapid_pixels_of_one_material_are_pooled() -> None:

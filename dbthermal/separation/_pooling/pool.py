@@ -19,6 +19,8 @@ _OUTLIER_SIGMAS: Final = 4.0
 _ROUNDS: Final = 6
 # Deviations beyond which the order of the pixels is too small for their material.
 _ORDER_SIGMAS: Final = 3.0
+# Share of the pixels from which those with an emissivity of their own speak for a material [1].
+_MAJORITY: Final = 0.5
 # Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
 _ENERGY_SIGMAS: Final = 8.0
 _LEAST_ENERGY: Final = 0.01
@@ -61,8 +63,13 @@ def estimate(labels: Labels, count: int, survey: Survey, noise: Array) -> Materi
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         # A pixel that takes a rapid object for the background has an energy beyond all others'.
-        sound = np.where(np.isfinite(survey.emissivity), labels, -1)
+        told = np.isfinite(survey.emissivity) * 1.0
+        sound = np.where(told > 0, labels, -1)
         outliers = _outliers(labels, _ratios(sound, count, survey, noise), survey, noise)
+        # Near black the few that have an emissivity alone are selected by their own ratio.
+        surveyed = np.where(survey.frames > 0, 1.0, 0.0)
+        most = _sum(labels, told, count) > _MAJORITY * _sum(labels, surveyed, count)
+        outliers &= np.append(most, False)[labels]
         used = np.where(outliers, -1, labels)
         for _ in range(_ROUNDS):
             found = _ratios(used, count, survey, noise)

@@ -267,13 +267,9 @@ def _linear_variance(
     tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio, fit: _Fit, limit: Array
 ) -> Array:
     r"""
-    Variance (pixel) [1] of the regression's slope from a background that drifts linearly in time.
+    Variance (pixel) [1] of the slope from a linear drift of size d, seen with a variance v.
 
-    What the object's curve leaves of a line in time tells its size d, with a variance v. Normal
-    beforehand, of a variance D as large as the `limit`'s (pixel) [K] or as what is seen, the mean
-    square of the slope's error is
-
-    .. math:: \gamma^2 k (k d^2 + v), \quad k = D / (D + v)
+    :math:`\gamma^2 k (k d^2 + v)`, k = D / (D + v), with D of the `limit` [K] or of what is seen.
     """
     drift = functions.rising[:, 0]
     slope, size, kernel = _drift_beside(fit.line, fit.emitted, drift)
@@ -285,12 +281,10 @@ def _linear_variance(
 
 
 def _drift_beside(line: residuals.Line, curve: Array, drift: Array) -> tuple[Array, Array, Array]:
-    r"""
-    Linear drift (time) beside the object's curve in the residual r of the robust line.
+    """
+    Slope of a linear drift (time) on the object's curve, its size in the residual, and its kernel.
 
-    Its slope :math:`\gamma` on the curve (pixel), its size d (pixel), and the kernel k
-    (time, pixel) of :math:`d = \sum k r`. A large drift takes the weight from the frames that tell
-    it best: the second time the weights are those of the residual beside it.
+    Weighted twice, for a large drift takes the weight from the frames that tell it best.
     """
     weights = line.weights
     for last in (False, True):

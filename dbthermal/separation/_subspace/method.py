@@ -338,7 +338,8 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
         flagged = (best.status != 0) | (cost > lowest + _LIKELY)
         tried = (division.cost < cost) | (flagged & (division.cost < lowest + _LIKELY))
-        places = np.flatnonzero(tried)
+        # One piece is a smooth curve.
+        places = np.flatnonzero(tried & (division.first.sum(axis=0) > 1))
         if places.size == 0:
             continue
         again = _divided(part.select_pixels(places), division.first[:, places], settings, _report)

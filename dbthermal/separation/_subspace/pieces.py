@@ -36,11 +36,11 @@ _MARGIN: Final = 3.0
 _COARSE: Final = 4
 # Halvings after which the pieces give the axes to start from.
 _STARTS: Final = (0, 2, 3, 4, 5)
-_ROUNDS: Final = 5
+_ROUNDS: Final = 4
 # Axes that are refined, of which the two best are kept: joined, they may change places.
 _AXES: Final = 4
-# Parts in which these are tried: together they would need much memory.
-_PARTS: Final = 8
+# Costs of pieces that are computed at once: all together would need much memory.
+_AT_ONCE: Final = 2**20
 # Standard deviations between two axes that are told apart.
 _APART: Final = 6.0
 
@@ -76,8 +76,9 @@ def divide(
         along = (known / noise[:, np.newaxis]).T
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
         axes = np.concatenate([axes, np.where(np.isfinite(along), along, axes[0])[np.newaxis]])
+    parts = 1 + axes[..., 0].size * edges.size // _AT_ONCE
     costs = np.concatenate(
-        [_best(scatters, prices, some)[0] for some in np.array_split(axes, _PARTS)]
+        [_best(scatters, prices, some)[0] for some in np.array_split(axes, parts)]
     )
     divisions: list[Division] = []
     taken = np.full((0, *axes.shape[1:]), np.nan)
@@ -283,19 +284,21 @@ def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Who
     """
     levels = min(int(np.log2(len(time) / _FUNCTIONS)), _COARSE + 2)
     edges = np.round(np.linspace(0, len(time), 2**levels + 1)).astype(np.intp)
-    root = np.sqrt(np.diff(edges))[:, np.newaxis]
-    places = np.add.reduceat(time, edges[:-1]) / root[:, 0] ** 2
-    # Means in units of their noise, with the curve and without.
-    deviation = root * np.sqrt(np.where(variance > 0, variance, np.inf))
-    left = np.add.reduceat(residual, edges[:-1], axis=0) / deviation
-    mean = left + np.add.reduceat(curve, edges[:-1], axis=0) / deviation
+    length = np.diff(edges)[:, np.newaxis]
+    # Means in units of their noise, about as many frames in each; with the curve and without.
+    deviation = np.sqrt(np.where(variance > 0, variance, np.inf) / length.mean())
+    places = np.add.reduceat(time, edges[:-1]) / length[:, 0]
+    left = np.add.reduceat(residual, edges[:-1], axis=0) / (length * deviation)
+    mean = left + np.add.reduceat(curve, edges[:-1], axis=0) / (length * deviation)
     costs = []
     for level in range(levels - 1):
-        pieces = np.split(np.arange(1 << levels), 1 << level)
-        bases = [root[one] * smooth.polynomial_basis(places[one], _FUNCTIONS) for one in pieces]
-        held = [np.linalg.qr(q)[0].T @ mean[one] for q, one in zip(bases, pieces, strict=True)]
-        energy = np.stack([(mean[one] ** 2).sum(axis=0) for one in pieces])
-        costs.append(energy - (np.stack(held) ** 2).sum(axis=1) + COST * _FUNCTIONS)
+        cost = np.empty((1 << level, mean.shape[1]))
+        for piece, part in enumerate(np.split(mean, len(cost))):
+            start = piece * len(part)
+            basis, chosen = functions(places[start : start + len(part)].tobytes(), None)
+            held = basis[:, :chosen].T @ part
+            cost[piece] = (part**2).sum(axis=0) - (held**2).sum(axis=0) + COST * chosen
+        costs.append(cost)
     smoothly = (left**2).sum(axis=0) + COST * used
-    least, chosen = _halve(costs)
-    return np.asarray((smoothly > least + _MARGIN * COST) & ~chosen[0][0])
+    least, whole = _halve(costs)
+    return np.asarray((smoothly > least + _MARGIN * COST) & ~whole[0][0])
