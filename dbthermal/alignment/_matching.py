@@ -14,7 +14,7 @@ one body to the next: differences follow Student's distribution, not a normal on
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import Any, Final
@@ -214,45 +214,32 @@ def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
     )
 
 
-def _whole_pixels(movies: Movies, reach: tuple[int, int]) -> tuple[Array, Array]:
+def _whole_pixels(
+    first: Movie, others: list[Movie], freedom: float, reach: tuple[int, int]
+) -> tuple[Array, Array]:
     """
     Shift (2, y, x) of whole pixels that explains most, and its weight (y, x), 0 of chance.
 
-    Explained is a part of the others' energy in a window; the weight is the share that is.
+    Movies are in deviations of noise. Explained is a part of the others' energy in a window; the
+    weight is the share that is.
     """
-    noise, window = movies.noise * _VALUE_NOISE, 4.0 * np.pi * WINDOW**2
-    auto = np.einsum("yxt,yxt->yx", movies.first, movies.first)
-    energy = sum(
-        gaussian_filter(np.einsum("yxt,yxt->yx", part, part), WINDOW) / level**2
-        for part, level in zip(movies.others, noise[1:], strict=True)
-    )
-    best, where = np.zeros(movies.shape), np.zeros((2, *movies.shape))
-    for down in range(-reach[0], reach[0] + 1):
-        for right in range(-reach[1], reach[1] + 1):
-            here, there = _overlap(movies.shape, (down, right))
-            gain, local = np.zeros(movies.shape), np.zeros(movies.shape)
-            local[here] = auto[there]
-            local = np.maximum(gaussian_filter(local, WINDOW), movies.freedom * noise[0] ** 2)
-            for part, level in zip(movies.others, noise[1:], strict=True):
-                cross = np.zeros(movies.shape)
-                cross[here] = np.einsum("yxt,yxt->yx", movies.first[there], part[here])
-                cross = np.maximum(gaussian_filter(cross, WINDOW), 0.0)
-                gain += cross**2 / local / level**2
-            better = gain > best
-            best[better], where[0][better], where[1][better] = gain[better], down, right
-    share = best / np.maximum(energy, 1e-9) * movies.valid
+    height, width = first.shape[:2]
+    padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
+    energies = [np.einsum("yxt,yxt->yx", it, it).astype(np.float64) for it in (padded, *others)]
+    best, where = np.zeros((height, width)), np.zeros((2, height, width))
+    for down, right in np.ndindex(2 * reach[0] + 1, 2 * reach[1] + 1):
+        there = slice(down, down + height), slice(right, right + width)
+        gain = np.zeros(best.shape)
+        for part in others:
+            cross = np.einsum("yxt,yxt->yx", padded[there], part).astype(np.float64)
+            gain += np.maximum(gaussian_filter(cross, WINDOW), 0.0) ** 2
+        gain /= np.maximum(gaussian_filter(energies[0][there], WINDOW), freedom)
+        better = gain > best
+        best[better], where[0][better], where[1][better] = gain[better], down, right
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
-    chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2
-    return where, np.where(best * window > chance, share, 0.0)
-
-
-def _overlap(
-    shape: tuple[int, int], shift: tuple[int, int]
-) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Pixels here, and those a shift away."""
-    sizes = list(zip(shape, shift, strict=True))
-    here = tuple(slice(max(-by, 0), size - max(by, 0)) for size, by in sizes)
-    return here, tuple(slice(max(by, 0), size - max(-by, 0)) for size, by in sizes)
+    chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2 / (4.0 * np.pi * WINDOW**2)
+    share = best / np.maximum(gaussian_filter(sum(energies[1:]), WINDOW), 1e-9)
+    return where - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
 
 
 def inside(places: Array, valid: Mask) -> Mask:
@@ -391,8 +378,12 @@ def _positive(tensor: Array) -> Array:
 def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | None:
     """Field of whole-pixel matches, wrong ones taken for outliers; None without any."""
     # Changes as large as there are seldom are cut: an object's, if rapid.
-    first, *others = (part * np.sqrt(_moderate(part)) for part in (movies.first, *movies.others))
-    rough, share = _whole_pixels(replace(movies, first=first, others=others), reach)
+    first, *others = (
+        part * np.sqrt(_moderate(part)) / np.float32(level * _VALUE_NOISE)
+        for part, level in zip((movies.first, *movies.others), movies.noise, strict=True)
+    )
+    rough, share = _whole_pixels(first, others, movies.freedom, reach)
+    share *= movies.valid
     if not share.any():
         return None
     at_end = np.any(np.abs(rough) == np.reshape(reach, (2, 1, 1)), axis=0)

@@ -152,14 +152,13 @@ class _Capture:
     def rapid(self, period: float, used: npt.NDArray[np.intp]) -> list[matching.Movie]:
         """Rapid changes of the bands (y, x, time) [K] in some of the frames."""
         smoothing = self.smoothing(period)
-        result = [np.empty((*self.valid.shape, used.size), np.float32) for _ in self.bands]
+        result = np.empty((self.bands.size, *self.valid.shape, used.size), np.float32)
         for rows, signals in self.blocks(_ROWS):
             for movie, signal in zip(result, signals, strict=True):
                 movie[rows] = _rapid(_filled(signal), smoothing)[..., used]
         nearest = distance_transform_edt(~self.valid, return_distances=False, return_indices=True)
-        for movie in result:
-            movie[~self.valid] = movie[tuple(nearest[:, ~self.valid])]
-        return result
+        result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
+        return list(result)
 
     def binned(self, factor: int) -> tuple[list[Array], Mask]:
         """Signals (y, x, time) [K] of squares of pixels, and the pixels that lack few frames."""
@@ -177,8 +176,7 @@ def _coarse(
 ) -> tuple[_Capture, float, npt.NDArray[np.intp], Field]:
     """Capture with its valid pixels, the period that tells most, energetic frames, rough field."""
     signals, valid = capture.binned(factor)
-    height, width = signals[0].shape[:2]
-    reach = (int(height / 3), int(width / 3))
+    reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
     frames, best, result = capture.frames.size, 0.0, None
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
@@ -190,8 +188,10 @@ def _coarse(
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
-        told = float(_told(data, factor).mean())
-        if told > _MORE * best and (result is None or _agree(result[-1], field, level.centres())):
+        told, places = float(_told(data, factor).mean()), level.centres()
+        # A field of slower changes must lie within the deviation of the more robust one.
+        apart = (begin.on(places) - field.on(places)) ** 2 / begin.variances(places)
+        if told > _MORE * best and (result is None or apart.mean() < _AGREE**2):
             energy = np.minimum((pictures[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
             # Those of the largest energy, no more than memory allows.
             most = max(noises.MINIMUM_FRAMES, _SAMPLES // valid.size)
@@ -210,12 +210,6 @@ def _told(data: Information, factor: int = 1) -> Mask:
     down, both, right = data.tensor * (4.0 * np.pi * (matching.WINDOW * factor) ** 2)
     largest = 0.5 * (down + right) + np.hypot(0.5 * (down - right), both)
     return np.asarray(largest > 1.0 / _KNOWN**2)
-
-
-def _agree(robust: Field, other: Field, centres: list[Array]) -> bool:
-    """Return whether a field lies within the deviation of another one that is more robust."""
-    apart = (robust.on(centres) - other.on(centres)) ** 2
-    return bool(np.mean(apart / robust.variances(centres)) < _AGREE**2)
 
 
 def _freedom(frames: int, period: float) -> float:
