@@ -46,7 +46,6 @@ _AROUND: Final = (3, 3, 5)  # samples among which a residual is judged
 _ROUNDS: Final = 12
 _CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
 _ROWS: Final = 32  # that are resampled at a time
-_MISFIT: Final = 0.7  # by how much a residual's variance exceeds noise at half weight, relative
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 _TAIL: Final = 4.0  # variances of the residual at which a sample has half its weight
@@ -294,9 +293,8 @@ def _moments(
         ]
         for other, match, out in zip(movies.others, matches, result, strict=True):
             four = [*moved, other[rows]]
-            if match is None:
-                weight = _moderate(four[0]) * _moderate(four[3])
-            else:
+            weight = np.ones_like(four[0])
+            if match is not None:
                 ratio = match.ratio[rows, :, np.newaxis].astype(np.float32)
                 residual = four[3] - ratio * four[0]
                 square = uniform_filter(residual**2, _AROUND)
@@ -348,7 +346,7 @@ def _information(
         misfit = np.maximum(residual / (number * floor), 1.0)
         spread = misfit * floor if match is None else gaussian_filter(squares, WINDOW)
         found.append(_Match(ratio, np.maximum(spread, floor)))
-        weight = used / (misfit * (1.0 + ((misfit - 1.0) / _MISFIT) ** 2) * variance)
+        weight = used / (misfit * variance)
         less = samples * (movies.noise[0] * _SLOPE_NOISE) ** 2
         tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
         gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
