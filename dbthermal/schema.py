@@ -260,7 +260,7 @@ class Status(Flags):
     NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
     OBJECT_JUMP = 1 << 13, "sudden steps of the object, taken into its curve; the values hold"
     BANDS_APART = 1 << 14, "rapid changes not simultaneous: a time offset, or a parallax"
-    ROLES_MAY_BE_SWAPPED = 1 << 15, "mean emissivity below 1/2: object and background exchanged"
+    ROLES_MAY_BE_SWAPPED = 1 << 15, "object and background exchanged: low emissivity, lasting step"
     COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity of the same material"
     COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity of a library, or stated"
     COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background of surroundings"

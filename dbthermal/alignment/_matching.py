@@ -1,18 +1,32 @@
-r"""Displacement field between movies of one changing picture, matched by its own texture.
+r"""Smooth displacement field between movies of one changing picture, matched by its own texture.
 
 Sought is d with :math:`h_m(p, t) = k_m(p) h_1(p + d(p), t)` beside noise, m = 2, 3, ...: first the
-whole pixels that explain most, then Gauss-Newton from coarse images to fine ones on a smooth field.
+whole pixels that explain most, then Gauss-Newton from coarse images to fine ones.
+
+The field is a grid of cubic B-splines with nodes c. Data with information A about it, the penalty
+of the second differences q of neighbouring nodes, and a wide prior make
+
+.. math:: (A + \lambda Q^T W Q + R) c = A c_0 + b
+
+whose inverse matrix is the covariance. The penalty has the largest marginal likelihood (Patterson,
+Thompson 1971, doi:10.1093/biomet/58.3.545); W lets the field bend sharply in few places, as from
+one body to the next: differences follow Student's distribution, not a normal one.
 """
 
-from dataclasses import dataclass, replace
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations_with_replacement
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
-from scipy.ndimage import gaussian_filter, spline_filter1d, uniform_filter
+from scipy.interpolate import BSpline
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.ndimage import gaussian_filter, uniform_filter
 
-from dbthermal.alignment._fields import Field, Information, Spline, weights
+from dbthermal.alignment._resampling import interpolation
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -23,54 +37,162 @@ WINDOW: Final = 2.5
 BLUR: Final = 1.2
 """Deviation of the blur of all movies before they are matched, that nothing aliases [pixel]."""
 
+# White noise of values, and of slopes over a pixel, after the blur over that before.
+_VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
+_SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
+_TAPS: Final = 6  # neighbours a side, of which the blurred movies are interpolated
+_BORDER: Final = 4  # pixels by which they are mirrored at the border for it
+_AROUND: Final = (3, 3, 5)  # samples among which a residual is judged
 _ROUNDS: Final = 12
 _CONVERGED: Final = 2e-3  # mean change of the field at its end [pixel]
 _ROWS: Final = 32  # that are resampled at a time
-_MISFIT: Final = 0.7  # by how much a residual's variance exceeds noise at half weight, relative
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 _TAIL: Final = 4.0  # variances of the residual at which a sample has half its weight
 _COLOUR: Final = 0.05  # least variance of coloured noise over that of white noise
 _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
-_TEXTURED: Final = 0.3  # least information over that which noise pretends, of a pixel that counts
 # Rough matches count as if each were known so well [pixel].
 _ROUGH: Final = 0.5
+# Pixels between two nodes, at least, and nodes along the longer side, at most.
+_SPACING: Final = 6.0
+_NODES: Final = 18
+# Degrees of freedom of a bending's distribution.
+_FREEDOM: Final = 3.0
+# Penalties that are tried, over the mean information of a node; and over the last one.
+_PENALTIES: Final = 10.0 ** np.arange(-3.0, 5.0)
+_STEPS: Final = np.array([0.4, 1.0, 2.5])
+
+
+@dataclass(frozen=True)
+class Information:
+    """Information on a step of a field: A as its three numbers (3, y, x), and b (2, y, x)."""
+
+    tensor: Array  # of rows, of rows with columns, of columns [1/pixel^2]
+    gradient: Array  # [1/pixel]
+
+
+@dataclass(frozen=True)
+class Spline:
+    """Grid of nodes over an image of so many rows and columns, and its wide prior [pixel]."""
+
+    shape: tuple[int, int]
+    prior: float
+
+    @cached_property
+    def nodes(self) -> tuple[int, int]:
+        """Nodes along either side."""
+        spacing = max(_SPACING, max(self.shape) / _NODES)
+        rows, columns = (max(2, int(np.ceil((size - 1) / spacing)) + 1) + 2 for size in self.shape)
+        return rows, columns
+
+    @cached_property
+    def bending(self) -> sparse.csr_array:
+        """Second differences of the nodes: down, right, and twice the mixed one."""
+        (row, *rows), (column, *columns) = (
+            [np.diff(np.eye(n), order, axis=0) for order in (0, 1, 2)] for n in self.nodes
+        )
+        mixed = np.sqrt(2.0) * np.kron(rows[0], columns[0])
+        parts = [np.kron(rows[1], column), np.kron(row, columns[1]), mixed]
+        return sparse.csr_array(np.concatenate(parts))
+
+    def values(self, centres: list[Array]) -> list[Array]:
+        """Splines (place, node) at rows and at columns."""
+        return [
+            BSpline.design_matrix(
+                place / (size - 1) * (count - 3), np.arange(count + 4) - 3.0, 3
+            ).toarray()
+            for place, size, count in zip(centres, self.shape, self.nodes, strict=True)
+        ]
+
+    def fitted(
+        self, data: Information, centres: list[Array], around: "Field | None" = None
+    ) -> "Field":
+        """Field of information at places, which is on steps from another field, or from 0."""
+        rows, columns = self.values(centres)
+        matrix = _normal(data.tensor, rows, columns)
+        target = np.concatenate([(rows.T @ part @ columns).ravel() for part in data.gradient])
+        bends = self.bending
+        sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
+        if around is not None:
+            target += matrix @ around.nodes
+            sharp, trials = around.sharpness, around.penalty * _STEPS
+        ridge = np.eye(len(matrix)) / self.prior**2
+        blocks = [(bends.T @ (bends * part[:, np.newaxis])).toarray() for part in sharp]
+        bending, best = block_diag(*blocks), -np.inf
+        for trial in trials:
+            # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
+            trial_factor = cho_factor(matrix + trial * bending + ridge)
+            trial_nodes = cho_solve(trial_factor, target)
+            before = np.linalg.cholesky(trial * bending + ridge)
+            logs = [2.0 * np.sum(np.log(np.diag(part))) for part in (before, trial_factor[0])]
+            likelihood = logs[0] - logs[1] + target @ trial_nodes
+            if likelihood > best:
+                best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
+        squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])
+        sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
+        covariance = cho_solve(factor, np.eye(len(matrix)))
+        return Field(self, nodes, covariance, float(penalty), sharp)
+
+
+@dataclass(frozen=True)
+class Field:
+    """Nodes (rows', then columns') [pixel] of a displacement field, and their covariance."""
+
+    spline: Spline
+    nodes: Array
+    covariance: Array
+    penalty: float
+    sharpness: Array  # weight of each bending (2, bending) [1]
+
+    def on(self, centres: list[Array]) -> Array:
+        """Displacement (2, y, x) [pixel] at rows and columns."""
+        rows, columns = self.spline.values(centres)
+        parts = self.nodes.reshape(2, *self.spline.nodes)
+        return np.stack([rows @ part @ columns.T for part in parts])
+
+    def variances(self, centres: list[Array]) -> Array:
+        """Variance (2, y, x) of the displacement at each place [pixel^2]."""
+        rows, columns = (_pairs(part) for part in self.spline.values(centres))
+        height, width = self.spline.nodes
+        blocks = self.covariance.reshape(2, height, width, 2, height, width)
+        parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
+        return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in parts])
+
+
+def _pairs(values: Array) -> Array:
+    """Products of all pairs of splines (place, node * node)."""
+    return (values[:, :, np.newaxis] * values[:, np.newaxis]).reshape(len(values), -1)
+
+
+def _normal(tensor: Array, rows: Array, columns: Array) -> Array:
+    """Normal matrix of the nodes, of rows and then of columns, from the tensors of the pixels."""
+    (height, width), blocks = (rows.shape[1], columns.shape[1]), []
+    for part in tensor:
+        sums = (_pairs(rows).T @ part @ _pairs(columns)).reshape(height, height, width, width)
+        blocks.append(sums.transpose(0, 2, 1, 3).reshape(height * width, -1))
+    return np.block([[blocks[0], blocks[1]], [blocks[1], blocks[2]]])
 
 
 @dataclass(frozen=True)
 class Movies:
-    """Rapid changes of one picture (y, x, time) [K], blurred alike; 0 where missing."""
+    """Rapid changes of one picture (y, x, time) [K], blurred alike."""
 
     first: Movie
-    others: tuple[Movie, ...]
+    others: list[Movie]
     valid: Mask  # pixels (y, x) with data in all
-    noise: tuple[float, ...]  # standard deviation of a sample before the blur, first and others [K]
+    noise: Array  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
-    factor: int = 1  # pixels of the capture along a side of one of these
-    around: tuple[int, int, int] = (3, 3, 5)  # samples among which a residual is judged
+    factor: int  # pixels of the capture along a side of one of these
 
     @classmethod
     def blurred(
-        cls, movies: list[Movie], valid: Mask, noise: Array, freedom: float, factor: int = 1
-    ) -> "Movies":
-        """Movies of a factor coarser pixels, blurred."""
-        return cls.coarse(
-            [binned(movie, factor) for movie in movies],
-            coarse_mask(valid, factor),
-            noise / factor,
-            freedom,
-            factor,
-        )
-
-    @classmethod
-    def coarse(
         cls, movies: list[Movie], valid: Mask, noise: Array, freedom: float, factor: int
     ) -> "Movies":
-        """Movies of pixels that are so many times coarser, blurred in place."""
+        """Movies of pixels that are so many times coarser than the mask's, blurred in place."""
         for movie in movies:
             gaussian_filter(movie, (BLUR, BLUR, 0.0), output=movie)
-        levels = tuple(float(level) for level in noise)
-        return cls(movies[0], tuple(movies[1:]), valid, levels, freedom, factor)
+        mostly = binned(valid.astype(np.float64), factor) > 0.5
+        return cls(movies[0], movies[1:], mostly, noise / factor, freedom, factor)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -82,94 +204,41 @@ class Movies:
         return [np.asarray(self.factor * (np.arange(n) + 0.5) - 0.5) for n in self.shape]
 
 
-def binned(movie: Movie, factor: int) -> Movie:
-    """Means (y, x, time) over squares of pixels, in memory of their own."""
-    if factor == 1:
-        return movie.copy()
-    rows, columns = (size // factor for size in movie.shape[:2])
-    parts = movie[: rows * factor, : columns * factor]
-    parts = parts.reshape(rows, factor, columns, factor, -1)
-    return np.asarray(parts.mean(axis=(1, 3)), dtype=np.float32)
+def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
+    """Means (y, x, ...) over squares of pixels, in memory of their own."""
+    rows, columns = (size // factor for size in image.shape[:2])
+    parts = image[: rows * factor, : columns * factor]
+    return np.asarray(
+        parts.reshape(rows, factor, columns, factor, *image.shape[2:]).mean(axis=(1, 3))
+    )
 
 
-def coarse_mask(valid: Mask, factor: int) -> Mask:
-    """Squares of pixels of which most are valid."""
-    return np.asarray(binned(valid[..., np.newaxis].astype(np.float32), factor)[..., 0] > 0.5)
-
-
-def _blur_noise() -> tuple[float, float]:
-    """Noise of values and of slopes after the blur, over that before."""
-    impulse = np.zeros((33, 33))
-    impulse[16, 16] = 1.0
-    kernel = gaussian_filter(impulse, BLUR)
-    slope = 0.5 * (kernel[2:] - kernel[:-2])
-    return float(np.sqrt(np.sum(kernel**2))), float(np.sqrt(np.sum(slope**2)))
-
-
-def whole_pixels(movies: Movies, reach: tuple[int, int]) -> tuple[Array, Array]:
+def _whole_pixels(
+    first: Movie, others: list[Movie], freedom: float, reach: tuple[int, int]
+) -> tuple[Array, Array]:
     """
     Shift (2, y, x) of whole pixels that explains most, and its weight (y, x), 0 of chance.
 
-    Explained is a part of the others' energy in a window; the weight is the share that is.
+    Movies are in deviations of noise. Explained is a part of the others' energy in a window; the
+    weight is the share that is.
     """
-    noise, window = _blur_noise()[0], 4.0 * np.pi * WINDOW**2
-    floor = movies.freedom * (movies.noise[0] * noise) ** 2
-    auto = np.einsum("yxt,yxt->yx", movies.first, movies.first)
-    energy = sum(
-        gaussian_filter(np.einsum("yxt,yxt->yx", part, part), WINDOW) / (level * noise) ** 2
-        for part, level in zip(movies.others, movies.noise[1:], strict=True)
-    )
-    best, where = np.zeros(movies.shape), np.zeros((2, *movies.shape))
-    for down in range(-reach[0], reach[0] + 1):
-        for right in range(-reach[1], reach[1] + 1):
-            here, there = _overlap(movies.shape, (down, right))
-            gain, local = np.zeros(movies.shape), np.zeros(movies.shape)
-            local[here] = auto[there]
-            local = np.maximum(gaussian_filter(local, WINDOW), floor)
-            for part, level in zip(movies.others, movies.noise[1:], strict=True):
-                cross = np.zeros(movies.shape)
-                cross[here] = np.einsum("yxt,yxt->yx", movies.first[there], part[here])
-                cross = np.maximum(gaussian_filter(cross, WINDOW), 0.0)
-                gain += cross**2 / local / (level * noise) ** 2
-            better = gain > best
-            best[better], where[0][better], where[1][better] = gain[better], down, right
-    share = best / np.maximum(energy, 1e-9) * movies.valid
+    height, width = first.shape[:2]
+    padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
+    energies = [np.einsum("yxt,yxt->yx", it, it).astype(np.float64) for it in (padded, *others)]
+    best, where = np.zeros((height, width)), np.zeros((2, height, width))
+    for down, right in np.ndindex(2 * reach[0] + 1, 2 * reach[1] + 1):
+        there = slice(down, down + height), slice(right, right + width)
+        gain = np.zeros(best.shape)
+        for part in others:
+            cross = np.einsum("yxt,yxt->yx", padded[there], part).astype(np.float64)
+            gain += np.maximum(gaussian_filter(cross, WINDOW), 0.0) ** 2
+        gain /= np.maximum(gaussian_filter(energies[0][there], WINDOW), freedom)
+        better = gain > best
+        best[better], where[0][better], where[1][better] = gain[better], down, right
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
-    chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2
-    return where, np.where(best * window > chance, share, 0.0)
-
-
-def _overlap(
-    shape: tuple[int, int], shift: tuple[int, int]
-) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Pixels here, and those a shift away."""
-    sizes = list(zip(shape, shift, strict=True))
-    here = tuple(slice(max(-by, 0), size - max(by, 0)) for size, by in sizes)
-    return here, tuple(slice(max(by, 0), size - max(-by, 0)) for size, by in sizes)
-
-
-def interpolation(places: Array, shape: tuple[int, int]) -> list[sparse.csr_array]:
-    """
-    Matrices from spline coefficients to values, slopes down and right, at places (2, place).
-
-    The coefficients (row, column) are those of `spline_filter1d`, mirrored at the borders.
-    """
-    nodes, parts = [], []
-    for place, size in zip(places, shape, strict=True):
-        low = np.clip(np.floor(place), -1, size)
-        parts.append(weights(place - low))
-        node = np.abs(low.astype(np.intp) + np.arange(-1, 3)[:, np.newaxis])
-        nodes.append(np.where(node >= size, np.maximum(2 * size - 2 - node, 0), node))
-    columns = (nodes[0][:, np.newaxis] * shape[1] + nodes[1]).reshape(16, -1).T.ravel()
-    (row, row_slope), (column, column_slope) = parts
-    pointer = np.arange(0, columns.size + 1, 16)
-    return [
-        sparse.csr_array(
-            ((a[:, np.newaxis] * b).reshape(16, -1).T.ravel().astype(np.float32), columns, pointer),
-            shape=(places.shape[1], shape[0] * shape[1]),
-        )
-        for a, b in ((row, column), (row_slope, column), (row, column_slope))
-    ]
+    chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2 / (4.0 * np.pi * WINDOW**2)
+    share = best / np.maximum(gaussian_filter(sum(energies[1:]), WINDOW), 1e-9)
+    return where - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
 
 
 def inside(places: Array, valid: Mask) -> Mask:
@@ -187,11 +256,6 @@ class _Match:
     ratio: Array
     variance: Array  # of a sample of the residual [K^2]
 
-    def trust(self, square: Movie, rows: slice) -> Movie:
-        """Weight of samples (y, x, time): 1 of noise, 0 of changes that are no reflection."""
-        scale = (1.0 / (_TAIL * self.variance[rows, :, np.newaxis])).astype(np.float32)
-        return np.asarray(1.0 / (1.0 + (square * scale) ** 2))
-
 
 def _moderate(movie: Movie) -> Movie:
     """Weight of samples (..., time), smaller where a movie changes as it seldom does."""
@@ -199,31 +263,43 @@ def _moderate(movie: Movie) -> Movie:
     return np.asarray(1.0 / (1.0 + (movie / np.maximum(usual, 1e-12)) ** 2), dtype=np.float32)
 
 
+def _resamplers(places: Array) -> list[sparse.csr_array]:
+    """Matrices from a padded movie to its values, slopes down and right, at places (2, y, x)."""
+    border = (_BORDER, _BORDER)
+    places = np.pad(places + _BORDER, ((0, 0), border, border), mode="edge")
+    halves = 0.5 * np.eye(2)[:, :, np.newaxis, np.newaxis]
+    slopes = [interpolation(places + h, _TAPS) - interpolation(places - h, _TAPS) for h in halves]
+    return [interpolation(places, _TAPS), *slopes]
+
+
 def _moments(
-    movies: Movies, coefficients: Movie, places: Array, matches: list[_Match] | None
+    movies: Movies, padded: Movie, places: Array, matches: Sequence[_Match | None]
 ) -> Array:
     """
     Products (other, 14, y, x), summed over time, of moved, its slopes, and another movie.
 
-    Weighted by how well samples match; then the number of samples, their residual's variance, and
+    Weighted by how well samples match; then the sum of weights, their residual's variance, and
     the slopes' products with the residual of another time.
     """
-    frames = coefficients.shape[1]
+    _, width, frames = padded.shape
+    resamplers, flat = _resamplers(places), padded.reshape(-1, frames)
     result = np.zeros((len(movies.others), 14, *movies.shape))
-    pairs = [(i, j) for i in range(4) for j in range(i, 4)]
     for start in range(0, movies.shape[0], _ROWS):
-        rows = slice(start, start + _ROWS)
-        matrices = interpolation(places[:, rows].reshape(2, -1), movies.shape)
-        moved = [(m @ coefficients).reshape(-1, movies.shape[1], frames) for m in matrices]
-        for number, (other, out) in enumerate(zip(movies.others, result, strict=True)):
+        rows = slice(start, min(start + _ROWS, movies.shape[0]))
+        pixels = slice((rows.start + _BORDER) * width, (rows.stop + _BORDER) * width)
+        moved = [
+            (matrix[pixels] @ flat).reshape(-1, width, frames)[:, _BORDER:-_BORDER]
+            for matrix in resamplers
+        ]
+        for other, match, out in zip(movies.others, matches, result, strict=True):
             four = [*moved, other[rows]]
-            if matches is None:
-                weight = _moderate(four[0]) * _moderate(four[3])
-            else:
-                ratio = matches[number].ratio[rows, :, np.newaxis].astype(np.float32)
+            weight = np.ones_like(four[0])
+            if match is not None:
+                ratio = match.ratio[rows, :, np.newaxis].astype(np.float32)
                 residual = four[3] - ratio * four[0]
-                square = uniform_filter(residual**2, movies.around)
-                weight = matches[number].trust(square, rows)
+                square = uniform_filter(residual**2, _AROUND)
+                most = (_TAIL * match.variance[rows, :, np.newaxis]).astype(np.float32)
+                weight = 1.0 / (1.0 + (square / most) ** 2)
                 out[11, rows] = np.median(square, axis=2)
                 other_time = np.roll(weight * residual, frames // 2, axis=2)
                 for place in (1, 2):
@@ -232,13 +308,13 @@ def _moments(
                     )
             out[10, rows] = weight.sum(axis=2)
             weighted = [weight * one for one in four]
-            for place, (i, j) in enumerate(pairs):
+            for place, (i, j) in enumerate(combinations_with_replacement(range(4), 2)):
                 out[place, rows] = np.einsum("yxt,yxt->yx", weighted[i], four[j])
     return result
 
 
-def information(
-    movies: Movies, coefficients: Movie, shift: Array, matches: list[_Match] | None
+def _information(
+    movies: Movies, padded: Movie, shift: Array, matches: Sequence[_Match | None]
 ) -> tuple[Information, list[_Match]]:
     r"""
     Information on a step of the field at each pixel, by Gauss-Newton, and how well it matches.
@@ -252,41 +328,39 @@ def information(
     """
     places = np.indices(movies.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
-    value_noise, slope_noise = _blur_noise()
-    noise = movies.noise[0] * value_noise
+    noise = movies.noise[0] * _VALUE_NOISE
     tensor, gradient = np.zeros((3, *used.shape)), np.zeros((2, *used.shape))
     chance, found, scatter, white = np.zeros(used.shape), [], 0.0, 0.0
-    for moments, level in zip(
-        _moments(movies, coefficients, places, matches) * used, movies.noise[1:], strict=True
-    ):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh, samples, squares, null_y, null_x = moments
-        samples *= movies.freedom / coefficients.shape[1]
+    moments = _moments(movies, padded, places, matches) * used
+    for parts, level, match in zip(moments, movies.noise[1:], matches, strict=True):
+        mm, my, mx, mh, yy, yx, yh, xx, xh, hh, samples, squares, *null = parts
+        samples *= movies.freedom / movies.first.shape[2]
         number = np.maximum(gaussian_filter(samples, WINDOW), 1e-9)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto = gaussian_filter(mm, WINDOW) - number * noise**2
         ratio = gaussian_filter(mh, WINDOW) / np.maximum(auto, 0.1 * number * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
-        floor = variance * value_noise**2
+        floor = variance * _VALUE_NOISE**2
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
         misfit = np.maximum(residual / (number * floor), 1.0)
-        spread = misfit * floor if matches is None else gaussian_filter(squares, WINDOW)
+        spread = misfit * floor if match is None else gaussian_filter(squares, WINDOW)
         found.append(_Match(ratio, np.maximum(spread, floor)))
-        weight = used / (misfit * (1.0 + ((misfit - 1.0) / _MISFIT) ** 2) * variance)
-        less = samples * (movies.noise[0] * slope_noise) ** 2
+        weight = used / (misfit * variance)
+        less = samples * (movies.noise[0] * _SLOPE_NOISE) ** 2
         tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
         gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
         chance += weight * ratio**2 * less
         # Noise that both filters have coloured: its products with the slopes, over white noise's.
-        for null, energy in ((null_y, yy), (null_x, xx)):
-            scatter += np.sum(gaussian_filter(weight * ratio * null, WINDOW) ** 2)
+        for product, energy in zip(null, (yy, xx), strict=True):
+            scatter += np.sum(gaussian_filter(weight * ratio * product, WINDOW) ** 2)
             white += np.sum((weight * ratio) ** 2 * variance * energy) / (4.0 * np.pi * WINDOW**2)
-    tensor, gradient = (
-        np.stack([gaussian_filter(one, WINDOW) for one in part]) for part in (tensor, gradient)
+    tensor, gradient, less = (
+        gaussian_filter(part, WINDOW, axes=(-2, -1)) for part in (tensor, gradient, chance)
     )
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
-    total, less = tensor[0] + tensor[2], gaussian_filter(chance, WINDOW)
-    share = np.where(total > _TEXTURED * less, total / np.maximum(total + less, 1e-300), 0.0)
+    total = tensor[0] + tensor[2]
+    share = np.maximum(total, 0.0) / np.maximum(total + less, 1e-300)
     share /= max(scatter / white, _COLOUR) if scatter > 0 else 1.0
     tensor, gradient = _positive(tensor) * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor), found
@@ -294,23 +368,20 @@ def information(
 
 def _positive(tensor: Array) -> Array:
     """Tensors (3, y, x) without their negative eigenvalues."""
-    a, b, c = tensor
-    middle, radius = 0.5 * (a + c), np.hypot(0.5 * (a - c), b)
-    high, low = np.maximum(middle + radius, 0.0), np.maximum(middle - radius, 0.0)
-    share = 0.5 * (high - low) / np.maximum(radius, 1e-300)
-    mean, half = 0.5 * (high + low), 0.5 * share * (a - c)
-    return np.stack([mean + half, share * b, mean - half])
-
-
-def clipped(movies: Movies) -> Movies:
-    """Movies of which changes as large as there are seldom are cut: an object's, if rapid."""
-    first, *others = (part * np.sqrt(_moderate(part)) for part in (movies.first, *movies.others))
-    return replace(movies, first=first, others=tuple(others))
+    values, vectors = np.linalg.eigh(np.moveaxis(tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1)))
+    result = (vectors * np.maximum(values, 0.0)[..., np.newaxis, :]) @ vectors.mT
+    return np.stack([result[..., 0, 0], result[..., 0, 1], result[..., 1, 1]])
 
 
 def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | None:
     """Field of whole-pixel matches, wrong ones taken for outliers; None without any."""
-    rough, share = whole_pixels(clipped(movies), reach)
+    # Changes as large as there are seldom are cut: an object's, if rapid.
+    first, *others = (
+        part * np.sqrt(_moderate(part)) / np.float32(level * _VALUE_NOISE)
+        for part, level in zip((movies.first, *movies.others), movies.noise, strict=True)
+    )
+    rough, share = _whole_pixels(first, others, movies.freedom, reach)
+    share *= movies.valid
     if not share.any():
         return None
     at_end = np.any(np.abs(rough) == np.reshape(reach, (2, 1, 1)), axis=0)
@@ -333,15 +404,12 @@ def start(movies: Movies, spline: Spline, reach: tuple[int, int]) -> Field | Non
 
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
-    shape = movies.first.shape
-    coefficients = movies.first
-    for axis in (0, 1):
-        coefficients = spline_filter1d(coefficients, 3, axis=axis, output=np.float32)
-    coefficients = coefficients.reshape(-1, shape[2])
-    matches = None
+    border = (_BORDER, _BORDER)
+    padded = np.pad(movies.first, (border, border, (0, 0)), mode="reflect")
+    matches: Sequence[_Match | None] = [None] * len(movies.others)
     for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
-        data, matches = information(movies, coefficients, shift, matches)
+        data, matches = _information(movies, padded, shift, matches)
         field = field.spline.fitted(data, movies.centres(), field)
         change = np.abs(field.on(movies.centres()) - shift)
         if change.mean() < _CONVERGED * movies.factor:

@@ -1,11 +1,13 @@
 """Shift between the reflections that two cameras side by side see in one surface."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy import sparse
 from scipy.linalg import solveh_banded
 from scipy.ndimage import distance_transform_edt
 
@@ -14,7 +16,7 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _matching as matching
-from dbthermal.alignment._fields import Field, Information, Spline
+from dbthermal.alignment._matching import Field, Information, Movies, Spline
 from dbthermal.alignment._offset import sample
 from dbthermal.schema import Status
 
@@ -77,19 +79,20 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         If an input is not as described, the image is too small, nothing that both bands see changes
         rapidly, or the shift is beyond a third of the image.
     """
-    movies = _Capture.of(corrected, response)
-    shape = movies.valid.shape
+    capture = _Capture.of(corrected, response)
+    shape = capture.valid.shape
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
-    movies, period, used, field = _coarse(movies, spline, factor)
-    fine = movies.rapid(period, used)
-    freedom = _freedom(movies.frames.size, period) * used.size / movies.frames.size
+    capture, period, used, field = _coarse(capture, spline, factor)
+    fine = capture.rapid(period, used)
+    freedom = _freedom(capture.frames.size, period) * used.size / capture.frames.size
     while True:
         factor = max(1, factor // 2)
-        level = matching.Movies.blurred(fine, movies.valid, movies.noise, freedom, factor)
+        pictures = [matching.binned(movie, factor) for movie in fine]
+        level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor)
         field, data = matching.refine(level, field)
         if factor == 1:
-            return _result(corrected, movies, field, data)
+            return _result(corrected, capture, field, data)
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,7 @@ class _Capture:
     """Capture and all that matching needs to know of it, the quietest band first."""
 
     counts: xr.DataArray
-    bands: list[int]
-    names: list[str]
+    bands: npt.NDArray[np.intp]  # places in the counts
     slopes: Array  # of the bands [count/K]
     noise: Array  # of the bands [K]
     valid: Mask  # pixels (y, x)
@@ -128,76 +130,45 @@ class _Capture:
         steps = np.diff(times)
         joined = (steps < 1.5 * np.median(steps)) & (np.diff(segment) == 0)
         rough = np.flatnonzero(joined[:-2] & joined[1:-1] & joined[2:])
-        return cls(
-            counts,
-            order.tolist(),
-            [names[i] for i in order],
-            slopes[order],
-            noise[order],
-            valid,
-            frames,
-            rough,
-        )
+        return cls(counts, order, slopes[order], noise[order], valid, frames, rough)
 
-    def signals(self, band: int, rows: slice) -> Array:
-        """Signals (time, y, x) [K] of some rows of a band, in the frames, NaN where missing."""
-        place = self.bands[band]
-        values = self.counts.isel(band=place, y=rows).values[self.frames]
-        return np.asarray(np.where(schema.measured(values), values, np.nan) / self.slopes[band])
+    def blocks(self, height: int) -> Iterator[tuple[slice, Array]]:
+        """Rows, and their signals (band, y, x, time) [K] in the frames, NaN where missing."""
+        for start in range(0, self.valid.shape[0], height):
+            rows = slice(start, start + height)
+            values = self.counts.isel(y=rows).values[self.bands][:, self.frames]
+            values = np.where(schema.measured(values), values, np.nan)
+            yield rows, np.moveaxis(values, 1, -1) / self.slopes[:, None, None, None]
 
     def smoothing(self, period: float) -> Array:
         """Smoother that passes half of a period [frame], as `solveh_banded` takes a matrix."""
         size, weight = self.frames.size, (2.0 * np.sin(np.pi / period)) ** -6
-        result = np.zeros((4, size))
-        result[-1] = 1.0
-        third = np.array([-1.0, 3.0, -3.0, 1.0])
-        for lag in range(4):
-            for first in range(4 - lag):
-                np.add.at(
-                    result[3 - lag],
-                    self.rough + first + lag,
-                    weight * third[first] * third[first + lag],
-                )
-        return result
+        third = sparse.diags_array(
+            [-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(size - 3, size), format="csr"
+        )[self.rough]
+        penalty = sparse.dia_array(sparse.eye_array(size) + weight * third.T @ third)
+        return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
 
     def rapid(self, period: float, used: npt.NDArray[np.intp]) -> list[matching.Movie]:
         """Rapid changes of the bands (y, x, time) [K] in some of the frames."""
-        matrix = self.smoothing(period)
+        smoothing = self.smoothing(period)
+        result = np.empty((self.bands.size, *self.valid.shape, used.size), np.float32)
+        for rows, signals in self.blocks(_ROWS):
+            for movie, signal in zip(result, signals, strict=True):
+                movie[rows] = _rapid(_filled(signal), smoothing)[..., used]
         nearest = distance_transform_edt(~self.valid, return_distances=False, return_indices=True)
-        result = []
-        for band in range(len(self.bands)):
-            movie = np.empty((*self.valid.shape, used.size), dtype=np.float32)
-            for start in range(0, self.valid.shape[0], _ROWS):
-                rows = slice(start, start + _ROWS)
-                signal = self.signals(band, rows)
-                movie[rows] = np.moveaxis(_filtered(signal, matrix)[used], 0, -1)
-            movie[~self.valid] = movie[tuple(nearest[:, ~self.valid])]
-            result.append(movie)
-        return result
+        result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
+        return list(result)
 
     def binned(self, factor: int) -> tuple[list[Array], Mask]:
-        """Signals (time, y, x) [K] of squares of pixels, and the pixels that lack few frames."""
-        valid, result = self.valid.copy(), []
-        height, width = (size // factor for size in valid.shape)
-        for band in range(len(self.bands)):
-            image = np.zeros((self.frames.size, height, width))
-            step = max(1, _ROWS // factor)
-            for start in range(0, height, step):
-                rows = slice(start * factor, min(start + step, height) * factor)
-                signal = self.signals(band, rows)
-                valid[rows] &= np.isnan(signal).mean(axis=0) <= _MISSING
-                weight = valid[rows, : width * factor].astype(float)
-                parts = (
-                    (part * weight)
-                    .reshape(*part.shape[:-2], -1, factor, width, factor)
-                    .sum((-3, -1))
-                    for part in (_filled(signal)[..., : width * factor], np.ones_like(weight))
-                )
-                total, number = parts
-                image[:, start : start + step] = total / np.maximum(number, 1.0)
-            result.append(image)
-        valid[height * factor :] &= self.valid[height * factor :]
-        return result, valid
+        """Signals (y, x, time) [K] of squares of pixels, and the pixels that lack few frames."""
+        valid, parts = self.valid.copy(), []
+        for rows, signals in self.blocks(max(1, _ROWS // factor) * factor):
+            valid[rows] &= np.all(np.isnan(signals).mean(axis=-1) <= _MISSING, axis=0)
+            here = valid[rows, :, np.newaxis].astype(np.float64)
+            share = np.maximum(matching.binned(here, factor), factor**-2)
+            parts.append([matching.binned(_filled(s) * here, factor) / share for s in signals])
+        return [np.concatenate(band) for band in zip(*parts, strict=True)], valid
 
 
 def _coarse(
@@ -205,31 +176,27 @@ def _coarse(
 ) -> tuple[_Capture, float, npt.NDArray[np.intp], Field]:
     """Capture with its valid pixels, the period that tells most, energetic frames, rough field."""
     signals, valid = capture.binned(factor)
-    capture = replace(capture, valid=valid)
-    height, width = signals[0].shape[1:]
-    reach = (int(height / 3), int(width / 3))
+    reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
     frames, best, result = capture.frames.size, 0.0, None
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
-        smoothing = capture.smoothing(period)
-        movies = [np.moveaxis(_filtered(part, smoothing), 0, -1) for part in signals]
-        level = matching.Movies.coarse(
-            [movie.astype(np.float32) for movie in movies],
-            matching.coarse_mask(valid, factor),
-            capture.noise / factor,
-            _freedom(frames, period),
-            factor,
-        )
+        smoothing, freedom = capture.smoothing(period), _freedom(frames, period)
+        pictures = [_rapid(part, smoothing).astype(np.float32) for part in signals]
+        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor)
         begin = matching.start(level, spline, reach) if result is None else result[-1]
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
-        told = float(_told(data, factor).mean())
-        agrees = result is None or _agree(result[-1], field, level.centres())
-        if told > _MORE * best and agrees:
-            energy = np.minimum((movies[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
-            best, result = told, (capture, period, _energetic(energy, capture.valid.size), field)
+        told, places = float(_told(data, factor).mean()), level.centres()
+        # A field of slower changes must lie within the deviation of the more robust one.
+        apart = (begin.on(places) - field.on(places)) ** 2 / begin.variances(places)
+        if told > _MORE * best and (result is None or apart.mean() < _AGREE**2):
+            energy = np.minimum((pictures[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
+            # Those of the largest energy, no more than memory allows.
+            most = max(noises.MINIMUM_FRAMES, _SAMPLES // valid.size)
+            used = np.sort(np.argsort(energy)[::-1][:most])
+            best, result = told, (replace(capture, valid=valid), period, used, field)
     if result is None:
         raise ValueError(
             "Missing texture in the reflections: no rapid change that the bands share. "
@@ -245,18 +212,6 @@ def _told(data: Information, factor: int = 1) -> Mask:
     return np.asarray(largest > 1.0 / _KNOWN**2)
 
 
-def _agree(robust: Field, other: Field, centres: list[Array]) -> bool:
-    """Return whether a field lies within the deviation of another one that is more robust."""
-    apart = (robust.on(centres) - other.on(centres)) ** 2
-    return bool(np.mean(apart / robust.variances(centres)[[0, 2]]) < _AGREE**2)
-
-
-def _energetic(energy: Array, pixels: int) -> npt.NDArray[np.intp]:
-    """Frames of the largest energy (time), no more than memory allows."""
-    most = max(noises.MINIMUM_FRAMES, _SAMPLES // pixels)
-    return np.sort(np.argsort(energy)[::-1][:most])
-
-
 def _freedom(frames: int, period: float) -> float:
     """Degrees of freedom of white noise that a smoother leaves, see `_Capture.smoothing`."""
     frequency = np.pi * (np.arange(frames) + 0.5) / frames
@@ -265,21 +220,20 @@ def _freedom(frames: int, period: float) -> float:
 
 
 def _filled(signal: Array) -> Array:
-    """Signal (time, y, x) with missing samples on the line between those before and after."""
-    lacking = np.isnan(signal).any(axis=0)
-    places = np.arange(len(signal))
-    for row, column in np.argwhere(lacking):
-        part = signal[:, row, column]
+    """Signal (y, x, time) with missing samples on the line between those before and after."""
+    places = np.arange(signal.shape[-1])
+    for row, column in np.argwhere(np.isnan(signal).any(axis=-1)):
+        part = signal[row, column]
         here = np.isfinite(part)
-        signal[:, row, column] = np.interp(places, places[here], part[here]) if here.any() else 0.0
+        part[:] = np.interp(places, places[here], part[here]) if here.any() else 0.0
     return signal
 
 
-def _filtered(signal: Array, smoothing: Array) -> Array:
-    """Signal (time, y, x) less what a smoother passes."""
-    flat = _filled(signal).reshape(len(signal), -1)
+def _rapid(signal: Array, smoothing: Array) -> Array:
+    """Signal (y, x, time) less what a smoother passes."""
+    flat = signal.reshape(-1, signal.shape[-1]).T
     flat = flat - flat.mean(axis=0)
-    return np.asarray(flat - solveh_banded(smoothing, flat)).reshape(signal.shape)
+    return np.asarray((flat - solveh_banded(smoothing, flat)).T).reshape(signal.shape)
 
 
 def _noise(corrected: xr.Dataset, response: xr.Dataset, names: list[str], slopes: Array) -> Array:
@@ -314,13 +268,17 @@ def _result(
     """Field as a dataset, NaN far from where it is known."""
     shape = capture.valid.shape
     centres = [np.arange(size, dtype=np.float64) for size in shape]
-    shift, covariance = field.on(centres), field.variances(centres)
+    shift, variance = field.on(centres), field.variances(centres)
     reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
     known = _told(data) & reached
-    near = np.asarray(distance_transform_edt(~known)) <= _NEAR * min(shape)
-    near &= reached
-    std = np.sqrt(np.maximum(covariance[[0, 2]], 0.0))
+    distance = np.asarray(distance_transform_edt(~known))
+    near = (distance <= _NEAR * min(shape)) & reached & known.any()
+    # Away from where it is known the field may change as much as it does there.
+    slopes = np.square(np.gradient(shift, axis=(1, 2))).sum(axis=0)[:, known]
+    growth = np.multiply.outer(slopes.sum(axis=1) / max(1, known.sum()), distance**2)
+    std = np.sqrt(np.maximum(variance, 0.0) + growth)
     definitions = schema.STAGES["reflection_shift"]
+    names = [str(name) for name in corrected["band"].values[capture.bands]]
     values = {
         "shift": np.where(near, shift, np.nan).astype(np.float32),
         "shift_std": np.where(near, std, np.nan).astype(np.float32),
@@ -330,6 +288,6 @@ def _result(
     result = xr.Dataset(
         {name: (one.dims, values[name], one.attrs) for name, one in definitions.items()},
         coords={"axis": ["y", "x"], **places},
-        attrs={**corrected.attrs, "reference_band": capture.names[0], "bands": capture.names[1:]},
+        attrs={**corrected.attrs, "reference_band": names[0], "bands": names[1:]},
     )
     return schema.check(result, "reflection_shift")

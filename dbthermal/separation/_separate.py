@@ -16,6 +16,8 @@ from dbthermal.separation._solve import solve
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
+# Pixels, about, from which it is told whether bands are apart.
+_LOOKED_AT: Final = 2000
 # Share of the pixels with moving reflections whose bands are apart, from which a shift is sought.
 _APART: Final = 0.02
 # Rows and columns, at least, in which a shift can be found.
@@ -88,14 +90,19 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     """
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     source = "none" if reflection_shift is None else "given"
-    alone = one(reflection_shift=reflection_shift)
+    alone = None
     wide = min(corrected.sizes["y"], corrected.sizes["x"]) >= _WIDE
-    if reflection_shift is None and wide and _share_apart(alone) > _APART:
-        shift = alignment.reflection_shift(corrected, response)
-        if bool(shift["known"].any()):
-            displaced = one(reflection_shift=shift)
-            if _share_apart(displaced) < _share_apart(alone):
-                alone, reflection_shift, source = displaced, shift, "found"
+    if reflection_shift is None and wide:
+        # Pixels whose bands are apart take long: some tell whether the cameras are.
+        apart = _share_apart(solve(_thinned(corrected), response, workers=workers))
+        if apart > _APART:
+            shift = alignment.reflection_shift(corrected, response)
+            if bool(shift["known"].any()):
+                alone = one(reflection_shift=shift)
+                if _share_apart(alone) < apart:
+                    reflection_shift, source = shift, "found"
+    if alone is None or source != "found":
+        alone = one(reflection_shift=reflection_shift)
     result, pooled = alone, None
     if materials is None and find_spec("skimage") is not None:
         pooled = pooling.regions(pooling.materials(alone, corrected, response), alone)
@@ -117,6 +124,13 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if materials is not None:
         result["material"] = materials
     return result.assign_attrs(reflection_shift=source)
+
+
+def _thinned(corrected: xr.Dataset) -> xr.Dataset:
+    """Some thousand pixels of a capture, evenly spaced over the image."""
+    pixels = corrected.sizes["y"] * corrected.sizes["x"]
+    every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
+    return corrected.isel(y=every, x=every)
 
 
 def _share_apart(result: xr.Dataset) -> float:

@@ -138,3 +138,13 @@ def test_sudden_steps() -> None:
     curve = np.stack([TIME >= 14.0, np.clip((TIME - 14.0) / 0.5, 0, 1), 0.0 * TIME], axis=1)
     found = residuals.sudden(6.0 * curve + 0.3 * noise(3), np.full(curve.shape, 0.3), TIME)
     np.testing.assert_array_equal(found, [True, False, False])
+
+
+def test_a_background_returns_and_a_rise_does_not() -> None:
+    """Passers-by leave the signal where it was; a front that has passed does not."""
+    time, rng = np.arange(300.0) / 10.0, np.random.default_rng(1)
+    passing = np.where((time > 8.0) & (time < 11.0), 0.4, 0.0)
+    rise = 20.0 / (1.0 + np.exp(-(time - 14.0) / 0.4))
+    signal = np.stack([passing, rise, rise + passing], axis=1)
+    signal += rng.normal(0.0, 0.03, signal.shape)
+    assert residuals.returning(signal).tolist() == [True, False, False]

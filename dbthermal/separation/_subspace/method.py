@@ -136,6 +136,7 @@ class _Solution:
     background_variance: Array  # (time, pixel) [K^2]
     straight: Tile  # the tile with signals of proportional reflections
     gray: Mask  # the signals as they are may be those of a gray body (pixel)
+    by_pattern: tuple[Array | float, Array | float]  # variances, see `pattern_variances`
 
 
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
@@ -212,8 +213,9 @@ def _steps(
         slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
         gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
     emission = emissions.estimate(straight, functions, ratios, settings.background_drift)
-    background = emissions.estimate_background(tile, emission, ratios)
-    return _Solution(ratios, emission, *background, straight, gray)
+    background, variance = emissions.estimate_background(tile, emission, ratios)
+    by_pattern = emissions.pattern_variances(tile, emission, ratios, background)
+    return _Solution(ratios, emission, background, variance, straight, gray, by_pattern)
 
 
 def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Estimate:
@@ -221,15 +223,16 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Esti
     ratios, emission = solution.ratios, solution.emission
     flags = _flags(tile, functions, solution)
     still = flags[Status.NO_BACKGROUND_MOTION]
-    undefined = still | flags[Status.GRAY]
+    ambiguous = emission.constant & flags[Status.ROLES_MAY_BE_SWAPPED]
+    undefined = still | flags[Status.GRAY] | ambiguous
     unidentified = undefined | emission.constant
     ratio_variance = ratios.variance + emission.level_std**2
-    by_pattern = emissions.pattern_variances(tile, emission, ratios, solution.background)
+    of_object, of_background = solution.by_pattern
     result = Estimate(
         object_temperature=emission.temperature,
-        object_temperature_std=np.sqrt(emission.temperature_std**2 + by_pattern[0]),
+        object_temperature_std=np.sqrt(emission.temperature_std**2 + of_object),
         background_temperature=solution.background,
-        background_temperature_std=np.sqrt(solution.background_variance + by_pattern[1]),
+        background_temperature_std=np.sqrt(solution.background_variance + of_background),
         emissivity=emission.emissivity,
         emissivity_std=np.sqrt(np.einsum("bbp->bp", emission.emissivity_covariance)),
         emissivity_covariance=emission.emissivity_covariance,
@@ -294,6 +297,9 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     defined = ~still & ~gray & ~emission.constant
     nonphysical = defined & np.any((emission.emissivity <= 0) | (emission.emissivity >= 1), axis=0)
     swapped = defined & ~nonphysical & (emission.emissivity.mean(axis=0) < 0.5)
+    constant = ~still & ~gray & emission.constant
+    # Before a constant object all that changes would be the background, which comes and goes.
+    swapped |= constant & ~residuals.returning(signals[0])
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
     free = frames - ratios.order - functions.steps
     excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * free)
@@ -305,7 +311,7 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[
     return {
         Status.NO_BACKGROUND_MOTION: still,
         Status.GRAY: gray,
-        Status.CONSTANT_OBJECT: ~still & ~gray & emission.constant,
+        Status.CONSTANT_OBJECT: constant,
         Status.BACKGROUND_NEVER_RESTS: defined & emission.restless,
         Status.NONPHYSICAL_EMISSIVITY: nonphysical,
         Status.ROLES_MAY_BE_SWAPPED: swapped,

@@ -40,6 +40,10 @@ _STEPS: Final = 3
 _CHANGE: Final = 5.0
 # Share of the change within a second that a sudden step makes.
 _MOST: Final = 2.0 / 3.0
+# Parts of the capture, and the total variation of their means over its range, from which a signal
+# returns.
+_PARTS: Final = 24
+_RETURNED: Final = 1.7
 # Frames of the shortest blocks of a residual.
 _BLOCK: Final = 9
 
@@ -175,6 +179,19 @@ def unexplained(residual: Array, rapid: Array, null_variance: Array, common: Arr
         result |= np.any(sums**2 > limit * variance * length, axis=0)
         sums, length = sums[::2] + sums[1::2], length[::2] + length[1::2]
     return np.asarray(result)
+
+
+def returning(signal: Array) -> Mask:
+    """
+    Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse.
+
+    Of means over parts of the capture: their total variation over their range is 1 for a change
+    that stays, 2 for one that comes and goes.
+    """
+    parts = np.array_split(signal, min(_PARTS, len(signal)))
+    means = np.stack([part.mean(axis=0) for part in parts])
+    variation = np.abs(np.diff(means, axis=0)).sum(axis=0)
+    return np.asarray(variation > _RETURNED * np.ptp(means, axis=0))
 
 
 def sudden(curve: Array, std: Array, time: Array) -> Mask:
