@@ -280,7 +280,7 @@ def test_a_few_pixels_are_not_none() -> None:
 
 def test_unknown_bit() -> None:
     """An unknown status bit raises an error."""
-    unknown = 1 << 20
+    unknown = 1 << 30
     flags = xr.DataArray(np.array([[0, unknown | 1]], dtype=np.uint32), dims=("y", "x"))
     with pytest.raises(ValueError, match=f"Unknown bits {unknown} of a status"):
         status(xr.Dataset({"status": flags}))

@@ -156,7 +156,10 @@ def test_memory_is_that_of_the_frames() -> None:
     """
     peaks = []
     for time in (EVEN, CLOCKS["nanoseconds"], CLOCKS["a pause of 30 years"]):
-        _, capture = seen_at(time, 50, seed=1)
+        scene, _ = seen_at(time, 50, seed=1)
+        step = 6.0 * (scene["time"] >= time[100])  # so that every clock asks for pieces of time
+        moved = scene.assign(object_temperature=scene["object_temperature"] + step)
+        capture = simulation.observe(moved, RIG.response(), np.random.default_rng(7))
         tracemalloc.start()
         separation.solve(capture, RIG.response())
         peaks.append(tracemalloc.get_traced_memory()[1])

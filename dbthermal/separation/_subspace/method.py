@@ -359,6 +359,9 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
         best.object_temperature, best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
+    # What pieces do not mend may be the bands' delay, which they can hide.
+    apart = result.status[suspect] & np.uint32(Status.BANDS_APART)
+    status |= np.where(best.status != 0, apart, np.uint32(0))
     return result.replace_pixels(suspect, replace(best, status=status)), first
 
 
