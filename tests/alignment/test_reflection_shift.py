@@ -50,7 +50,7 @@ def test_finds_a_smooth_field() -> None:
 
 
 def test_opened_capture_with_steps_between_segments(tmp_path: Path) -> None:
-    """Steps at shutter events are no reflection; a capture on disk is read by the steps that it needs.
+    """Steps at shutter events are no reflection; a capture on disk is read block by block.
 
     Half of the reflection is still: no shift is known far from what moves, and nearer its deviation
     allows for the field to go on changing.
