@@ -39,12 +39,6 @@ def select(labels: Labels) -> Mask:
     return result
 
 
-def join(parts: list[Survey]) -> Survey:
-    """Survey of the pixels of all parts, one after another."""
-    names = [field.name for field in fields(Survey)]
-    return Survey(*(np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in names))
-
-
 def expand(materials: Material, labels: Labels) -> Material:
     """Materials at pixels of given labels (pixel,); NaN at those without a material, -1."""
     values = (getattr(materials, field.name) for field in fields(Material))
