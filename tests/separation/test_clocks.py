@@ -185,4 +185,4 @@ def test_memory_of_a_long_capture(noise: str) -> None:
     tracemalloc.stop()
     print(f"{peak / 1e6:.0f} MB")
     assert peak < 1e9
-    assert not np.any(result["status"])
+    assert np.mean(result["status"] != 0) < 0.005  # each check has some false alarms in 10,000

@@ -91,7 +91,8 @@ _SUSPECT: Final = (
 )
 # Cost of an explanation over that of the best, up to which it is preferred if it has no flag.
 _LIKELY: Final = 40.0
-_NEVER: Final = 1e9
+# Pieces of a rapid object, at most, whose bands seem apart in one smooth curve.
+_MOST_PIECES: Final = 10
 # Energy of the bend between the two responses, in units of the second band's noise, from which it
 # is worth taking out: it moves no linear function of the signal by more standard deviations.
 _BEND: Final = 0.2
@@ -359,9 +360,10 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
         best.object_temperature, best.object_temperature_std, tile.time
     )
     status = best.status | status_bits({Status.OBJECT_JUMP: jumping})
-    # What pieces do not mend may be the bands' delay, which they can hide.
+    # A delay of the bands asks for a piece at each change of the background, which hide it.
     apart = result.status[suspect] & np.uint32(Status.BANDS_APART)
-    status |= np.where(best.status != 0, apart, np.uint32(0))
+    hidden = first[:, suspect].sum(axis=0) > _MOST_PIECES
+    status |= np.where((best.status != 0) | hidden, apart, np.uint32(0))
     return result.replace_pixels(suspect, replace(best, status=status)), first
 
 
