@@ -8,7 +8,7 @@ emissivity needs a quiet ordinate.
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +27,10 @@ Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
 
-PIXELS: Final = 320
+PIXELS: Final = 2560
 """Pixels in a tile, unless a method sets its own number."""
 
-SAMPLES: Final = 2**19
+SAMPLES: Final = 2**20
 """Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
 
 BLOCK_ROWS: Final = 32
@@ -41,13 +41,13 @@ _TOGETHER: Final = 12
 # Resampled samples whose noise differs by less are separated together [1].
 _NOISE_STEP: Final = 0.05
 # A temperature leaves the calibrated range if it is so many standard deviations outside.
-_RANGE_SIGMAS: Final = 5.0
+RANGE_SIGMAS: Final = 5.0
 # A temperature [K], emissivity [1] or deviation beyond is no result.
-_USELESS: Final = 1e6
+USELESS: Final = 1e6
 
 
 @dataclass(frozen=True)
-class _Pixels:
+class Pixels:
     """A record of arrays, optional ones among them, whose last axis is the pixel."""
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
@@ -66,21 +66,17 @@ class _Pixels:
                 parts[field.name][..., selected] = getattr(part, field.name)
         return replace(self, **parts)
 
-
-Record = TypeVar("Record", bound=_Pixels)
-
-
-def join(parts: Sequence[Record]) -> Record:
-    """Record of the pixels of all parts, one after another."""
-    values = (([getattr(part, one.name) for part in parts], one.name) for one in fields(parts[0]))
-    joined: dict[str, Any] = {
-        name: None if value[0] is None else np.concatenate(value, axis=-1) for value, name in values
-    }
-    return replace(parts[0], **joined)
+    def join(self, others: Sequence[Self]) -> Self:
+        """Return the record with the pixels of others after its own."""
+        joined: dict[str, Any] = {}
+        for field in fields(self):
+            values = [getattr(part, field.name) for part in (self, *others)]
+            joined[field.name] = None if values[0] is None else np.concatenate(values, axis=-1)
+        return replace(self, **joined)
 
 
 @dataclass(frozen=True)
-class Material(_Pixels):
+class Material(Pixels):
     """Reflection ratios and emissivity that the pixels of one material share; NaN for others."""
 
     ratio: Array  # reflection ratios (band, pixel) [1]
@@ -91,7 +87,7 @@ class Material(_Pixels):
 
 
 @dataclass(frozen=True)
-class Survey(_Pixels):
+class Survey(Pixels):
     """Contribution of each pixel to the estimate for its material."""
 
     scatter: Array  # noise-whitened scatter of rapid changes less noise (band, band, pixel) [1]
@@ -163,7 +159,7 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class Estimate(_Pixels):
+class Estimate(Pixels):
     """Estimate of one tile; NaN where a quantity is undefined, with a status bit that says so."""
 
     object_temperature: Array  # (time, pixel) [K]
@@ -224,19 +220,25 @@ class Estimate(_Pixels):
             if getattr(self, name) is None:
                 continue
             value, std = getattr(self, name), getattr(self, f"{name}_std")
-            precise = (std < _USELESS) | (f"{name}_std" in not_estimated)
-            lost = ~((np.abs(value) < _USELESS) & precise)
+            precise = (std < USELESS) | (f"{name}_std" in not_estimated)
+            lost = ~((np.abs(value) < USELESS) & precise)
             explained = np.all(np.isnan(value), axis=0) & (self.status != 0)
             beyond |= np.any(lost, axis=0) & ~explained
             values[name], values[f"{name}_std"] = (
                 np.where(lost, np.nan, part) for part in (value, std)
             )
             if name.endswith("temperature"):
-                margin = _RANGE_SIGMAS * np.where(np.isnan(std), 0.0, std)
-                cold, hot = value < curve.lowest - margin, value > curve.highest + margin
-                beyond |= np.any(cold | hot, axis=0)
+                beyond |= np.any(out_of_range(value, std, curve), axis=0)
         status = self.status | status_bits({Status.OUTSIDE_RESPONSE: beyond})
         return replace(self, **values, status=status)
+
+
+def out_of_range(temperature: Array, std: Array, curve: Curve) -> Mask:
+    """Temperatures [K] outside the calibrated range of a response by several deviations."""
+    margin = RANGE_SIGMAS * np.where(np.isnan(std), 0.0, std)
+    return np.asarray(
+        (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
+    )
 
 
 @dataclass(frozen=True)
@@ -272,7 +274,7 @@ def numbers(window: Window, width: int) -> Whole:
 
 def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterator[Cut]:
     """Read a block of rows and cut it into tiles; with the material of each pixel of the image."""
-    displacement, method, bands = inputs.displacement, inputs.method, inputs.bands
+    displacement, method = inputs.displacement, inputs.method
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
     width = block.sizes["x"]
@@ -282,11 +284,10 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     size = block.sizes["y"] * width if method.whole_image else size
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
-    curves = tuple(inputs.curves[band] for band in bands)
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
     grains = None
     for window in windows(rows, width, size):
-        rng, places = generator(inputs.seed, window), numbers(window, width)
+        places = numbers(window, width)
         grains = grains or quality.grains(block, inputs.noise * slopes)
         gain = np.ones(places.size)
         if displacement is None:
@@ -302,31 +303,9 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        emissivity, covariance = (
-            None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)
-            for known in (inputs.emissivity, inputs.emissivity_covariance)
-        )
-        if emissivity is not None and covariance is not None:
-            emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
-        tile = Tile(
-            # The linearised signals (see `response`), less the reference temperature.
-            signals=np.stack(
-                [
-                    curve.linearise(counts[band]) - curve.reference
-                    for band, curve in zip(bands, curves, strict=True)
-                ]
-            ),
-            time=time,
-            curves=curves,
-            noise=tuple(float(inputs.noise[band]) for band in bands),
-            shape=(window[0].stop - window[0].start, window[1].stop - window[1].start),
-            rng=rng,
-            pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
-            segment=segment,
-            material=None if material is None else material.select_pixels(places),
-            emissivity=emissivity,
-            emissivity_covariance=covariance,
-        )
+        tile = _tile(inputs, counts, time, window, segment)
+        if material is not None:
+            tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
             tile.signals[1:] -= inputs.difference(window[0])
         parts = []
@@ -337,6 +316,35 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
         if displacement is not None:
             parts = [alike for one in parts for alike in _of_one_noise(*one, gain, most)]
         yield Cut(window, status, valid, parts)
+
+
+def _tile(
+    inputs: Inputs, counts: Array, time: Array, window: Window, segment: Whole | None
+) -> Tile:
+    """Tile of the counts (band, time, pixel) [count] of a window, the quietest band first."""
+    bands = inputs.bands
+    curves = tuple(inputs.curves[band] for band in bands)
+    emissivity, covariance = (
+        None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)
+        for known in (inputs.emissivity, inputs.emissivity_covariance)
+    )
+    if emissivity is not None and covariance is not None:
+        emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
+    # The linearised signals (see `response`), less the reference temperature.
+    pairs = zip(bands, curves, strict=True)
+    signals = np.stack([curve.linearise(counts[band]) - curve.reference for band, curve in pairs])
+    return Tile(
+        signals=signals,
+        time=time,
+        curves=curves,
+        noise=tuple(float(inputs.noise[band]) for band in bands),
+        shape=(window[0].stop - window[0].start, window[1].stop - window[1].start),
+        rng=generator(inputs.seed, window),
+        pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
+        segment=segment,
+        emissivity=emissivity,
+        emissivity_covariance=covariance,
+    )
 
 
 def _of_one_noise(
