@@ -30,10 +30,7 @@ from dbthermal.instruments.session import Session
 from dbthermal.instruments.signals import SignalExit, raised_signals
 
 __all__ = ["ask_for_blackbody", "main", "plugged_in"]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 _FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)

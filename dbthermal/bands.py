@@ -16,6 +16,7 @@ import numpy.typing as npt
 from dbthermal import planck
 
 __all__ = ["FILTERS", "TEMPERATURE_RANGE", "Band", "get"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
 
@@ -24,10 +25,6 @@ TEMPERATURE_RANGE: Final = (100.0, 2000.0)
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 _NEWTON_STEPS = 50
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ __all__ = [
     "pair_summary",
     "rank_filters",
 ]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
 Bands = Mapping[str, Band] | Iterable[Band | str]
@@ -51,10 +52,6 @@ _OTHERS = (0.05, 0.7, 0.25, 0.9)
 # Steps on which Planck's law is integrated beside those of the spectrum, and nodes in each.
 _STEPS = 64
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def band_table(

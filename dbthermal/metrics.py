@@ -14,12 +14,9 @@ from dbthermal import schema
 from dbthermal._coordinates import laid_on
 
 __all__ = ["correlation", "relative_error_celsius"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def correlation(

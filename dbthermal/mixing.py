@@ -14,12 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 __all__ = ["background", "condition_number", "leaving", "matrix", "mixed"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:

@@ -17,6 +17,7 @@ from dbthermal import _smooth as smooth
 from dbthermal import schema
 
 __all__ = ["MINIMUM_FRAMES", "estimate", "estimate_bands", "second_difference"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
 
@@ -35,10 +36,6 @@ _TRIMMED_VARIANCE = float(chi2.cdf(_TRIM, 4) / chi2.cdf(_TRIM, 2))
 # Standard deviation of a correlation of second differences, times sqrt(frames): their
 # autocorrelation is 1, -2/3, 1/6, so sqrt(1 + 2 (4/9 + 1/36)).
 _CORRELATION_STD = np.sqrt(35.0 / 18.0)
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:

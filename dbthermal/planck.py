@@ -18,6 +18,7 @@ __all__ = [
     "spectral_radiance",
     "spectral_radiance_slope",
 ]
+__dir__ = __all__.copy
 
 FIRST_RADIATION_CONSTANT: float = 2.0 * constants.h * constants.c**2
 """2 h c^2, first radiation constant for radiance [W m^2 sr^-1]."""
@@ -27,10 +28,6 @@ SECOND_RADIATION_CONSTANT: float = constants.h * constants.c / constants.k
 
 Array = npt.NDArray[np.float64]
 Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def require_positive(name: str, value: npt.ArrayLike) -> Array:

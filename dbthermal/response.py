@@ -27,6 +27,7 @@ __all__ = [
     "noise",
     "require_range",
 ]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
 
@@ -38,10 +39,6 @@ COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", 
 
 # Temperatures at which the slope of a curve is checked.
 _SLOPE_POINTS: Final = 16
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 @dataclass(frozen=True)

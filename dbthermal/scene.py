@@ -21,6 +21,7 @@ from dbthermal.schema import Status
 from dbthermal.separation import separate
 
 __all__ = ["separate_capture"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -38,10 +39,6 @@ _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
 # fewest rows; rows around them, in multiples of the shift.
 _MEMORY, _SAMPLE, _FEWEST, _SHIFTS = 2_500_000_000, 220, 4, 4.0
 _BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def separate_capture(  # noqa: PLR0913 - the options of each step, by name

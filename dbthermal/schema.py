@@ -41,10 +41,7 @@ __all__ = [
     "nomenclature",
     "status_attrs",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 @dataclass(frozen=True)

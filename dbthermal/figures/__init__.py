@@ -38,7 +38,4 @@ __all__ = [
     "status",
     "truth_and_estimate",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

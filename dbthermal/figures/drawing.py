@@ -22,16 +22,13 @@ __all__ = [
     "plain_ticks",
     "provenance_note",
 ]
+__dir__ = __all__.copy
 
 COLORS: Final = ("#1b6ca8", "#d1495b", "#66a182", "#edae49", "#6c4f77")
 """Colours of the bands, in their order."""
 
 MARKERS: Final = "osD^vPX*"
 """Markers of lines, in their order."""
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def canvas(

@@ -49,6 +49,7 @@ __all__ = [
     "camera_kind",
     "next_shutter",
 ]
+__dir__ = __all__.copy
 
 Counts = npt.NDArray[np.uint16]
 Identity = Mapping[str, str | bool]
@@ -358,7 +359,3 @@ def next_shutter(
     frozen = known is None and copies >= FEWEST_COPIES
     closed = renewed or (repeated and (before.closed or announced or frozen))
     return Shutter(closed, copies, known)
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -37,6 +37,7 @@ from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 
 __all__ = ["Devices", "ReadingError", "Thermocouples", "open_devices"]
+__dir__ = __all__.copy
 
 SCAN_AGE: Final = 1.0
 """Longest time for which a scan of all thermocouples gives the readings of its channels [s]."""
@@ -348,7 +349,3 @@ def _require_same(band: str, source: Identity, control: Identity) -> None:
             f"Invalid cameras {numbers} of band '{band}': frames come from the first, commands go "
             "to the second. Must be one camera."
         )
-
-
-def __dir__() -> list[str]:
-    return __all__

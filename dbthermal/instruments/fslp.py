@@ -28,6 +28,7 @@ __all__ = [
     "encode",
     "next_sequence",
 ]
+__dir__ = __all__.copy
 
 COMMAND_CHANNEL: Final = 0x00
 """Channel of commands and their replies; a receiver discards the frames of all others."""
@@ -211,7 +212,3 @@ class Decoder:
         """Give up the open frame."""
         self.damaged += 1
         self._content, self._escaping = None, False
-
-
-def __dir__() -> list[str]:
-    return __all__

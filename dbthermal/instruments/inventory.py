@@ -23,6 +23,7 @@ import usb.util
 from serial.tools import list_ports
 
 __all__ = ["KINDS", "Device", "Kind", "LibusbMissingError", "describe", "find"]
+__dir__ = __all__.copy
 
 
 @dataclass(frozen=True)
@@ -331,7 +332,3 @@ def _udev_advice(kind: Kind, subsystem: str) -> str:
         f"Type this, and plug it in again: echo '{rule}' | sudo tee -a {RULES} "
         "&& sudo udevadm control --reload"
     )
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -37,10 +37,7 @@ if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does
     from dbthermal.figures import LiveFigure
 
 __all__ = ["Display", "Picture", "Status", "View", "Watch"]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 _WINDOW: Final = 3.0  # time over which a frame rate is measured [s]

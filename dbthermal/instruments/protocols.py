@@ -36,10 +36,7 @@ from dbthermal.instruments.recording._sweep import (
 from dbthermal.instruments.session import Session
 
 __all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 STABILITY_PERIOD: Final = 1.0

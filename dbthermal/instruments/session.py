@@ -58,10 +58,7 @@ from dbthermal.instruments import filterwheel, telemetry
 from dbthermal.instruments.camera import FFC_READING, FPA_READING, camera_kind
 
 __all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)

@@ -13,10 +13,7 @@ from types import FrameType
 from typing import Any, Final
 
 __all__ = ["SignalExit", "raised_signals"]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 _ENDING: Final = tuple(

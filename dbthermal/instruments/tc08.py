@@ -31,6 +31,7 @@ from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.transport import Closing
 
 __all__ = ["ERRORS", "TC08", "Flag", "Identity", "Scan", "TC08Error", "load"]
+__dir__ = __all__.copy
 
 Library = Any
 """A library bound by `load`, or an object with the same functions, such as the emulated one.
@@ -380,7 +381,3 @@ def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -
         getattr(library, function).restype = c_int16
         getattr(library, function).argtypes = arguments
     return library
-
-
-def __dir__() -> list[str]:
-    return __all__

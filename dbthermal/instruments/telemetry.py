@@ -23,6 +23,7 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments.camera import Counts, Metadata
 
 __all__ = ["FIELDS", "ROWS", "WORDS", "Field", "decode", "encode", "metadata"]
+__dir__ = __all__.copy
 
 ROWS: Final = 2
 """Rows of telemetry on USB: 514 rows of the frame are requested instead of 512."""
@@ -145,7 +146,3 @@ def _checked(rows: Counts) -> Counts:
     if rows.size < WORDS:
         raise ValueError(f"Invalid telemetry of {rows.size} words. Must hold {WORDS} or more.")
     return rows.ravel()
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -19,6 +19,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 from scipy.constants import zero_Celsius
 
 __all__ = ["EMF", "TEMPERATURE", "emf", "temperature"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
 Coefficients = npt.NDArray[np.floating] | tuple[float, ...]
@@ -148,7 +149,3 @@ def _inside(name: str, value: npt.ArrayLike, limits: tuple[float, float], unit: 
             f"Must lie in {limits[0]} to {limits[1]} {unit}."
         )
     return values
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -26,6 +26,7 @@ __all__ = [
     "TransportError",
     "open_serial",
 ]
+__dir__ = __all__.copy
 
 WRITE_TIMEOUT: Final = 1.0
 """Longest wait until the operating system took the bytes to send [s]."""
@@ -232,7 +233,3 @@ def _open_port(path: str, *, baudrate: int, rtscts: bool) -> "serial.Serial":
             f"Could not open '{path}': {error}. It must exist, be yours to use, and in no "
             "other program's use."
         ) from error
-
-
-def __dir__() -> list[str]:
-    return __all__

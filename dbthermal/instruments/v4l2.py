@@ -41,6 +41,7 @@ except ImportError as missing:  # Windows
     raise ImportError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.") from missing
 
 __all__ = ["BUFFERS", "Y16", "Capture", "Kernel", "open_url"]
+__dir__ = __all__.copy
 
 Y16: Final = 0x20363159
 """Pixel format ``Y16 ``: 16 bits a pixel, little-endian, before any gain control."""
@@ -323,7 +324,3 @@ def _formats(file: int, kernel: Kernel) -> list[int]:
 def _buffer(index: int) -> bytearray:
     """Argument for a buffer of this number."""
     return bytearray(BUFFER.pack(index, CAPTURE, 0, 0, 0, 0, 0, 0, MMAP, 0, 0))
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -42,6 +42,7 @@ __all__ = [
     "uncalibrated_reflection",
     "unscaled",
 ]
+__dir__ = __all__.copy
 
 # The settings are imported with their method when they are first used: one needs torch.
 _SETTINGS: Final = {
@@ -58,7 +59,3 @@ def __getattr__(name: str) -> Any:
     if name in _SETTINGS:
         return getattr(importlib.import_module(f"{__name__}.{_SETTINGS[name]}"), name)
     raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -72,6 +72,7 @@ __all__ = [
     "surroundings",
     "walkers",
 ]
+__dir__ = __all__.copy
 
 
 def __getattr__(name: str) -> ModuleType:
@@ -79,7 +80,3 @@ def __getattr__(name: str) -> ModuleType:
     if name in {"heat", "rays", "surroundings"}:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")
-
-
-def __dir__() -> list[str]:
-    return __all__

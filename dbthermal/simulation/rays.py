@@ -16,6 +16,7 @@ import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 __all__ = ["MISSED", "Camera", "Caster", "Hits", "mirror", "unit", "vertex_normals"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -30,10 +31,6 @@ _UP: Final = (0.0, 0.0, 1.0)
 _LIFT: Final = 1e-4
 # Two points on a surface are one within this, in units of the mesh's size.
 _SAME: Final = 1e-3
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,9 @@ from dbthermal.simulation._scenes import increasing
 from dbthermal.simulation.rays import Caster, Hits
 
 __all__ = ["Actor", "Pose", "gliding", "hinged", "incident", "painted"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ __all__ = [
     "BosonTimeoutError",
     "commands",
 ]
+__dir__ = __all__.copy
 
 T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
@@ -324,7 +325,3 @@ def _open_control(url: str, world: object | None) -> Boson:
 
 KIND: Final = CameraKind(_open_frames, _open_control, telemetry_rows=(0, telemetry.ROWS))
 """The kind of camera of a session's ``kind: boson``."""
-
-
-def __dir__() -> list[str]:
-    return __all__

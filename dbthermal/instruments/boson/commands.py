@@ -44,6 +44,7 @@ __all__ = [
     "Switch",
     "TelemetryLocation",
 ]
+__dir__ = __all__.copy
 
 T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
@@ -190,7 +191,3 @@ STATUSES: Final = MappingProxyType(
     }
 )
 """Meaning of each status of a refusal."""
-
-
-def __dir__() -> list[str]:
-    return __all__

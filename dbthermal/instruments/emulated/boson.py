@@ -20,6 +20,7 @@ from dbthermal.instruments.emulated.port import EmulatedPort, number, require_kn
 from dbthermal.instruments.emulated.world import FPA, SERIAL_NUMBERS, World
 
 __all__ = ["DEFAULTS", "FRAME_RATE", "EmulatedBoson", "start"]
+__dir__ = __all__.copy
 
 FRAME_RATE: Final = 60
 """Frames per second of a camera whose frames no source counts [Hz]."""
@@ -171,7 +172,3 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     elif {"sn", "fpa"} & options.keys():
         raise ValueError(f"Invalid options sn, fpa of camera '{name}'. Must be set in its world.")
     return EmulatedPort(EmulatedBoson(world, name))
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -41,6 +41,7 @@ __all__ = [
     "Picture",
     "open_frames",
 ]
+__dir__ = __all__.copy
 
 Picture = Callable[[float], Counts]
 
@@ -204,7 +205,3 @@ def open_frames(
         kind=address.target,
         ffc_period=number(address.options, "ffc", math.inf, FFC_PERIODS),
     )
-
-
-def __dir__() -> list[str]:
-    return __all__

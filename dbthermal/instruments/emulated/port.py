@@ -15,6 +15,7 @@ from typing import Final, Protocol, TypeVar
 from dbthermal.instruments.transport import Closing
 
 __all__ = ["TICK", "Device", "EmulatedPort", "number", "require_known"]
+__dir__ = __all__.copy
 
 Number = TypeVar("Number", bound=float)
 
@@ -119,7 +120,3 @@ def number(
             f"Must be a number ({type(default).__name__}) in {lowest} to {highest}."
         )
     return value
-
-
-def __dir__() -> list[str]:
-    return __all__

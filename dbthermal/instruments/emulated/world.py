@@ -19,6 +19,7 @@ from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.session import Session
 
 __all__ = ["FFC_DURATION", "FPA", "POSITIONS", "ROOM", "CameraState", "World", "emulated_world"]
+__dir__ = __all__.copy
 
 POSITIONS: Final = 6
 """Slots of the wheel, numbered from 1."""
@@ -210,7 +211,3 @@ def _slot(position: int) -> int:
     if position not in range(1, POSITIONS + 1):
         raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
     return position
-
-
-def __dir__() -> list[str]:
-    return __all__
