@@ -28,8 +28,7 @@ Mask = npt.NDArray[np.bool_]
 _QUIET: Final = 0.8
 # Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
-PIXELS: Final = 16
-"""About as many pixels tell the noise and the step of the counts."""
+PIXELS: Final = 16  # about as many pixels tell the noise and the step of the counts
 
 # The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
 _MARGIN: Final = 1.25

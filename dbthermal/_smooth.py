@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-PIECE_ORDER: Final = 5
-"""Number of polynomials in a piece of time."""
+PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 
 # Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
 _ROUNDED: Final = 1e-6

@@ -36,8 +36,7 @@ Mask = npt.NDArray[np.bool_]
 _PIXELS: Final = 16384
 # Samples of a band, at most: of a long capture fewer pixels.
 _SAMPLES: Final = 2**25
-SEARCH: Final = 5
-"""Largest lag that is searched by default, either way [frame]."""
+SEARCH: Final = 5  # largest lag that is searched by default, either way [frame]
 
 # Step of one clock against the other from which a lost frame, or a clock that is set, is suspected
 # [frame period].

@@ -45,11 +45,8 @@ SCAN_AGE: Final = 1.0
 FLUSH_TIMEOUT: Final = 2.0
 """Longest time in which the frames that a driver holds are read and discarded [s]."""
 
-WHEEL: Final = "filter_wheel"
-"""Name of the wheel, and of the reading of its slot."""
-
-THERMOCOUPLE: Final = "T"
-"""Letter of the rig's thermocouples."""
+WHEEL: Final = "filter_wheel"  # name of the wheel, and of the reading of its slot
+THERMOCOUPLE: Final = "T"  # letter of the rig's thermocouples
 
 
 class ReadingError(RuntimeError):

@@ -39,8 +39,7 @@ __all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]
 __dir__ = __all__.copy
 
 
-STABILITY_PERIOD: Final = 1.0
-"""Time from reading to reading while a temperature is awaited [s]."""
+STABILITY_PERIOD: Final = 1.0  # time from reading to reading while a temperature is awaited [s]
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,7 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-WRITE_TIMEOUT: Final = 1.0
-"""Longest wait until the operating system took the bytes to send [s]."""
+WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
 
 EMULATORS: Final = MappingProxyType(
     {

@@ -15,14 +15,9 @@ Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.uint32]
 Mask = npt.NDArray[np.bool_]
 
-MOST_MISSING: Final = 0.5
-"""Share of the frames without which a pixel is not solved."""
-
-LONGEST_GAP: Final = 2
-"""Frames in a row that may be bridged in a pixel."""
-
-MOST_BRIDGED: Final = 0.15
-"""Share of the frames from which a pixel lacks too many to be bridged."""
+MOST_MISSING: Final = 0.5  # share of the frames without which a pixel is not solved
+LONGEST_GAP: Final = 2  # frames in a row that may be bridged in a pixel
+MOST_BRIDGED: Final = 0.15  # share of the frames from which a pixel lacks too many to be bridged
 
 # Frames from which fewer pixels are sampled, of as many samples together.
 _LONG: Final = 2048

@@ -53,10 +53,8 @@ class Pose:
         return (origins - np.asarray(self.translation)) @ matrix, directions @ matrix
 
 
-Motion = Callable[[float], Pose]
-"""Pose at a time [s]."""
-Warmth = Callable[[float], Array]
-"""Temperature of each vertex (vertex,) [K] at a time [s]."""
+Motion = Callable[[float], Pose]  # pose at a time [s]
+Warmth = Callable[[float], Array]  # temperature of each vertex (vertex,) [K] at a time [s]
 
 
 def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:

@@ -51,20 +51,14 @@ __dir__ = __all__.copy
 T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
 
-BAUDRATE: Final = 921600
-"""Speed of the line [bit/s]; over USB probably without effect."""
-
-REPLY_TIMEOUT: Final = 1.0
-"""Longest wait for a reply [s], as in the vendor's own software."""
+BAUDRATE: Final = 921600  # speed of the line [bit/s]; over USB probably without effect
+REPLY_TIMEOUT: Final = 1.0  # longest wait for a reply [s], as in the vendor's own software
 
 REPEATS: Final = 2
 """Repetitions of a reading without a reply; a command that changes the camera is sent once."""
 
-FFC_TIMEOUT: Final = 10.0
-"""Longest wait for a flat-field correction [s]."""
-
-POLL: Final = 0.05
-"""Time between two questions while waiting [s]."""
+FFC_TIMEOUT: Final = 10.0  # longest wait for a flat-field correction [s]
+POLL: Final = 0.05  # time between two questions while waiting [s]
 
 MAXIMUM_RECEIVED: Final = 65536
 """Most bytes to search for one reply: a line that talks without end is an error."""

@@ -12,8 +12,7 @@ from dbthermal.bands import FILTERS
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.session import Session
 
-NETD = 0.1
-"""Noise of the emulated cameras near 25 degrees Celsius [K]."""
+NETD = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
 
 Counts = npt.NDArray[np.uint16]
 

@@ -22,8 +22,7 @@ from dbthermal.instruments.emulated.world import FPA, SERIAL_NUMBERS, World
 __all__ = ["DEFAULTS", "FRAME_RATE", "EmulatedBoson", "start"]
 __dir__ = __all__.copy
 
-FRAME_RATE: Final = 60
-"""Frames per second of a camera whose frames no source counts [Hz]."""
+FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source counts [Hz]
 
 DEFAULTS: Final = MappingProxyType(
     {

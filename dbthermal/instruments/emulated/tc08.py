@@ -14,11 +14,8 @@ from dbthermal.instruments import thermocouple
 from dbthermal.instruments.emulated.world import ROOM, World
 from dbthermal.instruments.tc08 import CHANNELS, KELVIN
 
-Numbers = MutableSequence[Any]
-"""A ctypes array of the caller, written in place."""
-
-CONVERSION: Final = 0.1
-"""Conversion time of one channel [s]."""
+Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
+CONVERSION: Final = 0.1  # conversion time of one channel [s]
 
 _HANDLE = 1
 

@@ -21,20 +21,14 @@ from dbthermal.instruments.session import Session
 __all__ = ["FFC_DURATION", "FPA", "POSITIONS", "ROOM", "CameraState", "World", "emulated_world"]
 __dir__ = __all__.copy
 
-POSITIONS: Final = 6
-"""Slots of the wheel, numbered from 1."""
-
-ROOM: Final = 296.15
-"""Default temperature of the room [K]."""
-
-FPA: Final = 308.15
-"""Default temperature of a focal-plane array [K]."""
+POSITIONS: Final = 6  # slots of the wheel, numbered from 1
+ROOM: Final = 296.15  # default temperature of the room [K]
+FPA: Final = 308.15  # default temperature of a focal-plane array [K]
 
 FFC_DURATION: Final = 0.5
 """Duration of an emulated flat-field correction [s]; the real one is not documented publicly."""
 
-SERIAL_NUMBERS: Final = 93588
-"""Number of the first emulated camera of a session; the others follow."""
+SERIAL_NUMBERS: Final = 93588  # number of the first emulated camera of a session; the others follow
 
 
 @dataclass

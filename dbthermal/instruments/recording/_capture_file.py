@@ -40,8 +40,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.schema import EXPOSURE_TIME, FRAME_FLAGS, STAGES, Variable
 
-CHUNK: Final = 30
-"""Frames of a chunk: half a second at 60 Hz, the most that a kill may cost."""
+CHUNK: Final = 30  # frames of a chunk: half a second at 60 Hz, the most that a kill may cost
 
 _AHEAD: Final = 1e-3  # by how much a stamp may be later than the frame's arrival [s]
 _STALE: Final = 3.0  # age at which a reading of the serial line says no more of the shutter [s]

@@ -16,8 +16,7 @@ from dbthermal import schema, store
 from dbthermal.correction import correct
 from dbthermal.instruments.recording._capture import good_frames, mean_reading, notes, open_capture
 
-BLACKBODY = "blackbody"
-"""Name of the reading of the blackbody's temperature [K]."""
+BLACKBODY = "blackbody"  # name of the reading of the blackbody's temperature [K]
 
 Region = tuple[slice, slice]
 

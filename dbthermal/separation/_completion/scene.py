@@ -41,8 +41,7 @@ _MEDIAN: Final = np.pi / 2.0
 # Precision of a level that a pixel does not show [1/K^2].
 _NOTHING: Final = 1e-9
 
-Values = dict[str, Array]
-"""Completed values of some pixels by their names in the stage `separated`."""
+Values = dict[str, Array]  # completed values of some pixels by their names in the stage `separated`
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,7 @@ from dbthermal.separation._pooling.region_merging import Features, Labels, Regio
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-NONE: Final = -1
-"""Label of pixels that belong to no material: they are pooled with nobody."""
+NONE: Final = -1  # label of pixels that belong to no material: they are pooled with nobody
 
 # Sizes of the cells, and of those that a mixed cell is cut into [pixel].
 _SPACINGS: Final = (8, 4, 2)

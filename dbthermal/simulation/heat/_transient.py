@@ -25,8 +25,7 @@ _GAMMA: Final = 1.0 - np.sqrt(0.5)
 _CONTRACTION: Final = 0.5
 """Contraction of the error above which an iteration gets a new factorisation [1]."""
 
-_ITERATIONS: Final = 40
-"""Largest number of iterations of a stage; each at least halves the error."""
+_ITERATIONS: Final = 40  # largest number of iterations of a stage; each at least halves the error
 
 _EVEN: Final = 1e-7
 """Relative difference below which two steps, or a step and its limit, are the same [1]."""
