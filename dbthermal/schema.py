@@ -390,7 +390,7 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
     for dim in array.dims:
         if dim == "band":
-            _check_bands(array, label)
+            band_positions(array, [], label)
         elif dim in COORDINATES:
             _check_coordinate(array, str(dim), label)
 
@@ -424,14 +424,6 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
     if missing:
         raise ValueError(f"Missing band '{missing[0]}' in {label}. Has {names}.")
     return [names.index(name) for name in wanted]
-
-
-def _check_bands(array: xr.DataArray, label: str) -> None:
-    if "band" not in array.coords:
-        raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
-    names = [str(name) for name in array["band"].values]
-    if len(set(names)) != len(names):
-        raise ValueError(f"Repeated band in {names} of {label}. Each band must occur once.")
 
 
 def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.stats import chi2
 
-from dbthermal import planck, schema
+from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
@@ -252,21 +252,10 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
 
 
 def correct(
-    capture: xr.Dataset,
-    correction: xr.Dataset,
-    *,
-    after: xr.Dataset | None = None,
-    maximum: int = DETECTOR_MAXIMUM,
+    capture: xr.Dataset, correction: xr.Dataset, *, maximum: int = DETECTOR_MAXIMUM
 ) -> xr.Dataset:
-    r"""
+    """
     Apply gain and offset to a capture, and mark its bad and saturated pixels.
-
-    With a second correction gain and offset go from the first to it in proportion to time,
-
-    .. math:: I' = (1 - w) (g_0 I + f_0) + w (g_1 I + f_1), \quad w = \frac{t - t_0}{t_1 - t_0}
-
-    from the first frame to the last, which is right for a pattern that drifts so, and wrong across
-    a shutter event, where a camera renews its offsets.
 
     Parameters
     ----------
@@ -274,8 +263,6 @@ def correct(
         Stage `capture` of `schema`, raw uint16. Other variables are handed on.
     correction : Dataset
         From `fit_correction`, of the same pixels; it may hold more bands.
-    after : Dataset, optional
-        Correction that holds after the capture, e.g. from `renew_offset`.
     maximum : int
         Largest count of the detector [count].
 
@@ -287,8 +274,8 @@ def correct(
         at 0) of `schema.Status`. The counts of these pixels are kept. `pattern_std` (band) [count]
         where the correction has its deviations: what it leaves from pixel to pixel, constant in
         time, root mean square over the levels of the capture. Attributes:
-        ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``),
-        ``offset_interpolated``, and the numbers of marked pixels.
+        ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``), and the
+        numbers of marked pixels.
 
     Raises
     ------
@@ -297,30 +284,17 @@ def correct(
         gain or offset is not finite, or the pixels are not the same.
     """
     counts = _require_raw(capture)
-    names = [str(name) for name in counts["band"].values]
     maps = _maps(correction, counts)
-    if after is not None:
-        last = _maps(after, counts)
-        time = counts["time"].values.astype(np.float64)
-        planck.require_positive("length of the capture [s]", time[-1] - time[0])
-        weight = (time - time[0]) / (time[-1] - time[0])
-        change = last[["gain", "offset"]] - maps
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
-    for band in range(len(names)):
+    for band in range(len(counts)):
         # One band at a time, written where it stays: no second movie in memory.
         raw = counts.isel(band=band).values
         gain, offset = maps["gain"].values[band], maps["offset"].values[band]
         np.multiply(raw, gain.astype(np.float32), out=corrected[band])
         corrected[band] += offset.astype(np.float32)
-        if after is not None:
-            gain, offset = change["gain"].values[band], change["offset"].values[band]
-            for frame, share in enumerate(weight):
-                corrected[band, frame] += share * (gain * raw[frame] + offset)
         saturated |= (raw.max(axis=0) >= maximum) | (raw.min(axis=0) <= 0)
     bad = maps["bad"].values.any(axis=0)
-    if after is not None:
-        bad |= last["bad"].values.any(axis=0)
     status = bad * np.uint32(Status.DEAD_PIXEL) | saturated * np.uint32(Status.SATURATED)
     result = capture.drop_vars("counts").assign(
         counts=(counts.dims, corrected, schema.STAGES["corrected"]["counts"].attrs),
@@ -335,7 +309,6 @@ def correct(
         result.assign_attrs(
             gain_offset_corrected=1,
             **done,
-            offset_interpolated=int(after is not None),
             detector_maximum=maximum,
             dead_pixels=int(bad.sum()),
             saturated_pixels=int(saturated.sum()),

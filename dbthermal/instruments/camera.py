@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from types import MappingProxyType
 from typing import Final, Protocol
 
@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import _text as texts
+from dbthermal.schema import Flags
 
 __all__ = [
     "DAMAGED",
@@ -29,7 +30,6 @@ __all__ = [
     "FRAME_TIMEOUT",
     "GOOD",
     "KINDS",
-    "MEANINGS",
     "UNTIMED",
     "CameraControl",
     "CameraKind",
@@ -76,40 +76,23 @@ KINDS: Final = MappingProxyType(
 """Module of each kind of camera; its ``KIND`` is a `CameraKind`."""
 
 
-class FrameFlag(IntFlag):
-    """State of one frame; `MEANINGS` has a sentence for each bit."""
+class FrameFlag(Flags):
+    """State of one frame; the driver sets the first three bits, the recorder the others."""
 
-    DRIVER_ERROR = 1
-    WRONG_SIZE = 2
-    FOREIGN_CLOCK = 4
-    SHUTTER_CLOSED = 8
-    FRAMES_LOST_BEFORE = 16
-    SEQUENCE_STANDS = 32
-    TIME_STANDS = 64
-    TIME_WRONG = 128
-    PADDED = 256
-    IMAGE_REPEATED = 512
+    DRIVER_ERROR = 1, "the driver reports damaged data"
+    WRONG_SIZE = 2, "fewer or more bytes than a frame has: missing ones are 0"
+    FOREIGN_CLOCK = 4, "the device time is not on the host's monotonic clock"
+    SHUTTER_CLOSED = 8, "the shutter is closed, or the offsets were just renewed"
+    FRAMES_LOST_BEFORE = 16, "the sequence number leaps: frames are missing before it"
+    SEQUENCE_STANDS = 32, "the sequence number does not rise: repeated, or started anew"
+    TIME_STANDS = 64, "the device time does not rise, or is not known"
+    TIME_WRONG = 128, "the device time is before the start, or after the host's"
+    PADDED = 256, "no frame: the band has fewer than another, and its last one is repeated"
+    IMAGE_REPEATED = 512, "no pixel differs from the frame before: frozen, or saturated"
 
 
 GOOD: Final = FrameFlag(0)
 """No flag."""
-
-MEANINGS: Final = MappingProxyType(
-    {
-        FrameFlag.DRIVER_ERROR: "the driver reports damaged data",
-        FrameFlag.WRONG_SIZE: "fewer or more bytes than a frame has: missing ones are 0",
-        FrameFlag.FOREIGN_CLOCK: "the device time is not on the host's monotonic clock",
-        FrameFlag.SHUTTER_CLOSED: "the shutter is closed, or the offsets were just renewed",
-        FrameFlag.FRAMES_LOST_BEFORE: "the sequence number leaps: frames are missing before it",
-        FrameFlag.SEQUENCE_STANDS: "the sequence number does not rise: repeated, or started anew",
-        FrameFlag.TIME_STANDS: "the device time does not rise, or is not known",
-        FrameFlag.TIME_WRONG: "the device time is before the start, or after the host's",
-        FrameFlag.PADDED: "no frame: the band has fewer than another, and its last one is repeated",
-        FrameFlag.IMAGE_REPEATED: "no pixel differs from the frame before: frozen, or saturated",
-    }
-)
-"""The first three are set by the driver, the others by the recorder, which sees the frame before.
-"""
 
 UNTIMED: Final = (
     FrameFlag.DRIVER_ERROR
@@ -261,12 +244,6 @@ class CameraControl(Protocol):
 
     def fpa_temperature(self) -> float:
         """Temperature of the focal-plane array [K]."""
-
-    def ffc_mode(self) -> FfcMode:
-        """Trigger of a flat-field correction."""
-
-    def gain_mode(self) -> GainMode:
-        """Sensitivity."""
 
     def close(self) -> None:
         """Release the port; a second call does nothing."""

@@ -20,8 +20,6 @@ from dbthermal.simulation._bench import (
 )
 from dbthermal.simulation._nuisances import (
     SPOILED,
-    drift_pattern,
-    drop_frames,
     expose,
     fire_shutter,
     lag,
@@ -52,8 +50,6 @@ __all__ = [
     "capture",
     "contact_measurements",
     "digitise",
-    "drift_pattern",
-    "drop_frames",
     "expose",
     "fire_shutter",
     "heat",

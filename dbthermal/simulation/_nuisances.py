@@ -88,27 +88,6 @@ def expose(
     )
 
 
-def drop_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
-    """
-    Remove lost frames, as a driver does that stamps the others: those that follow move up.
-
-    The capture has `exposure_time` (band, time) [s], see `expose`; `lost` is a mask (band, time).
-    In the result each band's remaining counts and stamps come first, and NaN behind them.
-    """
-    _check_lost(corrected, lost)
-    counts, stamps = (
-        corrected[name].values.astype(np.float64 if name == "exposure_time" else np.float32)
-        for name in ("counts", "exposure_time")
-    )
-    for band, gone in enumerate(lost):
-        kept = np.count_nonzero(~gone)
-        for values in (counts[band], stamps[band]):
-            values[:kept] = values[~gone]
-            values[kept:] = np.nan
-    replaced = {"counts": counts, "exposure_time": stamps}
-    return corrected.assign({name: corrected[name].copy(data=it) for name, it in replaced.items()})
-
-
 def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
     """
     Replace lost frames by copies of the frame before, as a driver does that stamps none.
@@ -215,46 +194,6 @@ def fire_shutter(
             movie[first:after] = movie[first - 1]
             movie[after:] += rng.normal(0.0, offset_std, movie.shape[1:]).astype(movie.dtype)
     return corrected.assign(counts=counts)
-
-
-def drift_pattern(
-    corrected: xr.Dataset,
-    rng: np.random.Generator,
-    *,
-    common: float = 0.0,
-    pattern_std: float = 0.0,
-) -> xr.Dataset:
-    """
-    Drift of the offsets, in proportion to time from the first frame to the last.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, of two frames or more.
-    rng : Generator
-        Source of the pattern.
-    common : float
-        Drift that all pixels of all bands share [count].
-    pattern_std : float
-        Standard deviation of each pixel's own drift [count].
-
-    Returns
-    -------
-    Dataset
-        The drifting capture, and `drifted` (band, y, x) [count]: the offsets at the last frame.
-    """
-    counts = _floating(corrected)
-    time = counts["time"].values.astype(np.float64)
-    planck.require_positive("length of the capture [s]", time[-1] - time[0])
-    share = ((time - time[0]) / (time[-1] - time[0])).astype(counts.dtype)
-    last = (common + pattern_std * rng.standard_normal(counts.isel(time=0).shape)).astype(
-        counts.dtype
-    )
-    drifting = counts.values + share[:, np.newaxis, np.newaxis] * last[:, np.newaxis]
-    return corrected.assign(
-        counts=(counts.dims, drifting, counts.attrs),
-        drifted=(("band", "y", "x"), last, {"units": "count", "long_name": "drift at the end"}),
-    )
 
 
 def spoil_pixels(

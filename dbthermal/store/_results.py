@@ -94,24 +94,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
     [20310, 20750]
     """
-    # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
-    plain = _with_text_as(dataset.drop_encoding(), "U", np.dtypes.StringDType())
-    plain.attrs = {**MARK, **dataset.attrs, "provenance": json.loads(_json(provenance))}
-    encoding = {
-        name: {"chunks": _chunks(variable), "compressors": _COMPRESSORS}
-        for name, variable in plain.variables.items()
-    }
-    with _whole(path, ".zarr") as part:
-        part.mkdir()
-        plain.to_zarr(
-            SummedStore(part),
-            mode="w-",
-            encoding=encoding,
-            zarr_format=3,
-            consolidated=False,
-            write_empty_chunks=True,
-        )
-        (part / SUMS).write_bytes(last_sums(part))
+    _save_rows([dataset], path, provenance, even=False)
 
 
 def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
@@ -139,18 +122,25 @@ def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
+    _save_rows(parts, path, provenance, even=True)
+
+
+def _save_rows(
+    parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any], *, even: bool
+) -> None:
+    """Save parts that follow one another along y; their chunks divide the rows if `even`."""
+    options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
     with _whole(path, ".zarr") as folder:
         folder.mkdir()
         for number, part in enumerate(parts):
+            # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
             plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
-            options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
+            encoding = {
+                name: {"chunks": _chunks(variable, even=even), "compressors": _COMPRESSORS}
+                for name, variable in plain.variables.items()
+            }
             if number == 0:
                 plain.attrs = {**MARK, **part.attrs, "provenance": json.loads(_json(provenance))}
-                encoding = {
-                    name: {"chunks": _chunks(variable, even=True), "compressors": _COMPRESSORS}
-                    for name, variable in plain.variables.items()
-                }
-                options = {"mode": "w-", "encoding": encoding}
             else:
                 rest = [name for name, one in plain.variables.items() if "y" not in one.dims]
                 plain = plain.drop_vars(rest).drop_attrs(deep=False)
@@ -159,7 +149,7 @@ def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping
                 zarr_format=3,
                 consolidated=False,
                 write_empty_chunks=True,
-                **options,
+                **(options if number else {"mode": "w-", "encoding": encoding}),
             )
         (folder / SUMS).write_bytes(last_sums(folder))
 

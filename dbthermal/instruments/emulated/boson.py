@@ -19,9 +19,6 @@ from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.emulated.port import EmulatedPort, number, require_known
 from dbthermal.instruments.emulated.world import FPA, SERIAL_NUMBERS, World
 
-__all__ = ["DEFAULTS", "FRAME_RATE", "EmulatedBoson", "start"]
-__dir__ = __all__.copy
-
 FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source counts [Hz]
 
 DEFAULTS: Final = MappingProxyType(

@@ -14,9 +14,6 @@ from typing import Final, Protocol, TypeVar
 
 from dbthermal.instruments.transport import Closing
 
-__all__ = ["TICK", "Device", "EmulatedPort", "number", "require_known"]
-__dir__ = __all__.copy
-
 Number = TypeVar("Number", bound=float)
 
 TICK: Final = 0.01

@@ -18,9 +18,6 @@ from typing import Any, Final
 from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.session import Session
 
-__all__ = ["FFC_DURATION", "FPA", "POSITIONS", "ROOM", "CameraState", "World", "emulated_world"]
-__dir__ = __all__.copy
-
 POSITIONS: Final = 6  # slots of the wheel, numbered from 1
 ROOM: Final = 296.15  # default temperature of the room [K]
 FPA: Final = 308.15  # default temperature of a focal-plane array [K]
