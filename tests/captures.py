@@ -50,7 +50,7 @@ def movie(signal: np.ndarray, time: object) -> xr.Dataset:
 
 
 def drop_frames(corrected: xr.Dataset, lost: np.ndarray) -> xr.Dataset:
-    """Remove lost frames (band, time), as a driver does that stamps the others: those after move up.
+    """Remove lost frames (band, time), as a driver that stamps the others does: the next move up.
 
     Each band's remaining counts and stamps come first, and NaN behind them.
     """
