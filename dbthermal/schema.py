@@ -177,7 +177,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
         "separated": {
             "emissivity_covariance": _of(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
-            ),
+            )
         },
         "blackbody_frames": {"noise": NOISE},
         "correction": {

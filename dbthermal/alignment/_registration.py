@@ -32,11 +32,7 @@ _FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
 # Numbers of a homography that each model changes, one matrix each.
 _FREE: Final = {
     model: np.eye(9)[places].reshape(-1, 3, 3)
-    for model, places in (
-        ("translation", [2, 5]),
-        ("affine", range(6)),
-        ("homography", range(8)),
-    )
+    for model, places in (("translation", [2, 5]), ("affine", range(6)), ("homography", range(8)))
 }
 # Gauss-Newton: steps, length of a difference and of the last step, border left out [pixel].
 _NEWTON, _STEP, _CONVERGED, _MARGIN = 15, 1e-2, 1e-4, 3

@@ -6,12 +6,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _rows, schema
-from dbthermal.correction._nonuniformity import (
-    DETECTOR_MAXIMUM,
-    OUTLIER,
-    correct,
-    renew_offset,
-)
+from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
 from dbthermal.correction._shutter import find_shutter, mark_shutter
 from dbthermal.correction._temporal import undo_drift, undo_lag

@@ -68,10 +68,7 @@ FFC_READING: Final = "ffc "
 """Prefix of the name of a reading of the `FfcStatus`; the band follows."""
 
 KINDS: Final = MappingProxyType(
-    {
-        "boson": "dbthermal.instruments.boson",
-        "y16": "dbthermal.instruments.y16",
-    }
+    {"boson": "dbthermal.instruments.boson", "y16": "dbthermal.instruments.y16"}
 )
 """Module of each kind of camera; its ``KIND`` is a `CameraKind`."""
 

@@ -20,19 +20,9 @@ import numpy as np
 from dbthermal import store
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.recording import (
-    Limits,
-    Preview,
-    Summary,
-    record,
-)
+from dbthermal.instruments.recording import Limits, Preview, Summary, record
 from dbthermal.instruments.recording._capture import mean_reading
-from dbthermal.instruments.recording._sweep import (
-    BLACKBODY,
-    is_complete,
-    require_filter,
-    step_path,
-)
+from dbthermal.instruments.recording._sweep import BLACKBODY, is_complete, require_filter, step_path
 from dbthermal.instruments.session import Session
 
 __all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]

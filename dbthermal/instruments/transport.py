@@ -18,23 +18,13 @@ from dbthermal.instruments import _addresses as addresses
 if TYPE_CHECKING:
     import serial
 
-__all__ = [
-    "EMULATORS",
-    "Closing",
-    "SerialTransport",
-    "Transport",
-    "TransportError",
-    "open_serial",
-]
+__all__ = ["EMULATORS", "Closing", "SerialTransport", "Transport", "TransportError", "open_serial"]
 __dir__ = __all__.copy
 
 WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
 
 EMULATORS: Final = MappingProxyType(
-    {
-        "boson": "dbthermal.instruments.emulated.boson",
-        "apt": "dbthermal.instruments.emulated.apt",
-    }
+    {"boson": "dbthermal.instruments.emulated.boson", "apt": "dbthermal.instruments.emulated.apt"}
 )
 """Module of each emulator, imported when it is started: its ``start(options, world)`` returns an
 object with `path` and `close`."""
@@ -163,11 +153,7 @@ class SerialTransport(Closing):
 
 
 def open_serial(
-    url: str,
-    *,
-    baudrate: int,
-    rtscts: bool = False,
-    world: object | None = None,
+    url: str, *, baudrate: int, rtscts: bool = False, world: object | None = None
 ) -> SerialTransport:
     """
     Open the line to a device by its name, for this program alone; nothing is sent.

@@ -42,10 +42,7 @@ def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
 
 
 def ratio_variance_bound(
-    emissivity: tuple[float, float],
-    noise: tuple[float, float],
-    background: Array,
-    functions: Array,
+    emissivity: tuple[float, float], noise: tuple[float, float], background: Array, functions: Array
 ) -> Array:
     r"""
     Cramer-Rao bound of the reflection ratio of two linear bands.

@@ -279,12 +279,7 @@ def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.
     information = np.block([[ee, ec, el], [ce, cc, cl], [le, lc, ll]])
     # Information about each unknown, were it the only one: no background to eliminate.
     alone = np.concatenate(
-        [
-            np.sum(g**2, axis=1).T + prior,
-            np.sum(p**2, axis=0).T @ functions**2,
-            ll[..., 0],
-        ],
-        axis=1,
+        [np.sum(g**2, axis=1).T + prior, np.sum(p**2, axis=0).T @ functions**2, ll[..., 0]], axis=1
     )
     scale = np.sqrt(np.divide(1.0, alone, out=np.ones_like(alone), where=alone > 0))
     scaled = information * scale[:, np.newaxis] * scale[..., np.newaxis]

@@ -38,11 +38,7 @@ _COLOURED: Final = 30  # least difference between the channels of a coloured pix
 
 
 def palette_video(
-    path: str | Path,
-    palette: str = "plasma",
-    *,
-    memory: float = MEMORY,
-    sha256: str | None = None,
+    path: str | Path, palette: str = "plasma", *, memory: float = MEMORY, sha256: str | None = None
 ) -> xr.DataArray:
     """
     Video drawn in a palette, as positions in the palette.

@@ -9,11 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
-from dbthermal.separation._reflection import (
-    reflected_change,
-    uncalibrated_reflection,
-    unscaled,
-)
+from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection, unscaled
 from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
 

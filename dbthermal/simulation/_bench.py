@@ -334,10 +334,7 @@ def reflector_series(
     foil = mixing.leaving(bench.foil_emissivity, emitted, uneven)
     return _dataset(
         response,
-        {
-            "counts": _noisy(response, counts, rng),
-            "reflected_counts": _noisy(response, foil, rng),
-        },
+        {"counts": _noisy(response, counts, rng), "reflected_counts": _noisy(response, foil, rng)},
         {"object_temperature": _thermocouple(warm, bench, rng)},
     )
 

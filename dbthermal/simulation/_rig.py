@@ -238,11 +238,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
 
 
 def blackbody_movies(
-    rig: Rig,
-    temperatures: np.ndarray,
-    frames: int,
-    detector: xr.Dataset,
-    rng: np.random.Generator,
+    rig: Rig, temperatures: np.ndarray, frames: int, detector: xr.Dataset, rng: np.random.Generator
 ) -> xr.Dataset:
     """
     Raw movies of a blackbody that fills the view, at several temperatures.

@@ -22,13 +22,7 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal.schema import COORDINATES, Variable
-from dbthermal.store._durable import (
-    DurableStore,
-    HeldFolder,
-    made_beside,
-    replace,
-    tree_to_disk,
-)
+from dbthermal.store._durable import DurableStore, HeldFolder, made_beside, replace, tree_to_disk
 from dbthermal.store._integrity import (
     GROUP,
     GROWING,

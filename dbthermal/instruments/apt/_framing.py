@@ -199,9 +199,7 @@ class Decoder:
     """
 
     def __init__(
-        self,
-        destinations: Collection[int] = ADDRESSES,
-        sources: Collection[int] = ADDRESSES,
+        self, destinations: Collection[int] = ADDRESSES, sources: Collection[int] = ADDRESSES
     ) -> None:
         self.dropped = 0
         self._destinations = frozenset(destinations)

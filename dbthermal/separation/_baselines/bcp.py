@@ -159,10 +159,5 @@ def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Ar
     return np.asarray(uniform_filter(slope, window) * guide + uniform_filter(intercept, window))
 
 
-METHOD: Final = Method(
-    separate,
-    settings=BcpSettings,
-    whole_image=True,
-    not_estimated=WITHOUT_STD,
-)
+METHOD: Final = Method(separate, settings=BcpSettings, whole_image=True, not_estimated=WITHOUT_STD)
 """The reconstructed blackbody channel prior, for `solve`."""

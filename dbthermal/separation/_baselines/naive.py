@@ -209,9 +209,5 @@ def _symmetric(matrix: tuple[Array, Array, Array], right: Array) -> Array:
     )
 
 
-METHOD: Final = Method(
-    separate,
-    settings=NaiveSettings,
-    not_estimated=WITHOUT_STD,
-)
+METHOD: Final = Method(separate, settings=NaiveSettings, not_estimated=WITHOUT_STD)
 """Least squares without a prior, for `solve`."""

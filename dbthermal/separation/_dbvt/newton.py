@@ -102,11 +102,7 @@ def _terms(
         terms.append(_huber_term(part, slopes, images, settings, band, share))
     # r = p_2 - k_2 p_1
     weight = settings.reconstruction * images.share / images.sigma[1] ** 2
-    of_error = of_second | {
-        _FIRST: reflection,
-        _SMOOTH: reflection - emission,
-        _REFLECTION: -first,
-    }
+    of_error = of_second | {_FIRST: reflection, _SMOOTH: reflection - emission, _REFLECTION: -first}
     return [*terms, _Term(of_error, weight * error, weight)]
 
 
