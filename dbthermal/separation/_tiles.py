@@ -24,13 +24,17 @@ from dbthermal.separation._quality import Bits, status_bits
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
-Window = tuple[slice, slice]  # rows and columns of a tile in the image
-PIXELS: Final = 320  # pixels in a tile, unless a method sets its own number
+Window = tuple[slice, slice]
+"""Rows and columns of a tile in the image."""
+
+PIXELS: Final = 320
+"""Pixels in a tile, unless a method sets its own number."""
 
 SAMPLES: Final = 2**19
 """Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
 
-BLOCK_ROWS: Final = 32  # rows that are read at once: a lazy capture is then decoded about once
+BLOCK_ROWS: Final = 32
+"""Rows that are read at once: a lazy capture is then decoded about once."""
 
 # Tiles whose pixels are read together where they are then sorted by their noise.
 _TOGETHER: Final = 12
