@@ -19,10 +19,8 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.special import bdtrc, ndtri
 
+from dbthermal._arrays import Array, Mask
 from dbthermal.noise import MINIMUM_FRAMES
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
 _QUIET: Final = 0.8

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
 
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 
@@ -48,27 +48,11 @@ def subspace(
     time: npt.ArrayLike, order: int, *, segment: npt.NDArray[np.integer] | None = None
 ) -> Subspace:
     """
-    Smooth functions over given times, with steps of the camera.
+    Smooth functions of an order over given times (time,) [s], with steps of the camera.
 
-    Parameters
-    ----------
-    time : array_like, shape (time,)
-        Times [s], strictly increasing.
-    order : int
-        Number of smooth functions.
-    segment : ndarray of int, shape (time,), optional
-        Number of shutter events before each frame. At each change every signal has a step of its
-        own, which is not the object's.
-
-    Returns
-    -------
-    Subspace
-        The functions.
-
-    Raises
-    ------
-    ValueError
-        As `polynomial_basis`, or if there are more functions than times.
+    At each change of the `segment` (time), the number of shutter events before each frame, every
+    signal has a step of its own, which is not the object's. ValueError as `polynomial_basis`, or if
+    there are more functions than times.
     """
     plain, steps = polynomial_basis(time, order), camera_steps(segment)
     if not steps:

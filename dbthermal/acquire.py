@@ -32,7 +32,6 @@ from dbthermal.instruments.signals import SignalExit, raised_signals
 __all__ = ["ask_for_blackbody", "main", "plugged_in"]
 __dir__ = __all__.copy
 
-
 _FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)
 """Errors of devices and recordings: the drivers' own ones are of these kinds."""
 

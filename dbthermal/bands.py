@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import planck
+from dbthermal._arrays import Array
 
 __all__ = ["FILTERS", "TEMPERATURE_RANGE", "Band", "get"]
 __dir__ = __all__.copy
-
-Array = npt.NDArray[np.float64]
 
 TEMPERATURE_RANGE: Final = (100.0, 2000.0)
 """Temperatures [K] between which the pair radiance, temperature is defined."""

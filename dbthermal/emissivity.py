@@ -11,11 +11,11 @@ from importlib import resources
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _text as texts
 from dbthermal import mixing, planck, schema
+from dbthermal._arrays import Array
 from dbthermal.bands import FILTERS, Band, get
 
 __all__ = [
@@ -31,7 +31,6 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-Array = npt.NDArray[np.float64]
 Bands = Mapping[str, Band] | Iterable[Band | str]
 
 CAMERA_BAND: Final = "8-14"
@@ -518,7 +517,7 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
         raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
     if np.any(np.isinf(values)):
         raise ValueError("Invalid emissivity of the table: infinite. Must be finite, or NaN.")
-    std = _noise_of(noise, names)
+    std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     others = [name for name in names if name != beside]
     camera, filtered = values.sel(band=beside).values[:, np.newaxis], values.sel(band=others).values
     noises = std[names.index(beside)], std[[names.index(name) for name in others]]
@@ -531,11 +530,3 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
         name="object_temperature_std",
         attrs={"units": "K", "long_name": "standard deviation of the object temperature"},
     )
-
-
-def _noise_of(noise: xr.DataArray, names: list[str]) -> Array:
-    """Noise [K] of the named bands."""
-    if schema.check_numbers(noise, "the noise", "K").dims != ("band",):
-        raise ValueError(f"Invalid dims {noise.dims} of the noise. Must be ('band',).")
-    places = schema.band_positions(noise, names, "the noise")
-    return planck.require_positive("noise [K]", noise.values[places])

@@ -6,17 +6,15 @@ an average over the pixels that happened to work would flatter the method.
 """
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import schema
+from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
 
 __all__ = ["correlation", "relative_error_celsius"]
 __dir__ = __all__.copy
-
-Array = npt.NDArray[np.float64]
 
 
 def correlation(

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal._arrays import Array
+
 __all__ = ["background", "condition_number", "leaving", "matrix", "mixed"]
 __dir__ = __all__.copy
-
-Array = npt.NDArray[np.float64]
 
 
 def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:

@@ -15,11 +15,10 @@ from scipy.stats import chi2
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
+from dbthermal._arrays import Array
 
 __all__ = ["MINIMUM_FRAMES", "estimate", "estimate_bands", "second_difference"]
 __dir__ = __all__.copy
-
-Array = npt.NDArray[np.float64]
 
 MINIMUM_FRAMES: Final = 16
 """Fewest frames from which a noise is estimated."""

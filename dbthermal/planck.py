@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import constants
 
+from dbthermal._arrays import Array
+
 __all__ = [
     "FIRST_RADIATION_CONSTANT",
     "SECOND_RADIATION_CONSTANT",
@@ -26,7 +28,6 @@ FIRST_RADIATION_CONSTANT: float = 2.0 * constants.h * constants.c**2
 SECOND_RADIATION_CONSTANT: float = constants.h * constants.c / constants.k
 """h c / k, second radiation constant [m K]."""
 
-Array = npt.NDArray[np.float64]
 Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
+from dbthermal._arrays import Array
 
 __all__ = [
     "COEFFICIENTS",
@@ -28,8 +29,6 @@ __all__ = [
     "require_range",
 ]
 __dir__ = __all__.copy
-
-Array = npt.NDArray[np.float64]
 
 KINDS: Final = ("exact", "linear")
 """Kinds of response: the Sakuma-Hattori curve, and the paper's linear approximation."""

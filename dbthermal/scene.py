@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
@@ -22,9 +21,6 @@ from dbthermal.separation import separate
 
 __all__ = ["separate_capture"]
 __dir__ = __all__.copy
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Pixels and frames, at most, of the reduced capture, from which all is found that is of the whole
 # image; and frames whose mean is registered.

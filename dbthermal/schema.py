@@ -32,6 +32,7 @@ __all__ = [
     "Status",
     "Variable",
     "band_positions",
+    "band_values",
     "check",
     "check_corrected",
     "check_numbers",
@@ -424,6 +425,19 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
     if missing:
         raise ValueError(f"Missing band '{missing[0]}' in {label}. Has {names}.")
     return [names.index(name) for name in wanted]
+
+
+def band_values(
+    array: xr.DataArray, wanted: list[str], label: str, units: str
+) -> npt.NDArray[np.float64]:
+    """
+    Values (band,) of an array of numbers over the bands alone, in the order of some bands.
+
+    Raises as `check_numbers` and `band_positions`, and ValueError for other dims.
+    """
+    if check_numbers(array, label, units).dims != ("band",):
+        raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")
+    return array.values[band_positions(array, wanted, label)].astype(np.float64)
 
 
 def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:

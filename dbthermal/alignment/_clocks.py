@@ -8,9 +8,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.intp]
 
 # A sample nearer than this to the wanted time is taken as it is [frame period].

@@ -26,11 +26,9 @@ import xarray as xr
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.schema import Status
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Pixels, at most, of which a capture is judged; a full frame would say it no better.
 _PIXELS: Final = 16384

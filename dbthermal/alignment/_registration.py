@@ -10,13 +10,11 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter, map_coordinates, median_filter, spline_filter
 
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._resampling import TRANSFORM, positions
 from dbthermal.noise import MAD
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Kinds of transform, of two, six and eight numbers.
 _MODELS: Final = ("translation", "affine", "homography")

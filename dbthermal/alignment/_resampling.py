@@ -11,12 +11,12 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import _rows, schema
 from dbthermal import noise as noises
+from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
 from dbthermal.noise import MAD
 
-Array = npt.NDArray[np.float64]
 Movie = npt.NDArray[np.float32]
 
 TRANSFORM: Final = schema.Variable(

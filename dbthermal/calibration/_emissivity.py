@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.response import Curve, require_range
-
-Array = npt.NDArray[np.float64]
 
 _ITERATIONS: Final = 50
 _CONVERGED: Final = 1e-12

@@ -3,16 +3,14 @@
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from dbthermal import bands, planck, schema
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.response import Curve
-
-Array = npt.NDArray[np.float64]
 
 AMBIENT: Final = 298.15
 """Ambient temperature [K]; a response refers to the calibrated temperature nearest to it."""

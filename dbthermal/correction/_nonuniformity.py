@@ -9,17 +9,14 @@ measurement but is not one.
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.stats import chi2
 
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 DETECTOR_MAXIMUM: Final = 65535
 """Largest count of a 16-bit detector; at this value, and at 0, a sample is saturated [count]."""

@@ -13,13 +13,12 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from dbthermal import _samples as samples
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.correction._nonuniformity import OUTLIER
 from dbthermal.noise import MAD, MINIMUM_FRAMES
 from dbthermal.schema import Status
 
-Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 
 # A pixel is held against those around it: the median of a window this wide, and the eight nearest.
 _WINDOW = 5

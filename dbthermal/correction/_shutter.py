@@ -13,11 +13,10 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
-Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 # Fewest pixels that must change in a capture for an unchanged image to be a copy.
 _MINIMUM_PIXELS: Final = 16

@@ -6,9 +6,8 @@ import xarray as xr
 
 from dbthermal import _rows, planck, schema
 from dbthermal import _smooth as smooth
+from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
-
-Array = npt.NDArray[np.float64]
 
 
 def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
@@ -58,11 +57,13 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
             # z_n = I_n + (I_n - I_n-1) a / (1 - a): a correction that is small where the lag is.
             gain = old[band, frame - 1] / new[band, frame - 1]
             signal[band, frame] = movie[frame] + (movie[frame] - movie[frame - 1]) * gain
-    middle = np.median(np.diff(counts["time"].values.astype(np.float64)))
     constants = _time_constants(time_constant, counts)
+    ratio = np.median(np.diff(counts["time"].values.astype(np.float64))) / constants
+    # z = (I_n - a I_n-1) / (1 - a), of independent noises: sqrt(1 + a^2) / (1 - a).
+    amplification = np.hypot(1.0, np.exp(-ratio)) / -np.expm1(-ratio)
     return corrected.assign(counts=(counts.dims, signal, counts.attrs)).assign_attrs(
         lag_time_constant=constants.tolist(),
-        lag_noise_amplification=_noise_amplification(middle / constants).tolist(),
+        lag_noise_amplification=amplification.tolist(),
     )
 
 
@@ -159,12 +160,6 @@ def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -
         return planck.require_positive("time_constant [s]", time_constant.values[places])
     value = planck.require_positive("time_constant [s]", time_constant)
     return np.full(len(names), float(value))
-
-
-def _noise_amplification(ratio: Array) -> Array:
-    """Factor of white noise when the lag is undone, by interval over time constant [1]."""
-    # z = (I_n - a I_n-1) / (1 - a), of independent noises: sqrt(1 + a^2) / (1 - a).
-    return np.asarray(np.hypot(1.0, np.exp(-ratio)) / -np.expm1(-ratio))
 
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:

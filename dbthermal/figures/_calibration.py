@@ -23,11 +23,6 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
     ----------
     correction : Dataset
         From `correction.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
-
-    Returns
-    -------
-    Figure
-        Maps and marks.
     """
     bands = correction["band"].values
     figure, axes = canvas(len(bands), 2, (8.0, 2.8 * len(bands)))

@@ -16,11 +16,6 @@ def emissivity_bars(table: xr.Dataset) -> Figure:
     ----------
     table : Dataset
         From `emissivity.band_table`: `emissivity` (material, band) [1].
-
-    Returns
-    -------
-    Figure
-        Bars.
     """
     materials, bands = table["material"].values, table["band"].values
     figure, ((axis,),) = canvas(1, 1, (max(7.0, 0.62 * len(materials)), 4.6))
@@ -47,11 +42,6 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
         (first, second) [1], averaged over materials; NaN or infinite on the diagonal.
     materials : int
         Number of materials that the average is over.
-
-    Returns
-    -------
-    Figure
-        Matrix with its numbers.
     """
     figure, ((axis,),) = canvas(1, 1, (5.4, 4.6))
     values = np.where(np.isfinite(summary.values), summary.values, np.nan)
@@ -84,11 +74,6 @@ def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = Non
         `emissivity`, `emissivity_std` (material, band) [1].
     table : DataArray, optional
         Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
-
-    Returns
-    -------
-    Figure
-        One point per band and material.
     """
     figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
     if table is not None:

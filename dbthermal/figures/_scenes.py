@@ -29,7 +29,7 @@ _DPI: Final = 100
 
 def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, int]) -> Figure:
     """
-    Truth against estimate over time at one pixel, with two standard deviations.
+    Truth against estimate over time at one pixel, object above background, two deviations wide.
 
     Parameters
     ----------
@@ -39,11 +39,6 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
         From `separation.solve`.
     pixel : tuple of int
         Row and column.
-
-    Returns
-    -------
-    Figure
-        Object above, background below.
     """
     figure, axes = canvas(2, 1, (7.4, 5.6))
     truth = laid_on(truth, result, "the truth", "the result", dims=("y", "x"))
@@ -85,11 +80,6 @@ def separated_frames(
         Name of the scene.
     labels : tuple of str
         Labels with units of inputs, emission and reflection.
-
-    Returns
-    -------
-    Figure
-        As many rows as there are times.
     """
     emission = laid_on(emission, inputs, "the emission", "the inputs")
     reflection = laid_on(reflection, inputs, "the reflection", "the inputs")
@@ -139,11 +129,6 @@ def separated_temperatures(
         Name of the scene.
     label : str
         Label of the change, with its unit.
-
-    Returns
-    -------
-    Figure
-        As many rows as there are times.
 
     Examples
     --------

@@ -39,7 +39,6 @@ if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does
 __all__ = ["Display", "Picture", "Status", "View", "Watch"]
 __dir__ = __all__.copy
 
-
 _WINDOW: Final = 3.0  # time over which a frame rate is measured [s]
 _PERIOD: Final = 1.0  # least time from picture to picture [s]; one takes a tenth of it
 _PERCENTILES: Final = (1.0, 99.0)  # of the counts that are black and white in the picture [%]

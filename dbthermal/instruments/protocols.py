@@ -28,7 +28,6 @@ from dbthermal.instruments.session import Session
 __all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]
 __dir__ = __all__.copy
 
-
 STABILITY_PERIOD: Final = 1.0  # time from reading to reading while a temperature is awaited [s]
 
 

@@ -60,7 +60,6 @@ from dbthermal.instruments.camera import FFC_READING, FPA_READING, camera_kind
 __all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
 __dir__ = __all__.copy
 
-
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
 BLACKBODY: Final = "blackbody"  # name of its thermocouple

@@ -15,7 +15,6 @@ from typing import Any, Final
 __all__ = ["SignalExit", "raised_signals"]
 __dir__ = __all__.copy
 
-
 _ENDING: Final = tuple(
     number for name in ("SIGTERM", "SIGHUP") if (number := getattr(signal, name, None)) is not None
 )

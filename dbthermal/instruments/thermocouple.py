@@ -18,10 +18,11 @@ import numpy.typing as npt
 from numpy.polynomial.polynomial import polyder, polyval
 from scipy.constants import zero_Celsius
 
+from dbthermal._arrays import Array
+
 __all__ = ["EMF", "TEMPERATURE", "emf", "temperature"]
 __dir__ = __all__.copy
 
-Array = npt.NDArray[np.float64]
 Coefficients = npt.NDArray[np.floating] | tuple[float, ...]
 
 TEMPERATURE: Final = (3.15, 673.15)

@@ -11,7 +11,8 @@ import xarray as xr
 
 from dbthermal import mixing, schema
 from dbthermal import response as responses
-from dbthermal.limits._fisher import QUANTITIES, Array, Mask, Truth, deviations, smallest_order
+from dbthermal._arrays import Array, Mask
+from dbthermal.limits._fisher import QUANTITIES, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
 _UNIFORM: Final = 1.0 / np.sqrt(12.0)

@@ -15,11 +15,10 @@ import numpy.typing as npt
 
 from dbthermal import _smooth as smooth
 from dbthermal import mixing
+from dbthermal._arrays import Array, Mask
 from dbthermal.bands import Band
 from dbthermal.response import Curve
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.intp]
 
 QUANTITIES: Final = (

@@ -9,8 +9,9 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import mixing, planck, schema
+from dbthermal._arrays import Array
 from dbthermal.bands import FILTERS, Band
-from dbthermal.limits._fisher import Array, TopHat, Truth, deviations, smallest_order
+from dbthermal.limits._fisher import TopHat, Truth, deviations, smallest_order
 
 # Entry of a material without a best filter: none of them determines its temperature.
 _NO_FILTER: Final = "none"
@@ -141,7 +142,7 @@ def plan(
     emissivity = _emissivities(table)
     names = [str(name) for name in table["band"].values]
     sets = _combinations(names, beside, together)
-    std = _noise(noise, names)
+    std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     for name in names:
         if name not in filters:
             raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
@@ -257,13 +258,6 @@ def _combinations(names: list[str], beside: str, together: int) -> list[list[int
             f"Invalid together {together}. Must lie in [1, {len(others)}], the number of filters."
         )
     return [[names.index(beside), *chosen] for chosen in combinations(others, together)]
-
-
-def _noise(noise: xr.DataArray, names: list[str]) -> Array:
-    """Noise [K] of the named bands."""
-    schema.check_variable(noise, replace(schema.NOISE, units="K"), "the noise")
-    places = schema.band_positions(noise, names, "the noise")
-    return planck.require_positive("noise [K]", noise.values[places])
 
 
 def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str, Array]:

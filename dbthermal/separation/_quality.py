@@ -9,11 +9,10 @@ import xarray as xr
 
 from dbthermal import _samples as samples
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.schema import Status
 
-Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.uint32]
-Mask = npt.NDArray[np.bool_]
 
 MOST_MISSING: Final = 0.5  # share of the frames without which a pixel is not solved
 LONGEST_GAP: Final = 2  # frames in a row that may be bridged in a pixel

@@ -3,15 +3,12 @@
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
 _UNCORRELATED: Final = 0.1

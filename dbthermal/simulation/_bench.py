@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import calibration, mixing, planck, schema
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.emissivity import embedded_table
 from dbthermal.response import Curve, require_range
-
-Array = npt.NDArray[np.float64]
 
 _POSITIVE: Final = (
     "object_temperatures",

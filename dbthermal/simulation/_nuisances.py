@@ -8,11 +8,9 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.correction import lag_coefficients
 from dbthermal.simulation._rig import observe
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 SPOILED: Final = ("good", "noisy", "blinking", "stuck")
 """Kinds of pixel of `spoil_pixels`, by their number."""

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
-
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
 
 _BACKGROUNDS: Final = ("pulses", "random walk", "still")
 

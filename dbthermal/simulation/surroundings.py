@@ -14,13 +14,12 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from dbthermal._arrays import Array
 from dbthermal.simulation._scenes import increasing
 from dbthermal.simulation.rays import Caster, Hits
 
 __all__ = ["Actor", "Pose", "gliding", "hinged", "incident", "painted"]
 __dir__ = __all__.copy
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

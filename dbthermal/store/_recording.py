@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -178,8 +178,8 @@ class Recording:
                 if 0 < recorded < frames:
                     self._repeat_last(place, recorded, frames)
             for array in self._arrays.values():
-                shape = {"time": frames, "log": self.rows}
-                sizes = zip(_dims(array), array.shape, strict=True)
+                shape, metadata = {"time": frames, "log": self.rows}, cast("Any", array.metadata)
+                sizes = zip(metadata.dimension_names, array.shape, strict=True)
                 array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
             if time is not None:
                 zarr.create_array(
@@ -240,10 +240,6 @@ def _create(
         dimension_names=variable.dims,
         attributes=dict(variable.attrs),
     )
-
-
-def _dims(array: Any) -> tuple[str, ...]:
-    return tuple(array.metadata.dimension_names)
 
 
 def _grow(array: Any, axis: int, size: int) -> None:

@@ -31,7 +31,6 @@ from dbthermal.instruments.camera import (
     FfcMode,
     FfcStatus,
     FrameSource,
-    GainMode,
     Identity,
     Stream,
 )
@@ -145,7 +144,7 @@ class Boson(Closing):
             self._transport.close()
 
     def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
-        """Value of one of `commands.READINGS`, in the unit that its name says."""
+        """Value of one of the readings of `commands`, in the unit that its name says."""
         reply = self._exchange(reading.name, reading.command, repeats=repeats)
         try:
             return reading.value(reply)
@@ -171,8 +170,8 @@ class Boson(Closing):
             "sensor_serial_number": str(self.read(commands.SENSOR_SERIAL_NUMBER)),
             "part_number": self.read(commands.PART_NUMBER),
             "software_revision": self.read(commands.SOFTWARE_REVISION),
-            "gain_mode": self.gain_mode().name.lower(),
-            "ffc_mode": self.ffc_mode().name.lower(),
+            "gain_mode": self.get(commands.GAIN_MODE).name.lower(),
+            "ffc_mode": self.get(commands.FFC_MODE).name.lower(),
             "is_simulated": self.is_simulated,
         }
 
@@ -183,14 +182,6 @@ class Boson(Closing):
     def ffc_status(self) -> FfcStatus:
         """State of the flat-field correction."""
         return self.read(commands.FFC_STATUS)
-
-    def ffc_mode(self) -> FfcMode:
-        """Trigger of a flat-field correction."""
-        return self.get(commands.FFC_MODE)
-
-    def gain_mode(self) -> GainMode:
-        """Sensitivity."""
-        return self.get(commands.GAIN_MODE)
 
     def prepare(self, telemetry_rows: int) -> None:
         """Set 16-bit counts, FFC on command only, and telemetry below the image; read all back."""

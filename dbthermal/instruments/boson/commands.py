@@ -29,7 +29,6 @@ __all__ = [
     "IR16_MODE",
     "LAST_FFC_FRAME",
     "PART_NUMBER",
-    "READINGS",
     "RUN_FFC",
     "SENSOR_SERIAL_NUMBER",
     "SERIAL_NUMBER",
@@ -132,18 +131,6 @@ FPA_TEMPERATURE: Final = Reading("FPA temperature [K]", 0x00050030, ">h", _kelvi
 FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, ">h", Switch)
 FFC_STATUS: Final = Reading("FFC status", 0x00050054, ">i", FfcStatus)
 LAST_FFC_FRAME: Final = Reading("frame of the last FFC", 0x0005005D, ">I", int)
-
-READINGS: Final[tuple[Reading[Any], ...]] = (
-    SERIAL_NUMBER,
-    PART_NUMBER,
-    SENSOR_SERIAL_NUMBER,
-    SOFTWARE_REVISION,
-    FPA_TEMPERATURE,
-    FFC_IN_PROGRESS,
-    FFC_STATUS,
-    LAST_FFC_FRAME,
-)
-"""All readings."""
 
 FFC_MODE: Final = Setting("FFC mode", 0x00050012, FfcMode)
 GAIN_MODE: Final = Setting("gain mode", 0x00050014, GainMode)

@@ -39,7 +39,6 @@ BUFFERS: Final = 32
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
 
-
 MODELS: Final = MappingProxyType({"boson": "emulated Boson", "y16": "emulated Y16 camera"})
 """Model of the emulated camera by its kind, as in its address ``sim://boson/wide``."""
 

@@ -45,34 +45,14 @@ class CameraState:
 
 class World:
     """
-    One emulated bench: wheel, blackbody, scene and cameras, on one clock.
+    One emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch` on.
 
-    Single attributes may be read and set from any thread. To change several together, hold `lock`,
-    which is re-entrant, or call a method, which does.
-
-    Parameters
-    ----------
-    clock : callable
-        Gives the time [s]; injected by tests. The world begins at its `epoch`.
-    filters : mapping, optional
-        Band in each slot of the wheel, by its number 1 to 6. Slots left out hold no filter.
-    wheel_position : int
-        The slot in the beam at the start.
-    blackbody_temperature : float
-        Of the blackbody [K].
-    scene : callable, optional
-        Temperatures of the objects in the scene [K], by name, at a time of the scene [s].
-    waits : bool
-        Whether the scene stands at its beginning until `begin` sets `scene_began` [s]; else it
-        begins with the world.
-
-    Attributes
-    ----------
-    thermocouples : dict
-        Place of each channel, 1 to 8, of the thermocouple logger: a name in `scene`, or
-        ``"blackbody"``, ``"room"`` or ``"open"``.
-    cameras : dict
-        `CameraState` of each camera by its name; see `add_camera`.
+    `filters` has the band in each slot of the wheel, 1 to 6; slots left out have none. `scene` has
+    temperatures [K] by name at a time of the scene [s]; if it `waits` it stands at its beginning
+    until `begin` sets `scene_began`. `thermocouples` has the place of each channel, 1 to 8: a name
+    in the scene, ``"blackbody"``, ``"room"`` or ``"open"``; `cameras` the `CameraState` of each
+    camera by its name. Single attributes may be read and set from any thread. To change several
+    together, hold `lock`, which is re-entrant, or call a method, which does.
     """
 
     is_simulated: Final = True

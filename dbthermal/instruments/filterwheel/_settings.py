@@ -33,20 +33,11 @@ _HOME = {"home_direction": (1, 2), "home_limit_switch": (1, 4)}
 
 @dataclass(frozen=True)
 class Scale:
-    """
-    Units of a controller.
+    """Units of a controller."""
 
-    Attributes
-    ----------
-    turn : int
-        Counts of one turn of the wheel.
-    velocity, acceleration : float
-        Device units of one count/s and of one count/s^2.
-    """
-
-    turn: int
-    velocity: float
-    acceleration: float
+    turn: int  # counts of one turn of the wheel
+    velocity: float  # device units of one count/s
+    acceleration: float  # device units of one count/s^2
 
     def target(self, position: int, offset: float = 0.0) -> int:
         """

@@ -8,6 +8,7 @@ import xarray as xr
 
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
+from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
@@ -35,8 +36,7 @@ _COLDEST: Final = 150.0
 # Residual, in standard deviations of the noise, from which a result is of another capture.
 _STRANGE: Final = 8.0
 _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
-# Median of the absolute deviations of a normal distribution, inverse; variance of its median.
-_MAD: Final = 1.4826
+# Variance of the median of normal values, relative to that of their mean.
 _MEDIAN: Final = np.pi / 2.0
 # Precision of a level that a pixel does not show [1/K^2].
 _NOTHING: Final = 1e-9
@@ -245,7 +245,7 @@ def find_level(scene: Scene) -> Level:
     order = np.argsort(value)
     share = np.cumsum(weight[order]) / weight.sum()
     middle = float(value[order][np.searchsorted(share, 0.5)])
-    scatter = (_MAD * float(np.median(np.abs(value - middle)))) ** 2
+    scatter = (MAD * float(np.median(np.abs(value - middle)))) ** 2
     between = max(scatter - float(np.median(variance)), 0.0)
     own = between + _MEDIAN / float(np.sum(1.0 / variance)) + _LEAST[0] ** 2
     signal = (middle * wide + room * own) / (wide + own)

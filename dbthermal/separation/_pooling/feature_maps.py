@@ -16,10 +16,9 @@ from scipy import ndimage
 
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.noise import MAD
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Labels = npt.NDArray[np.intp]
 
 # Rows of a capture that are read at a time.

@@ -19,18 +19,15 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.stats import chi2
 
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.separation._pooling import feature_maps, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 NONE: Final = -1  # label of pixels that belong to no material: they are pooled with nobody
 

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array, Mask
+
 Labels = npt.NDArray[np.intp]
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

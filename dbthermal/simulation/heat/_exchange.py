@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy.constants import Stefan_Boltzmann
 
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
+
 Varying: TypeAlias = float | Array | Callable[[float], float | Array]
 """A number, one for each vertex, or a function of time [s] that returns either."""
 

@@ -9,9 +9,8 @@ import numpy.typing as npt
 import robust_laplacian
 from scipy import sparse
 
+from dbthermal._arrays import Array
 from dbthermal.planck import require_positive
-
-Array = npt.NDArray[np.float64]
 
 _FLATTEST: Final = 1e-9
 """A face whose area falls below this fraction of its longest edge squared is degenerate [1]."""
@@ -40,11 +39,6 @@ class Solid:
         """Refuse a property that is not finite and positive."""
         for field in fields(self):
             require_positive(f"{field.name} of a solid", getattr(self, field.name))
-
-    @property
-    def diffusivity(self) -> float:
-        r"""Thermal diffusivity :math:`\alpha = k / \rho c` [m^2 s^-1]."""
-        return self.conductivity / (self.density * self.specific_heat)
 
 
 # At 300 K, from table A.3 of Bergman, Lavine, Incropera, DeWitt (2011), Fundamentals of Heat and
@@ -116,17 +110,11 @@ class Shell:
     @cached_property
     def _operators(self) -> tuple[Any, Array]:
         r"""
-        Weak Laplacian [1] and lumped area of the mesh [m^2].
-
-        .. math:: (L T)_i = \int \nabla \varphi_i \cdot \nabla T \, dA
+        Weak Laplacian [1], :math:`(L T)_i = \int \nabla \varphi_i \cdot \nabla T dA`, area [m^2].
 
         Built on intrinsic Delaunay triangles, so no off-diagonal element is positive (but for
-        rounding) and the step obeys the maximum principle whatever the triangles are [1]_.
-
-        References
-        ----------
-        .. [1] Sharp, Crane (2020), A Laplacian for Nonmanifold Triangle Meshes, Computer
-           Graphics Forum 39(5), doi:10.1111/cgf.14069
+        rounding) and the step obeys the maximum principle whatever the triangles are: Sharp, Crane
+        (2020), Computer Graphics Forum 39(5), doi:10.1111/cgf.14069.
         """
         laplacian, mass = robust_laplacian.mesh_laplacian(
             np.array(self.vertices), np.array(self.faces)

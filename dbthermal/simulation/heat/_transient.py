@@ -10,11 +10,10 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from dbthermal._arrays import Array
 from dbthermal.planck import require_positive
 from dbthermal.simulation.heat._exchange import Balance, Exchange, combine
 from dbthermal.simulation.heat._shell import Shell
-
-Array = npt.NDArray[np.float64]
 
 TOLERANCE: Final = 1e-6
 """Largest error of the iteration in a stage of a step [K]."""
