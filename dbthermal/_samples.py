@@ -44,8 +44,7 @@ _END: Final = 2.0
 
 
 def noise(signal: npt.NDArray[Any]) -> Array:
-    """
-    Noise (pixel ...) of signals (time, pixel ...), which may hold NaN; NaN of too few frames.
+    """Noise (pixel ...) of signals (time, pixel ...), which may hold NaN; NaN of too few frames.
 
     The mean magnitude of the smaller four fifths of the second differences: neither object nor
     walkers enter.
@@ -96,8 +95,7 @@ class Grain:
 
 
 def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grain:
-    """
-    Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
+    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
 
     Samples at a heap, and frames in which no pixel changes, say nothing of the noise.
     """

@@ -47,8 +47,7 @@ class Subspace:
 def subspace(
     time: npt.ArrayLike, order: int, *, segment: npt.NDArray[np.integer] | None = None
 ) -> Subspace:
-    """
-    Smooth functions of an order over given times (time,) [s], with steps of the camera.
+    """Smooth functions of an order over given times (time,) [s], with steps of the camera.
 
     At each change of the `segment` (time), the number of shutter events before each frame, every
     signal has a step of its own, which is not the object's. ValueError as `polynomial_basis`, or if
@@ -73,8 +72,7 @@ def piecewise(
     *,
     segment: npt.NDArray[np.integer] | None = None,
 ) -> Subspace:
-    """
-    Polynomials in pieces of the time that begin with some frames (time,), of one order together.
+    """Polynomials in pieces of the time that begin with some frames (time,), of one order together.
 
     The rising polynomials are those of `subspace` of an order. A shutter event must not be the
     first frame of a piece: its step would be the object's as well.
@@ -112,8 +110,7 @@ def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Arr
 
 
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
-    r"""
-    Orthonormal polynomials over given times, the discrete Legendre polynomials.
+    r"""Orthonormal polynomials over given times, the discrete Legendre polynomials.
 
     Parameters
     ----------
@@ -146,8 +143,7 @@ def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
 
 
 def _arnoldi(position: Array, order: int) -> Array:
-    """
-    As `polynomial_basis`, where frames in few places make polynomials nearly dependent.
+    """As `polynomial_basis`, where frames in few places make polynomials nearly dependent.
 
     Each function is the one before times the position, made orthogonal (Brubeck, Nakatsukasa,
     Trefethen 2021, doi:10.1137/19M130839X).

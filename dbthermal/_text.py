@@ -173,8 +173,7 @@ def parse_json(text: str, source: str) -> Any:
 
 
 def read_yaml(path: str | Path) -> dict[Any, Any]:
-    """
-    Mapping in a YAML file, whose values mean the same in YAML 1.1 and 1.2.
+    """Mapping in a YAML file, whose values mean the same in YAML 1.1 and 1.2.
 
     Parameters
     ----------

@@ -37,8 +37,7 @@ _FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)
 
 
 def ask_for_blackbody(name: str, temperature: float) -> None:
-    """
-    Ask the user to set the blackbody to a temperature [K], and wait for Enter.
+    """Ask the user to set the blackbody to a temperature [K], and wait for Enter.
 
     RuntimeError if there is no keyboard, as under papermill.
     """

@@ -60,8 +60,7 @@ def band_table(
     *,
     minimum_coverage: float = MINIMUM_COVERAGE,
 ) -> xr.Dataset:
-    r"""
-    Planck-weighted band emissivities of materials.
+    r"""Planck-weighted band emissivities of materials.
 
     .. math:: e_m = \frac{\int_m e(\lambda) L(\lambda, T) d\lambda}{\int_m L(\lambda, T) d\lambda}
 
@@ -130,8 +129,7 @@ def band_table(
 
 
 def embedded_table() -> xr.Dataset:
-    """
-    Table of 25 common materials that comes with the package.
+    """Table of 25 common materials that comes with the package.
 
     Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
     [1]_ [2]_ [3]_, whose spectra are not redistributed.
@@ -170,8 +168,7 @@ def embedded_table() -> xr.Dataset:
 
 
 def library_mixture(bands: Iterable[str]) -> xr.Dataset:
-    r"""
-    Joint distribution of the band emissivities of materials, where nothing is known of them.
+    r"""Joint distribution of the band emissivities of materials, where nothing is known of them.
 
     A mixture of normal distributions over the 993 spectra of the libraries of `embedded_table`,
     with a wide component for the one material in twenty that is assumed to be none of theirs,
@@ -233,8 +230,7 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
 
 
 def condition_numbers(table: xr.Dataset) -> xr.DataArray:
-    """
-    Condition number of the mixing matrix for each material and pair of bands.
+    """Condition number of the mixing matrix for each material and pair of bands.
 
     Parameters
     ----------
@@ -273,8 +269,7 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
 
 
 def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
-    """
-    Condition number of each pair of bands, over the materials.
+    """Condition number of each pair of bands, over the materials.
 
     Parameters
     ----------
@@ -308,8 +303,7 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
 
 
 def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.DataArray:
-    r"""
-    Noise of a camera behind filters, from its noise without one.
+    r"""Noise of a camera behind filters, from its noise without one.
 
     The noise in counts is the camera's own and does not change, while a kelvin gives fewer counts:
 
@@ -356,8 +350,7 @@ def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.Da
 def rank_filters(
     table: xr.Dataset, noise: xr.DataArray, *, beside: str = CAMERA_BAND
 ) -> xr.Dataset:
-    """
-    Filters to set beside a band, best conditioned first, by two criteria.
+    """Filters to set beside a band, best conditioned first, by two criteria.
 
     The paper takes the filter of the lowest condition number (its section 5 says highest, a slip;
     its supplement says lowest) and notes the trade-off with the noise that a narrow filter brings.
@@ -504,8 +497,7 @@ def _dataset(materials: list[str], names: list[str], values: Array, coverage: Ar
 
 
 def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr.DataArray:
-    r"""
-    Standard deviation [K] of the object temperature from one frame (material, band).
+    r"""Standard deviation [K] of the object temperature from one frame (material, band).
 
     For each band m beside band 1, emissivities known, in the linear approximation,
     :math:`\mathrm{var}(x) = [(1 - e_m)^2 s_1^2 + (1 - e_1)^2 s_m^2] / (e_1 - e_m)^2`; infinite for

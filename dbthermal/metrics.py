@@ -20,8 +20,7 @@ __dir__ = __all__.copy
 def correlation(
     first: xr.DataArray, second: xr.DataArray, mask: xr.DataArray | None = None
 ) -> xr.DataArray:
-    """
-    Pearson's correlation of two maps, frame by frame.
+    """Pearson's correlation of two maps, frame by frame.
 
     Parameters
     ----------
@@ -62,8 +61,7 @@ def correlation(
 
 
 def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.DataArray:
-    r"""
-    Error in per cent of the true temperature in degrees Celsius, as the paper reports it.
+    r"""Error in per cent of the true temperature in degrees Celsius, as the paper reports it.
 
     .. math:: 100 \, |\hat T - T| / (T - 273.15)
 

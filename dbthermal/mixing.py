@@ -20,8 +20,7 @@ __dir__ = __all__.copy
 
 
 def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:
-    r"""
-    Signal of a surface, :math:`e \Phi_x + (1 - e) \Phi_y`, without a check of the values.
+    r"""Signal of a surface, :math:`e \Phi_x + (1 - e) \Phi_y`, without a check of the values.
 
     Parameters
     ----------
@@ -44,8 +43,7 @@ def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:
 
 
 def background(emissivity: Any, signal: Any, emitted: Any) -> Any:
-    r"""
-    Blackbody signal of the background, :math:`\Phi_y = (\Phi - e \Phi_x) / (1 - e)`.
+    r"""Blackbody signal of the background, :math:`\Phi_y = (\Phi - e \Phi_x) / (1 - e)`.
 
     Parameters
     ----------
@@ -63,8 +61,7 @@ def background(emissivity: Any, signal: Any, emitted: Any) -> Any:
 
 
 def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.ArrayLike) -> Array:
-    """
-    Signal that leaves a surface: as `mixed`, but refuses emissivities outside [0, 1].
+    """Signal that leaves a surface: as `mixed`, but refuses emissivities outside [0, 1].
 
     Parameters
     ----------
@@ -98,8 +95,7 @@ def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.Ar
 
 
 def matrix(emissivity: npt.ArrayLike) -> Array:
-    r"""
-    Mixing matrix E of several bands, rows :math:`(e_m, 1 - e_m)`.
+    r"""Mixing matrix E of several bands, rows :math:`(e_m, 1 - e_m)`.
 
     Parameters
     ----------
@@ -116,8 +112,7 @@ def matrix(emissivity: npt.ArrayLike) -> Array:
 
 
 def condition_number(emissivity: npt.ArrayLike) -> Array:
-    """
-    Condition number of the mixing matrix in the 2-norm; infinite for a gray body.
+    """Condition number of the mixing matrix in the 2-norm; infinite for a gray body.
 
     Parameters
     ----------

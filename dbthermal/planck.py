@@ -32,8 +32,7 @@ Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 
 
 def require_positive(name: str, value: npt.ArrayLike) -> Array:
-    """
-    Value as a float array, of which every element must be finite and positive.
+    """Value as a float array, of which every element must be finite and positive.
 
     Raises ValueError with the name and the first element that is not.
     """
@@ -45,8 +44,7 @@ def require_positive(name: str, value: npt.ArrayLike) -> Array:
 
 
 def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
-    r"""
-    Spectral radiance of a blackbody.
+    r"""Spectral radiance of a blackbody.
 
     .. math:: L(\lambda, T) = \frac{2 h c^2}{\lambda^5 (\exp(c_2 / \lambda T) - 1)}
 
@@ -87,8 +85,7 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
 
 
 def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
-    r"""
-    Derivative [W m^-2 sr^-1 m^-1 K^-1] of the blackbody's spectral radiance with temperature.
+    r"""Derivative [W m^-2 sr^-1 m^-1 K^-1] of the blackbody's spectral radiance with temperature.
 
     .. math:: \frac{\partial L}{\partial T} = L \, \frac{x}{T (1 - e^{-x})}, \quad
               x = c_2 / \lambda T
@@ -102,8 +99,7 @@ def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLik
 
 
 def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -> Array:
-    r"""
-    Temperature [K] of the blackbody of a spectral radiance, the exact inverse of Planck's law.
+    r"""Temperature [K] of the blackbody of a spectral radiance, the exact inverse of Planck's law.
 
     .. math:: T = \frac{c_2}{\lambda \ln(1 + 2 h c^2 / \lambda^5 L)}
 

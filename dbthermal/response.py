@@ -42,8 +42,7 @@ _SLOPE_POINTS: Final = 16
 
 @dataclass(frozen=True)
 class Curve:
-    r"""
-    Sakuma-Hattori response of one band.
+    r"""Sakuma-Hattori response of one band.
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O
 
@@ -135,8 +134,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class LinearCurve(Curve):
-    """
-    The paper's linear response, counts = slope * T + intercept, with the methods of `Curve`.
+    """The paper's linear response, counts = slope * T + intercept, with the methods of `Curve`.
 
     Attributes
     ----------
@@ -160,8 +158,7 @@ class LinearCurve(Curve):
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
-    """
-    Temperatures [K] as float64, all of which must lie in the calibrated range of a curve.
+    """Temperatures [K] as float64, all of which must lie in the calibrated range of a curve.
 
     Raises ValueError with the name and the first temperature that lies outside or is NaN.
     """
@@ -176,8 +173,7 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
 
 
 def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
-    """
-    Curve of one band.
+    """Curve of one band.
 
     Parameters
     ----------
@@ -247,8 +243,7 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
 
 
 def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact") -> xr.DataArray:
-    """
-    Counts of a blackbody in every band of a response.
+    """Counts of a blackbody in every band of a response.
 
     Parameters
     ----------
@@ -280,8 +275,7 @@ def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact")
 def apparent_temperature(
     response: xr.Dataset, counts: xr.DataArray, kind: str = "exact"
 ) -> xr.DataArray:
-    """
-    Temperature of the blackbody that would give the same counts, band by band.
+    """Temperature of the blackbody that would give the same counts, band by band.
 
     Parameters
     ----------

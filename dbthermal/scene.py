@@ -49,8 +49,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     target: str | Path | None = None,
     provenance: Mapping[str, Any] = MappingProxyType({}),
 ) -> xr.Dataset:
-    """
-    Raw counts of two cameras to temperatures, emissivities and reflections: every step in order.
+    """Raw counts of two cameras to temperatures, emissivities and reflections: every step in order.
 
     1. `correction.correct_capture`.
     2. `alignment.register`, `align` and `reflection_shift`. Where the cameras stand apart, the

@@ -47,8 +47,7 @@ __dir__ = __all__.copy
 
 @dataclass(frozen=True)
 class Variable:
-    """
-    Definition of a variable: dimensions in order, type as written, unit, and meaning.
+    """Definition of a variable: dimensions in order, type as written, unit, and meaning.
 
     Read, any real type of the same kind passes.
     """
@@ -272,8 +271,7 @@ def status_attrs() -> dict[str, object]:
 
 
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
-    """
-    Mask of the places where any of some flags is set, by the CF attributes of the variable.
+    """Mask of the places where any of some flags is set, by the CF attributes of the variable.
 
     Parameters
     ----------
@@ -318,8 +316,7 @@ def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
 
 
 def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
-    """
-    Check a dataset against its stage, and return it unchanged.
+    """Check a dataset against its stage, and return it unchanged.
 
     A missing `units` attribute is taken as the agreed unit; a different one is an error. Of the
     values only those of the coordinates are read.
@@ -411,8 +408,7 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
-    """
-    Positions of bands on the dimension `band`, by name as text; the label names the array.
+    """Positions of bands on the dimension `band`, by name as text; the label names the array.
 
     Raises ValueError if there is no coordinate `band`, or a band is missing or repeated.
     """
@@ -430,8 +426,7 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
 def band_values(
     array: xr.DataArray, wanted: list[str], label: str, units: str
 ) -> npt.NDArray[np.float64]:
-    """
-    Values (band,) of an array of numbers over the bands alone, in the order of some bands.
+    """Values (band,) of an array of numbers over the bands alone, in the order of some bands.
 
     Raises as `check_numbers` and `band_positions`, and ValueError for other dims.
     """

@@ -44,8 +44,7 @@ def fit_response(
     *,
     temperature_std: float = TEMPERATURE_STD,
 ) -> xr.Dataset:
-    r"""
-    Fit the response of each band to blackbody measurements.
+    r"""Fit the response of each band to blackbody measurements.
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
 
@@ -195,8 +194,7 @@ def _check_growth(band: str, temperature: Array, counts: Array, std: float) -> N
 
 
 def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float) -> None:
-    """
-    Refuse counts farther from their Planck curve than errors of a standard deviation explain.
+    """Refuse counts farther from their Planck curve than errors of a standard deviation explain.
 
     The nearest curve of any shape is no farther from the counts than the nearest one of the true
     shape, whose two linear parameters leave a chi-square of n - 2 degrees of freedom.

@@ -23,8 +23,7 @@ def correct_capture(
     drift_reference: xr.DataArray | None = None,
     lazy: bool = False,
 ) -> xr.Dataset:
-    """
-    Raw capture to corrected counts with a status: every correction, in the right order.
+    """Raw capture to corrected counts with a status: every correction, in the right order.
 
     1. `find_shutter` on the raw counts, where a frame that the camera repeats is an exact copy; the
        bit `schema.SHUTTER_CLOSED` of the recorded `frame_flags`, if there are any, adds the frames

@@ -34,8 +34,7 @@ _ROUNDING = 0.01
 
 
 def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
-    r"""
-    Mean frames and temporal noise of movies of a blackbody.
+    r"""Mean frames and temporal noise of movies of a blackbody.
 
     The noise of a pixel, :math:`s^2 = \overline{d^2} / 2`, comes from the differences d of
     successive frames, so that a drift of the camera or of the blackbody does not enter. Its median
@@ -100,8 +99,7 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
 def fit_correction(
     blackbody: xr.Dataset, *, threshold: float = OUTLIER, maximum: int = DETECTOR_MAXIMUM
 ) -> xr.Dataset:
-    r"""
-    Fit gain and offset of each pixel to frames of a blackbody that fills the view.
+    r"""Fit gain and offset of each pixel to frames of a blackbody that fills the view.
 
     For each pixel, g and f minimise
 
@@ -196,8 +194,7 @@ def fit_correction(
 
 
 def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
-    r"""
-    One-point correction: new offsets from one image of a uniform view, the gains kept.
+    r"""One-point correction: new offsets from one image of a uniform view, the gains kept.
 
     .. math:: f' = f - [(g F + f) - \overline{g F + f}]
 
@@ -251,8 +248,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
 def correct(
     capture: xr.Dataset, correction: xr.Dataset, *, maximum: int = DETECTOR_MAXIMUM
 ) -> xr.Dataset:
-    """
-    Apply gain and offset to a capture, and mark its bad and saturated pixels.
+    """Apply gain and offset to a capture, and mark its bad and saturated pixels.
 
     Parameters
     ----------

@@ -37,8 +37,7 @@ _BLOCK = 8_000_000
 
 
 def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset:
-    r"""
-    Mark pixels that are noisy, stuck or jump by themselves, in any band.
+    r"""Mark pixels that are noisy, stuck or jump by themselves, in any band.
 
     Noise. A pixel's noise s is the mean magnitude of the smaller four fifths of its second
     differences in time, so that neither object nor walkers enter. With m the median of s over 5 by
@@ -151,8 +150,7 @@ def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> 
 
 
 def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
-    """
-    Pixels (y, x) of one band, raw counts (time, y, x), that are clipped, and that are frozen.
+    """Pixels (y, x) of one band, raw counts (time, y, x), that are clipped, and that are frozen.
 
     Judged are the measured frames (time).
 

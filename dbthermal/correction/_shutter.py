@@ -32,8 +32,7 @@ _EVENT = ("band", "first_frame", "frames", "renewed")
 
 
 def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -> xr.Dataset:
-    """
-    Find the runs of frames in which a band repeats its image.
+    """Find the runs of frames in which a band repeats its image.
 
     A frame is a copy if no pixel differs from the frame before. Some thousands of pixels are
     compared first, then the whole of the remaining frames, in blocks of rows, so that a lazy
@@ -89,8 +88,7 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
 
 
 def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.Dataset:
-    """
-    Set frames of a closed shutter or a repeated image to NaN, and number the segments.
+    """Set frames of a closed shutter or a repeated image to NaN, and number the segments.
 
     A `segment` is the stretch between two renewals of the offsets, at which every pixel of the band
     makes an offset step of its own, of tens of counts, which no camera reports. It is left in the

@@ -11,8 +11,7 @@ from dbthermal._coordinates import laid_on
 
 
 def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
-    r"""
-    Undo the thermal lag of the pixels, bodies with a time constant of their own.
+    r"""Undo the thermal lag of the pixels, bodies with a time constant of their own.
 
     A pixel follows :math:`\tau \dot I = z - I`. For z held from each frame to the next, exactly,
 
@@ -85,8 +84,7 @@ def lag_coefficients(
 def undo_drift(
     corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5, lazy: bool = False
 ) -> xr.Dataset:
-    r"""
-    Subtract from all of a band the drift that a patch of constant temperature shows.
+    r"""Subtract from all of a band the drift that a patch of constant temperature shows.
 
     The patch's mean is smoothed by polynomials in time, in each segment between two shutter events
     by itself, and

@@ -16,8 +16,7 @@ from dbthermal.figures.drawing import (
 
 
 def gain_offset_maps(correction: xr.Dataset) -> Figure:
-    """
-    Maps of gain and offset, one row per band, with the bad pixels marked.
+    """Maps of gain and offset, one row per band, with the bad pixels marked.
 
     Parameters
     ----------
@@ -41,8 +40,7 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
 
 
 def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
-    """
-    Response of each band with the residuals of both fits.
+    """Response of each band with the residuals of both fits.
 
     Parameters
     ----------

@@ -9,8 +9,7 @@ from dbthermal.figures.drawing import COLORS, band_label, canvas, limits_of, pro
 
 
 def emissivity_bars(table: xr.Dataset) -> Figure:
-    """
-    Band emissivities as bars, one group per material.
+    """Band emissivities as bars, one group per material.
 
     Parameters
     ----------
@@ -33,8 +32,7 @@ def emissivity_bars(table: xr.Dataset) -> Figure:
 
 
 def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
-    """
-    Condition number of the emissivity matrix for every pair of bands.
+    """Condition number of the emissivity matrix for every pair of bands.
 
     Parameters
     ----------
@@ -65,8 +63,7 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
 
 
 def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
-    """
-    Emissivities from thermocouple and blackbody with their standard deviations.
+    """Emissivities from thermocouple and blackbody with their standard deviations.
 
     Parameters
     ----------

@@ -26,8 +26,7 @@ _MICRO: Final = "\N{MICRO SIGN}m"
 
 
 def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) -> Figure:
-    """
-    Expected accuracy of the object temperature by filter, and by length of the film.
+    """Expected accuracy of the object temperature by filter, and by length of the film.
 
     Parameters
     ----------

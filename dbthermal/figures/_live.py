@@ -50,8 +50,7 @@ class _Artists:
 
 
 class LiveFigure:
-    """
-    Figure whose pictures and texts are replaced while it stays the same.
+    """Figure whose pictures and texts are replaced while it stays the same.
 
     Parameters
     ----------

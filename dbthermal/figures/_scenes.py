@@ -28,8 +28,7 @@ _DPI: Final = 100
 
 
 def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, int]) -> Figure:
-    """
-    Truth against estimate over time at one pixel, object above background, two deviations wide.
+    """Truth against estimate over time at one pixel, object above background, two deviations wide.
 
     Parameters
     ----------
@@ -67,8 +66,7 @@ def separated_frames(
     title: str,
     labels: tuple[str, str, str],
 ) -> Figure:
-    """
-    Inputs, emission and mean-subtracted reflection of a scene, one row per time.
+    """Inputs, emission and mean-subtracted reflection of a scene, one row per time.
 
     Parameters
     ----------
@@ -113,8 +111,7 @@ def separated_temperatures(
     title: str,
     label: str = "background change [K]",
 ) -> Figure:
-    """
-    `separated_frames` of temperatures, in degrees Celsius.
+    """`separated_frames` of temperatures, in degrees Celsius.
 
     Parameters
     ----------
@@ -145,8 +142,7 @@ def separated_temperatures(
 
 
 def reflection_shift(field: xr.Dataset) -> Figure:
-    """
-    Shift of the reflections between two cameras: its components and their standard deviations.
+    """Shift of the reflections between two cameras: its components and their standard deviations.
 
     Parameters
     ----------
@@ -180,8 +176,7 @@ def reflection_shift(field: xr.Dataset) -> Figure:
 def separated_film(
     apparent: xr.DataArray, emission: xr.DataArray, change: xr.DataArray, *, title: str
 ) -> Iterator[npt.NDArray[np.uint8]]:
-    """
-    Frames of a film: the inputs, the emission and the mean-subtracted reflection side by side.
+    """Frames of a film: the inputs, the emission and the mean-subtracted reflection side by side.
 
     Parameters
     ----------

@@ -45,8 +45,7 @@ _RIGHT: Final = "#a8d5b0"
 
 
 def status(result: xr.Dataset) -> Figure:
-    """
-    Map of the pixels without a flag, and of the most decisive flag of the others, in words.
+    """Map of the pixels without a flag, and of the most decisive flag of the others, in words.
 
     Parameters
     ----------

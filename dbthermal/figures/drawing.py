@@ -41,8 +41,7 @@ def canvas(
 
 
 def band_label(name: object) -> str:
-    """
-    Label of a band, with its unit.
+    """Label of a band, with its unit.
 
     Parameters
     ----------
@@ -58,8 +57,7 @@ def band_label(name: object) -> str:
 
 
 def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
-    """
-    Origin of the data in brackets, for a title.
+    """Origin of the data in brackets, for a title.
 
     Parameters
     ----------
@@ -92,8 +90,7 @@ def draw_image(
     cmap: str = "inferno",
     limits: tuple[float, float] | None = None,
 ) -> None:
-    """
-    Draw an image with its colour bar; pixels without a value are gray.
+    """Draw an image with its colour bar; pixels without a value are gray.
 
     Parameters
     ----------

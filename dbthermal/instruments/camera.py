@@ -156,8 +156,7 @@ class Metadata:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """
-    One frame as it came.
+    """One frame as it came.
 
     No driver writes to the counts again. A leap of the sequence number is a loss. Metadata are
     missing without telemetry, or if the frame is damaged.
@@ -252,8 +251,7 @@ OpenControl = Callable[[str, object | None], AbstractContextManager[CameraContro
 
 @dataclass(frozen=True)
 class CameraKind:
-    """
-    One kind of camera, as its module names it in ``KIND``.
+    """One kind of camera, as its module names it in ``KIND``.
 
     `open_frames` opens the frames of a hardware address in a format, `open_control` the command
     port of an address, given the emulated bench or None.
@@ -290,8 +288,7 @@ def next_shutter(
     last_ffc_frame: int | None = None,
     ffc_status: FfcStatus | None = None,
 ) -> Shutter:
-    """
-    State of a camera's shutter after one more frame, from telemetry, serial line and image.
+    """State of a camera's shutter after one more frame, from telemetry, serial line and image.
 
     A camera freezes its image while the shutter is closed. A frame counts as closed if
 

@@ -77,8 +77,7 @@ def encode(
     *,
     channel: int = COMMAND_CHANNEL,
 ) -> bytes:
-    """
-    Bytes of a frame, ready to send.
+    """Bytes of a frame, ready to send.
 
     Header, data and checksum are all escaped, so that start and end bytes occur nowhere else.
 
@@ -128,8 +127,7 @@ def _escaped(content: bytes) -> bytes:
 
 
 def next_sequence(sequence: int) -> int:
-    """
-    Sequence number that follows another, with no byte that would be escaped.
+    """Sequence number that follows another, with no byte that would be escaped.
 
     The vendor's software avoids such numbers too, perhaps because one of its receivers does not
     unescape the header. The numbers increase, so that none returns within 32 bits.
@@ -143,8 +141,7 @@ def next_sequence(sequence: int) -> int:
 
 
 class Decoder:
-    """
-    Finds the frames in a stream of bytes, however it is cut into pieces.
+    """Finds the frames in a stream of bytes, however it is cut into pieces.
 
     Bytes between frames are ignored. A start byte always begins anew. A frame that is cut short,
     too long or too short, holds an illegal escape or has the wrong checksum is dropped and counted

@@ -66,8 +66,7 @@ class LibusbMissingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Device:
-    """
-    One device that is plugged in.
+    """One device that is plugged in.
 
     Attributes
     ----------
@@ -114,8 +113,7 @@ def find(
     dev: Path = Path("/dev"),
     frame_rate: float = 60.0,
 ) -> list[Device]:
-    """
-    List the rig's devices that are plugged in.
+    """List the rig's devices that are plugged in.
 
     Parameters
     ----------
@@ -153,8 +151,7 @@ def find(
 
 
 def describe(devices: Iterable[Device]) -> str:
-    """
-    Text with a line for each device, its warnings below it, and one for each missing kind.
+    """Text with a line for each device, its warnings below it, and one for each missing kind.
 
     Examples
     --------

@@ -98,8 +98,7 @@ def _at(share: float, counts: int, meaning: str) -> str:
 
 
 class Watch:
-    """
-    Numbers of a recording while it goes on, from its previews.
+    """Numbers of a recording while it goes on, from its previews.
 
     `window` is the time over which frame rates are measured [s]; ValueError if not positive.
     """
@@ -238,8 +237,7 @@ class Picture:
 
 
 class View:
-    """
-    Live view: an instance is the `preview` of a recording, or of several.
+    """Live view: an instance is the `preview` of a recording, or of several.
 
     One update of two bands of 640 x 512 takes about a tenth of a second of one core; the fetching
     threads go on meanwhile.

@@ -50,8 +50,7 @@ def wait_stable(
     clock: Callable[[], float] = system_time.monotonic,
     sleep: Callable[[float], None] = system_time.sleep,
 ) -> float:
-    """
-    Wait until a temperature is stable near its set point [K], and return its mean [K].
+    """Wait until a temperature is stable near its set point [K], and return its mean [K].
 
     Within the session's `window` the readings must lie within its `stability` of one another, and
     their mean within its `tolerance` of the set point. TimeoutError after its `timeout`, ValueError
@@ -85,8 +84,7 @@ def record_sweep(
     limits: Limits | None = None,
     preview: Callable[[Preview], None] | None = None,
 ) -> list[Step]:
-    """
-    Record a blackbody at each of its temperatures, once it is stable, through each filter.
+    """Record a blackbody at each of its temperatures, once it is stable, through each filter.
 
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep,
     and a scene too is recorded after a correction. Recordings of this sweep that are in the folder
@@ -153,8 +151,7 @@ def record_scene(
     preview: Callable[[Preview], None] | None = None,
     stop: threading.Event | None = None,
 ) -> Summary:
-    """
-    Record a scene with all devices; an emulated scene begins with the recording.
+    """Record a scene with all devices; an emulated scene begins with the recording.
 
     Parameters
     ----------

@@ -179,8 +179,7 @@ class Wheel(filterwheel.Settings):
 
 @dataclass(frozen=True, config=_CHECKED)
 class Session:
-    """
-    Description of a recording: devices, procedure and duration; see the module.
+    """Description of a recording: devices, procedure and duration; see the module.
 
     All protocols but ``scene`` go through the blackbody's temperatures. Invalid values raise
     pydantic's ValidationError, a ValueError.
@@ -289,8 +288,7 @@ class Session:
 
     @classmethod
     def from_yaml(cls, text: str) -> Self:
-        """
-        Read a session from YAML, see the module; ValueError as from `load`.
+        """Read a session from YAML, see the module; ValueError as from `load`.
 
         Examples
         --------
@@ -309,8 +307,7 @@ class Session:
 
     @classmethod
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
-        """
-        Read a session from a file, and from the file that it names as its ``rig``.
+        """Read a session from a file, and from the file that it names as its ``rig``.
 
         Parameters
         ----------

@@ -31,8 +31,7 @@ class SignalExit(SystemExit):
 
 @contextmanager
 def raised_signals() -> Iterator[None]:
-    """
-    Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
+    """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
 
     The first one is raised, those after it are passed over: a closed terminal sends several, and
     what is being closed must be left to end. Nothing changes in other threads, nor for a signal

@@ -118,8 +118,7 @@ class Flag(IntFlag):
 
 @dataclass(frozen=True)
 class Scan:
-    """
-    One reading of all nine channels; index 0 is the cold junction.
+    """One reading of all nine channels; index 0 is the cold junction.
 
     Attributes
     ----------
@@ -149,8 +148,7 @@ class Identity:
 
 
 class TC08(Closing):
-    """
-    A TC-08, for one thread at a time; opened by `from_url`, `open` or ``with``.
+    """A TC-08, for one thread at a time; opened by `from_url`, `open` or ``with``.
 
     Parameters
     ----------
@@ -174,8 +172,7 @@ class TC08(Closing):
 
     @classmethod
     def from_url(cls, url: str = "tc08:", *, world: object | None = None) -> Self:
-        """
-        Load the library and open the first free unit.
+        """Load the library and open the first free unit.
 
         Parameters
         ----------
@@ -218,8 +215,7 @@ class TC08(Closing):
         return bool(getattr(self._library, "is_simulated", False))
 
     def open(self, *, timeout: float = OPEN_TIMEOUT) -> Self:
-        """
-        Open the first free unit, within `timeout` [s].
+        """Open the first free unit, within `timeout` [s].
 
         Raises
         ------
@@ -251,8 +247,7 @@ class TC08(Closing):
         return self
 
     def close(self) -> None:
-        """
-        Close the unit; a second call does nothing.
+        """Close the unit; a second call does nothing.
 
         TC08Error if the library could not, as after unplugging; the unit counts as closed.
         """
@@ -276,8 +271,7 @@ class TC08(Closing):
         return Identity(serial, date, driver, *versions, self.is_simulated)
 
     def set_channels(self, kinds: Mapping[int, str]) -> None:
-        """
-        Set the type of each thermocouple; all other sockets are switched off.
+        """Set the type of each thermocouple; all other sockets are switched off.
 
         Parameters
         ----------
@@ -310,8 +304,7 @@ class TC08(Closing):
         self._has_channels = True
 
     def single(self) -> Scan:
-        """
-        Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
+        """Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
 
         Raises
         ------
@@ -350,8 +343,7 @@ def flagged(
 
 
 def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -> Library:
-    """
-    Load the vendor's library and declare the types of its functions.
+    """Load the vendor's library and declare the types of its functions.
 
     Parameters
     ----------

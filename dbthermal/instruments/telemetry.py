@@ -78,8 +78,7 @@ FIELDS: Final = MappingProxyType(
 
 
 def decode(rows: Counts, *, high_word_first: bool = True) -> dict[str, float]:
-    """
-    Read the fields from telemetry rows.
+    """Read the fields from telemetry rows.
 
     Parameters
     ----------
@@ -120,8 +119,7 @@ def metadata(rows: Counts) -> Metadata:
 
 
 def encode(values: Mapping[str, float], columns: int, rows: int = ROWS) -> Counts:
-    """
-    Write fields as telemetry (rows, columns), 0 elsewhere, as an emulated camera does.
+    """Write fields as telemetry (rows, columns), 0 elsewhere, as an emulated camera does.
 
     ValueError if these are too few, or a value does not fit its field.
     """

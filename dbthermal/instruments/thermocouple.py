@@ -56,8 +56,7 @@ _STEPS = 3
 
 
 def emf(temperature: npt.ArrayLike) -> Array:
-    r"""
-    Voltage of a type-T thermocouple whose cold junction is at 0 °C.
+    r"""Voltage of a type-T thermocouple whose cold junction is at 0 °C.
 
     .. math:: E = \sum_i c_i t^i, \quad t = T - 273.15\,\mathrm{K}
 
@@ -91,8 +90,7 @@ def emf(temperature: npt.ArrayLike) -> Array:
 
 
 def temperature(emf_mV: npt.ArrayLike, junction_temperature: npt.ArrayLike) -> Array:  # noqa: N803
-    """
-    Temperature of the tip from the voltage at the terminals: the exact inverse of `emf`.
+    """Temperature of the tip from the voltage at the terminals: the exact inverse of `emf`.
 
     Parameters
     ----------

@@ -34,8 +34,7 @@ _NO_LINE = (errno.ENOTTY, errno.EINVAL)
 
 
 class Closing:
-    """
-    Context manager that closes at its end, without hiding an error inside it.
+    """Context manager that closes at its end, without hiding an error inside it.
 
     A failure to close is raised if there was no other error, and else added to it as a note.
     """
@@ -76,8 +75,7 @@ class Transport(Protocol):
         """Send all bytes; `TransportError` if the device is gone."""
 
     def read(self, size: int, timeout: float) -> bytes:
-        """
-        Wait until bytes came, or `timeout` [s] went by.
+        """Wait until bytes came, or `timeout` [s] went by.
 
         Return at most `size` bytes and often fewer; none only if `timeout` went by.
         `TransportError` if the device is gone.
@@ -88,8 +86,7 @@ class Transport(Protocol):
 
 
 class SerialTransport(Closing):
-    """
-    A serial port, or a pseudo-terminal, that is open already; see `open_serial`.
+    """A serial port, or a pseudo-terminal, that is open already; see `open_serial`.
 
     `port` is open, of pyserial; `url` is its name in messages; `after` is called once the port is
     closed, to end an emulator.
@@ -155,8 +152,7 @@ class SerialTransport(Closing):
 def open_serial(
     url: str, *, baudrate: int, rtscts: bool = False, world: object | None = None
 ) -> SerialTransport:
-    """
-    Open the line to a device by its name, for this program alone; nothing is sent.
+    """Open the line to a device by its name, for this program alone; nothing is sent.
 
     Parameters
     ----------

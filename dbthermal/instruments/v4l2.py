@@ -119,8 +119,7 @@ class Kernel:
 
 
 class Capture(Closing):
-    """
-    A camera's node that streams Y16 frames, a `camera.FrameSource`; see `Capture.open`.
+    """A camera's node that streams Y16 frames, a `camera.FrameSource`; see `Capture.open`.
 
     Its identity is the node, the driver's name of the camera, the bus it is plugged in, and the
     driver with its version, on which a stamp's meaning depends.
@@ -148,8 +147,7 @@ class Capture(Closing):
         kernel: Kernel | None = None,
         decode: Decode | None = None,
     ) -> Self:
-        """
-        Open a node, agree on format and rate, and start the stream; nothing is reset.
+        """Open a node, agree on format and rate, and start the stream; nothing is reset.
 
         `decode` reads the metadata of a frame from its telemetry rows. OSError if the node cannot
         be opened, is busy, or this is not Linux; ValueError if it gives no Y16, or the driver

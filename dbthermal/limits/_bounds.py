@@ -20,8 +20,7 @@ _UNIFORM: Final = 1.0 / np.sqrt(12.0)
 
 
 def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
-    r"""
-    Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` of the reflections in the two bands.
+    r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` of the reflections in the two bands.
 
     Parameters
     ----------
@@ -45,8 +44,7 @@ def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
 def ratio_variance_bound(
     emissivity: tuple[float, float], noise: tuple[float, float], background: Array, functions: Array
 ) -> Array:
-    r"""
-    Cramer-Rao bound of the reflection ratio of two linear bands.
+    r"""Cramer-Rao bound of the reflection ratio of two linear bands.
 
     .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
               {\sum_t [(1 - e_1) P y(t)]^2}
@@ -94,8 +92,7 @@ def bounds(
     emissivity_std: float = np.inf,
     response_kind: str = "exact",
 ) -> xr.Dataset:
-    r"""
-    Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
+    r"""Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
 
     The inverse Fisher information [1]_ of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` +
     white noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a known smooth
@@ -221,8 +218,7 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
 
 
 def _most_frequent(background: Array) -> Mask:
-    """
-    Frames (time, pixel) in which a pixel's background has its most frequent temperature.
+    """Frames (time, pixel) in which a pixel's background has its most frequent temperature.
 
     No frame where no two share a temperature; the lowest of several that are as frequent.
     """

@@ -21,8 +21,7 @@ _TIME_CONSTANT: Final = 1.0 / 3.0
 
 @dataclass(frozen=True)
 class CaptureDesign:
-    """
-    Capture conditions: a warming object before a background of regular pulses.
+    """Capture conditions: a warming object before a background of regular pulses.
 
     The object's time constant is a third of the capture. The background is warmer for the end of
     each period, as if someone stood there, and rests before.
@@ -87,8 +86,7 @@ def plan(
     filters: Mapping[str, Band] = FILTERS,
     temperature: float = 300.0,
 ) -> xr.Dataset:
-    r"""
-    Expected accuracy of one pixel for each material and filter, and the best filter.
+    r"""Expected accuracy of one pixel for each material and filter, and the best filter.
 
     The Cramer-Rao bound of `bounds` for a designed capture, with the response of Planck's law over
     each band. Those of n pixels of one material share their ratios and emissivities, whose
@@ -172,8 +170,7 @@ def plan_durations(
     seconds: Sequence[float],
     design: CaptureDesign | None = None,
 ) -> xr.Dataset:
-    """
-    Expected accuracy of captures of several lengths, of one filter at a time.
+    """Expected accuracy of captures of several lengths, of one filter at a time.
 
     Parameters
     ----------

@@ -46,8 +46,7 @@ _HEADER_RULES: Final = {
 
 
 def ecostress(path: str | Path) -> xr.Dataset:
-    r"""
-    Spectrum of an ECOSTRESS (or ASTER) library file, ``*.spectrum.txt``.
+    r"""Spectrum of an ECOSTRESS (or ASTER) library file, ``*.spectrum.txt``.
 
     The file gives the hemispherical reflectance R [%] of an opaque sample, so that by Kirchhoff's
     law its emissivity is 1 - R / 100. Header and values are compared: units, kind of measurement,
@@ -104,8 +103,7 @@ def ecostress(path: str | Path) -> xr.Dataset:
 
 
 def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> dict[str, xr.Dataset]:
-    r"""
-    Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
+    r"""Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
 
     Parameters
     ----------
@@ -161,8 +159,7 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
 
 
 def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
-    r"""
-    Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
+    r"""Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
 
     Parameters
     ----------

@@ -40,8 +40,7 @@ _COLOURED: Final = 30  # least difference between the channels of a coloured pix
 def palette_video(
     path: str | Path, palette: str = "plasma", *, memory: float = MEMORY, sha256: str | None = None
 ) -> xr.DataArray:
-    """
-    Video drawn in a palette, as positions in the palette.
+    """Video drawn in a palette, as positions in the palette.
 
     Each pixel gets the position of the nearest point on the line through the palette's colours in
     Y'CbCr, finer than its steps. Luma counts whole and chroma half: in these videos four pixels
@@ -119,8 +118,7 @@ def masked_palette_video(
     memory: float = MEMORY,
     sha256: str | None = None,
 ) -> xr.Dataset:
-    """
-    Video whose object is drawn in a palette while the rest is gray.
+    """Video whose object is drawn in a palette while the rest is gray.
 
     A pixel is valid where its colour is nearer to the palette than to gray, in the measure of
     `palette_video`. Compression pulls single pixels between strong colours over that line, so the

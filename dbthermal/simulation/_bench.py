@@ -46,8 +46,7 @@ _CAMERA_BAND: Final = "8-14"
 
 @dataclass(frozen=True)
 class Sample:
-    """
-    An object on the bench.
+    """An object on the bench.
 
     Attributes
     ----------
@@ -89,8 +88,7 @@ its reference values for 8-14 um; the rest is this project's choice."""
 
 
 def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
-    """
-    True emissivity (band) [1] of a sample in bands of `bands.FILTERS`.
+    """True emissivity (band) [1] of a sample in bands of `bands.FILTERS`.
 
     The sample's own value for 8-14 um times the ratio of its kin's: of the emissivities where the
     value is below 0.5 as a metal's, of the reflectances above as a dielectric's, so that the
@@ -107,8 +105,7 @@ def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
 
 @dataclass(frozen=True)
 class Bench:
-    """
-    Steps and errors of the bench; each `tolerance` is the half width of a uniform error.
+    """Steps and errors of the bench; each `tolerance` is the half width of a uniform error.
 
     Attributes
     ----------
@@ -198,8 +195,7 @@ def contact_measurements(
     stds: tuple[float, float],
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """
-    Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
+    """Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
 
     Parameters
     ----------
@@ -245,8 +241,7 @@ def contact_measurements(
 def bench_series(
     response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
 ) -> xr.Dataset:
-    """
-    One series of measurements on the paper's bench, with all its errors: the stage `contact`.
+    """One series of measurements on the paper's bench, with all its errors: the stage `contact`.
 
     Parameters
     ----------
@@ -292,8 +287,7 @@ def bench_series(
 def reflector_series(
     response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
 ) -> xr.Dataset:
-    """
-    One series by the reflector method, with all its errors: the stage `reflector`.
+    """One series by the reflector method, with all its errors: the stage `reflector`.
 
     The foil gives the mean of the room, and a little of its own emission. Of the object's
     reflection all but the stray part is mirror-like, of a temperature higher by

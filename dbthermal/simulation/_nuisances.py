@@ -27,8 +27,7 @@ def expose(
     offsets: Sequence[int],
     frames: int,
 ) -> xr.Dataset:
-    r"""
-    Capture of bands that expose at times of their own: the stage `corrected`, with time stamps.
+    r"""Capture of bands that expose at times of their own: the stage `corrected`, with time stamps.
 
     The scene is on a fine clock. Frame n of band m is exposed at its step
 
@@ -87,8 +86,7 @@ def expose(
 
 
 def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
-    """
-    Replace lost frames by copies of the frame before, as a driver does that stamps none.
+    """Replace lost frames by copies of the frame before, as a driver does that stamps none.
 
     `lost` is a mask (band, time); ValueError if a band's first frame is lost. The result has no
     `exposure_time`.
@@ -105,8 +103,7 @@ def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
-    """
-    Lose frames at random in each band: each is replaced by the one before (`repeat_frames`).
+    """Lose frames at random in each band: each is replaced by the one before (`repeat_frames`).
 
     Parameters
     ----------
@@ -140,8 +137,7 @@ def fire_shutter(
     offset_std: float = 40.0,
     bands: tuple[str, ...] | None = None,
 ) -> xr.Dataset:
-    """
-    Shutter events: a frozen image while it is closed, new offsets of the pixels afterwards.
+    """Shutter events: a frozen image while it is closed, new offsets of the pixels afterwards.
 
     Parameters
     ----------
@@ -203,8 +199,7 @@ def spoil_pixels(
     amplitude: float = 60.0,
     dwell: float = 3.0,
 ) -> xr.Dataset:
-    """
-    Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
+    """Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
 
     Parameters
     ----------
@@ -249,8 +244,7 @@ def spoil_pixels(
 
 
 def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
-    r"""
-    First-order thermal lag of the pixels behind the scene.
+    r"""First-order thermal lag of the pixels behind the scene.
 
     .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
 

@@ -17,8 +17,7 @@ _SLOPE_TEMPERATURE: Final = 300.0
 
 @dataclass(frozen=True)
 class Rig:
-    """
-    Simulated cameras, one a band: response, noise and fixed pattern.
+    """Simulated cameras, one a band: response, noise and fixed pattern.
 
     The defaults are round figures for the camera of the paper: a 16-bit 640x512 microbolometer,
     about 115 counts/K near 300 K and NETD 20-40 mK without a filter; behind a filter the counts
@@ -70,8 +69,7 @@ class Rig:
             raise ValueError(f"Invalid bad_fraction {self.bad_fraction}. Must lie in [0, 1).")
 
     def response(self) -> xr.Dataset:
-        """
-        Response of the rig, from Planck's law in each band: the stage `response` with `noise`.
+        """Response of the rig, from Planck's law in each band: the stage `response` with `noise`.
 
         The Sakuma-Hattori curve through exact in-band radiances, which it meets within 0.05 mK
         between -10 and 80 degrees Celsius.
@@ -111,8 +109,7 @@ def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarr
 def observe(
     scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator, dtype: str = "float32"
 ) -> xr.Dataset:
-    r"""
-    Counts of a scene in a perfectly corrected rig: the stage `corrected`.
+    r"""Counts of a scene in a perfectly corrected rig: the stage `corrected`.
 
     .. math:: I_m = e_m U_m(x) + (1 - e_m) U_m(y) + \mathrm{noise}
 
@@ -171,8 +168,7 @@ def observe(
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
-    """
-    Random fixed pattern of the rig's detectors, of a shape (rows, columns).
+    """Random fixed pattern of the rig's detectors, of a shape (rows, columns).
 
     `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies, relative to
     the mean of the live pixels, a smooth vignette (narcissus) included; `dead` (band, y, x).
@@ -199,8 +195,7 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
 
 
 def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
-    """
-    Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
+    """Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
 
     Parameters
     ----------
@@ -240,8 +235,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
 def blackbody_movies(
     rig: Rig, temperatures: np.ndarray, frames: int, detector: xr.Dataset, rng: np.random.Generator
 ) -> xr.Dataset:
-    """
-    Raw movies of a blackbody that fills the view, at several temperatures.
+    """Raw movies of a blackbody that fills the view, at several temperatures.
 
     Parameters
     ----------
@@ -291,8 +285,7 @@ def blackbody_movies(
 
 
 def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
-    """
-    Raw counts of one band, uint16 (..., y, x): fixed pattern, rounding, dead pixels at 0.
+    """Raw counts of one band, uint16 (..., y, x): fixed pattern, rounding, dead pixels at 0.
 
     Takes corrected counts (..., y, x) [count] and the `pattern` (y, x) of this band. Raises a
     ValueError if a count does not fit into 16 bits.

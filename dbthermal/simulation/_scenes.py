@@ -16,8 +16,7 @@ _BACKGROUNDS: Final = ("pulses", "random walk", "still")
 
 @dataclass(frozen=True)
 class Background:
-    """
-    Temporal variation of the background.
+    """Temporal variation of the background.
 
     Attributes
     ----------
@@ -92,8 +91,7 @@ class Background:
 
 
 def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike) -> Array:
-    r"""
-    Temperature of a body that relaxes exponentially, from start to stop over the capture.
+    r"""Temperature of a body that relaxes exponentially, from start to stop over the capture.
 
     .. math:: T(t) = T_0 + (T_1 - T_0) \frac{1 - e^{-t / \tau}}{1 - e^{-t_1 / \tau}}
 
@@ -129,8 +127,7 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
 def scene(
     time: Array, object_temperature: Array, background_temperature: Array, emissivity: xr.DataArray
 ) -> xr.Dataset:
-    """
-    Scene of given temperatures (time, y, x) [K] and emissivity (band) or (band, y, x) [1].
+    """Scene of given temperatures (time, y, x) [K] and emissivity (band) or (band, y, x) [1].
 
     The truth of a simulated capture: names, dims and units of the stage `separated` without its
     deviations. Raises a ValueError unless the times (time,) [s] are two or more and increase.
@@ -182,8 +179,7 @@ def independent_pixels(
     stop: float,
     time_constant: tuple[float, float] = (8.0, 20.0),
 ) -> xr.Dataset:
-    """
-    Scene of many pixels of one material, each with its own heating curve and background.
+    """Scene of many pixels of one material, each with its own heating curve and background.
 
     Parameters
     ----------
@@ -223,8 +219,7 @@ def walkers(
     crossings: int = 7,
     time_constant: float = 12.0,
 ) -> xr.Dataset:
-    """
-    Simulated twin of a plate heated in its middle that reflects people who walk by.
+    """Simulated twin of a plate heated in its middle that reflects people who walk by.
 
     Each person is an upright ellipse with a head, warmer than the room, that crosses the view
     once at a steady pace. Along an edge of the silhouette the reflection is abrupt.

@@ -35,8 +35,7 @@ _SAME: Final = 1e-3
 
 @dataclass(frozen=True)
 class Camera:
-    """
-    A pinhole camera with square pixels.
+    """A pinhole camera with square pixels.
 
     Attributes
     ----------
@@ -81,8 +80,7 @@ class Camera:
         return float(2.0 * np.tan(np.radians(self.field_of_view) / 2.0) / self.shape[1])
 
     def directions(self, places: npt.ArrayLike | None = None) -> Array:
-        """
-        Unit vectors (..., 3) of the rays through rows and columns (..., 2) [pixel].
+        """Unit vectors (..., 3) of the rays through rows and columns (..., 2) [pixel].
 
         By default through the pixels' middles, (pixel, 3) in C order.
         """
@@ -93,8 +91,7 @@ class Camera:
         return unit(np.stack([right, down, np.ones_like(right)], axis=-1) @ self.axes)
 
     def project(self, points: npt.ArrayLike) -> Array:
-        """
-        Row and column (..., 2) [pixel] at which points (..., 3) [m] appear.
+        """Row and column (..., 2) [pixel] at which points (..., 3) [m] appear.
 
         The inverse of `directions`; whole numbers are the middles of pixels. Raises a ValueError
         if a point lies behind the camera.
@@ -114,8 +111,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Hits:
-    """
-    First intersections of rays with a mesh.
+    """First intersections of rays with a mesh.
 
     Attributes
     ----------
@@ -142,8 +138,7 @@ class Hits:
 
 
 class Caster:
-    """
-    Ray caster for one mesh.
+    """Ray caster for one mesh.
 
     Parameters
     ----------
@@ -160,8 +155,7 @@ class Caster:
         self._intersector = RayMeshIntersector(mesh)
 
     def cast(self, origins: Array, directions: Array) -> Hits:
-        """
-        First intersection of each ray, of origins [m] and unit directions (ray, 3).
+        """First intersection of each ray, of origins [m] and unit directions (ray, 3).
 
         The face is found in single precision, the point on it in double.
         """
@@ -197,8 +191,7 @@ class Caster:
         return np.asarray(sum(part * hits.weights[:, corner] for corner, part in enumerate(parts)))
 
     def mirrored(self, hits: Hits, directions: Array) -> tuple[Array, Array]:
-        """
-        Origins [m] and directions (ray, 3) of rays that the mesh reflects, on either side.
+        """Origins [m] and directions (ray, 3) of rays that the mesh reflects, on either side.
 
         All rays must meet the mesh. The reflected ones start a little off the surface. Where the
         interpolated normal would send one into its own face, as it may at a silhouette, the
@@ -234,8 +227,7 @@ def vertex_normals(mesh: trimesh.Trimesh) -> Array:
 
 
 def mirror(directions: Array, normals: Array) -> Array:
-    r"""
-    Mirror law :math:`r = d - 2 (d \cdot n) n` for directions and unit normals (..., 3).
+    r"""Mirror law :math:`r = d - 2 (d \cdot n) n` for directions and unit normals (..., 3).
 
     Examples
     --------

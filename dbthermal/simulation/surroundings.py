@@ -24,8 +24,7 @@ __dir__ = __all__.copy
 
 @dataclass(frozen=True)
 class Pose:
-    """
-    Position and orientation of a rigid body: its point p is at R p + t in the world.
+    """Position and orientation of a rigid body: its point p is at R p + t in the world.
 
     Attributes
     ----------
@@ -63,8 +62,7 @@ def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:
 
 
 def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
-    """
-    Motion in straight lines between places (stop, 3) [m] at times (stop,) [s], without turning.
+    """Motion in straight lines between places (stop, 3) [m] at times (stop,) [s], without turning.
 
     Before and after, the pose is that of the nearest stop. Raises a ValueError if the times do not
     increase, or the places are not finite, one for each time.
@@ -80,8 +78,7 @@ def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
 
 @dataclass(frozen=True)
 class Actor:
-    """
-    A rigid body of the surroundings.
+    """A rigid body of the surroundings.
 
     Attributes
     ----------
@@ -166,8 +163,7 @@ class _Target:
 def incident(
     origins: Array, directions: Array, time: Array, room: float, actors: Sequence[Actor]
 ) -> Array:
-    """
-    Blackbody temperature (time, ray) [K] that rays meet, frame by frame.
+    """Blackbody temperature (time, ray) [K] that rays meet, frame by frame.
 
     Parameters
     ----------

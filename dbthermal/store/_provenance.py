@@ -22,8 +22,7 @@ _PACKAGES = ("numpy", "scipy", "xarray", "zarr")
 def provenance(
     parameters: Mapping[str, object], inputs: Mapping[str, str | Path] | None = None
 ) -> dict[str, Any]:
-    """
-    Provenance of a result, for the functions that save it.
+    """Provenance of a result, for the functions that save it.
 
     Parameters
     ----------
@@ -60,8 +59,7 @@ def provenance(
 
 
 def checksum(path: str | Path) -> str:
-    """
-    SHA-256 of a file, as of ``sha256sum``, or of a folder's file names and contents.
+    """SHA-256 of a file, as of ``sha256sum``, or of a folder's file names and contents.
 
     FileNotFoundError if `path` does not exist.
     """

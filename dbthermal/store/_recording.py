@@ -42,8 +42,7 @@ _COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), 
 
 
 class Recording:
-    """
-    A recording that is being written, in a new folder ``*.zarr``; FileExistsError if it exists.
+    """A recording that is being written, in a new folder ``*.zarr``; FileExistsError if it exists.
 
     `variables` are of dims (band, time, ...), frame by frame, or (log,), row by row, and `sizes`
     has their other dims. `chunk` is the number of frames that a kill costs at most, `attrs` are
@@ -123,8 +122,7 @@ class Recording:
             raise
 
     def append(self, band: str, block: Mapping[str, Values]) -> None:
-        """
-        Write a chunk of frames of one band behind its others; valid with the next `commit`.
+        """Write a chunk of frames of one band behind its others; valid with the next `commit`.
 
         `block` holds every variable of frames, (frame, ...): a whole chunk, or at last less.
         """
@@ -163,8 +161,7 @@ class Recording:
             self._store.replace(GROUP, text.encode(), self._part(GROUP))
 
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
-        """
-        Bring all bands to one number of frames, with `time` [s] as coordinate; set attributes.
+        """Bring all bands to one number of frames, with `time` [s] as coordinate; set attributes.
 
         A band with fewer frames than another gets copies of its last one, without stamps, as from
         a driver that lost frames. A second call does nothing.

@@ -50,8 +50,7 @@ _ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str
 
 
 def _chunks(variable: xr.Variable | xr.DataArray, *, even: bool = False) -> tuple[int, ...]:
-    """
-    Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
+    """Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
 
     Every stage works pixel by pixel on all frames and bands, so a chunk holds the full story of a
     nearly square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression; `even`
@@ -71,8 +70,7 @@ def _chunks(variable: xr.Variable | xr.DataArray, *, even: bool = False) -> tupl
 
 
 def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """
-    Save a dataset as zarr (format 3, not consolidated), in place of an earlier one.
+    """Save a dataset as zarr (format 3, not consolidated), in place of an earlier one.
 
     Parameters
     ----------
@@ -98,8 +96,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
 
 
 def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """
-    Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
+    """Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
 
     Parameters
     ----------
@@ -155,8 +152,7 @@ def _save_rows(
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
-    """
-    Open a saved dataset or a recording; values are read when they are used.
+    """Open a saved dataset or a recording; values are read when they are used.
 
     A recording that was cut short, or is being written, opens as far as all bands are valid; its
     attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
@@ -230,8 +226,7 @@ def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
 def save_numbers(
     numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
 ) -> None:
-    """
-    Save headline numbers as strict JSON, with sorted names.
+    """Save headline numbers as strict JSON, with sorted names.
 
     Parameters
     ----------
@@ -263,8 +258,7 @@ def save_numbers(
 
 
 def read_numbers(path: str | Path) -> dict[str, Number]:
-    """
-    Read a file of `save_numbers`: name to value.
+    """Read a file of `save_numbers`: name to value.
 
     ValueError, with file and line, if it is not such a file, a name is listed twice, a number is
     not finite, or it differs from what was written. A file without a checksum, of dbthermal 0.1.0,
@@ -300,8 +294,7 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
 def save_figure(
     figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
 ) -> None:
-    """
-    Save a figure as PNG, the same bytes for the same figure.
+    """Save a figure as PNG, the same bytes for the same figure.
 
     Parameters
     ----------
@@ -338,8 +331,7 @@ def save_video(
     rate: float,
     codec: Literal["vp9", "h264"] = "vp9",
 ) -> None:
-    """
-    Save a film in MP4, as browsers play it.
+    """Save a film in MP4, as browsers play it.
 
     Parameters
     ----------

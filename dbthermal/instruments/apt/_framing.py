@@ -90,8 +90,7 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """
-    Bytes of a message, ready to send.
+    """Bytes of a message, ready to send.
 
     Parameters
     ----------
@@ -137,8 +136,7 @@ def encode(message: Message) -> bytes:
 def command(
     identifier: Id, channel: int = 0, value: int = 0, *, data: bytes = b"", destination: int
 ) -> bytes:
-    """
-    Bytes of a message from the computer to a controller.
+    """Bytes of a message from the computer to a controller.
 
     Parameters
     ----------
@@ -170,8 +168,7 @@ def command(
 
 
 class Decoder:
-    """
-    Finds the messages in a stream of bytes, however it is cut into pieces.
+    """Finds the messages in a stream of bytes, however it is cut into pieces.
 
     A byte with which no possible message begins is dropped and counted, and the search goes on
     with the next. Each received byte belongs to a message that was returned, is counted in
@@ -212,8 +209,7 @@ class Decoder:
         return len(self._buffer)
 
     def feed(self, received: bytes) -> list[Message]:
-        """
-        Messages that the next bytes of the stream complete.
+        """Messages that the next bytes of the stream complete.
 
         An unknown identifier, or one of `Id` with a length that it never has, is not a message.
         """

@@ -95,8 +95,7 @@ class Statistics:
 
 
 class Boson(Closing):
-    """
-    One camera's command port, a `camera.CameraControl`; for any number of threads.
+    """One camera's command port, a `camera.CameraControl`; for any number of threads.
 
     Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
     `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is
@@ -202,8 +201,7 @@ class Boson(Closing):
                 )
 
     def run_ffc(self, *, timeout: float = FFC_TIMEOUT) -> int:
-        """
-        Run a flat-field correction, wait until it is complete, return its frame number.
+        """Run a flat-field correction, wait until it is complete, return its frame number.
 
         When it starts the camera still says "complete" of the one before. So another status has to
         be seen, or the frame number of the last correction has to change. While the shutter is

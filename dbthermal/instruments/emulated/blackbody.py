@@ -18,8 +18,7 @@ Counts = npt.NDArray[np.uint16]
 
 
 def pictures(session: Session, world: World) -> dict[str, Callable[[float], Counts]]:
-    """
-    Raw frames, by band, of the world's blackbody as the cameras of a session see it.
+    """Raw frames, by band, of the world's blackbody as the cameras of a session see it.
 
     The detectors have a fixed pattern and noise of `NETD`; see `of_rig`. Bands that are not in
     `dbthermal.bands.FILTERS` get no picture.
@@ -36,8 +35,7 @@ def pictures(session: Session, world: World) -> dict[str, Callable[[float], Coun
 def of_rig(
     rig: simulation.Rig, detector: xr.Dataset, seed: int, world: World
 ) -> dict[str, Callable[[float], Counts]]:
-    """
-    Raw frames, by band, of the world's blackbody as a simulated rig records them.
+    """Raw frames, by band, of the world's blackbody as a simulated rig records them.
 
     Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise from the
     seed, the fixed pattern of the detector (see `dbthermal.simulation.pattern`) and 16 bits.

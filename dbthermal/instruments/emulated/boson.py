@@ -37,8 +37,7 @@ Handler = tuple[int, Callable[[bytes], bytes | None]]
 
 
 class EmulatedBoson:
-    """
-    One emulated camera of a world, as an `emulated.port.Device`.
+    """One emulated camera of a world, as an `emulated.port.Device`.
 
     Its clock is the world's; KeyError if the world has no camera of this name.
     """
@@ -150,8 +149,7 @@ def _packed(layout: str, values: Callable[[], tuple[int | bytes, ...]]) -> Calla
 
 
 def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
-    """
-    Start an emulated camera for ``sim://boson``, on a pseudo-terminal of its own.
+    """Start an emulated camera for ``sim://boson``, on a pseudo-terminal of its own.
 
     Options are ``name``, its name in the world (``"boson"`` by default), and without a world also
     ``sn``, its serial number, and ``fpa``, the temperature of its focal-plane array [K]. ValueError

@@ -48,8 +48,7 @@ FFC_PERIODS: Final = (1.0, math.inf)
 
 @dataclass
 class EmulatedCamera(Closing):
-    """
-    A `camera.FrameSource` without a camera; its frames begin with the first `read`.
+    """A `camera.FrameSource` without a camera; its frames begin with the first `read`.
 
     It shows a camera of the world by its name: through a filter of its own, or, where `band` is
     None, through the one in the beam of the wheel.

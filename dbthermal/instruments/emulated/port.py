@@ -40,8 +40,7 @@ class Device(Protocol):
 
 
 class EmulatedPort(Closing):
-    """
-    A raw pseudo-terminal on which a thread lets an emulated device answer.
+    """A raw pseudo-terminal on which a thread lets an emulated device answer.
 
     `path` is of the end for the driver, as in ``/dev/pts/3``. If the device is pulled out, or an
     error in it ends the thread, the terminal hangs up, as a real one does. Bytes that a driver does

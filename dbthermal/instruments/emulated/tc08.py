@@ -21,8 +21,7 @@ _HANDLE = 1
 
 
 class EmulatedTC08:
-    """
-    The library and one unit, with type-T thermocouples whatever letter they are set to.
+    """The library and one unit, with type-T thermocouples whatever letter they are set to.
 
     `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open;
     `junction_temperature` is that of the terminals [K]; `sleep` waits while a reading is converted.

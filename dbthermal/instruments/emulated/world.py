@@ -113,8 +113,7 @@ class World:
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:
-        """
-        Temperature of the tip of one thermocouple [K]; NaN if it is open or missing.
+        """Temperature of the tip of one thermocouple [K]; NaN if it is open or missing.
 
         KeyError if its place is not in the scene.
         """
@@ -165,8 +164,7 @@ class World:
 
 
 def emulated_world(session: Session, **settings: Any) -> World:
-    """
-    Bench with the cameras, filters and thermocouples of an emulated session.
+    """Bench with the cameras, filters and thermocouples of an emulated session.
 
     The thermocouples are at the places that they are named after, all at room temperature but the
     blackbody, unless the settings of the `World` say otherwise.

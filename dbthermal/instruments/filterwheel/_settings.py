@@ -40,8 +40,7 @@ class Scale:
     acceleration: float  # device units of one count/s^2
 
     def target(self, position: int, offset: float = 0.0) -> int:
-        """
-        Absolute place [count] of a slot, `offset` [deg] being that of slot 1 after homing.
+        """Absolute place [count] of a slot, `offset` [deg] being that of slot 1 after homing.
 
         A sixth of a turn is not a whole number of counts. Each place is rounded by itself, so that
         errors of up to half a count never add up. ValueError if the slot is not 1 to 6.
@@ -88,8 +87,7 @@ FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
 
 @dataclass(frozen=True)
 class Settings:
-    """
-    Properties of one wheel.
+    """Properties of one wheel.
 
     Attributes
     ----------

@@ -47,8 +47,7 @@ class Identity:
 
 
 class FilterWheel(Closing):
-    """
-    A filter wheel whose line is open, for one thread at a time; see `from_url`.
+    """A filter wheel whose line is open, for one thread at a time; see `from_url`.
 
     Parameters
     ----------
@@ -76,8 +75,7 @@ class FilterWheel(Closing):
 
     @classmethod
     def from_url(cls, url: str, settings: Settings, *, world: object | None = None) -> Self:
-        """
-        Open the line and `connect`; the wheel does not move.
+        """Open the line and `connect`; the wheel does not move.
 
         Parameters
         ----------
@@ -106,8 +104,7 @@ class FilterWheel(Closing):
         return wheel
 
     def connect(self) -> apt.Info:
-        """
-        Find the controller, check its identity, set the speeds and enable the motor.
+        """Find the controller, check its identity, set the speeds and enable the motor.
 
         Raises
         ------
@@ -136,8 +133,7 @@ class FilterWheel(Closing):
         return self._controller.status()
 
     def home(self) -> None:
-        """
-        Search for the home switch, from which all places count.
+        """Search for the home switch, from which all places count.
 
         The speeds are set before: where they are near 0, as in some controllers that were just
         switched on, homing does nothing and says nothing.
@@ -162,8 +158,7 @@ class FilterWheel(Closing):
         self._is_lost = False
 
     def move_to(self, position: int) -> None:
-        """
-        Turn a slot, 1 to 6, into the beam, and confirm that it is there.
+        """Turn a slot, 1 to 6, into the beam, and confirm that it is there.
 
         Raises
         ------
@@ -203,8 +198,7 @@ class FilterWheel(Closing):
         self.move_to(self.settings.position(band))
 
     def position(self) -> int:
-        """
-        Slot in the beam, 1 to 6.
+        """Slot in the beam, 1 to 6.
 
         Raises
         ------

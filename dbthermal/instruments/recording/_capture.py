@@ -12,8 +12,7 @@ from dbthermal.instruments.camera import UNTIMED, FrameFlag
 
 
 def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
-    r"""
-    Open a recording as stage `capture`, also one that was cut short or is being written.
+    r"""Open a recording as stage `capture`, also one that was cut short or is being written.
 
     Parameters
     ----------
@@ -65,8 +64,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
 
 
 def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
-    """
-    Log of a recording: time [s], kind, source and value of each note, in the order of writing.
+    """Log of a recording: time [s], kind, source and value of each note, in the order of writing.
 
     Kinds are ``"reading"``, ``"frames_lost"``, ``"shutter_closed"`` and others; the attributes of
     the store explain their values. FileNotFoundError if the folder does not exist.
@@ -82,8 +80,7 @@ def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
 
 
 def mean_reading(path: str | Path, source: str) -> float:
-    """
-    Mean of an instrument's readings during a recording, in its unit, without failed ones.
+    """Mean of an instrument's readings during a recording, in its unit, without failed ones.
 
     FileNotFoundError if the recording does not exist; ValueError if it has no such reading.
     """
@@ -94,8 +91,7 @@ def mean_reading(path: str | Path, source: str) -> float:
 
 
 def overview(folder: str | Path) -> xr.Dataset:
-    """
-    Table of the recordings in a folder: frames, losses, rate and completeness of each band.
+    """Table of the recordings in a folder: frames, losses, rate and completeness of each band.
 
     Parameters
     ----------

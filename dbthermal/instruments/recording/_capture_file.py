@@ -182,8 +182,7 @@ class _Band:
 
 
 class CaptureFile:
-    """
-    A new recording at `path` that takes frames and notes in the order in which they come.
+    """A new recording at `path` that takes frames and notes in the order in which they come.
 
     `readings` has the unit of each further instrument, `origin` is the host's clock at time 0 [s],
     `attrs` are attributes of the recording (JSON), and `chunk` is the number of frames that are
@@ -239,8 +238,7 @@ class CaptureFile:
         self._origin, self._start = origin, {"clock_origin": origin, "started": started}
 
     def frame(self, band: str, frame: Frame, refused: int = 0) -> FrameFlag:
-        """
-        Take a frame, write the chunk if it is full, and return all flags of the frame.
+        """Take a frame, write the chunk if it is full, and return all flags of the frame.
 
         `refused` is the number of frames of this band that came before it and were not taken.
         """

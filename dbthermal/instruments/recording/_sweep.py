@@ -75,8 +75,7 @@ class _Sweep:
 
 
 def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
-    """
-    Join the recordings of a blackbody sweep into one dataset.
+    """Join the recordings of a blackbody sweep into one dataset.
 
     Parameters
     ----------
@@ -128,8 +127,7 @@ def bench_series(
     region: Mapping[str, Region],
     correction: xr.Dataset | None = None,
 ) -> dict[str, xr.Dataset]:
-    """
-    Mean counts and temperatures of an emissivity bench, a measurement for each step.
+    """Mean counts and temperatures of an emissivity bench, a measurement for each step.
 
     Parameters
     ----------

@@ -43,8 +43,7 @@ class Mixture:
         return grid, np.gradient(grid, axis=0)
 
     def conditional(self, grid: Array) -> tuple[Array, Array, Array]:
-        """
-        Log-density of the first emissivity, mean and variance of the others given it.
+        """Log-density of the first emissivity, mean and variance of the others given it.
 
         (component, grid, pixel), (component, band - 1, grid, pixel), and of ones for the grid. The
         others are taken as independent given the first.

@@ -179,8 +179,7 @@ def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Leve
 def solve(
     scene: Scene, tile: Tile, valid: Mask, source: int, places: Whole
 ) -> tuple[Values, Array]:
-    """
-    Complete the pixels of a tile whose emissivities come from one source.
+    """Complete the pixels of a tile whose emissivities come from one source.
 
     Beside the values, the posterior mean and variance of the background's level, the prior's
     variance, and the variance of the background over time (4, pixel).
@@ -215,8 +214,7 @@ def solve(
 
 
 def find_level(scene: Scene) -> Level:
-    """
-    Level of the background over the pixels, from those that show it, beside what is known.
+    """Level of the background over the pixels, from those that show it, beside what is known.
 
     Each pixel's posterior without the prior in it is a measurement; their weighted median, and the
     scatter that they do not explain, which is how much pixels differ.

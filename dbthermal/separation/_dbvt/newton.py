@@ -123,8 +123,7 @@ def _huber_term(
 
 
 class _System:
-    r"""
-    Newton's equations of a step, the noise of each frame eliminated.
+    r"""Newton's equations of a step, the noise of each frame eliminated.
 
     With N the 2x2 block of a frame's noise, c its coupling to another unknown and f the forces
     (negative gradients), :math:`H - c^T N^{-1} c` and :math:`f - c^T N^{-1} f_n` are left.
@@ -260,8 +259,7 @@ def bending(signal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def whittaker(diagonal: Tensor, stiffness: Tensor, right: Tensor) -> Tensor:
-    r"""
-    Solutions (time, side, column) of Whittaker's smoother for many pixels at once.
+    r"""Solutions (time, side, column) of Whittaker's smoother for many pixels at once.
 
     .. math:: (\mathrm{diag}(d) + \lambda D^T D)\, x = b
 

@@ -69,8 +69,7 @@ def materials(
     error_rate: float = 0.01,
     resolution: float = 0.1,
 ) -> xr.DataArray:
-    r"""
-    Label the pixels by material, for `solve(..., pool=labels)`.
+    r"""Label the pixels by material, for `solve(..., pool=labels)`.
 
     Parameters
     ----------
@@ -164,8 +163,7 @@ def regions(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
 
 
 def joined(labels: xr.DataArray, pooled: xr.Dataset, *, resolution: float = 0.1) -> xr.DataArray:
-    """
-    Regions (y, x) joined with those they touch, if what was pooled over each agrees.
+    """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
 
     A material is cut where ratios of single pixels are biased by what their order leaves of the
     object; pooled ratios are not.
@@ -260,8 +258,7 @@ def _cells(
 def _links(
     cells: Labels, pairs: Labels, emitted: Array, variances: Array, change: Array
 ) -> tuple[Labels, Array]:
-    """
-    Pairs of cells with no step between them in the emitted maps, and the steps' significances.
+    """Pairs of cells with no step between them in the emitted maps, and the steps' significances.
 
     A border shows in proportion to the object's change: no step is no proof without one.
     """
@@ -282,8 +279,7 @@ def _links(
 def step(
     places: tuple[Labels, Labels], values: Array, variance: Array, first: int, least: float
 ) -> float:
-    r"""
-    Significance of a step between two cells, beside a cubic function of the place.
+    r"""Significance of a step between two cells, beside a cubic function of the place.
 
     .. math:: f(x, y) = \sum_{i + j \le 3} c_{ij} x^i y^j + h [p \in \mathrm{second}]
 

@@ -20,8 +20,7 @@ Varying: TypeAlias = float | Array | Callable[[float], float | Array]
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """
-    Flux a - b T - s T^4 into a shell at one time, as a function of its temperature T.
+    """Flux a - b T - s T^4 into a shell at one time, as a function of its temperature T.
 
     Of a, b and s (vertex,) in [W m^-2], [W m^-2 K^-1] and [W m^-2 K^-4].
     """
@@ -44,8 +43,7 @@ class Exchange(ABC):
 
     @abstractmethod
     def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
-        """
-        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
+        """Terms a, b, s of `Balance` at a time [s] for a number of vertices.
 
         Raises a ValueError if an attribute does not fit the vertices or is not physical.
         """
@@ -53,8 +51,7 @@ class Exchange(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Convection(Exchange):
-    """
-    Exchange with a fluid, or through a contact: h (T_fluid - T).
+    """Exchange with a fluid, or through a contact: h (T_fluid - T).
 
     With a very large coefficient, such as 1e9 W m^-2 K^-1, a prescribed temperature.
 
@@ -78,8 +75,7 @@ class Convection(Exchange):
 
 @dataclass(frozen=True, eq=False)
 class Radiation(Exchange):
-    """
-    Exchange of one side with large surroundings: emissivity sigma (T_s^4 - T^4).
+    """Exchange of one side with large surroundings: emissivity sigma (T_s^4 - T^4).
 
     Attributes
     ----------
@@ -108,8 +104,7 @@ class Radiation(Exchange):
 
 @dataclass(frozen=True, eq=False)
 class Heating(Exchange):
-    """
-    Prescribed flux into the shell, such as absorbed light; negative if it cools.
+    """Prescribed flux into the shell, such as absorbed light; negative if it cools.
 
     Attributes
     ----------

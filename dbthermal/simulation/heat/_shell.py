@@ -18,8 +18,7 @@ _FLATTEST: Final = 1e-9
 
 @dataclass(frozen=True)
 class Solid:
-    """
-    Thermal properties of a solid, constant over the temperatures of a scene.
+    """Thermal properties of a solid, constant over the temperatures of a scene.
 
     Attributes
     ----------
@@ -56,8 +55,7 @@ CERAMIC: Final = Solid(conductivity=1.5, density=2400.0, specific_heat=1050.0)
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    r"""
-    A shell so thin that its temperature is uniform through it.
+    r"""A shell so thin that its temperature is uniform through it.
 
     That holds while the Biot number :math:`h d / k` is far below 1: 0.02 for 3 mm of glass in
     still air, but 1 where hot water wets it. There the half wall up to the middle belongs in
@@ -128,8 +126,7 @@ class Shell:
 
     @cached_property
     def stiffness(self) -> Any:
-        r"""
-        Conduction :math:`k d L` as a sparse matrix, (vertex, vertex) [W/K].
+        r"""Conduction :math:`k d L` as a sparse matrix, (vertex, vertex) [W/K].
 
         Symmetric, positive semidefinite: heat leaves vertex i at the rate :math:`(k d L T)_i`;
         its rows add up to zero.

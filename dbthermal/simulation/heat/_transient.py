@@ -39,8 +39,7 @@ def simulate(
     step: float | None = None,
     tolerance: float = TOLERANCE,
 ) -> Array:
-    r"""
-    Transient temperature of a thin shell.
+    r"""Transient temperature of a thin shell.
 
     .. math:: \rho c d \, \dot T = \nabla \cdot (k d \, \nabla T) + \sum_i h_i (T_i - T)
               + \sum_j \varepsilon_j \sigma (T_j^4 - T^4) + q
@@ -115,8 +114,7 @@ def simulate(
 
 
 class _Stepper:
-    r"""
-    Steps of one shell, with the factorisation they share.
+    r"""Steps of one shell, with the factorisation they share.
 
     A stage solves :math:`C (T - B) = w (A f(T) - K T)` for T, with the capacity C, the base B,
     the weight w (a time), the vertices' areas A, the flux f and the stiffness K, by
@@ -143,8 +141,7 @@ class _Stepper:
         return temperature
 
     def advance(self, temperature: Array, begin: float, end: float) -> Array:
-        r"""
-        Temperature [K] at the end of a step from a time to another [s].
+        r"""Temperature [K] at the end of a step from a time to another [s].
 
         .. math:: T_1 = T + \gamma \tau F(t + \gamma \tau, T_1), \quad
                   T_2 = T + (1 - \gamma) \tau F(t + \gamma \tau, T_1)
