@@ -13,13 +13,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import calibration, mixing, planck, schema
+from dbthermal import calibration, mixing, planck
 from dbthermal import response as responses
-from dbthermal._arrays import Array
 from dbthermal.emissivity import embedded_table
 from dbthermal.response import Curve, require_range
+
+Array = npt.NDArray[np.float64]
 
 _POSITIVE: Final = (
     "object_temperatures",
@@ -187,57 +189,6 @@ class Bench:
         )
 
 
-def contact_measurements(
-    response: xr.Dataset,
-    emissivity: xr.DataArray,
-    object_temperature: np.ndarray,
-    background_temperature: np.ndarray,
-    stds: tuple[float, float],
-    rng: np.random.Generator,
-) -> xr.Dataset:
-    """Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
-
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    emissivity : DataArray
-        True emissivity (band) [1].
-    object_temperature, background_temperature : ndarray, shape (measurement,)
-        True temperatures [K].
-    stds : tuple of float
-        Standard deviation of a reading of thermocouple and blackbody [K].
-    rng : Generator
-        Source of the errors.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
-        (measurement) [K], as read.
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the response, or the emissivity lacks a band.
-    """
-    curves = _curves(response)
-    names = [curve.band for curve in curves]
-    schema.band_positions(emissivity, names, "the emissivity")
-    share = emissivity.sel(band=names).values[:, np.newaxis]
-    true = {
-        "object_temperature": object_temperature,
-        "background_temperature": background_temperature,
-    }
-    emitted, reflected = (_blackbody(curves, level) for level in true.values())
-    counts = _noisy(response, mixing.leaving(share, emitted, reflected), rng)
-    read = {
-        name: level + rng.normal(0, std, len(level))
-        for (name, level), std in zip(true.items(), stds, strict=True)
-    }
-    return _dataset(response, {"counts": counts}, read)
-
-
 def bench_series(
     response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
 ) -> xr.Dataset:
@@ -258,9 +209,9 @@ def bench_series(
     The emissivity of a chrome ball, 0.10, from a series with all errors of the bench:
 
     >>> from dbthermal import calibration, simulation
-    >>> bench, ball = simulation.Bench(), simulation.OBJECTS[0]
+    >>> bench, ball = Bench(), OBJECTS[0]
     >>> response, rng = simulation.Rig().response(), np.random.default_rng(1)
-    >>> series = simulation.bench_series(response, ball, bench, rng)
+    >>> series = bench_series(response, ball, bench, rng)
     >>> stds = (bench.reading_std, bench.blackbody_std)  # K
     >>> fitted = calibration.fit_emissivity(series, response, stds, bench.bias(ball))
     >>> fitted["emissivity"].values.round(2).tolist()
@@ -299,9 +250,9 @@ def reflector_series(
     A chrome ball of emissivity 0.10 seems to have 0.3, for it reflects what the foil does not:
 
     >>> from dbthermal import calibration, simulation
-    >>> bench, ball = simulation.Bench(), simulation.OBJECTS[0]
+    >>> bench, ball = Bench(), OBJECTS[0]
     >>> response, rng = simulation.Rig().response(), np.random.default_rng(1)
-    >>> series = simulation.reflector_series(response, ball, bench, rng)
+    >>> series = reflector_series(response, ball, bench, rng)
     >>> stds = (bench.reading_std, bench.foil_std)  # K
     >>> fitted = calibration.reflector_emissivity(series, response, stds, bench.bias(ball))
     >>> fitted["emissivity"].values.round(1).tolist()
