@@ -173,27 +173,11 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
 
 
 def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
-    """Curve of one band.
+    """Curve of one band, by its name, of a response (stage `response` of `schema`).
 
-    Parameters
-    ----------
-    response : Dataset
-        Stage `response` of `schema`.
-    band : str
-        Name of the band.
-    kind : {"exact", "linear"}
-        Sakuma-Hattori, or the linear pair.
-
-    Returns
-    -------
-    Curve
-        Of the kind wanted; a `LinearCurve` if linear.
-
-    Raises
-    ------
-    ValueError
-        If the band is missing, the kind unknown, a coefficient not finite, or the slope not
-        positive.
+    The Sakuma-Hattori curve if its kind is "exact", a `LinearCurve` of the linear pair if "linear".
+    ValueError if the band is missing, the kind unknown, a coefficient not finite, or the slope not
+    positive.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
@@ -243,26 +227,10 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
 
 
 def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact") -> xr.DataArray:
-    """Counts of a blackbody in every band of a response.
+    """Counts (band, ...) [count] of a blackbody in every band of a response.
 
-    Parameters
-    ----------
-    response : Dataset
-        Stage `response` of `schema`.
-    temperature : DataArray
-        Temperature [K], any dims but `band`.
-    kind : {"exact", "linear"}
-        Kind of response.
-
-    Returns
-    -------
-    DataArray
-        Counts (band, ...) [count].
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the calibrated range of the response.
+    Of a response (stage `response` of `schema`), by its kind of curve, and temperatures [K] of any
+    dims but `band`. ValueError if one lies outside the calibrated range of the response.
     """
     names = [str(name) for name in response["band"].values]
     curves = [curve(response, name, kind) for name in names]
@@ -277,25 +245,9 @@ def apparent_temperature(
 ) -> xr.DataArray:
     """Temperature of the blackbody that would give the same counts, band by band.
 
-    Parameters
-    ----------
-    response : Dataset
-        Stage `response` of `schema`.
-    counts : DataArray
-        (band, ...) [count].
-    kind : {"exact", "linear"}
-        Kind of response.
-
-    Returns
-    -------
-    DataArray
-        Apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN where
-        no temperature gives such counts.
-
-    Raises
-    ------
-    ValueError
-        If a band is missing in the response.
+    Of a response (stage `response` of `schema`), by its kind of curve, and counts (band, ...)
+    [count] the apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN
+    where no temperature gives such counts. ValueError if a band is missing in the response.
 
     Examples
     --------

@@ -18,10 +18,7 @@ from dbthermal.figures.drawing import (
 def gain_offset_maps(correction: xr.Dataset) -> Figure:
     """Maps of gain and offset, one row per band, with the bad pixels marked.
 
-    Parameters
-    ----------
-    correction : Dataset
-        From `correction.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
+    Of `gain` [1], `offset` [count] and `bad`, all (band, y, x), from `correction.fit_correction`.
     """
     bands = correction["band"].values
     figure, axes = canvas(len(bands), 2, (8.0, 2.8 * len(bands)))
@@ -42,19 +39,11 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
 def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
     """Response of each band with the residuals of both fits.
 
-    Parameters
-    ----------
-    response : Dataset
-        From `calibration.fit_response`.
-    fine : DataArray
-        Fitted counts (band, temperature) on a fine grid of temperatures, from `response.counts`.
-
-    Returns
-    -------
-    Figure
-        From above: counts over temperature, the line's residuals, and those of the
-        Sakuma-Hattori curve on a scale of their own, with the noise of one pixel and frame where
-        the response has it; residuals and noise over the slope of the line.
+    Of a response from `calibration.fit_response`, and the fitted counts (band, temperature) on a
+    fine grid of temperatures, from `response.counts`. From above: counts over temperature, the
+    line's residuals, and those of the Sakuma-Hattori curve on a scale of their own, with the noise
+    of one pixel and frame where the response has it; residuals and noise over the slope of the
+    line.
     """
     bands = response["band"].values
     figure, axes = canvas(3, len(bands), (4.6 * len(bands), 7.2))

@@ -9,13 +9,7 @@ from dbthermal.figures.drawing import COLORS, band_label, canvas, limits_of, pro
 
 
 def emissivity_bars(table: xr.Dataset) -> Figure:
-    """Band emissivities as bars, one group per material.
-
-    Parameters
-    ----------
-    table : Dataset
-        From `emissivity.band_table`: `emissivity` (material, band) [1].
-    """
+    """Band emissivities (material, band) [1] as bars, one group per material."""
     materials, bands = table["material"].values, table["band"].values
     figure, ((axis,),) = canvas(1, 1, (max(7.0, 0.62 * len(materials)), 4.6))
     width = 0.8 / len(bands)
@@ -32,14 +26,9 @@ def emissivity_bars(table: xr.Dataset) -> Figure:
 
 
 def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
-    """Condition number of the emissivity matrix for every pair of bands.
+    """Condition number of the emissivity matrix for every pair of bands, with its numbers.
 
-    Parameters
-    ----------
-    summary : DataArray
-        (first, second) [1], averaged over materials; NaN or infinite on the diagonal.
-    materials : int
-        Number of materials that the average is over.
+    (first, second) [1], averaged over a number of materials; NaN or infinite on the diagonal.
     """
     figure, ((axis,),) = canvas(1, 1, (5.4, 4.6))
     values = np.where(np.isfinite(summary.values), summary.values, np.nan)
@@ -65,12 +54,8 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
 def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
     """Emissivities from thermocouple and blackbody with their standard deviations.
 
-    Parameters
-    ----------
-    measured : Dataset
-        `emissivity`, `emissivity_std` (material, band) [1].
-    table : DataArray, optional
-        Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
+    One point per band and material, of `emissivity` and `emissivity_std` (material, band) [1], with
+    tabulated values (material, band) [1] as crosses: of a simulation the truth.
     """
     figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
     if table is not None:

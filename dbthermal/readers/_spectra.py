@@ -161,26 +161,11 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
 def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
     r"""Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
 
-    Parameters
-    ----------
-    path : str or Path
-        File with columns ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>``
-        emissivity [1], in steps as for `slum`.
-    reach : tuple of float
-        Wavelengths that the table must reach [micrometre], as for `slum`.
-
-    Returns
-    -------
-    Dataset
-        A spectrum as `ecostress`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or the
-        table or a value is refused as by `slum`.
+    They are ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>`` emissivity
+    [1], in steps and as far as `reach` [micrometre] as for `slum`; the result is as from
+    `ecostress`. FileNotFoundError if the file does not exist; ValueError if the columns are not
+    these, wavelength and wavenumber disagree by more than 0.1 %, or the table or a value is refused
+    as by `slum`.
 
     Examples
     --------

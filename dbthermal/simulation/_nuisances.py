@@ -103,21 +103,9 @@ def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
-    """Lose frames at random in each band: each is replaced by the one before (`repeat_frames`).
+    """Lose a share of the frames, in [0, 1), at random in each band, as `repeat_frames` does.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`.
-    share : float
-        Share of frames that are lost, in [0, 1).
-    rng : Generator
-        Source of the losses.
-
-    Returns
-    -------
-    Dataset
-        The capture with frames repeated, and `repeated` (band, time), bool.
+    Of a capture of stage `corrected`; the result has `repeated` (band, time), bool, beside it.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not 0 <= share < 1:
@@ -201,25 +189,10 @@ def spoil_pixels(
 ) -> xr.Dataset:
     """Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`.
-    share : float
-        Share of pixels that are bad in a band, a third of each kind on average, in [0, 1).
-    rng : Generator
-        Source of the pixels and of their signals.
-    noise_std : float
-        Noise added to a noisy pixel [count].
-    amplitude : float
-        Step of a blinking pixel [count].
-    dwell : float
-        Mean time between its steps [s]; there is at least one step.
-
-    Returns
-    -------
-    Dataset
-        The capture with bad pixels, and `spoiled` (band, y, x), int8: position in `SPOILED`.
+    Of a capture of stage `corrected`, a share of the pixels in each band, in [0, 1), a third of
+    each kind on average. A noisy pixel has a noise [count] added; a blinking one steps by an
+    amplitude [count], at a mean dwell [s], at least once. The result has `spoiled` (band, y, x),
+    int8, beside it: position in `SPOILED`.
     """
     counts = _floating(corrected).copy(deep=True)
     if not 0 <= share < 1:

@@ -93,18 +93,10 @@ def mean_reading(path: str | Path, source: str) -> float:
 def overview(folder: str | Path) -> xr.Dataset:
     """Table of the recordings in a folder: frames, losses, rate and completeness of each band.
 
-    Parameters
-    ----------
-    folder : str or Path
-        With recordings (ValueError without any); other files in it are passed over.
-
-    Returns
-    -------
-    Dataset
-        One row for each recording and band: `frames`, of which `damaged`; `lost` by camera or
-        driver, and `refused` by a full queue; `frame_rate` by the good frames' stamps [Hz], NaN
-        without two; `complete`, whether the recording went to its planned end. Coordinates
-        `recording` and `band`.
+    A row for each recording and band, by coordinates `recording` and `band`: `frames`, of which
+    `damaged`; `lost` by camera or driver, and `refused` by a full queue; `frame_rate` by the good
+    frames' stamps [Hz], NaN without two; `complete`, whether the recording went to its planned end.
+    Other files are passed over; ValueError without any recording.
     """
     rows = [
         {"recording": path.stem, "band": band, **totals, **_rate_and_end(opened, band)}

@@ -20,14 +20,8 @@ _FLATTEST: Final = 1e-9
 class Solid:
     """Thermal properties of a solid, constant over the temperatures of a scene.
 
-    Attributes
-    ----------
-    conductivity : float
-        Thermal conductivity k [W m^-1 K^-1].
-    density : float
-        Density [kg m^-3].
-    specific_heat : float
-        Specific heat at constant pressure c [J kg^-1 K^-1].
+    Conductivity k [W m^-1 K^-1], density [kg m^-3], and specific heat at constant pressure [J kg^-1
+    K^-1].
     """
 
     conductivity: float
