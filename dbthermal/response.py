@@ -46,23 +46,6 @@ class Curve:
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O
 
-    Attributes
-    ----------
-    band : str
-        Name of the band.
-    amplitude : float
-        C [count].
-    wavelength : float
-        A, effective wavelength [m].
-    shift : float
-        B [m K].
-    offset : float
-        O [count].
-    reference : float
-        Reference temperature :math:`T_r` [K].
-    lowest, highest : float
-        Calibrated range [K].
-
     References
     ----------
     .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
@@ -70,14 +53,14 @@ class Curve:
     .. [2] Saunders, White (2003), Metrologia 40, 195, doi:10.1088/0026-1394/40/4/309
     """
 
-    band: str
-    amplitude: float
-    wavelength: float
-    shift: float
-    offset: float
-    reference: float
-    lowest: float
-    highest: float
+    band: str  # its name
+    amplitude: float  # C [count]
+    wavelength: float  # A, effective wavelength [m]
+    shift: float  # B [m K]
+    offset: float  # O [count]
+    reference: float  # reference temperature T_r [K]
+    lowest: float  # of the calibrated range [K]
+    highest: float  # of the calibrated range [K]
 
     def counts(self, temperature: npt.ArrayLike) -> Array:
         """Counts of a blackbody at a temperature [K] that fills the pixel, extrapolated [count]."""
@@ -136,12 +119,8 @@ class Curve:
 class LinearCurve(Curve):
     """The paper's linear response, counts = slope * T + intercept, with the methods of `Curve`.
 
-    Attributes
-    ----------
-    amplitude : float
-        Slope [count/K].
-    offset : float
-        Intercept [count]; `wavelength` and `shift` are not used.
+    `amplitude` is the slope [count/K], `offset` the intercept [count]; `wavelength` and `shift` are
+    not used.
     """
 
     def counts(self, temperature: npt.ArrayLike) -> Array:

@@ -273,23 +273,9 @@ def status_attrs() -> dict[str, object]:
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """Mask of the places where any of some flags is set, by the CF attributes of the variable.
 
-    Parameters
-    ----------
-    flags : DataArray
-        `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
-        ``flag_meanings``.
-    names : str
-        Names of flags, in lower case.
-
-    Returns
-    -------
-    DataArray of bool
-        Of the shape of the flags.
-
-    Raises
-    ------
-    ValueError
-        If a name is not among the attributes.
+    Of `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
+    ``flag_meanings``, and names of flags, in lower case: bool, of the shape of the flags.
+    ValueError if a name is not among the attributes.
 
     Examples
     --------

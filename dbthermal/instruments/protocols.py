@@ -153,19 +153,9 @@ def record_scene(
 ) -> Summary:
     """Record a scene with all devices; an emulated scene begins with the recording.
 
-    Parameters
-    ----------
-    devices : Devices
-        Of any session; call `Devices.prepare` before.
-    path : str or Path
-        Folder ``*.zarr`` to make.
-    limits, preview, stop : optional
-        As for `dbthermal.instruments.recording.record`, whose errors it raises.
-
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames.
+    Of any session, after `Devices.prepare`, into a folder ``*.zarr`` to make; limits, preview, stop
+    and errors are those of `dbthermal.instruments.recording.record`. The summary says how it ended,
+    and the numbers of frames.
 
     Examples
     --------

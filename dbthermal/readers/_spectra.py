@@ -105,27 +105,12 @@ def ecostress(path: str | Path) -> xr.Dataset:
 def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> dict[str, xr.Dataset]:
     r"""Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
 
-    Parameters
-    ----------
-    path : str or Path
-        File with a column ``wavelength`` [micrometre], in steps that change little from one to the
-        next, and one of emissivity [1] per sample.
-    reach : tuple of float
-        Wavelengths that the table must reach [micrometre], so that a file that was cut is refused;
-        by default those of the library.
-
-    Returns
-    -------
-    dict of str to Dataset
-        Sample code, such as ``"A001"``, to a spectrum as `ecostress`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If the columns are not these, a row is short, missing or added, the last line has no end,
-        the table does not reach so far, or a value is refused as by `ecostress`.
+    Its columns are ``wavelength`` [micrometre], in steps that change little from one to the next,
+    and one of emissivity [1] per sample: sample code, such as ``"A001"``, to a spectrum as from
+    `ecostress`. The table must `reach` some wavelengths [micrometre], by default those of the
+    library, so that a file that was cut is refused. FileNotFoundError if the file does not exist;
+    ValueError if the columns are not these, a row is short, missing or added, the last line has no
+    end, the table does not reach so far, or a value is refused as by `ecostress`.
 
     References
     ----------

@@ -114,17 +114,11 @@ class FilterWheel(Closing):
         """Search for the home switch, from which all places count.
 
         The speeds are set before: where they are near 0, as in some controllers that were just
-        switched on, homing does nothing and says nothing.
-
-        Raises
-        ------
-        StalledWheelError, WheelTimeoutError
-            If the wheel does not start or stops before the switch, the controller reports a fault,
-            or it takes longer than the settings' `home_timeout`; the wheel was stopped.
-        WheelError
-            If it is still moving, or the controller reports an error or does not take the speeds.
-        NoReplyError, TransportError
-            If the controller falls silent, or the device is gone.
+        switched on, homing does nothing and says nothing. StalledWheelError or WheelTimeoutError if
+        the wheel does not start or stops before the switch, the controller reports a fault, or it
+        takes longer than the settings' `home_timeout`; the wheel was stopped. WheelError if it is
+        still moving, or the controller reports an error or does not take the speeds; NoReplyError
+        or TransportError if that falls silent, or the device is gone.
         """
         self._controller.prepare()
         self._require_rest()
@@ -138,21 +132,12 @@ class FilterWheel(Closing):
     def move_to(self, position: int) -> None:
         """Turn a slot, 1 to 6, into the beam, and confirm that it is there.
 
-        Raises
-        ------
-        ValueError
-            If the slot is not 1 to 6.
-        NotHomedError
-            If the controller was not homed since it was switched on, or steps may be lost since.
-        StalledWheelError
-            If the wheel does not move, stops elsewhere, or the controller reports a fault: steps
-            may be lost, and it must be homed before the next move.
-        WheelTimeoutError
-            If it takes longer than the settings' `move_timeout`; the wheel was stopped.
-        WheelError
-            If it is still moving, or the controller reports an error.
-        NoReplyError, TransportError
-            If the controller falls silent, or the device is gone.
+        ValueError if the slot is not 1 to 6; NotHomedError if the controller was not homed since it
+        was switched on, or steps may be lost since; StalledWheelError if the wheel does not move,
+        stops elsewhere, or the controller reports a fault: steps may be lost, and it must be homed
+        before the next move; WheelTimeoutError if it takes longer than the settings'
+        `move_timeout`, and was stopped; WheelError if it is still moving, or the controller reports
+        an error; NoReplyError or TransportError if that falls silent, or the device is gone.
         """
         scale, settings = self._controller.scale, self.settings
         target = scale.target(position, settings.home_offset)
