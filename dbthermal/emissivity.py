@@ -132,14 +132,9 @@ def embedded_table() -> xr.Dataset:
     """Table of 25 common materials that comes with the package.
 
     Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
-    [1]_ [2]_ [3]_, whose spectra are not redistributed.
-
-    Returns
-    -------
-    Dataset
-        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]; some metals and
-        tiles were measured up to 12.5 um only. Coordinates `library` and `source` (material) name
-        the library, and the file or sample in it.
+    [1]_ [2]_ [3]_, whose spectra are not redistributed: stage `emissivity_table`, `emissivity` and
+    `coverage` (material, band) [1]; some metals and tiles were measured up to 12.5 um only.
+    Coordinates `library` and `source` (material) name the library, and the file or sample in it.
 
     References
     ----------
@@ -310,27 +305,13 @@ def rank_filters(
     The second criterion settles it: the standard deviation of the object temperature from one
     frame. Both are medians over the materials, for a few nearly gray materials govern any mean.
 
-    Parameters
-    ----------
-    table : Dataset
-        Stage `emissivity_table`.
-    noise : DataArray
-        Noise (band) [K] of every band of the table, such as from `filter_noise`.
-    beside : str
-        Name of the camera's own band.
-
-    Returns
-    -------
-    Dataset
-        Each (band), in the order of the first: `condition_number` [1]; `condition_number_mean` [1],
-        over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
-        `lowest_condition_number` and `lowest_std` name the filter of each criterion.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the table is not as `schema` has it or has no band `beside` and another, or the noise
-        lacks a band, is in another unit, or is not finite and positive.
+    Of a table (stage `emissivity_table`), the noise (band) [K] of its every band, such as from
+    `filter_noise`, and the name of the camera's own band: each (band), in the order of the first
+    criterion, `condition_number` [1]; `condition_number_mean` [1], over the materials where it is
+    finite; `object_temperature_std` [K]; `noise` [K]. Attributes `lowest_condition_number` and
+    `lowest_std` name the filter of each criterion. TypeError or ValueError if the table is not as
+    `schema` has it or has no band `beside` and another, or the noise lacks a band, is in another
+    unit, or is not finite and positive.
 
     Examples
     --------

@@ -8,7 +8,7 @@ glossary as text, which is docs/nomenclature.md.
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntFlag
 from types import MappingProxyType
 from typing import Any, Final, Self
@@ -56,11 +56,12 @@ class Variable:
     dtype: str
     units: str
     long_name: str
+    more: Mapping[str, Any] = field(default_factory=dict, hash=False)  # further attributes
 
     @property
-    def attrs(self) -> dict[str, str]:
+    def attrs(self) -> dict[str, Any]:
         """Attributes to write on the variable."""
-        return {"units": self.units, "long_name": self.long_name}
+        return {"units": self.units, "long_name": self.long_name, **self.more}
 
 
 def _of(dims: str, units: str, long_name: str, dtype: str = "float64") -> Variable:
