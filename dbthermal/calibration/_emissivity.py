@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.response import Curve, require_range
-
-Array = npt.NDArray[np.float64]
 
 _ITERATIONS: Final = 50
 _CONVERGED: Final = 1e-12
@@ -24,8 +22,7 @@ _CONVERGED: Final = 1e-12
 
 @dataclass(frozen=True)
 class Bias:
-    r"""
-    Errors that all readings of one series have in common, each uniform in a range.
+    r"""Errors that all readings of one series have in common, each uniform in a range.
 
     A range's middle is corrected for, and its standard deviation, the width over :math:`\sqrt{12}`,
     is carried into the result: a rectangular distribution, clause 4.3.7 of the Guide to the
@@ -90,8 +87,7 @@ class Bias:
         return self.air_temperature + (reading - self.air_temperature) / self._felt
 
     def emitted(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
-        """
-        Errors of the object's signal [count]: independent (n), and common (2, n).
+        """Errors of the object's signal [count]: independent (n), and common (2, n).
 
         Of n measurements at corrected temperatures [K], for a standard deviation of one reading
         [K]; the common ones by the offset and by the contact error.
@@ -122,8 +118,7 @@ NO_BIAS: Final = Bias()
 
 @dataclass(frozen=True)
 class _Signals:
-    """
-    Signals of one band and their errors, n measurements.
+    """Signals of one band and their errors, n measurements.
 
     `counts`, `emitted`, `reflected` (n): I, W_o, W_b [count]; `noise`: standard deviation of the
     counts [count]; `..._std` (n): independent errors of the other two; `..._bias` (term, n): effect
@@ -150,8 +145,7 @@ class _Signals:
         return self.counts - self.reflected
 
     def weighted(self, emissivity: float, values: Array) -> Array:
-        """
-        Inverse covariance of the residual y - e x, times values (n).
+        """Inverse covariance of the residual y - e x, times values (n).
 
         The covariance is diagonal but for the few common errors F (term, n), which the Woodbury
         identity inverts: (D + F'F)^-1 v = v/D - (F/D)' (1 + F (F/D)')^-1 F (v/D).
@@ -184,8 +178,7 @@ def fit_emissivity(
     reading_std: tuple[float, float],
     bias: Bias = NO_BIAS,
 ) -> xr.Dataset:
-    r"""
-    Emissivity of a material per band, by contact thermometry and a reflected blackbody.
+    r"""Emissivity of a material per band, by contact thermometry and a reflected blackbody.
 
     Each measurement i has counts :math:`I_i`, the object's temperature by thermocouple and the
     reflected blackbody's temperature (equation 10 of the paper [1]_, by least squares):
@@ -279,8 +272,7 @@ def reflector_emissivity(
     reading_std: tuple[float, float],
     bias: Bias = NO_BIAS,
 ) -> xr.Dataset:
-    r"""
-    Emissivity of a material per band by the reflector method of the standards.
+    r"""Emissivity of a material per band by the reflector method of the standards.
 
     A crumpled foil in the object's place gives the reflected signal :math:`W_r`, a contact
     thermometer the object's own :math:`W_o = U(T_o)`, and the camera the object's W [1]_ [2]_:

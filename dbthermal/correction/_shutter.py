@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import _rows, schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
-Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 # Fewest pixels that must change in a capture for an unchanged image to be a copy.
 _MINIMUM_PIXELS: Final = 16
@@ -33,8 +32,7 @@ _EVENT = ("band", "first_frame", "frames", "renewed")
 
 
 def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -> xr.Dataset:
-    """
-    Find the runs of frames in which a band repeats its image.
+    """Find the runs of frames in which a band repeats its image.
 
     A frame is a copy if no pixel differs from the frame before. Some thousands of pixels are
     compared first, then the whole of the remaining frames, in blocks of rows, so that a lazy
@@ -90,8 +88,7 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
 
 
 def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.Dataset:
-    """
-    Set frames of a closed shutter or a repeated image to NaN, and number the segments.
+    """Set frames of a closed shutter or a repeated image to NaN, and number the segments.
 
     A `segment` is the stretch between two renewals of the offsets, at which every pixel of the band
     makes an offset step of its own, of tens of counts, which no camera reports. It is left in the
@@ -186,10 +183,9 @@ def _whole_copies(counts: xr.DataArray, candidates: Integers) -> Mask:
     """Candidates that repeat the frame before in all of the image, read in blocks of rows."""
     needed = np.union1d(candidates, candidates - 1)
     here, before = (np.searchsorted(needed, part) for part in (candidates, candidates - 1))
-    rows = max(1, _BLOCK // (needed.size * counts.sizes["x"]))
     copies = np.ones(candidates.size, dtype=bool)
-    for top in range(0, counts.sizes["y"], rows):
-        block = counts.isel(time=needed, y=slice(top, top + rows)).values
+    for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
+        block = counts.isel(time=needed, y=rows).values
         copies &= ~_changed(block[before], block[here])[0].any(axis=(1, 2))
     return copies
 

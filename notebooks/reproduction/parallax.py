@@ -93,11 +93,7 @@ def _rapid(movie: xr.DataArray, inside: Mask) -> list[Movie]:
     return result
 
 
-def _correlations(
-    first: Movie,
-    second: Movie,
-    inside: Mask,
-) -> Array:
+def _correlations(first: Movie, second: Movie, inside: Mask) -> Array:
     """Correlation of second(p) with first(p + d) over the object, by d within `REACH`."""
     size = [next_fast_len(n + r, real=True) for n, r in zip(inside.shape, REACH, strict=True)]
 
@@ -123,10 +119,7 @@ def _parabola(scores: Array, place: npt.NDArray[np.intp], axis: int) -> float:
 
 
 def _neighbourhoods(
-    first: Movie,
-    second: Movie,
-    inside: Mask,
-    near: npt.NDArray[np.intp],
+    first: Movie, second: Movie, inside: Mask, near: npt.NDArray[np.intp]
 ) -> tuple[Array, Array]:
     """Quantiles of the displacement of the neighbourhoods with the strongest common change."""
     steps = [(y, x) for y in range(-_NEAR, _NEAR + 1) for x in range(-_NEAR, _NEAR + 1)]

@@ -158,10 +158,7 @@ def still(outline: xr.DataArray) -> xr.DataArray:
 
 
 def agreement(
-    reflection: xr.DataArray,
-    theirs: xr.Dataset,
-    frames: npt.NDArray[np.intp],
-    pixels: xr.DataArray,
+    reflection: xr.DataArray, theirs: xr.Dataset, frames: npt.NDArray[np.intp], pixels: xr.DataArray
 ) -> xr.DataArray:
     """
     Correlation (time) [1] of our reflection's magnitude with the authors', in some frames.

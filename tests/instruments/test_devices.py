@@ -51,7 +51,7 @@ def test_whole_rig_is_opened_and_closed() -> None:
 
 def test_opening_changes_nothing(devices: Devices) -> None:
     """Opening leaves the cameras' settings, and neither homes nor turns the wheel."""
-    assert devices.cameras["9.5"].ffc_mode() == FfcMode.AUTO
+    assert devices.cameras["9.5"].identity()["ffc_mode"] == "auto"
     assert devices.cameras["9.5"].ffc_status() == FfcStatus.NONE_PERFORMED
     assert devices.wheel is not None
     with pytest.raises(NotHomedError):

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import calibration
-from dbthermal.simulation import (
+from reproduction.experiments.bench import (
     OBJECTS,
     Bench,
     Sample,

@@ -11,6 +11,7 @@ from dbthermal import alignment, calibration, emissivity, metrics, separation, s
 from dbthermal import correction as corrections
 from dbthermal import response as responses
 from reproduction import twins
+from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.comparison import MOVING, arguments
 from reproduction.experiments.stress import INTERVAL
 from reproduction.twins.views import Registration
@@ -145,8 +146,8 @@ def over_the_image(scene: xr.Dataset, separated: xr.Dataset) -> xr.Dataset:
 def on_bench(response: xr.Dataset, material: str, rng: np.random.Generator) -> xr.Dataset:
     """Emissivity of a smooth piece of a material, calibrated on the simulated bench."""
     value = float(emissivity.embedded_table()["emissivity"].sel(material=material, band="8-14"))
-    sample, bench = simulation.Sample(material, value, material, _STRAY), simulation.Bench()
-    series = simulation.bench_series(response, sample, bench, rng)
+    sample, bench = Sample(material, value, material, _STRAY), Bench()
+    series = bench_series(response, sample, bench, rng)
     stds = (bench.reading_std, bench.blackbody_std)
     return calibration.fit_emissivity(series, response, stds, bench.bias(sample))
 
