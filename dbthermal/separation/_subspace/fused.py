@@ -21,7 +21,7 @@ from dbthermal.separation._subspace import kernels, pixel, reflection_ratio, res
 from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._subspace.pixel import Ratio
 from dbthermal.separation._subspace.shared import Model, Work, share, work_space
-from dbthermal.separation._subspace.steps import Solution
+from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Tile
 
 Array = npt.NDArray[np.float64]
@@ -285,12 +285,15 @@ def solve(
         np.moveaxis(record[name][..., [[0, 1], [1, 2]]], 0, -1)
         for name in ("covariance", "scatter", "rapid_scatter")
     )
+    single = (
+        *("inverse_energy", "null_variance", "contrast", "reduced_chi2", "pooled", "gray"),
+        *("noise_variance", "drift_variance", "constant", "restless", "correlation", "delay"),
+    )
+    named: dict[str, Any] = {name: record[name] for name in single}
+    for name in ("missing", "lost", "beyond"):
+        named[name] = np.stack([record[f"object_{name}"], record[f"background_{name}"]])
+    named |= zip(FILMS, films, strict=True)
     return Solution(
-        *films,
-        *(
-            np.stack([record[f"object_{name}"], record[f"background_{name}"]])
-            for name in ("missing", "lost", "beyond")
-        ),
         ratio=ratio,
         ratio_variance=variance,
         null_weights=np.stack([record["first_weight"], record["second_weight"]]),
@@ -302,12 +305,5 @@ def solve(
         epsilon_variance=record["epsilon"],
         unexplained=record["rough"],
         sums=sums.transpose(1, 2, 0),
-        **{
-            name: record[name].copy()
-            for name in (
-                *("inverse_energy", "null_variance", "contrast", "reduced_chi2", "pooled"),
-                *("noise_variance", "drift_variance", "constant", "restless", "gray"),
-                *("correlation", "delay"),
-            )
-        },
+        **named,
     )

@@ -52,41 +52,43 @@ class Table(NamedTuple):
 def table(curve: Curve) -> Table:
     """Polynomials of a response, of the least degree that keeps an error."""
     margin = _MARGIN * (curve.highest - curve.lowest)
-    low = max(curve.lowest - margin, 0.5 * curve.lowest)
-    ends = np.array([low, curve.highest + margin])
-    dense = np.linspace(*ends, 1001)
-    exact, slope = curve.signal(dense) - curve.reference, curve.slope(dense)
+    low, high = max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin
+    dense = np.linspace(low, high, 1001)
+
+    def signal(temperature: Array) -> Array:
+        return curve.signal(temperature) - curve.reference
+
     for degree in range(1, _TERMS):
-        parts = [
-            Chebyshev.interpolate(function, degree, domain=ends)
-            for function in (lambda t: curve.signal(t) - curve.reference, curve.slope)
-        ]
-        errors = [
-            np.abs(part(dense) - one).max() for part, one in zip(parts, (exact, slope), strict=True)
-        ]
-        if max(errors) < _ERROR:
+        u, slope = (Chebyshev.interpolate(f, degree, [low, high]) for f in (signal, curve.slope))
+        errors = np.abs([u(dense) - signal(dense), slope(dense) - curve.slope(dense)])
+        if errors.max() < _ERROR:
             break
     else:
-        raise ValueError(f"Invalid response in band '{curve.band}'. Must be smooth over its range.")
-    signals = exact[[0, -1]]
-    inverse = Chebyshev.interpolate(
-        lambda s: curve.temperature(s + curve.reference), _ROUGH, domain=signals
-    )
-    series = [np.polynomial.chebyshev.cheb2poly(part.coef) for part in (*parts, inverse)]
-    coefficients = [tuple(np.pad(one, (0, _TERMS - one.size)).tolist()) for one in series]
-    a = curve.reference_slope
+        raise ValueError(
+            f"Invalid response in band '{curve.band}': {errors.max():.1g} K from a polynomial of "
+            f"degree {degree}. Must be smooth over its range, {curve.lowest} to {curve.highest} K."
+        )
+    ends, a = signal(np.array([low, high])), curve.reference_slope
+    inverse = Chebyshev.interpolate(lambda s: curve.temperature(s + curve.reference), _ROUGH, ends)
     return Table(
-        *coefficients,
-        float(ends.mean()),
-        float(np.ptp(ends) / 2),
-        float(signals.mean()),
-        float(np.ptp(signals) / 2),
-        isinstance(curve, LinearCurve),
-        curve.amplitude / a,
-        curve.wavelength,
-        curve.shift,
-        (curve.offset - curve.reference_counts) / a,
+        signal=_coefficients(u),
+        slope=_coefficients(slope),
+        rough=_coefficients(inverse),
+        middle=0.5 * (low + high),
+        half=0.5 * (high - low),
+        middle_signal=float(ends.mean()),
+        half_signal=0.5 * float(ends[1] - ends[0]),
+        linear=isinstance(curve, LinearCurve),
+        amplitude=curve.amplitude / a,
+        wavelength=curve.wavelength,
+        shift=curve.shift,
+        offset=(curve.offset - curve.reference_counts) / a,
     )
+
+
+def _coefficients(series: Chebyshev) -> tuple[float, ...]:
+    powers = np.polynomial.chebyshev.cheb2poly(series.coef)
+    return tuple(np.pad(powers, (0, _TERMS - powers.size)).tolist())
 
 
 @compiled

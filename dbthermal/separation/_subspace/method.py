@@ -63,7 +63,7 @@ from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import clock, fused, pieces, reflection_ratio, residuals, steps
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace.steps import Solution
+from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Estimate, Mask, Survey, Tile
 
 # Thresholds of the flags, in standard deviations.
@@ -83,8 +83,6 @@ _SUSPECT: Final = np.uint32(
     | Status.ROLES_MAY_BE_SWAPPED
     | Status.BACKGROUND_NEVER_RESTS
 )
-# Temperatures, whose range is judged with the solution.
-_FILMS: Final = ("object_temperature", "background_temperature")
 # Cost of an explanation over that of the best, up to which it is preferred if it has no flag.
 _LIKELY: Final = 40.0
 # Pieces of a rapid object, at most, whose bands seem apart in one smooth curve.
@@ -148,8 +146,8 @@ def _solve(
     least: float = emissions.BEND,
 ) -> Solution:
     """Steps 1 to 4, compiled for two bands."""
-    form = fused if len(tile.noise) == 2 else steps
-    return form.solve(tile, functions, settings.background_drift, least)
+    solve = fused.solve if len(tile.noise) == 2 else steps.solve
+    return solve(tile, functions, settings.background_drift, least)
 
 
 def _report(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Estimate:
@@ -165,11 +163,9 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Estim
     lost = (solution.lost > 0) & ((solution.missing < tile.time.size) | (status == 0))
     beyond = (lost | solution.beyond) & ~np.stack([undefined, no_background])
     status |= status_bits({Status.OUTSIDE_RESPONSE: np.any(beyond, axis=0)})
+    films = {name: getattr(solution, name) for name in FILMS}
     result = Estimate(
-        object_temperature=solution.object_temperature,
-        object_temperature_std=solution.object_temperature_std,
-        background_temperature=solution.background_temperature,
-        background_temperature_std=solution.background_temperature_std,
+        **films,
         emissivity=solution.emissivity,
         emissivity_std=np.sqrt(np.einsum("bbp->bp", solution.emissivity_covariance)),
         emissivity_covariance=solution.emissivity_covariance,
@@ -178,7 +174,7 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Estim
         status=status,
     )
     result = result.undefine(undefined, unidentified, no_background)
-    return result.check_range(tile.curves[0], not_estimated=_FILMS)
+    return result.check_range(tile.curves[0], not_estimated=FILMS)
 
 
 def _survey(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Survey:
@@ -244,7 +240,9 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
     functions, noise = _functions(tile), np.array(tile.noise)
     solution = _solve(tile, functions, settings)
     result, used = _report(tile, functions, solution), solution.order + functions.steps
-    asked = pieces.asked(*solution.sums, tile.time, solution.null_variance, used)
+    asked = pieces.asked(
+        solution.sums[0], solution.sums[1], tile.time, solution.null_variance, used
+    )
     asked |= solution.order > functions.orders - _LAST
     suspect = np.flatnonzero(asked | ((result.status & _SUSPECT) != 0))
     first = np.zeros(tile.signals.shape[1:], dtype=bool)

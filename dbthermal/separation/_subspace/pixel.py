@@ -214,10 +214,11 @@ def _newton(model: Model, ratios: Ratio, emissivity: float, work: Work) -> None:
 
 @compiled
 def _curve_variance(model: Model, kernel: Array, count: int, variance: float) -> float:
-    total = 0.0
+    """Variance of a kernel's sum over the object's smoothed noise."""
+    total: float = 0.0
     for j in range(count):
         total += kernels.dot(model.object_part[j], kernel) ** 2
-    return variance * total
+    return variance * float(total)
 
 
 @compiled
@@ -293,7 +294,7 @@ def _linear(
     spread = drift.max() - drift.min()
     before = max((limit / spread) ** 2, size**2 + variance)
     share = before / (before + variance)
-    return slope**2 * share * (share * size**2 + variance)
+    return float(slope**2 * share * (share * size**2 + variance))
 
 
 @compiled

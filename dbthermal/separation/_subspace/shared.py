@@ -91,8 +91,8 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         rising=np.ascontiguousarray(functions.rising.T),
         leverage=np.ascontiguousarray(functions.leverage().T),
         steps=functions.steps,
-        noise=tile.noise,
-        pattern=(0.0, 0.0) if tile.pattern is None else tile.pattern,
+        noise=(tile.noise[0], tile.noise[1]),
+        pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
         drift=drift / np.sqrt(3.0),
         rate=float(rates[0]),
         gray=second.slope(temperatures) / first.slope(temperatures),
@@ -108,11 +108,10 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
 def work_space(model: Model) -> Work:
     """Arrays for the signals and curves of one pixel."""
     columns, frames = model.functions.shape
-    curves = Work._fields.index("few")
-    return Work(
-        *np.empty((curves, frames)),
-        few=np.empty((6, frames), np.float32),
-        coefficients=np.empty((2, columns)),
-        scatter=np.empty((len(model.leverage), 3)),
-        material=np.empty(5),
-    )
+    rest: dict[str, Any] = {
+        "few": np.empty((6, frames), np.float32),
+        "coefficients": np.empty((2, columns)),
+        "scatter": np.empty((len(model.leverage), 3)),
+        "material": np.empty(5),
+    }
+    return Work(**{name: np.empty(frames) for name in Work._fields} | rest)

@@ -13,8 +13,11 @@ from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import pieces, reflection_ratio, residuals
 from dbthermal.separation._tiles import USELESS, Array, Mask, Pixels, Tile, Whole, out_of_range
 
-# Quantities whose samples must be numbers where their deviation is of use.
-_FILMS: Final = ("object_temperature", "background_temperature")
+FILMS: Final = (
+    *("object_temperature", "object_temperature_std"),
+    *("background_temperature", "background_temperature_std"),
+)
+"""Names of the films of a solution."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,10 @@ def _steps(
     common = ratios.null_weights[0] * noise[0] ** 2 * free
     curves = np.stack([residual, functions.object_part @ smoothed])
     solution = Solution(
-        *(values[which, film] for film in (0, 1) for which in (0, 1)),
+        object_temperature=values[0, 0],
+        object_temperature_std=values[1, 0],
+        background_temperature=values[0, 1],
+        background_temperature_std=values[1, 1],
         missing=np.isnan(films).sum(axis=1),
         lost=lost.sum(axis=1),
         beyond=np.any(beyond, axis=1),
