@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from numpy.polynomial import Polynomial
-from scipy.ndimage import convolve, gaussian_filter1d
+from scipy.ndimage import convolve, gaussian_filter, gaussian_filter1d
 from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
@@ -61,6 +61,8 @@ _MOST: Final = 0.99
 # from which the iteration is taken to grow.
 _DRAWS: Final = 64
 _GROWN: Final = 1e3
+# Deviation of the neighbourhood that tells an emissivity, over the image's smaller side.
+_AROUND: Final = 0.125
 # Share of an error that a step may leave.
 _LARGEST: Final = 0.95
 # Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
@@ -194,6 +196,7 @@ def solve(
         first, change, variance = _first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
         shares = _coefficients(inputs, raw, solved)
+        told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
 
         @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread it runs in
         def both(alone: Array, change: Array) -> tuple[Array, Array, Array]:
@@ -217,7 +220,10 @@ def solve(
             steep = np.maximum(_slope(here, beside), 1.0)
             slope = emissivity[0] + (line.slope - emissivity[0]) / steep
             known = line.energy > _LEAST_CHANGE**2 * len(some)
-            slope = np.where(known, slope, emissivity[0])
+            likely = 1.0 - _ratio(raw) * (1.0 - slope)
+            known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
+            error = np.where(known, line.variance / steep**2, np.inf)
+            slope = _shared(slope, error, result["status"].shape)
             before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - slope))
             coefficients, own = _coefficients(inputs, emissivity, solved), emissivity[0]
             equations = replace(equations, first=np.where(solved, own, 1.0), shares=coefficients)
@@ -249,6 +255,25 @@ def _emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
     # That of a constant object is taken from the middle of what its ratios leave.
     middle = 1.0 - ratio * (0.5 / np.maximum(ratio.max(axis=0), 1.0))
     return np.where(np.isfinite(emissivity), emissivity, middle)
+
+
+def _shared(slope: Array, variance: Array, shape: tuple[int, ...]) -> Array:
+    """
+    Slopes (pixel) [1] that lean on those around, the more the less they are known.
+
+    The mean of their posterior, of a normal prior with the mean and variance of the neighbourhood.
+    """
+    weight, value = 1.0 / variance, np.where(np.isfinite(variance), slope, 0.0)
+    about = np.median(slope[np.isfinite(variance)]) if np.isfinite(variance).any() else 0.0
+
+    def around(part: Array) -> Array:
+        return gaussian_filter(part.reshape(shape), _AROUND * min(shape), mode="constant").ravel()
+
+    total = around(weight)
+    mean = np.where(total > 0, around(weight * value) / total, slope)
+    spread = np.maximum(around(weight * (value - about) ** 2) / total - (mean - about) ** 2, 0.0)
+    own = np.nan_to_num(weight * spread)
+    return (own * value + mean) / (own + 1.0)
 
 
 def _ratio(emissivity: Array) -> Array:
