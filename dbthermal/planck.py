@@ -44,29 +44,15 @@ def require_positive(name: str, value: npt.ArrayLike) -> Array:
 
 
 def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
-    r"""Spectral radiance of a blackbody.
+    r"""Spectral radiance of a blackbody [W m^-2 sr^-1 m^-1].
 
     .. math:: L(\lambda, T) = \frac{2 h c^2}{\lambda^5 (\exp(c_2 / \lambda T) - 1)}
 
     The first equation of the paper (doi:10.48550/arXiv.2509.11334) has the factor :math:`\lambda^5`
     and the :math:`-1` on one level of the denominator; this is the law as Planck gave it.
 
-    Parameters
-    ----------
-    wavelength : array_like
-        Wavelength [m], broadcast against the temperature.
-    temperature : array_like
-        Temperature [K].
-
-    Returns
-    -------
-    ndarray
-        Spectral radiance [W m^-2 sr^-1 m^-1], of the broadcast shape.
-
-    Raises
-    ------
-    ValueError
-        If a wavelength or a temperature is not finite and positive.
+    Of wavelengths [m] and temperatures [K], arrays that are broadcast. ValueError if one is not
+    finite and positive.
 
     Examples
     --------

@@ -8,7 +8,7 @@ glossary as text, which is docs/nomenclature.md.
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntFlag
 from types import MappingProxyType
 from typing import Any, Final, Self
@@ -56,11 +56,12 @@ class Variable:
     dtype: str
     units: str
     long_name: str
+    more: Mapping[str, Any] = field(default_factory=dict, hash=False)  # further attributes
 
     @property
-    def attrs(self) -> dict[str, str]:
+    def attrs(self) -> dict[str, Any]:
         """Attributes to write on the variable."""
-        return {"units": self.units, "long_name": self.long_name}
+        return {"units": self.units, "long_name": self.long_name, **self.more}
 
 
 def _of(dims: str, units: str, long_name: str, dtype: str = "float64") -> Variable:
@@ -273,23 +274,9 @@ def status_attrs() -> dict[str, object]:
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """Mask of the places where any of some flags is set, by the CF attributes of the variable.
 
-    Parameters
-    ----------
-    flags : DataArray
-        `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
-        ``flag_meanings``.
-    names : str
-        Names of flags, in lower case.
-
-    Returns
-    -------
-    DataArray of bool
-        Of the shape of the flags.
-
-    Raises
-    ------
-    ValueError
-        If a name is not among the attributes.
+    Of `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
+    ``flag_meanings``, and names of flags, in lower case: bool, of the shape of the flags.
+    ValueError if a name is not among the attributes.
 
     Examples
     --------

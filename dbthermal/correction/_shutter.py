@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import _rows, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
@@ -183,10 +183,9 @@ def _whole_copies(counts: xr.DataArray, candidates: Integers) -> Mask:
     """Candidates that repeat the frame before in all of the image, read in blocks of rows."""
     needed = np.union1d(candidates, candidates - 1)
     here, before = (np.searchsorted(needed, part) for part in (candidates, candidates - 1))
-    rows = max(1, _BLOCK // (needed.size * counts.sizes["x"]))
     copies = np.ones(candidates.size, dtype=bool)
-    for top in range(0, counts.sizes["y"], rows):
-        block = counts.isel(time=needed, y=slice(top, top + rows)).values
+    for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
+        block = counts.isel(time=needed, y=rows).values
         copies &= ~_changed(block[before], block[here])[0].any(axis=(1, 2))
     return copies
 

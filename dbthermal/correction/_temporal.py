@@ -22,25 +22,12 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     frames then have the correlation :math:`-a / (1 + a^2)`: undo a lag that matters, not one that
     does not.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, after `mark_shutter`: a repeated frame is no measurement.
-    time_constant : float or DataArray
-        Time constant of the pixels [s], of all bands or (band), by name.
-
-    Returns
-    -------
-    Dataset
-        The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
-        ``lag_noise_amplification`` [1], each by band; a known noise must be multiplied by the
-        latter.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
-        or a time constant is not finite and positive or a band has none.
+    Of stage `corrected` of `schema`, after `mark_shutter`, for a repeated frame is no measurement,
+    and the time constant of the pixels [s], of all bands or (band), by name: the dataset with other
+    `counts` [count], and the attributes ``lag_time_constant`` [s] and ``lag_noise_amplification``
+    [1], each by band; a known noise must be multiplied by the latter. TypeError or ValueError if
+    there are fewer than two frames, the lag was undone before, the counts are whole numbers, or a
+    time constant is not finite and positive or a band has none.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:

@@ -295,33 +295,20 @@ def next_shutter(
     - by its telemetry the offsets were renewed since the frame before (`last_ffc_frame`
       changed), be it at the start or at the end of the correction: then one frame more is lost, but
       no renewal is missed, even where the frozen frames were lost on the way; or
-    - it repeats the image, and the frame before counted as closed, or by the serial line a
-      correction is imminent or in progress (a reading is older than its frame, so that it does not
-      count against an image that changes); or
+    - it repeats the image (no pixel differs), and the frame before counted as closed, or by the
+      serial line a correction is imminent or in progress (a reading is older than its frame, so
+      that it does not count against an image that changes); or
     - it is the `FEWEST_COPIES`-th copy in a row or a later one, of a camera without telemetry. A
       serial line alone may miss an event: it is read once a second, and stalls meanwhile.
 
-    The flag is per band and frame, and is known with the frame. It marks an event, not
-    always from its first copy: `dbthermal.correction.find_shutter(capture, closed=...)` takes
-    ``(frame_flags & SHUTTER_CLOSED) != 0`` (band, time) as `closed`, and every run of copies that
-    holds or touches a flagged frame becomes one event with renewed offsets, which
-    `dbthermal.correction.mark_shutter` takes out.
+    The flag is per band and frame, and is known with the frame. It marks an event, not always from
+    its first copy: `dbthermal.correction.find_shutter(capture, closed=...)` takes ``(frame_flags &
+    SHUTTER_CLOSED) != 0`` (band, time) as `closed`, and every run of copies that holds or touches a
+    flagged frame becomes one event with renewed offsets, which `dbthermal.correction.mark_shutter`
+    takes out.
 
-    Parameters
-    ----------
-    before : Shutter
-        After the frame before; ``Shutter()`` before the first.
-    repeated : bool
-        No pixel differs from the frame before.
-    last_ffc_frame : int, optional
-        From the frame's telemetry (`Metadata`); None without any, or if the frame is damaged.
-    ffc_status : FfcStatus, optional
-        Latest reading of the serial line; None without any, or if it is too old.
-
-    Returns
-    -------
-    Shutter
-        After this frame.
+    `last_ffc_frame` is None without telemetry, or if the frame is damaged, and `ffc_status` without
+    a reading of the serial line, or if it is too old.
     """
     known = before.last_ffc_frame if last_ffc_frame is None else last_ffc_frame
     renewed = before.last_ffc_frame not in {None, known}

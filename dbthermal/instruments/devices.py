@@ -219,21 +219,10 @@ def open_devices(
     emulated session ``sim://<kind>/<name>``, with the kind of camera and its name in the world, for
     frames and commands alike, ``sim://apt/<any>`` and ``sim://tc08``.
 
-    Parameters
-    ----------
-    session : Session
-        Description of the devices.
-    world : `emulated.world.World`, optional
-        The emulated bench; by default one at room temperature.
-    pictures : mapping, optional
-        Band to the counts that an emulated camera sees in it, at a time of the scene [s]; by
-        default, with the default world, its blackbody, see
-        `dbthermal.instruments.emulated.blackbody`.
-
-    Yields
-    ------
-    Devices
-        Closed in the end.
+    `world` is the emulated bench, an `emulated.world.World`, by default one at room temperature,
+    and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
+    [s]; by default, with the default world, its blackbody, see
+    `dbthermal.instruments.emulated.blackbody`. The devices are closed in the end.
 
     Raises
     ------

@@ -77,28 +77,11 @@ def encode(
     *,
     channel: int = COMMAND_CHANNEL,
 ) -> bytes:
-    """Bytes of a frame, ready to send.
+    """Bytes of a frame, 17 or more, ready to send.
 
     Header, data and checksum are all escaped, so that start and end bytes occur nowhere else.
-
-    Parameters
-    ----------
-    sequence, command, status : int
-        As in `Frame`, each in [0, 2^32).
-    data : bytes
-        At most `MAXIMUM_DATA` bytes.
-    channel : int
-        In [0, 256).
-
-    Returns
-    -------
-    bytes
-        17 bytes or more.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a number is not whole, or does not fit its field, or there are too many data.
+    Numbers are as in `Frame`: sequence, command and status in [0, 2^32), the channel in [0, 256),
+    and at most `MAXIMUM_DATA` bytes of data; TypeError or ValueError for any other.
 
     Examples
     --------

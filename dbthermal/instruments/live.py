@@ -240,20 +240,10 @@ class View:
     """Live view: an instance is the `preview` of a recording, or of several.
 
     One update of two bands of 640 x 512 takes about a tenth of a second of one core; the fetching
-    threads go on meanwhile.
-
-    Parameters
-    ----------
-    display : Display, optional
-        Where it is shown; without one the figure is only kept.
-    is_simulated : bool
-        Whether the cameras are emulated; the title says so.
-    title : str
-        Name of the recording.
-    period : float
-        Least time from update to update [s], not negative.
-    window : float
-        Time over which frame rates are measured [s], positive.
+    threads go on meanwhile. It is shown on a `display`; without one the figure is only kept.
+    `title` is the name of the recording, beside which the figure says if it `is_simulated`;
+    `period` is the least time from update to update [s], not negative, and `window` that over which
+    frame rates are measured [s], positive.
 
     Examples
     --------

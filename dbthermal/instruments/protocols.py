@@ -91,34 +91,20 @@ def record_sweep(
     and complete are kept, so that a sweep that was interrupted goes on where it was. If the folder
     is renamed or moved meanwhile the sweep goes on in it. Call `Devices.prepare` before.
 
-    Parameters
-    ----------
-    devices : Devices
-        Of a session with a blackbody, which the thermocouple of that name reads.
-    folder : str or Path
-        Where the recordings go: ``<name>_<step>_<band>.zarr``.
-    set_temperature : callable
-        Sets the blackbody [K], or asks the user to set it.
-    limits, preview : optional
-        As for `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of
-        the filter in the beam.
-
-    Returns
-    -------
-    list of Step
-        In the order of the session, with those that were recorded before.
+    Of the devices of a session with a blackbody, which the thermocouple of that name reads, and a
+    folder for the recordings ``<name>_<step>_<band>.zarr``; `set_temperature` sets the blackbody
+    [K], or asks the user to, and limits and preview are those of
+    `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of the filter
+    in the beam. The steps are in the order of the session, with those that were recorded before.
 
     Raises
     ------
     ValueError
         If the session has no blackbody, or no reading of it; or a recording exists that is
         incomplete, of another temperature, or during which the wheel turned.
-    TimeoutError
-        As `wait_stable`; the recordings before are kept.
-    SourceLostError
-        If a camera is lost on the way.
-    FileNotFoundError
-        If the folder was deleted meanwhile.
+    TimeoutError, SourceLostError, FileNotFoundError
+        As `wait_stable`, where the recordings before are kept; if a camera is lost on the way; if
+        the folder was deleted meanwhile.
     """
     session = devices.session
     readings = devices.readings()
@@ -153,19 +139,9 @@ def record_scene(
 ) -> Summary:
     """Record a scene with all devices; an emulated scene begins with the recording.
 
-    Parameters
-    ----------
-    devices : Devices
-        Of any session; call `Devices.prepare` before.
-    path : str or Path
-        Folder ``*.zarr`` to make.
-    limits, preview, stop : optional
-        As for `dbthermal.instruments.recording.record`, whose errors it raises.
-
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames.
+    Of any session, after `Devices.prepare`, into a folder ``*.zarr`` to make; limits, preview, stop
+    and errors are those of `dbthermal.instruments.recording.record`. The summary says how it ended,
+    and the numbers of frames.
 
     Examples
     --------

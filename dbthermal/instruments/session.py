@@ -307,23 +307,13 @@ class Session:
 
     @classmethod
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
-        """Read a session from a file, and from the file that it names as its ``rig``.
+        """Read a session from YAML, see the module, and from the file that it names as its ``rig``.
 
-        Parameters
-        ----------
-        path : str or Path
-            YAML; see the module. Keys that several sessions share, such as the addresses, may stand
-            in another file, whose name relative to this one is the key ``rig``.
-        changes : mapping, optional
-            Values in place of those in the files, by key; of ``blackbody``, key by key.
-
-        Raises
-        ------
-        FileNotFoundError
-            If a file does not exist.
-        ValueError
-            If it is not YAML, or a key is missing, unknown, repeated or in both files, or a value
-            is invalid: one line for each error, with file, place in it, value and rule.
+        Keys that several sessions share, such as the addresses, may stand in another file, whose
+        name relative to this one is the key ``rig``. `changes` are values in place of those in the
+        files, by key; of ``blackbody``, key by key. FileNotFoundError if a file does not exist;
+        ValueError if it is not YAML, or a key is missing, unknown, repeated or in both files, or a
+        value is invalid: one line for each error, with file, place in it, value and rule.
         """
         content = texts.read_yaml(path)
         files = {}

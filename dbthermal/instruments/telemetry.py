@@ -78,25 +78,11 @@ FIELDS: Final = MappingProxyType(
 
 
 def decode(rows: Counts, *, high_word_first: bool = True) -> dict[str, float]:
-    """Read the fields from telemetry rows.
+    """Read the value of each of `FIELDS` from telemetry rows, uint16 (row, x) or (word,).
 
-    Parameters
-    ----------
-    rows : ndarray of uint16, shape (row, x) or (word,)
-        The rows as they came, words in the host's order.
-    high_word_first : bool
-        Order of the words of a longer number: likely, not certain.
-
-    Returns
-    -------
-    dict
-        Value of each of `FIELDS`. Any content is read as if it were telemetry: there is no
-        checksum.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the rows are not of uint16, or hold fewer than `WORDS` words.
+    The rows are as they came, and `high_word_first` is the order of the words of a longer number:
+    likely, not certain. Any content is read as if it were telemetry: there is no checksum.
+    TypeError or ValueError if the rows are not of uint16, or hold fewer than `WORDS` words.
     """
     words = _checked(rows)
     values: dict[str, float] = {}

@@ -154,17 +154,10 @@ def open_serial(
 ) -> SerialTransport:
     """Open the line to a device by its name, for this program alone; nothing is sent.
 
-    Parameters
-    ----------
-    url : str
-        ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, with the options of
-        the emulator; ``sim://boson/wide`` is ``sim://boson?name=wide``.
-    baudrate : int
-        Speed of the line [bit/s].
-    rtscts : bool
-        Flow control by the lines RTS and CTS.
-    world : object, optional
-        Emulated bench that a ``sim://`` device is part of; by default one of its own.
+    The name is ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, with the
+    options of the emulator; ``sim://boson/wide`` is ``sim://boson?name=wide``. `baudrate` [bit/s]
+    is the speed of the line, `rtscts` its flow control by RTS and CTS, and `world` the emulated
+    bench that a ``sim://`` device is part of; by default one of its own.
 
     Raises
     ------

@@ -172,24 +172,10 @@ def plan_durations(
 ) -> xr.Dataset:
     """Expected accuracy of captures of several lengths, of one filter at a time.
 
-    Parameters
-    ----------
-    table, noise
-        See `plan`.
-    seconds : sequence of float
-        Lengths [s], strictly increasing. The object's rise and the pulses are the same in all.
-    design : CaptureDesign, optional
-        All conditions but the length.
-
-    Returns
-    -------
-    Dataset
-        That of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all.
-
-    Raises
-    ------
-    ValueError
-        As `plan`, or if the lengths do not increase.
+    Of a table and noise as in `plan`, lengths [s], strictly increasing, and a design of all
+    conditions but the length: the object's rise and the pulses are the same in all. The result is
+    that of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all. ValueError
+    as `plan`, or if the lengths do not increase.
 
     Examples
     --------

@@ -28,23 +28,10 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     its emissivity is undefined, but all that changes is reflected: the apparent temperature less
     its mean.
 
-    Parameters
-    ----------
-    apparent : DataArray
-        Apparent temperature of the inputs (band, time, y, x) [K], from
-        `response.apparent_temperature`.
-    result : Dataset
-        From `solve`, of the same capture.
-
-    Returns
-    -------
-    DataArray
-        (time, y, x) [K], float32; NaN where the reflection is unknown.
-
-    Raises
-    ------
-    ValueError
-        If the first bands, sizes or coordinates differ.
+    Of the apparent temperature of the inputs (band, time, y, x) [K], from
+    `response.apparent_temperature`, and a result of `solve` of the same capture: (time, y, x) [K],
+    float32; NaN where the reflection is unknown. ValueError if the first bands, sizes or
+    coordinates differ.
 
     Examples
     --------

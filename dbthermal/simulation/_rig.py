@@ -197,22 +197,9 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
 def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     """Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        From `observe`.
-    detector : Dataset
-        From `pattern`, with the same bands and shape.
-
-    Returns
-    -------
-    Dataset
-        Stage `capture`: `counts` uint16 (band, time, y, x).
-
-    Raises
-    ------
-    ValueError
-        If the detector lacks a band, or a count does not fit into 16 bits (no silent saturation).
+    Of counts from `observe` and a detector from `pattern`, with the same bands and shape: the stage
+    `capture`, `counts` uint16 (band, time, y, x) [count]. ValueError if the detector lacks a band,
+    or a count does not fit into 16 bits (no silent saturation).
 
     Examples
     --------
@@ -237,23 +224,8 @@ def blackbody_movies(
 ) -> xr.Dataset:
     """Raw movies of a blackbody that fills the view, at several temperatures.
 
-    Parameters
-    ----------
-    rig : Rig
-        The rig.
-    temperatures : ndarray
-        Blackbody temperatures [K], increasing, within the rig's range.
-    frames : int
-        Frames at each.
-    detector : Dataset
-        From `pattern`.
-    rng : Generator
-        Source of the noise.
-
-    Returns
-    -------
-    Dataset
-        `counts` uint16 (band, temperature, frame, y, x) [count].
+    Of a rig, blackbody temperatures [K], increasing, within the rig's range, a number of frames at
+    each, and a detector from `pattern`: `counts` uint16 (band, temperature, frame, y, x) [count].
 
     Examples
     --------
@@ -294,29 +266,11 @@ def contact_measurements(
 ) -> xr.Dataset:
     """Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
 
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    emissivity : DataArray
-        True emissivity (band) [1].
-    object_temperature, background_temperature : ndarray, shape (measurement,)
-        True temperatures [K].
-    stds : tuple of float
-        Standard deviation of a reading of thermocouple and blackbody [K].
-    rng : Generator
-        Source of the errors.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
-        (measurement) [K], as read.
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the response, or the emissivity lacks a band.
+    Of a response with `noise`, a true emissivity (band) [1], the true temperatures (measurement)
+    [K] of object and background, and the standard deviations [K] of a reading of thermocouple and
+    blackbody: `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
+    (measurement) [K], as read. ValueError if a temperature lies outside the response, or the
+    emissivity lacks a band.
     """
     names = [str(name) for name in response["band"].values]
     places = schema.band_positions(emissivity, names, "the emissivity")

@@ -96,21 +96,8 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     .. math:: T(t) = T_0 + (T_1 - T_0) \frac{1 - e^{-t / \tau}}{1 - e^{-t_1 / \tau}}
 
     the solution of Newton's law of heating, the object prior of the paper
-    (doi:10.48550/arXiv.2509.11334).
-
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s], two or more, increasing.
-    start, stop : float
-        First and last temperature [K].
-    time_constant : array_like, shape (...)
-        Time constants, positive [s].
-
-    Returns
-    -------
-    ndarray, shape (time, ...)
-        Temperature [K].
+    (doi:10.48550/arXiv.2509.11334). Of times (time,) [s], two or more, increasing, the first and
+    the last temperature [K], and positive time constants (...) [s]: temperatures (time, ...) [K].
 
     Examples
     --------
@@ -181,27 +168,8 @@ def independent_pixels(
 ) -> xr.Dataset:
     """Scene of many pixels of one material, each with its own heating curve and background.
 
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s].
-    emissivity : DataArray
-        (band) [1].
-    background : Background
-        Variation of the background.
-    pixels : int
-        Number of pixels.
-    rng : Generator
-        Source of randomness.
-    start, stop : float
-        First and last object temperature [K].
-    time_constant : tuple of float
-        Range of the heating's time constant [s].
-
-    Returns
-    -------
-    Dataset
-        A scene one row high, see `scene`.
+    At times (time,) [s], of an emissivity (band) [1], warming from `start` to `stop` [K] with a
+    time constant within a range [s]: a scene one row high, see `scene`.
     """
     constants = rng.uniform(*time_constant, pixels)
     warm = heating(time, start, stop, constants)
@@ -221,30 +189,12 @@ def walkers(
 ) -> xr.Dataset:
     """Simulated twin of a plate heated in its middle that reflects people who walk by.
 
-    Each person is an upright ellipse with a head, warmer than the room, that crosses the view
-    once at a steady pace. Along an edge of the silhouette the reflection is abrupt.
+    Each person is an upright ellipse with a head, warmer than the room, that crosses the view once
+    at a steady pace. Along an edge of the silhouette the reflection is abrupt.
 
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s].
-    shape : tuple of int
-        Rows and columns.
-    emissivity : DataArray
-        (band) or (band, y, x) [1].
-    rng : Generator
-        Source of the paths.
-    temperatures : sequence of float
-        Temperatures of the room, of people, and of the plate's middle at the end [K].
-    crossings : int
-        Number of people.
-    time_constant : float
-        Time constant of the heating [s].
-
-    Returns
-    -------
-    Dataset
-        The scene, see `scene`.
+    At times (time,) [s], of rows and columns, an emissivity (band) or (band, y, x) [1], and
+    temperatures of the room, of people, and of the plate's middle at the end [K], with a number of
+    crossings, and the time constant of the heating [s]: the scene, see `scene`.
 
     Examples
     --------

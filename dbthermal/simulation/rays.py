@@ -37,14 +37,8 @@ _SAME: Final = 1e-3
 class Camera:
     """A pinhole camera with square pixels.
 
-    Attributes
-    ----------
-    position, target : tuple of float
-        Position of the camera, and the point at the middle of its view [m].
-    shape : tuple of int
-        Rows and columns.
-    field_of_view : float
-        Horizontal field of view [degrees]; 24 in the paper.
+    At a position, with a target at the middle of its view [m], of a shape (rows, columns) and a
+    horizontal field of view [degrees]; 24 in the paper.
     """
 
     position: Point
@@ -113,14 +107,9 @@ class Camera:
 class Hits:
     """First intersections of rays with a mesh.
 
-    Attributes
-    ----------
-    face : ndarray of int, shape (ray,)
-        Face that is met, or `MISSED`.
-    distance : ndarray, shape (ray,)
-        Distance from the ray's origin [m], infinite where nothing is met.
-    weights : ndarray, shape (ray, 3)
-        Barycentric weights of the face's corners [1], zero where nothing is met.
+    `face` (ray) is the face that is met, or `MISSED`; `distance` (ray) that from the ray's origin
+    [m], infinite where nothing is met; `weights` (ray, 3) the barycentric weights of the face's
+    corners [1], zero where nothing is met.
     """
 
     face: npt.NDArray[np.int64]
@@ -138,13 +127,7 @@ class Hits:
 
 
 class Caster:
-    """Ray caster for one mesh.
-
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        The mesh [m]; its normals point outward.
-    """
+    """Ray caster for one mesh [m], whose normals point outward."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.faces = np.asarray(mesh.faces)

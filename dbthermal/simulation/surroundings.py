@@ -24,15 +24,7 @@ __dir__ = __all__.copy
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and orientation of a rigid body: its point p is at R p + t in the world.
-
-    Attributes
-    ----------
-    rotation : scipy.spatial.transform.Rotation
-        Rotation R.
-    translation : array_like, shape (3,)
-        Translation t [m].
-    """
+    """Position and orientation of a rigid body: its point p is at R p + t [m] in the world."""
 
     rotation: Rotation = field(default_factory=Rotation.identity)
     translation: npt.ArrayLike = (0.0, 0.0, 0.0)
@@ -78,16 +70,10 @@ def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
 
 @dataclass(frozen=True)
 class Actor:
-    """A rigid body of the surroundings.
+    """A rigid body of the surroundings: a mesh in its own frame [m], and its temperature [K].
 
-    Attributes
-    ----------
-    mesh : trimesh.Trimesh
-        Its mesh, in its own frame [m].
-    temperature : ndarray, shape (vertex,), or function of time
-        Temperature [K], finite.
-    motion : function of time, optional
-        Its pose; without one it stands still, its own frame being the world's.
+    One for each vertex (vertex,), finite, or a function of time [s]. Without a motion, its pose as
+    a function of time, it stands still, its own frame being the world's.
     """
 
     mesh: trimesh.Trimesh
@@ -165,16 +151,8 @@ def incident(
 ) -> Array:
     """Blackbody temperature (time, ray) [K] that rays meet, frame by frame.
 
-    Parameters
-    ----------
-    origins, directions : ndarray, shape (ray, 3)
-        Origins [m] and unit vectors of the rays, the same in all frames.
-    time : ndarray, shape (time,)
-        Times [s].
-    room : float
-        Temperature of the walls behind all actors [K].
-    actors : sequence of Actor
-        Bodies; the nearest hides the others.
+    Of rays (ray, 3), the same in all frames, by their origins [m] and unit vectors, at times
+    (time,) [s], before the walls of a room [K] and actors, of which the nearest hides the others.
 
     Examples
     --------

@@ -25,19 +25,9 @@ _THREADS: Final = 8
 class HeldFolder:
     """A folder held by its descriptor, wherever it is renamed or moved on its disk.
 
-    Parameters
-    ----------
-    folder : Path
-        That exists (OSError otherwise).
-    path : Path, optional
-        Where it will be moved next, if that is another place.
-
-    Attributes
-    ----------
-    root : Path
-        Leads into it, wherever it is; without a /proc, as on macOS, its path.
-    close : callable
-        Lets it go.
+    It exists (OSError otherwise), and `path` is where it will be moved next, if that is another
+    place. `root` leads into it, wherever it is; without a /proc, as on macOS, it is its path.
+    `close` lets it go.
     """
 
     def __init__(self, folder: Path, path: Path | None = None) -> None:

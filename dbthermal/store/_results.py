@@ -72,14 +72,8 @@ def _chunks(variable: xr.Variable | xr.DataArray, *, even: bool = False) -> tupl
 def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:
     """Save a dataset as zarr (format 3, not consolidated), in place of an earlier one.
 
-    Parameters
-    ----------
-    dataset : Dataset
-        Of any stage; it is not changed.
-    path : str or Path
-        Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`; becomes ``attrs["provenance"]``.
+    The path is a folder ``*.zarr`` (ValueError if it has another suffix), whose parents are made.
+    The provenance, from `dbthermal.store.provenance`, becomes ``attrs["provenance"]``.
 
     Examples
     --------
@@ -98,15 +92,8 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
 def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
     """Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
 
-    Parameters
-    ----------
-    parts : iterable of Dataset
-        Rows from the first to the last, made when they are asked for: no more than one is held.
-        What has no y, and the attributes, are those of the first.
-    path : str or Path
-        Folder ``*.zarr``; see `save`.
-    provenance : mapping
-        See `save`.
+    The parts are the rows from the first to the last, made when they are asked for: no more than
+    one is held. What has no y, and the attributes, are those of the first.
 
     Examples
     --------
@@ -226,17 +213,10 @@ def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
 def save_numbers(
     numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
 ) -> None:
-    """Save headline numbers as strict JSON, with sorted names.
+    """Save headline numbers as strict JSON (``*.json``), with sorted names, and their provenance.
 
-    Parameters
-    ----------
-    numbers : mapping
-        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean;
-        TypeError or ValueError for any other value.
-    path : str or Path
-        File ``*.json``. Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`.
+    A name, unit included (``"object_rmse_K"``), has a finite number, a string or a boolean;
+    TypeError or ValueError for any other value.
 
     Examples
     --------
@@ -294,18 +274,10 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
 def save_figure(
     figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
 ) -> None:
-    """Save a figure as PNG, the same bytes for the same figure.
+    """Save a figure of matplotlib as PNG (``*.png``), the same bytes for the same figure.
 
-    Parameters
-    ----------
-    figure : Figure
-        Of matplotlib; it stays open.
-    path : str or Path
-        File ``*.png``. Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`; becomes the text chunk ``Comment``, as JSON.
-    dpi : int
-        Resolution [pixel/inch].
+    It stays open; its resolution is `dpi` [pixel/inch]. The provenance becomes the text chunk
+    ``Comment``, as JSON.
 
     Examples
     --------
@@ -331,22 +303,13 @@ def save_video(
     rate: float,
     codec: Literal["vp9", "h264"] = "vp9",
 ) -> None:
-    """Save a film in MP4, as browsers play it.
+    """Save a film in MP4 (``*.mp4``), as browsers play it, at a frame rate [Hz].
 
-    Parameters
-    ----------
-    frames : iterable of ndarray of uint8, shape (rows, columns, 3)
-        Colours; at least one frame, all of one size, both sizes even, else ValueError.
-    path : str or Path
-        File ``*.mp4``. Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`; becomes the file's comment, as JSON.
-    rate : float
-        Frame rate [Hz].
-    codec : {"vp9", "h264"}
-        Compression. VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of
-        H.264, x264, is under the GPL, and patents may ask for a licence where films are passed on
-        (see docs/licences.md). ValueError for any other.
+    Frames are uint8 (rows, columns, 3), colours; ValueError unless there is one at least, and all
+    are of one size, both sizes even. The provenance becomes the file's comment, as JSON. Of the
+    codecs VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of H.264,
+    x264, is under the GPL, and patents may ask for a licence where films are passed on (see
+    docs/licences.md). ValueError for any other.
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 

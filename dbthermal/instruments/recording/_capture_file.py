@@ -10,7 +10,7 @@ reader may have no more than the store.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 from time import monotonic
@@ -75,17 +75,6 @@ class Note(IntEnum):
     FOLDER_MOVED = 11, "NaN, the recording's folder was moved or renamed; it went on in it"
 
 
-@dataclass(frozen=True)
-class _Explained(Variable):
-    """A variable with more attributes than unit and meaning."""
-
-    more: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def attrs(self) -> dict[str, Any]:
-        return {**super().attrs, **self.more}
-
-
 def _of_frames(dtype: str, units: str, long_name: str) -> Variable:
     return Variable(("band", "time"), dtype, units, long_name)
 
@@ -102,7 +91,7 @@ def _coded(variable: Variable, codes: type[FrameFlag] | type[Note]) -> Variable:
         "flag_meanings": " ".join(sentences),
         "comment": "; ".join(f"{name}: {text}" for name, text in sentences.items()),
     }
-    return _Explained(variable.dims, variable.dtype, variable.units, variable.long_name, attrs)
+    return replace(variable, more=attrs)
 
 
 ABOUT: Final = (
@@ -148,7 +137,7 @@ VARIABLES: Final = MappingProxyType(
 
 TELEMETRY: Final = MappingProxyType(
     {
-        "telemetry": _Explained(
+        "telemetry": Variable(
             ("band", "time", "telemetry_row", "x"),
             "uint16",
             "1",
