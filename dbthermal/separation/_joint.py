@@ -222,7 +222,8 @@ def solve(
             known = line.energy > _LEAST_CHANGE**2 * len(some)
             likely = 1.0 - _ratio(raw) * (1.0 - slope)
             known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
-            error = np.where(known, line.variance / steep**2, np.inf)
+            slope = np.where(known, slope, emissivity[0])
+            error = np.where(known & (line.variance > 0), line.variance / steep**2, np.inf)
             slope = _shared(slope, error, result["status"].shape)
             before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - slope))
             coefficients, own = _coefficients(inputs, emissivity, solved), emissivity[0]
@@ -263,17 +264,16 @@ def _shared(slope: Array, variance: Array, shape: tuple[int, ...]) -> Array:
 
     The mean of their posterior, of a normal prior with the mean and variance of the neighbourhood.
     """
-    weight, value = 1.0 / variance, np.where(np.isfinite(variance), slope, 0.0)
-    about = np.median(slope[np.isfinite(variance)]) if np.isfinite(variance).any() else 0.0
 
     def around(part: Array) -> Array:
-        return gaussian_filter(part.reshape(shape), _AROUND * min(shape), mode="constant").ravel()
+        image = np.where(weight > 0, weight * part, 0.0).reshape(shape)
+        return gaussian_filter(image, _AROUND * min(shape), mode="constant").ravel()
 
-    total = around(weight)
-    mean = np.where(total > 0, around(weight * value) / total, slope)
-    spread = np.maximum(around(weight * (value - about) ** 2) / total - (mean - about) ** 2, 0.0)
-    own = np.nan_to_num(weight * spread)
-    return (own * value + mean) / (own + 1.0)
+    weight = 1.0 / variance
+    total = around(np.ones_like(weight))
+    mean = np.where(total > 0, around(slope) / total, slope)
+    own = weight * np.nan_to_num(around((slope - mean) ** 2) / total)
+    return np.asarray((own * slope + mean) / (own + 1.0))
 
 
 def _ratio(emissivity: Array) -> Array:
