@@ -84,29 +84,13 @@ def undo_drift(
     the ends of a polynomial: 0.11 counts for 100 pixels of 4 counts and 350 frames. A motion in
     front of the patch, or reflected in it, is taken for drift.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, after `mark_shutter` if there were shutter events.
-    reference : DataArray
-        True on the patch, (y, x), bool: a blackbody, a wall. Pixels with a `status` are left out.
-    order : int
-        Number of polynomials in a segment, the constant included.
-    lazy : bool
-        As in `correct_capture`.
-
-    Returns
-    -------
-    Dataset
-        The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted;
-        and the attributes ``drift_order`` and ``drift_pixels``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the drift was undone before, the reference is no boolean of its pixels or marks no good
-        pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are
-        not.
+    Of stage `corrected` of `schema`, after `mark_shutter` if there were shutter events; a reference
+    (y, x), bool, true on the patch, a blackbody, a wall, of which pixels with a `status` are left
+    out; the number of polynomials in a segment, the constant included; and `lazy` as in
+    `correct_capture`: the dataset with other `counts` [count]; `drift` (band, time) [count], which
+    was subtracted; and the attributes ``drift_order`` and ``drift_pixels``. TypeError or ValueError
+    if the drift was undone before, the reference is no boolean of its pixels or marks no good
+    pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are not.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:
