@@ -48,8 +48,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     # z = (I_n - a I_n-1) / (1 - a), of independent noises: sqrt(1 + a^2) / (1 - a).
     amplification = np.hypot(1.0, np.exp(-ratio)) / -np.expm1(-ratio)
     return corrected.assign(counts=(counts.dims, signal, counts.attrs)).assign_attrs(
-        lag_time_constant=constants.tolist(),
-        lag_noise_amplification=amplification.tolist(),
+        lag_time_constant=constants.tolist(), lag_noise_amplification=amplification.tolist()
     )
 
 
