@@ -38,14 +38,10 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     compared first, then the whole of the remaining frames, in blocks of rows, so that a lazy
     dataset is never read at once. The search is exact only before anything is interpolated in time.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, or a raw `capture`: `counts` (band, time, y, x) [count].
-    closed : DataArray, optional
-        True in frames in which the shutter is known to be closed, (time) or (band, time), bool:
-        from the camera, or because they show the shutter itself. A run of copies that includes or
-        touches one is part of its event.
+    Of `counts` (band, time, y, x) [count], stage `corrected` of `schema` or a raw `capture`.
+    `closed`, (time) or (band, time), bool, is true in frames in which the shutter is known to be
+    closed: from the camera, or because they show the shutter itself. A run of copies that includes
+    or touches one is part of its event.
 
     Returns
     -------
