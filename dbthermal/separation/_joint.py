@@ -267,7 +267,8 @@ def _shared(slope: Array, variance: Array, shape: tuple[int, ...]) -> Array:
 
     def around(part: Array) -> Array:
         image = np.where(weight > 0, weight * part, 0.0).reshape(shape)
-        return gaussian_filter(image, _AROUND * min(shape), mode="constant").ravel()
+        filtered = gaussian_filter(image, _AROUND * min(shape), mode="constant")
+        return np.asarray(filtered).ravel()
 
     weight = 1.0 / variance
     total = around(np.ones_like(weight))

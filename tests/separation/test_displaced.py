@@ -6,6 +6,8 @@ import xarray as xr
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
+from dbthermal.separation import _displaced as displaced
+from dbthermal.separation import _quality as quality
 from reproduction.experiments.pictures import Picture, smooth_shift
 
 RIG = simulation.Rig()
@@ -149,6 +151,23 @@ def test_known_emissivities_and_rapid_heating() -> None:
     assert got["apart"]["good"] > 0.85
     assert got["apart"]["rmse"] < 0.8 * got["one place"]["rmse"]
     assert 0.92 < got["apart"]["cover"] < 0.98
+
+
+def test_noise_of_a_registration_is_not_taken_for_white() -> None:
+    """Pixels that a registration has averaged share noise, which a resampling leaves: measured."""
+    shape, noise = (20, 48), np.random.default_rng(3).normal(20000.0, 10.0, (2, 300, 20, 49))
+    noise[1, ..., :-1] = 0.5 * (noise[1, ..., :-1] + noise[1, ..., 1:])
+    places = {"band": list(RIG.bands), "time": TIME}
+    capture = xr.Dataset({"counts": (("band", "time", "y", "x"), noise[..., :-1])}, places)
+    capture["noise_factor"] = "band", [1.0, 0.5**0.5]
+    moved = displaced.check(field(smooth_shift(shape, 2.5, 0.5)), capture, 0)
+    whole, grains = slice(0, 20), quality.grains(capture)
+    counts, _, _, gain = displaced.read(capture, moved, whole, whole, 1, grains)
+    paired = gain > 0
+    ratio = counts[1].std(axis=0)[paired] / (10.0 * 0.5**0.5 * gain[paired])
+    print(f"noise over what is said: {ratio.mean():.3f}")
+    assert abs(ratio.mean() - 1.0) < 0.03
+    assert ratio.std() < 0.1
 
 
 FIELD = field(np.zeros((2, *SMALL.shape)))
