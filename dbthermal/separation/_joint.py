@@ -328,11 +328,12 @@ def _equations(inputs: Inputs, emissivity: Array, solved: Mask) -> _Equations:
     shares = _coefficients(inputs, emissivity, solved)
     there, linked = _among(displacement.resample, solved, displacement.shape[1])
     onward, reached = _among(displacement.onward, solved, displacement.shape[1])
-    strong = np.abs(shares[1:].sum(axis=0)) < np.abs(shares[0])
+    own, others = np.abs(shares[0]), shares[1:].sum(axis=0)
+    strong = np.abs(others) < own
     # The error of a step: only where it contracts, with the weights' signs, are places linked.
-    gain = np.abs(shares[1:].sum(axis=0) / shares[0])
-    forward, back = (np.asarray(abs(one).sum(axis=1)).ravel() for one in (there, onward))
-    linked &= np.where(strong, gain * forward < _LARGEST, reached & (back < _LARGEST * gain))
+    forward, back = abs(there).sum(axis=1) * np.abs(others), abs(onward) @ own
+    reached &= back < _LARGEST * np.abs(onward @ others)
+    linked &= np.where(strong, forward < _LARGEST * own, reached)
     backward = np.flatnonzero(linked & ~strong)
     return _Equations(
         first=np.where(solved, emissivity[0], 1.0),
