@@ -27,6 +27,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from dbthermal.alignment._resampling import interpolation
+from dbthermal.noise import MAD
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -189,6 +190,10 @@ class Movies:
         cls, movies: list[Movie], valid: Mask, noise: Array, freedom: float, factor: int
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's, blurred in place."""
+        # Interpolated in time, a movie holds less rapid noise than white noise of its size.
+        white = np.sqrt(freedom / movies[0].shape[2]) / factor
+        usual = [MAD * np.median(np.abs(movie[::2, ::2])) for movie in movies]
+        noise = np.minimum(noise, np.array(usual) / white)
         for movie in movies:
             gaussian_filter(movie, (BLUR, BLUR, 0.0), output=movie)
         mostly = binned(valid.astype(np.float64), factor) > 0.5
