@@ -40,7 +40,7 @@ BLUR: Final = 1.2
 
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
-_SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
+SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _TAPS: Final = 6  # neighbours a side, of which the blurred movies are interpolated
 _BORDER: Final = 4  # pixels by which they are mirrored at the border for it
 _AROUND: Final = (3, 3, 5)  # samples among which a residual is judged
@@ -352,7 +352,7 @@ def _information(
         spread = misfit * floor if match is None else gaussian_filter(squares, WINDOW)
         found.append(_Match(ratio, np.maximum(spread, floor)))
         weight = used / (misfit * variance)
-        less = samples * (movies.noise[0] * _SLOPE_NOISE) ** 2
+        less = samples * (movies.noise[0] * SLOPE_NOISE) ** 2
         tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
         gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
         chance += weight * ratio**2 * less
