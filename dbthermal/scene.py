@@ -176,7 +176,7 @@ def _aligned(
             if step:
                 slope = float(np.clip((last - late) / step, _FLAT, 1.0))
             step, last = late / slope, late
-            if abs(step) < _LATE * frame:
+            if not abs(step) >= _LATE * frame:  # or not known
                 break
             behind = step * (names != field.attrs["reference_band"])
             together.values[:] = aligned.attrs["time_offset"] + behind - behind[0]
