@@ -33,6 +33,7 @@ __all__ = [
     "simulation",
     "store",
 ]
+__dir__ = __all__.copy
 
 
 def __getattr__(name: str) -> ModuleType:
@@ -40,7 +41,3 @@ def __getattr__(name: str) -> ModuleType:
     if name in __all__:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"Unknown module {name!r} in {__name__}. Must be one of {__all__}.")
-
-
-def __dir__() -> list[str]:
-    return __all__

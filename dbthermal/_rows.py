@@ -46,10 +46,10 @@ class _Rows(BackendArray):
         return np.asarray(result[tuple(whole)])
 
 
-def blocks(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Yield rows of an array (..., y, x) that are computed at once."""
+def blocks(shape: tuple[int, ...], samples: int = 0) -> Iterator[slice]:
+    """Yield rows of an array (..., y, x) that are computed at once, about so many samples."""
     height = shape[-2]
-    rows = max(1, min(height, _BLOCK * height // max(1, int(np.prod(shape)))))
+    rows = max(1, min(height, (samples or _BLOCK) * height // max(1, int(np.prod(shape)))))
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
 

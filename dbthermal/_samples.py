@@ -19,17 +19,14 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.special import bdtrc, ndtri
 
+from dbthermal._arrays import Array, Mask
 from dbthermal.noise import MINIMUM_FRAMES
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Share of a pixel's changes, the smallest ones, that is noise: the rest may be the scene's.
 _QUIET: Final = 0.8
 # Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
-PIXELS: Final = 16
-"""About as many pixels tell the noise and the step of the counts."""
+PIXELS: Final = 16  # about as many pixels tell the noise and the step of the counts
 
 # The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
 _MARGIN: Final = 1.25
@@ -47,8 +44,7 @@ _END: Final = 2.0
 
 
 def noise(signal: npt.NDArray[Any]) -> Array:
-    """
-    Noise (pixel ...) of signals (time, pixel ...), which may hold NaN; NaN of too few frames.
+    """Noise (pixel ...) of signals (time, pixel ...), which may hold NaN; NaN of too few frames.
 
     The mean magnitude of the smaller four fifths of the second differences: neither object nor
     walkers enter.
@@ -99,8 +95,7 @@ class Grain:
 
 
 def grain(counts: npt.NDArray[Any], valid: Mask, stated: float = np.inf) -> Grain:
-    """
-    Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
+    """Grain of counts (time, pixel) of a band; a stated noise [count] is an upper limit.
 
     Samples at a heap, and frames in which no pixel changes, say nothing of the noise.
     """

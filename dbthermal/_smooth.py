@@ -12,10 +12,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
 
-PIECE_ORDER: Final = 5
-"""Number of polynomials in a piece of time."""
+PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 
 # Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
 _ROUNDED: Final = 1e-6
@@ -48,28 +47,11 @@ class Subspace:
 def subspace(
     time: npt.ArrayLike, order: int, *, segment: npt.NDArray[np.integer] | None = None
 ) -> Subspace:
-    """
-    Smooth functions over given times, with steps of the camera.
+    """Smooth functions of an order over given times (time,) [s], with steps of the camera.
 
-    Parameters
-    ----------
-    time : array_like, shape (time,)
-        Times [s], strictly increasing.
-    order : int
-        Number of smooth functions.
-    segment : ndarray of int, shape (time,), optional
-        Number of shutter events before each frame. At each change every signal has a step of its
-        own, which is not the object's.
-
-    Returns
-    -------
-    Subspace
-        The functions.
-
-    Raises
-    ------
-    ValueError
-        As `polynomial_basis`, or if there are more functions than times.
+    At each change of the `segment` (time), the number of shutter events before each frame, every
+    signal has a step of its own, which is not the object's. ValueError as `polynomial_basis`, or if
+    there are more functions than times.
     """
     plain, steps = polynomial_basis(time, order), camera_steps(segment)
     if not steps:
@@ -90,8 +72,7 @@ def piecewise(
     *,
     segment: npt.NDArray[np.integer] | None = None,
 ) -> Subspace:
-    """
-    Polynomials in pieces of the time that begin with some frames (time,), of one order together.
+    """Polynomials in pieces of the time that begin with some frames (time,), of one order together.
 
     The rising polynomials are those of `subspace` of an order. A shutter event must not be the
     first frame of a piece: its step would be the object's as well.
@@ -129,25 +110,11 @@ def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Arr
 
 
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
-    r"""
-    Orthonormal polynomials over given times, the discrete Legendre polynomials.
+    r"""Orthonormal polynomials over given times, the discrete Legendre polynomials.
 
-    Parameters
-    ----------
-    time : array_like, shape (time,)
-        Times [s], strictly increasing, not necessarily evenly spaced.
-    order : int
-        Number of functions, the constant included.
-
-    Returns
-    -------
-    ndarray, shape (time, order)
-        Column j is a polynomial of degree j; :math:`\Phi^T \Phi = 1`.
-
-    Raises
-    ------
-    ValueError
-        If the order is not in [1, number of times].
+    Of times (time,) [s], strictly increasing, not necessarily evenly spaced, and a number of
+    functions, the constant included: (time, order), of which column j is a polynomial of degree j,
+    and :math:`\Phi^T \Phi = 1`. ValueError if the order is not in [1, number of times].
     """
     time = np.asarray(time, dtype=np.float64)
     if not 1 <= order <= time.size:
@@ -163,8 +130,7 @@ def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
 
 
 def _arnoldi(position: Array, order: int) -> Array:
-    """
-    As `polynomial_basis`, where frames in few places make polynomials nearly dependent.
+    """As `polynomial_basis`, where frames in few places make polynomials nearly dependent.
 
     Each function is the one before times the position, made orthogonal (Brubeck, Nakatsukasa,
     Trefethen 2021, doi:10.1137/19M130839X).

@@ -30,19 +30,14 @@ from dbthermal.instruments.session import Session
 from dbthermal.instruments.signals import SignalExit, raised_signals
 
 __all__ = ["ask_for_blackbody", "main", "plugged_in"]
-
-
-def __dir__() -> list[str]:
-    return __all__
-
+__dir__ = __all__.copy
 
 _FAILURES: Final = (OSError, RuntimeError, ValueError, KeyError)
 """Errors of devices and recordings: the drivers' own ones are of these kinds."""
 
 
 def ask_for_blackbody(name: str, temperature: float) -> None:
-    """
-    Ask the user to set the blackbody to a temperature [K], and wait for Enter.
+    """Ask the user to set the blackbody to a temperature [K], and wait for Enter.
 
     RuntimeError if there is no keyboard, as under papermill.
     """

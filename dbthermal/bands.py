@@ -14,20 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import planck
+from dbthermal._arrays import Array
 
 __all__ = ["FILTERS", "TEMPERATURE_RANGE", "Band", "get"]
-
-Array = npt.NDArray[np.float64]
+__dir__ = __all__.copy
 
 TEMPERATURE_RANGE: Final = (100.0, 2000.0)
 """Temperatures [K] between which the pair radiance, temperature is defined."""
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(40)
 _NEWTON_STEPS = 50
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 @dataclass(frozen=True)
@@ -57,8 +53,7 @@ class Band:
         return self.upper - self.lower
 
     def nodes(self) -> tuple[Array, Array]:
-        """
-        Gauss-Legendre nodes (node) [m], increasing, and weights (node) [m], over the band.
+        """Gauss-Legendre nodes (node) [m], increasing, and weights (node) [m], over the band.
 
         The weights add up to the band's width. With 40 nodes the integral of Planck's law over 8-14
         um is exact to rounding.
@@ -66,8 +61,7 @@ class Band:
         return self.centre + 0.5 * self.width * _NODES, 0.5 * self.width * _WEIGHTS
 
     def radiance(self, temperature: npt.ArrayLike) -> Array:
-        r"""
-        In-band radiance [W m^-2 sr^-1] of blackbodies at temperatures [K] of any shape.
+        r"""In-band radiance [W m^-2 sr^-1] of blackbodies at temperatures [K] of any shape.
 
         .. math:: B(T) = \int_{\lambda_l}^{\lambda_u} L(\lambda, T) \, d\lambda
 
@@ -77,8 +71,7 @@ class Band:
         return self._integral(planck.spectral_radiance, temperature)
 
     def slope(self, temperature: npt.ArrayLike) -> Array:
-        """
-        Derivative dB/dT [W m^-2 sr^-1 K^-1] of the in-band radiance at temperatures [K].
+        """Derivative dB/dT [W m^-2 sr^-1 K^-1] of the in-band radiance at temperatures [K].
 
         Raises ValueError for a temperature outside `TEMPERATURE_RANGE`.
         """
@@ -154,8 +147,7 @@ doi:10.48550/arXiv.2509.11334): centre and full width at half maximum, as top ha
 
 
 def get(name: str) -> Band:
-    """
-    Band of `FILTERS` by its name, e.g. "9.5"; KeyError lists the known ones.
+    """Band of `FILTERS` by its name, e.g. "9.5"; KeyError lists the known ones.
 
     Examples
     --------

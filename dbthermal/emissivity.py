@@ -11,11 +11,11 @@ from importlib import resources
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _text as texts
 from dbthermal import mixing, planck, schema
+from dbthermal._arrays import Array
 from dbthermal.bands import FILTERS, Band, get
 
 __all__ = [
@@ -29,8 +29,8 @@ __all__ = [
     "pair_summary",
     "rank_filters",
 ]
+__dir__ = __all__.copy
 
-Array = npt.NDArray[np.float64]
 Bands = Mapping[str, Band] | Iterable[Band | str]
 
 CAMERA_BAND: Final = "8-14"
@@ -53,10 +53,6 @@ _STEPS = 64
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
 def band_table(
     spectra: Mapping[str, xr.Dataset],
     bands: Bands,
@@ -64,8 +60,7 @@ def band_table(
     *,
     minimum_coverage: float = MINIMUM_COVERAGE,
 ) -> xr.Dataset:
-    r"""
-    Planck-weighted band emissivities of materials.
+    r"""Planck-weighted band emissivities of materials.
 
     .. math:: e_m = \frac{\int_m e(\lambda) L(\lambda, T) d\lambda}{\int_m L(\lambda, T) d\lambda}
 
@@ -73,29 +68,17 @@ def band_table(
     does not cover the whole band both integrals run over the covered part, whose share is
     `coverage`; nothing is extrapolated.
 
-    Parameters
-    ----------
-    spectra : mapping of str to Dataset
-        Material to stage `spectrum` of `schema`: `emissivity` (wavelength) [1], wavelength [m].
-    bands : mapping or iterable of Band or str
-        Bands, or names of `bands.FILTERS`.
-    temperature : float
-        Temperature of the material [K].
-    minimum_coverage : float
-        Share of the band's blackbody radiance that each spectrum must cover, in (0, 1].
-
-    Returns
-    -------
-    Dataset
-        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]. Values of the
-        libraries' spectra outside (0, 1] are averaged as they are.
+    Of spectra by material, stage `spectrum` of `schema`, `emissivity` (wavelength) [1], wavelength
+    [m]; bands, or names of `bands.FILTERS`; the temperature of the material [K]; and the share of
+    the band's blackbody radiance that each spectrum must cover, in (0, 1]: stage
+    `emissivity_table`, `emissivity` and `coverage` (material, band) [1]. Values of the libraries'
+    spectra outside (0, 1] are averaged as they are.
 
     Raises
     ------
-    KeyError
-        If a band's name is unknown.
-    TypeError
-        If the spectra are no mapping, or a band is neither a Band nor a name.
+    KeyError, TypeError
+        If a band is unknown; if the spectra are no mapping, or a band is neither a Band nor a
+        name.
     ValueError
         If there is no spectrum or no band, a band repeats, a spectrum is not as `schema` has it or
         holds NaN, the temperature is outside `bands.TEMPERATURE_RANGE`, or a spectrum covers less
@@ -134,18 +117,12 @@ def band_table(
 
 
 def embedded_table() -> xr.Dataset:
-    """
-    Table of 25 common materials that comes with the package.
+    """Table of 25 common materials that comes with the package.
 
     Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
-    [1]_ [2]_ [3]_, whose spectra are not redistributed.
-
-    Returns
-    -------
-    Dataset
-        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]; some metals and
-        tiles were measured up to 12.5 um only. Coordinates `library` and `source` (material) name
-        the library, and the file or sample in it.
+    [1]_ [2]_ [3]_, whose spectra are not redistributed: stage `emissivity_table`, `emissivity` and
+    `coverage` (material, band) [1]; some metals and tiles were measured up to 12.5 um only.
+    Coordinates `library` and `source` (material) name the library, and the file or sample in it.
 
     References
     ----------
@@ -174,29 +151,16 @@ def embedded_table() -> xr.Dataset:
 
 
 def library_mixture(bands: Iterable[str]) -> xr.Dataset:
-    r"""
-    Joint distribution of the band emissivities of materials, where nothing is known of them.
+    r"""Joint distribution of the band emissivities of materials, where nothing is known of them.
 
     A mixture of normal distributions over the 993 spectra of the libraries of `embedded_table`,
     with a wide component for the one material in twenty that is assumed to be none of theirs,
 
     .. math:: p(e) = \sum_k w_k N(e; \mu_k, C_k)
 
-    Parameters
-    ----------
-    bands : iterable of str
-        Names of `bands.FILTERS`, in the order that is wanted.
-
-    Returns
-    -------
-    Dataset
-        `weight` (component) [1], `mean` (component, band) [1], `covariance` (component, band,
-        other) [1].
-
-    Raises
-    ------
-    ValueError
-        If a band is none of the filters, or repeats.
+    as `weight` (component) [1], `mean` (component, band) [1] and `covariance` (component, band,
+    other) [1], of bands of `bands.FILTERS` in the order that is wanted; ValueError if one is none
+    of the filters, or repeats.
 
     Examples
     --------
@@ -237,24 +201,12 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
 
 
 def condition_numbers(table: xr.Dataset) -> xr.DataArray:
-    """
-    Condition number of the mixing matrix for each material and pair of bands.
+    """Condition number of the mixing matrix for each material and pair of bands.
 
-    Parameters
-    ----------
-    table : Dataset
-        Stage `emissivity_table`, of at least two bands.
-
-    Returns
-    -------
-    DataArray
-        Condition numbers (material, first, second) [1], symmetric; infinite on the diagonal and
-        where the two emissivities are equal. See `mixing.condition_number`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the table is not as `schema` has it, or has one band only.
+    Of a table (stage `emissivity_table`) of at least two bands, numbers (material, first, second)
+    [1], symmetric; infinite on the diagonal and where the two emissivities are equal. See
+    `mixing.condition_number`. TypeError or ValueError if the table is not as `schema` has it, or
+    has one band only.
 
     Examples
     --------
@@ -277,21 +229,12 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
 
 
 def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
-    """
-    Condition number of each pair of bands, over the materials.
+    """Condition number of each pair of bands, over the materials.
 
-    Parameters
-    ----------
-    numbers : DataArray
-        Condition numbers (material, first, second) [1], from `condition_numbers`.
-
-    Returns
-    -------
-    Dataset
-        `median` and `mean` (first, second) [1], and `finite` (first, second), the number of
-        materials in the mean. A gray material counts in the median as infinite and not in the mean,
-        which a few nearly gray ones govern: choose by the median. Both are infinite where every
-        material is gray, as on the diagonal.
+    Of the numbers (material, first, second) [1] of `condition_numbers`: `median` and `mean` (first,
+    second) [1], and `finite` (first, second), the number of materials in the mean. A gray material
+    counts in the median as infinite and not in the mean, which a few nearly gray ones govern:
+    choose by the median. Both are infinite where every material is gray, as on the diagonal.
 
     Examples
     --------
@@ -312,33 +255,16 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
 
 
 def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.DataArray:
-    r"""
-    Noise of a camera behind filters, from its noise without one.
+    r"""Noise (band) [K] of a camera behind filters, from its noise without one.
 
     The noise in counts is the camera's own and does not change, while a kelvin gives fewer counts:
 
     .. math:: s_m = s_1 \frac{dB_1 / dT}{dB_m / dT}
 
-    with the first of the bands as the camera's own. A filter's emission and losses are left out.
-
-    Parameters
-    ----------
-    netd : float
-        Noise-equivalent temperature difference in the first band [K].
-    bands : mapping or iterable of Band or str
-        Bands, or names of `bands.FILTERS`; the first is the one that `netd` belongs to.
-    temperature : float
-        Temperature of the object [K].
-
-    Returns
-    -------
-    DataArray
-        Noise (band) [K].
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If a band is unknown or repeats, or `netd` or the temperature is out of range.
+    with the first of the bands, or names of `bands.FILTERS`, as the one that `netd` [K], the
+    noise-equivalent temperature difference, belongs to, at the object's temperature [K]. A filter's
+    emission and losses are left out. KeyError, TypeError or ValueError if a band is unknown or
+    repeats, or `netd` or the temperature is out of range.
 
     Examples
     --------
@@ -360,35 +286,20 @@ def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.Da
 def rank_filters(
     table: xr.Dataset, noise: xr.DataArray, *, beside: str = CAMERA_BAND
 ) -> xr.Dataset:
-    """
-    Filters to set beside a band, best conditioned first, by two criteria.
+    """Filters to set beside a band, best conditioned first, by two criteria.
 
     The paper takes the filter of the lowest condition number (its section 5 says highest, a slip;
     its supplement says lowest) and notes the trade-off with the noise that a narrow filter brings.
     The second criterion settles it: the standard deviation of the object temperature from one
     frame. Both are medians over the materials, for a few nearly gray materials govern any mean.
 
-    Parameters
-    ----------
-    table : Dataset
-        Stage `emissivity_table`.
-    noise : DataArray
-        Noise (band) [K] of every band of the table, such as from `filter_noise`.
-    beside : str
-        Name of the camera's own band.
-
-    Returns
-    -------
-    Dataset
-        Each (band), in the order of the first: `condition_number` [1]; `condition_number_mean` [1],
-        over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
-        `lowest_condition_number` and `lowest_std` name the filter of each criterion.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the table is not as `schema` has it or has no band `beside` and another, or the noise
-        lacks a band, is in another unit, or is not finite and positive.
+    Of a table (stage `emissivity_table`), the noise (band) [K] of its every band, such as from
+    `filter_noise`, and the name of the camera's own band: each (band), in the order of the first
+    criterion, `condition_number` [1]; `condition_number_mean` [1], over the materials where it is
+    finite; `object_temperature_std` [K]; `noise` [K]. Attributes `lowest_condition_number` and
+    `lowest_std` name the filter of each criterion. TypeError or ValueError if the table is not as
+    `schema` has it or has no band `beside` and another, or the noise lacks a band, is in another
+    unit, or is not finite and positive.
 
     Examples
     --------
@@ -508,8 +419,7 @@ def _dataset(materials: list[str], names: list[str], values: Array, coverage: Ar
 
 
 def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr.DataArray:
-    r"""
-    Standard deviation [K] of the object temperature from one frame (material, band).
+    r"""Standard deviation [K] of the object temperature from one frame (material, band).
 
     For each band m beside band 1, emissivities known, in the linear approximation,
     :math:`\mathrm{var}(x) = [(1 - e_m)^2 s_1^2 + (1 - e_1)^2 s_m^2] / (e_1 - e_m)^2`; infinite for
@@ -521,7 +431,7 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
         raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
     if np.any(np.isinf(values)):
         raise ValueError("Invalid emissivity of the table: infinite. Must be finite, or NaN.")
-    std = _noise_of(noise, names)
+    std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     others = [name for name in names if name != beside]
     camera, filtered = values.sel(band=beside).values[:, np.newaxis], values.sel(band=others).values
     noises = std[names.index(beside)], std[[names.index(name) for name in others]]
@@ -534,11 +444,3 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr
         name="object_temperature_std",
         attrs={"units": "K", "long_name": "standard deviation of the object temperature"},
     )
-
-
-def _noise_of(noise: xr.DataArray, names: list[str]) -> Array:
-    """Noise [K] of the named bands."""
-    if schema.check_numbers(noise, "the noise", "K").dims != ("band",):
-        raise ValueError(f"Invalid dims {noise.dims} of the noise. Must be ('band',).")
-    places = schema.band_positions(noise, names, "the noise")
-    return planck.require_positive("noise [K]", noise.values[places])

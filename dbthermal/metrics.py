@@ -6,44 +6,25 @@ an average over the pixels that happened to work would flatter the method.
 """
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import schema
+from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
 
 __all__ = ["correlation", "relative_error_celsius"]
-
-Array = npt.NDArray[np.float64]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 def correlation(
     first: xr.DataArray, second: xr.DataArray, mask: xr.DataArray | None = None
 ) -> xr.DataArray:
-    """
-    Pearson's correlation of two maps, frame by frame.
+    """Pearson's correlation [1] of two maps, frame by frame.
 
-    Parameters
-    ----------
-    first, second : DataArray
-        Maps (..., y, x), each in a unit of its own.
-    mask : DataArray of bool, optional
-        Pixels (y, x) that count; all by default.
-
-    Returns
-    -------
-    DataArray
-        Correlation [1], in [-1, 1], over the dims other than y and x.
-
-    Raises
-    ------
-    ValueError
-        If coordinates differ, fewer than two pixels count, one is not finite, or a map is constant.
+    Of maps (..., y, x), each in a unit of its own, over the dims other than y and x; of the pixels
+    that count by a mask (y, x), bool, all by default. ValueError if coordinates differ, fewer than
+    two pixels count, one is not finite, or a map is constant.
 
     Examples
     --------
@@ -67,28 +48,16 @@ def correlation(
 
 
 def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.DataArray:
-    r"""
-    Error in per cent of the true temperature in degrees Celsius, as the paper reports it.
+    r"""Error in per cent of the true temperature in degrees Celsius, as the paper reports it.
 
     .. math:: 100 \, |\hat T - T| / (T - 273.15)
 
     The zero of the Celsius scale is arbitrary, and so is this number; it is here to stand beside
     the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled.
 
-    Parameters
-    ----------
-    estimate, truth : DataArray
-        Temperatures [K].
-
-    Returns
-    -------
-    DataArray
-        Error [percent], of the broadcast shape. NaN where the estimate is NaN.
-
-    Raises
-    ------
-    ValueError
-        If coordinates differ, a unit is not K, or a true temperature is not above 273.15 K.
+    Of temperatures [K], estimate and truth, of which one is broadcast; NaN where the estimate is
+    NaN. ValueError if coordinates differ, a unit is not K, or a true temperature is not above
+    273.15 K.
 
     Examples
     --------

@@ -15,10 +15,10 @@ from scipy.stats import chi2
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
+from dbthermal._arrays import Array
 
 __all__ = ["MINIMUM_FRAMES", "estimate", "estimate_bands", "second_difference"]
-
-Array = npt.NDArray[np.float64]
+__dir__ = __all__.copy
 
 MINIMUM_FRAMES: Final = 16
 """Fewest frames from which a noise is estimated."""
@@ -37,13 +37,8 @@ _TRIMMED_VARIANCE = float(chi2.cdf(_TRIM, 4) / chi2.cdf(_TRIM, 2))
 _CORRELATION_STD = np.sqrt(35.0 / 18.0)
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
-    """
-    Second difference in time of signals (time, pixel), in which white noise keeps its variance.
+    """Second difference in time of signals (time, pixel), in which white noise keeps its variance.
 
     Each sample less the line through its two neighbours (time - 2, pixel), over the root of the sum
     of the squared weights; times [s] need not be even. ValueError for an infinite sample.
@@ -57,8 +52,7 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
 
 
 def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, float]:
-    r"""
-    Noise of two bands from their signals.
+    r"""Noise of two bands from their signals.
 
     For each pixel, with D the covariance of the trimmed second differences of the residual on a
     smooth curve, and k the ratio of the bands' rapid changes (from their covariance one frame
@@ -73,23 +67,9 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     is too high: for glass by up to a half, at a correlation time near 10 s, at emissivities 0.3/0.5
     by up to three times, at 30 s.
 
-    Parameters
-    ----------
-    first, second : ndarray, shape (time, pixel)
-        Signals of the two bands, each in a unit of its own.
-    time : array_like, shape (time,)
-        Times [s].
-
-    Returns
-    -------
-    tuple of float
-        Standard deviations of the noise, in the signals' units.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or
-        a noise comes out as zero.
+    Of signals (time, pixel) of the two bands, each in a unit of its own, at times (time,) [s]:
+    standard deviations of the noise, in these units. ValueError if there are fewer than
+    `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or a noise comes out as zero.
 
     Examples
     --------
@@ -142,8 +122,7 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 
 
 def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
-    """
-    Noise (band) of two bands or more, each estimated beside the quietest; see `estimate`.
+    """Noise (band) of two bands or more, each estimated beside the quietest; see `estimate`.
 
     Signals (time, pixel) of more than two bands are all in one unit. The noise of the quietest band
     is the median of the estimates beside each other band.
@@ -165,8 +144,7 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
 
 
 def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Array]:
-    """
-    Variances and covariance (pixel) over the frames in which the bands do not step.
+    """Variances and covariance (pixel) over the frames in which the bands do not step.
 
     The frames are cut by an ellipse of the shape of the covariance, which scales all of it by one
     factor: a cut of each band alone would reduce the covariance more than the variances, whose

@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy import constants
 
+from dbthermal._arrays import Array
+
 __all__ = [
     "FIRST_RADIATION_CONSTANT",
     "SECOND_RADIATION_CONSTANT",
@@ -18,6 +20,7 @@ __all__ = [
     "spectral_radiance",
     "spectral_radiance_slope",
 ]
+__dir__ = __all__.copy
 
 FIRST_RADIATION_CONSTANT: float = 2.0 * constants.h * constants.c**2
 """2 h c^2, first radiation constant for radiance [W m^2 sr^-1]."""
@@ -25,17 +28,11 @@ FIRST_RADIATION_CONSTANT: float = 2.0 * constants.h * constants.c**2
 SECOND_RADIATION_CONSTANT: float = constants.h * constants.c / constants.k
 """h c / k, second radiation constant [m K]."""
 
-Array = npt.NDArray[np.float64]
 Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
 def require_positive(name: str, value: npt.ArrayLike) -> Array:
-    """
-    Value as a float array, of which every element must be finite and positive.
+    """Value as a float array, of which every element must be finite and positive.
 
     Raises ValueError with the name and the first element that is not.
     """
@@ -47,30 +44,15 @@ def require_positive(name: str, value: npt.ArrayLike) -> Array:
 
 
 def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
-    r"""
-    Spectral radiance of a blackbody.
+    r"""Spectral radiance of a blackbody [W m^-2 sr^-1 m^-1].
 
     .. math:: L(\lambda, T) = \frac{2 h c^2}{\lambda^5 (\exp(c_2 / \lambda T) - 1)}
 
     The first equation of the paper (doi:10.48550/arXiv.2509.11334) has the factor :math:`\lambda^5`
     and the :math:`-1` on one level of the denominator; this is the law as Planck gave it.
 
-    Parameters
-    ----------
-    wavelength : array_like
-        Wavelength [m], broadcast against the temperature.
-    temperature : array_like
-        Temperature [K].
-
-    Returns
-    -------
-    ndarray
-        Spectral radiance [W m^-2 sr^-1 m^-1], of the broadcast shape.
-
-    Raises
-    ------
-    ValueError
-        If a wavelength or a temperature is not finite and positive.
+    Of wavelengths [m] and temperatures [K], arrays that are broadcast. ValueError if one is not
+    finite and positive.
 
     Examples
     --------
@@ -89,8 +71,7 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
 
 
 def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
-    r"""
-    Derivative [W m^-2 sr^-1 m^-1 K^-1] of the blackbody's spectral radiance with temperature.
+    r"""Derivative [W m^-2 sr^-1 m^-1 K^-1] of the blackbody's spectral radiance with temperature.
 
     .. math:: \frac{\partial L}{\partial T} = L \, \frac{x}{T (1 - e^{-x})}, \quad
               x = c_2 / \lambda T
@@ -104,8 +85,7 @@ def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLik
 
 
 def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -> Array:
-    r"""
-    Temperature [K] of the blackbody of a spectral radiance, the exact inverse of Planck's law.
+    r"""Temperature [K] of the blackbody of a spectral radiance, the exact inverse of Planck's law.
 
     .. math:: T = \frac{c_2}{\lambda \ln(1 + 2 h c^2 / \lambda^5 L)}
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
+from dbthermal._arrays import Array
 
 __all__ = [
     "COEFFICIENTS",
@@ -27,8 +28,7 @@ __all__ = [
     "noise",
     "require_range",
 ]
-
-Array = npt.NDArray[np.float64]
+__dir__ = __all__.copy
 
 KINDS: Final = ("exact", "linear")
 """Kinds of response: the Sakuma-Hattori curve, and the paper's linear approximation."""
@@ -40,33 +40,11 @@ COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", 
 _SLOPE_POINTS: Final = 16
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
 @dataclass(frozen=True)
 class Curve:
-    r"""
-    Sakuma-Hattori response of one band.
+    r"""Sakuma-Hattori response of one band.
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O
-
-    Attributes
-    ----------
-    band : str
-        Name of the band.
-    amplitude : float
-        C [count].
-    wavelength : float
-        A, effective wavelength [m].
-    shift : float
-        B [m K].
-    offset : float
-        O [count].
-    reference : float
-        Reference temperature :math:`T_r` [K].
-    lowest, highest : float
-        Calibrated range [K].
 
     References
     ----------
@@ -75,14 +53,14 @@ class Curve:
     .. [2] Saunders, White (2003), Metrologia 40, 195, doi:10.1088/0026-1394/40/4/309
     """
 
-    band: str
-    amplitude: float
-    wavelength: float
-    shift: float
-    offset: float
-    reference: float
-    lowest: float
-    highest: float
+    band: str  # its name
+    amplitude: float  # C [count]
+    wavelength: float  # A, effective wavelength [m]
+    shift: float  # B [m K]
+    offset: float  # O [count]
+    reference: float  # reference temperature T_r [K]
+    lowest: float  # of the calibrated range [K]
+    highest: float  # of the calibrated range [K]
 
     def counts(self, temperature: npt.ArrayLike) -> Array:
         """Counts of a blackbody at a temperature [K] that fills the pixel, extrapolated [count]."""
@@ -139,15 +117,10 @@ class Curve:
 
 @dataclass(frozen=True)
 class LinearCurve(Curve):
-    """
-    The paper's linear response, counts = slope * T + intercept, with the methods of `Curve`.
+    """The paper's linear response, counts = slope * T + intercept, with the methods of `Curve`.
 
-    Attributes
-    ----------
-    amplitude : float
-        Slope [count/K].
-    offset : float
-        Intercept [count]; `wavelength` and `shift` are not used.
+    `amplitude` is the slope [count/K], `offset` the intercept [count]; `wavelength` and `shift` are
+    not used.
     """
 
     def counts(self, temperature: npt.ArrayLike) -> Array:
@@ -164,8 +137,7 @@ class LinearCurve(Curve):
 
 
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
-    """
-    Temperatures [K] as float64, all of which must lie in the calibrated range of a curve.
+    """Temperatures [K] as float64, all of which must lie in the calibrated range of a curve.
 
     Raises ValueError with the name and the first temperature that lies outside or is NaN.
     """
@@ -180,28 +152,11 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
 
 
 def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
-    """
-    Curve of one band.
+    """Curve of one band, by its name, of a response (stage `response` of `schema`).
 
-    Parameters
-    ----------
-    response : Dataset
-        Stage `response` of `schema`.
-    band : str
-        Name of the band.
-    kind : {"exact", "linear"}
-        Sakuma-Hattori, or the linear pair.
-
-    Returns
-    -------
-    Curve
-        Of the kind wanted; a `LinearCurve` if linear.
-
-    Raises
-    ------
-    ValueError
-        If the band is missing, the kind unknown, a coefficient not finite, or the slope not
-        positive.
+    The Sakuma-Hattori curve if its kind is "exact", a `LinearCurve` of the linear pair if "linear".
+    ValueError if the band is missing, the kind unknown, a coefficient not finite, or the slope not
+    positive.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
@@ -251,27 +206,10 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
 
 
 def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact") -> xr.DataArray:
-    """
-    Counts of a blackbody in every band of a response.
+    """Counts (band, ...) [count] of a blackbody in every band of a response.
 
-    Parameters
-    ----------
-    response : Dataset
-        Stage `response` of `schema`.
-    temperature : DataArray
-        Temperature [K], any dims but `band`.
-    kind : {"exact", "linear"}
-        Kind of response.
-
-    Returns
-    -------
-    DataArray
-        Counts (band, ...) [count].
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the calibrated range of the response.
+    Of a response (stage `response` of `schema`), by its kind of curve, and temperatures [K] of any
+    dims but `band`. ValueError if one lies outside the calibrated range of the response.
     """
     names = [str(name) for name in response["band"].values]
     curves = [curve(response, name, kind) for name in names]
@@ -284,28 +222,11 @@ def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact")
 def apparent_temperature(
     response: xr.Dataset, counts: xr.DataArray, kind: str = "exact"
 ) -> xr.DataArray:
-    """
-    Temperature of the blackbody that would give the same counts, band by band.
+    """Temperature of the blackbody that would give the same counts, band by band.
 
-    Parameters
-    ----------
-    response : Dataset
-        Stage `response` of `schema`.
-    counts : DataArray
-        (band, ...) [count].
-    kind : {"exact", "linear"}
-        Kind of response.
-
-    Returns
-    -------
-    DataArray
-        Apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN where
-        no temperature gives such counts.
-
-    Raises
-    ------
-    ValueError
-        If a band is missing in the response.
+    Of a response (stage `response` of `schema`), by its kind of curve, and counts (band, ...)
+    [count] the apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN
+    where no temperature gives such counts. ValueError if a band is missing in the response.
 
     Examples
     --------

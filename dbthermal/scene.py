@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
@@ -21,9 +20,7 @@ from dbthermal.schema import Status
 from dbthermal.separation import separate
 
 __all__ = ["separate_capture"]
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
+__dir__ = __all__.copy
 
 # Pixels and frames, at most, of the reduced capture, from which all is found that is of the whole
 # image; and frames whose mean is registered.
@@ -41,10 +38,6 @@ _MEMORY, _SAMPLE, _FEWEST, _SHIFTS = 2_500_000_000, 220, 4, 4.0
 _BAD: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
 def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     capture: xr.Dataset,
     correction: xr.Dataset,
@@ -57,8 +50,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     target: str | Path | None = None,
     provenance: Mapping[str, Any] = MappingProxyType({}),
 ) -> xr.Dataset:
-    """
-    Raw counts of two cameras to temperatures, emissivities and reflections: every step in order.
+    """Raw counts of two cameras to temperatures, emissivities and reflections: every step in order.
 
     1. `correction.correct_capture`.
     2. `alignment.register`, `align` and `reflection_shift`. Where the cameras stand apart, the

@@ -8,7 +8,7 @@ glossary as text, which is docs/nomenclature.md.
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntFlag
 from types import MappingProxyType
 from typing import Any, Final, Self
@@ -32,6 +32,7 @@ __all__ = [
     "Status",
     "Variable",
     "band_positions",
+    "band_values",
     "check",
     "check_corrected",
     "check_numbers",
@@ -41,16 +42,12 @@ __all__ = [
     "nomenclature",
     "status_attrs",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 @dataclass(frozen=True)
 class Variable:
-    """
-    Definition of a variable: dimensions in order, type as written, unit, and meaning.
+    """Definition of a variable: dimensions in order, type as written, unit, and meaning.
 
     Read, any real type of the same kind passes.
     """
@@ -59,11 +56,12 @@ class Variable:
     dtype: str
     units: str
     long_name: str
+    more: Mapping[str, Any] = field(default_factory=dict, hash=False)  # further attributes
 
     @property
-    def attrs(self) -> dict[str, str]:
+    def attrs(self) -> dict[str, Any]:
         """Attributes to write on the variable."""
-        return {"units": self.units, "long_name": self.long_name}
+        return {"units": self.units, "long_name": self.long_name, **self.more}
 
 
 def _of(dims: str, units: str, long_name: str, dtype: str = "float64") -> Variable:
@@ -180,7 +178,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
         "separated": {
             "emissivity_covariance": _of(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
-            ),
+            )
         },
         "blackbody_frames": {"noise": NOISE},
         "correction": {
@@ -274,26 +272,11 @@ def status_attrs() -> dict[str, object]:
 
 
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
-    """
-    Mask of the places where any of some flags is set, by the CF attributes of the variable.
+    """Mask of the places where any of some flags is set, by the CF attributes of the variable.
 
-    Parameters
-    ----------
-    flags : DataArray
-        `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
-        ``flag_meanings``.
-    names : str
-        Names of flags, in lower case.
-
-    Returns
-    -------
-    DataArray of bool
-        Of the shape of the flags.
-
-    Raises
-    ------
-    ValueError
-        If a name is not among the attributes.
+    Of `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
+    ``flag_meanings``, and names of flags, in lower case: bool, of the shape of the flags.
+    ValueError if a name is not among the attributes.
 
     Examples
     --------
@@ -320,26 +303,13 @@ def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
 
 
 def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
-    """
-    Check a dataset against its stage, and return it unchanged.
+    """Check a dataset against its stage, one of `STAGES`, and return it unchanged.
 
     A missing `units` attribute is taken as the agreed unit; a different one is an error. Of the
-    values only those of the coordinates are read.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        Data of a stage.
-    stage : str
-        One of `STAGES`.
-
-    Raises
-    ------
-    TypeError
-        If it is not a Dataset, or a variable's dtype is not a real number.
-    ValueError
-        If a variable, dimension or coordinate is missing, misnamed or out of order, a unit is
-        another one, a coordinate does not increase strictly, or bands repeat.
+    values only those of the coordinates are read. TypeError if it is not a Dataset, or a variable's
+    dtype is not a real number; ValueError if a variable, dimension or coordinate is missing,
+    misnamed or out of order, a unit is another one, a coordinate does not increase strictly, or
+    bands repeat.
 
     Examples
     --------
@@ -393,7 +363,7 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
     for dim in array.dims:
         if dim == "band":
-            _check_bands(array, label)
+            band_positions(array, [], label)
         elif dim in COORDINATES:
             _check_coordinate(array, str(dim), label)
 
@@ -413,8 +383,7 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
-    """
-    Positions of bands on the dimension `band`, by name as text; the label names the array.
+    """Positions of bands on the dimension `band`, by name as text; the label names the array.
 
     Raises ValueError if there is no coordinate `band`, or a band is missing or repeated.
     """
@@ -429,12 +398,16 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
     return [names.index(name) for name in wanted]
 
 
-def _check_bands(array: xr.DataArray, label: str) -> None:
-    if "band" not in array.coords:
-        raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
-    names = [str(name) for name in array["band"].values]
-    if len(set(names)) != len(names):
-        raise ValueError(f"Repeated band in {names} of {label}. Each band must occur once.")
+def band_values(
+    array: xr.DataArray, wanted: list[str], label: str, units: str
+) -> npt.NDArray[np.float64]:
+    """Values (band,) of an array of numbers over the bands alone, in the order of some bands.
+
+    Raises as `check_numbers` and `band_positions`, and ValueError for other dims.
+    """
+    if check_numbers(array, label, units).dims != ("band",):
+        raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")
+    return array.values[band_positions(array, wanted, label)].astype(np.float64)
 
 
 def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:

@@ -47,3 +47,26 @@ def movie(signal: np.ndarray, time: object) -> xr.Dataset:
         {"counts": (("band", "time", "y", "x"), counts.copy(), {"units": "count"})},
         coords={"band": list(RIG.bands), "time": np.asarray(time)},
     )
+
+
+def drop_frames(corrected: xr.Dataset, lost: np.ndarray) -> xr.Dataset:
+    """Remove lost frames (band, time), as a driver that stamps the others does: the next move up.
+
+    Each band's remaining counts and stamps come first, and NaN behind them.
+    """
+    counts, stamps = corrected["counts"].values.copy(), corrected["exposure_time"].values.copy()
+    for band, gone in enumerate(lost):
+        kept = np.count_nonzero(~gone)
+        for values in (counts[band], stamps[band]):
+            values[:kept] = values[~gone]
+            values[kept:] = np.nan
+    replaced = {"counts": counts, "exposure_time": stamps}
+    return corrected.assign({name: corrected[name].copy(data=it) for name, it in replaced.items()})
+
+
+def drift(corrected: xr.Dataset, last: float) -> xr.Dataset:
+    """A capture whose offsets drift in proportion to time, by some counts at the last frame."""
+    counts, time = corrected["counts"], corrected["time"].values
+    share = ((time - time[0]) / (time[-1] - time[0])).astype(counts.dtype)
+    drifting = counts.values + share[:, np.newaxis, np.newaxis] * counts.dtype.type(last)
+    return corrected.assign(counts=counts.copy(data=drifting))

@@ -93,11 +93,6 @@ def few(emission: xr.DataArray = OBJECT, reflection: xr.DataArray = CHANGE) -> F
     return frames(*(part.isel(FEW) for part in (APPARENT, emission, reflection)))
 
 
-def flat_after(flat: xr.DataArray) -> xr.Dataset:
-    """Corrected counts, with offsets to a second image."""
-    return correction.correct_capture(RAW, CORRECTION, flat_after=flat, shutter=False)
-
-
 # Name: function of the second array, that array, its dims whose coordinates count.
 LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     "solve mask of pixels": (lambda mask: solve(mask=mask), PIXELS, "y x"),
@@ -132,18 +127,12 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
         "band",
     ),
     "correct": (lambda maps: correction.correct(RAW, maps), CORRECTION, "y x band"),
-    "correct after": (
-        lambda maps: correction.correct(RAW, CORRECTION, after=maps),
-        CORRECTION,
-        "y x band",
-    ),
     "renew_offset": (lambda flat: correction.renew_offset(CORRECTION, flat), FLAT, "y x band"),
     "correct_capture flat": (
         lambda flat: correction.correct_capture(RAW, CORRECTION, flat=flat),
         FLAT,
         "y x band",
     ),
-    "correct_capture flat_after": (flat_after, FLAT, "y x band"),
     "correct_capture drift_reference": (
         lambda patch: correction.correct_capture(RAW, CORRECTION, drift_reference=patch),
         PIXELS,

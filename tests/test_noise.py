@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dbthermal import noise
+from dbthermal._arrays import Array
 
 FRAMES, PIXELS = 350, 200
 TIME = np.arange(FRAMES) / 10.0
@@ -12,7 +13,7 @@ REFLECTED = (0.14, 0.28)  # 1 - e of plate glass
 # Standard deviation of the median over 200 pixels of 350 frames: 0.5 %; three of them and a bias.
 TOLERANCE = 0.03
 
-Signals = tuple[noise.Array, noise.Array]
+Signals = tuple[Array, Array]
 
 
 @pytest.fixture
@@ -28,19 +29,19 @@ def white(rng: np.random.Generator) -> Signals:
     return first, second
 
 
-def curve() -> noise.Array:
+def curve() -> Array:
     """Object temperature (time, 1) [K], a heating and cooling by 30 K."""
     return 30.0 * np.exp(-(((TIME - 15.0) / 10.0) ** 2))[:, np.newaxis]
 
 
-def pulses(rng: np.random.Generator, share: float) -> noise.Array:
+def pulses(rng: np.random.Generator, share: float) -> Array:
     """Background (time, pixel) [K] that is 3 K warmer for a second, now and then."""
     starts = rng.random((FRAMES, PIXELS)) < share / 10.0
     kernel = np.ones(10)
     return np.apply_along_axis(lambda s: 3.0 * (np.convolve(s, kernel)[:FRAMES] > 0), 0, starts)
 
 
-def walk(rng: np.random.Generator, correlation_time: float) -> noise.Array:
+def walk(rng: np.random.Generator, correlation_time: float) -> Array:
     """Background (time, pixel) [K] of 3 K, a random walk of a `correlation_time` [s]."""
     keep = np.exp(-0.1 / correlation_time)
     steps = 3.0 * rng.standard_normal((FRAMES, PIXELS))
@@ -51,7 +52,7 @@ def walk(rng: np.random.Generator, correlation_time: float) -> noise.Array:
     return values
 
 
-def reflect(signals: Signals, background: noise.Array) -> Signals:
+def reflect(signals: Signals, background: Array) -> Signals:
     """Add what glass reflects of a background."""
     first, second = (
         signal + share * background for signal, share in zip(signals, REFLECTED, strict=True)

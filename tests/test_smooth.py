@@ -8,20 +8,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dbthermal import _smooth as smooth
+from dbthermal._arrays import Array
 
 TIMES = st.lists(st.floats(0.01, 10.0), min_size=12, max_size=40).map(np.cumsum)
 ORDERS = st.integers(1, 6)
 
 
 @given(TIMES, ORDERS)
-def test_basis_is_orthonormal(time: smooth.Array, order: int) -> None:
+def test_basis_is_orthonormal(time: Array, order: int) -> None:
     """The functions are orthonormal over the capture's own times, evenly spaced or not."""
     functions = smooth.polynomial_basis(time, order)
     np.testing.assert_allclose(functions.T @ functions, np.eye(order), rtol=0, atol=1e-12)
 
 
 @given(TIMES, ORDERS, st.integers(0, 1000))
-def test_basis_spans_the_polynomials(time: smooth.Array, order: int, seed: int) -> None:
+def test_basis_spans_the_polynomials(time: Array, order: int, seed: int) -> None:
     """A polynomial of a degree below the order is its own projection."""
     coefficients = np.random.default_rng(seed).standard_normal(order)
     signal = np.polynomial.Polynomial(coefficients, domain=[time[0], time[-1]])(time)

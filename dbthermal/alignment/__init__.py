@@ -12,7 +12,4 @@ from dbthermal.alignment._registration import register
 from dbthermal.alignment._resampling import align
 
 __all__ = ["align", "exposure_times", "fill_times", "reflection_shift", "register", "time_offset"]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

@@ -8,9 +8,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.intp]
 
 # A sample nearer than this to the wanted time is taken as it is [frame period].
@@ -28,8 +27,7 @@ PAUSE: Final = 20
 
 @dataclass(frozen=True)
 class Interpolation:
-    r"""
-    Linear interpolation in time, :math:`I(t) = (1 - w) I_{before} + w I_{after}`.
+    r"""Linear interpolation in time, :math:`I(t) = (1 - w) I_{before} + w I_{after}`.
 
     For a signal that changes by sudden steps, and for a random walk, this line is the expected
     value between two samples: its error has mean zero and is independent of its value, so that a
@@ -49,8 +47,7 @@ class Interpolation:
     def apply(
         self, frames: npt.NDArray[Any], out: npt.NDArray[Any], largest_step: float = np.inf
     ) -> None:
-        """
-        Write the interpolated frames (wanted, ...) into `out`, NaN where not valid.
+        """Write the interpolated frames (wanted, ...) into `out`, NaN where not valid.
 
         Between two samples that differ by more than `largest_step` no value is known: NaN.
         """
@@ -89,8 +86,7 @@ class Interpolation:
 
 
 def exposure_times(corrected: xr.Dataset) -> Array:
-    """
-    Exposure times (band, time) [s] of each band's frames, NaN where there is no frame.
+    """Exposure times (band, time) [s] of each band's frames, NaN where there is no frame.
 
     From `exposure_time` of a capture; without it `time`, in every band. Raises TypeError or
     ValueError if the times have other dims or another unit, fewer than two of a band are finite, or
@@ -108,8 +104,7 @@ def exposure_times(corrected: xr.Dataset) -> Array:
 
 
 def fill_times(stamps: Array) -> Array:
-    """
-    Exposure times (time) [s] of one camera, with those of missing frames (NaN) interpolated.
+    """Exposure times (time) [s] of one camera, with those of missing frames (NaN) interpolated.
 
     They increase strictly; before the first and after the last frame by a frame period.
     """
@@ -149,8 +144,7 @@ def segments(corrected: xr.Dataset) -> Indices:
 
 
 def missing(frames: npt.NDArray[Any]) -> Mask:
-    """
-    Frames (time) that are NaN in all pixels, or a copy of the frame before.
+    """Frames (time) that are NaN in all pixels, or a copy of the frame before.
 
     A driver that loses a frame may deliver the last one again; noise never repeats a whole frame.
     """
@@ -167,8 +161,7 @@ def frame_period(stamps: Array) -> float:
 
 
 def even_times(stamps: Array, reach: int) -> Array:
-    """
-    Evenly spaced times [s] that all cameras, exposure times (band, time), can be brought to.
+    """Evenly spaced times [s] that all cameras, exposure times (band, time), can be brought to.
 
     The stamps themselves where all bands share even ones (steps within 5 % of their median); else
     from the last camera's start to the first one's end, in steps of the longest frame period. Where
@@ -190,8 +183,7 @@ def even_times(stamps: Array, reach: int) -> Array:
 
 
 def require_steady(stamps: Array, bands: list[str]) -> None:
-    """
-    Refuse exposure times (band, time) [s] in which a camera has no frame period.
+    """Refuse exposure times (band, time) [s] in which a camera has no frame period.
 
     As of frames that arrive in bursts: of half of the steps it must be the period within 50 %, and
     half of the frames must lie between pauses in rows of `_ROW` at least.
@@ -218,8 +210,7 @@ def pauses(times: Array) -> Array:
 
 
 def interpolation(stamps: Array, present: Mask, wanted: Array) -> Interpolation:
-    """
-    Interpolation of the frames present, exposed at `stamps` (time) [s], at times `wanted` [s].
+    """Interpolation of the frames present, exposed at `stamps` (time) [s], at times `wanted` [s].
 
     Valid where a frame was exposed within 1 % of a period of the wanted time, or one each before
     and after it, no more than one and a half frame periods apart.

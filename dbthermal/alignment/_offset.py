@@ -26,18 +26,15 @@ import xarray as xr
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.schema import Status
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Pixels, at most, of which a capture is judged; a full frame would say it no better.
 _PIXELS: Final = 16384
 # Samples of a band, at most: of a long capture fewer pixels.
 _SAMPLES: Final = 2**25
-SEARCH: Final = 5
-"""Largest lag that is searched by default, either way [frame]."""
+SEARCH: Final = 5  # largest lag that is searched by default, either way [frame]
 
 # Step of one clock against the other from which a lost frame, or a clock that is set, is suspected
 # [frame period].
@@ -57,8 +54,7 @@ _UNUSABLE: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAM
 
 @dataclass(frozen=True)
 class _Pair:
-    """
-    Two bands on one clock of even steps.
+    """Two bands on one clock of even steps.
 
     `signals` (2, time, pixel): counts [count], NaN in missing frames; `segments` (2, time): number
     of shutter events before each frame; `times` (time) [s].
@@ -81,8 +77,7 @@ class _Pair:
 
 @dataclass(frozen=True)
 class _Covariances:
-    """
-    Covariances of groups of pixels, in rows, by lag, in columns.
+    """Covariances of groups of pixels, in rows, by lag, in columns.
 
     `lags` (lag): frames by which the first band is taken later; `cross` (group, lag): C, of the
     first band with the second; `auto` (group, 2): R of the first band, one and two frames apart.
@@ -94,8 +89,7 @@ class _Covariances:
 
 
 def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int = SEARCH) -> float:
-    """
-    Delay of a band's exposures behind the first band's [s]; negative if it is ahead.
+    """Delay of a band's exposures behind the first band's [s]; negative if it is ahead.
 
     Positive: frame n of this band was exposed that much **later** than frame n of the first. Where
     the capture has the cameras' own stamps, it is the delay beyond them.
@@ -161,8 +155,7 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
 def require_one_clock(
     pair: xr.Dataset, signals: Array, stamps: Array, search: int = SEARCH
 ) -> None:
-    """
-    Refuse exposure times (band, time) [s] of two bands if the clock of one of them was set.
+    """Refuse exposure times (band, time) [s] of two bands if the clock of one of them was set.
 
     Where their clocks step against one another the longest, frames were lost, or not taken, if the
     signals (band, time, pixel) [count] keep their offset at the times as they are; if they keep it
@@ -244,8 +237,7 @@ def _check(corrected: xr.Dataset, band: str | None, search: int) -> int:
 
 
 def sample(corrected: xr.Dataset) -> Array:
-    """
-    Counts (band, time, pixel) of usable pixels on an even grid, NaN in missing frames.
+    """Counts (band, time, pixel) of usable pixels on an even grid, NaN in missing frames.
 
     Usable is a pixel that is not flagged as dead, saturated or invalid, changes in every band, and
     is finite in every frame that is not missing.
@@ -305,8 +297,7 @@ def _covariances(shared: _Pair, search: int, names: list[str]) -> _Covariances:
 
 
 def _common(shared: _Pair, names: list[str]) -> Mask:
-    """
-    Frames (time) that both bands have.
+    """Frames (time) that both bands have.
 
     The smooth part must be taken out over the same frames of both: a part of it that is left in one
     band only would be taken for rapid changes.

@@ -10,13 +10,11 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter, map_coordinates, median_filter, spline_filter
 
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._resampling import TRANSFORM, positions
 from dbthermal.noise import MAD
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Kinds of transform, of two, six and eight numbers.
 _MODELS: Final = ("translation", "affine", "homography")
@@ -32,11 +30,7 @@ _FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
 # Numbers of a homography that each model changes, one matrix each.
 _FREE: Final = {
     model: np.eye(9)[places].reshape(-1, 3, 3)
-    for model, places in (
-        ("translation", [2, 5]),
-        ("affine", range(6)),
-        ("homography", range(8)),
-    )
+    for model, places in (("translation", [2, 5]), ("affine", range(6)), ("homography", range(8)))
 }
 # Gauss-Newton: steps, length of a difference and of the last step, border left out [pixel].
 _NEWTON, _STEP, _CONVERGED, _MARGIN = 15, 1e-2, 1e-4, 3
@@ -50,8 +44,7 @@ _LEAST_OVERLAP: Final = 0.5
 def register(
     corrected: xr.Dataset, *, model: Literal["translation", "affine", "homography"] = "homography"
 ) -> xr.DataArray:
-    r"""
-    Estimate the transform from the pixels of the first view to those of the others.
+    r"""Estimate the transform from the pixels of the first view to those of the others.
 
     Compared are means over time of smooth curves fitted robustly to each pixel, in which what
     passes by in the reflection hardly counts; and by how much each pixel rises steadily, as only a
@@ -171,8 +164,7 @@ def _scaled(image: Array, bad: npt.NDArray[np.bool_] | np.bool_) -> Array:
 
 
 def _smooth_mean(signal: Array) -> Array:
-    """
-    Mean (pixel,) of smooth curves through signals (time, pixel), with Tukey's bisquare weights.
+    """Mean (pixel,) of smooth curves through signals (time, pixel), with Tukey's bisquare weights.
 
     What passes by in the reflection is an outlier: a plain mean holds some of it, in each band
     another share, and a warm spot without detail then seems displaced by 0.2 pixel.
@@ -218,8 +210,7 @@ def _transform(first: Array, other: Array, model: str, band: str) -> tuple[float
 
 
 def _refined(pair: list[Array], matrix: Array, model: str) -> Array:
-    r"""
-    Transform that minimises :math:`\sum (g I_1(p) + o - I_2(H p))^2`, by Gauss-Newton steps.
+    r"""Transform that minimises :math:`\sum (g I_1(p) + o - I_2(H p))^2`, by Gauss-Newton steps.
 
     Of :math:`I_2` over the mean and deviation of what is compared, for else places where it varies
     little would be the best: the correlation is largest there, which :math:`g` and :math:`o` leave.

@@ -11,12 +11,12 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import _rows, schema
 from dbthermal import noise as noises
+from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
 from dbthermal.noise import MAD
 
-Array = npt.NDArray[np.float64]
 Movie = npt.NDArray[np.float32]
 
 TRANSFORM: Final = schema.Variable(
@@ -49,8 +49,7 @@ def align(
     reflection_shift: xr.Dataset | None = None,
     lazy: bool = False,
 ) -> xr.Dataset:
-    """
-    Resample all bands onto one clock, and onto the first band's grid.
+    """Resample all bands onto one clock, and onto the first band's grid.
 
     The samples of one band are not touched in time, and its noise stays white: the noisiest, by its
     noise relative to its signal, unless `clock` names another. The other bands are interpolated at
@@ -180,8 +179,7 @@ def align(
 
 
 def interpolation(places: Array, taps: int) -> csr_array:
-    """
-    Weights (pixel, pixel) [1] of samples at rows and columns (2, y, x) [pixel].
+    """Weights (pixel, pixel) [1] of samples at rows and columns (2, y, x) [pixel].
 
     Those of the polynomials through so many neighbours a side (Lagrange): of 6 they keep 95 % of
     what is four pixels long and 99.7 % from seven on, half-way between pixels; lines keep 71 and
@@ -220,8 +218,7 @@ def _weights(places: Array, bad: npt.NDArray[np.bool_]) -> csr_array:
 
 
 def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
-    r"""
-    Row and column (2, y, x) [pixel], in another view, of the pixels of the first.
+    r"""Row and column (2, y, x) [pixel], in another view, of the pixels of the first.
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T, counted from 0 at the centre of the first pixel.
     """

@@ -5,12 +5,7 @@ emissivity of a material, with its uncertainty, follows from thermocouple readin
 blackbody (`fit_emissivity`), or by the standards' reflector method (`reflector_emissivity`).
 """
 
-from dbthermal.calibration._emissivity import (
-    NO_BIAS,
-    Bias,
-    fit_emissivity,
-    reflector_emissivity,
-)
+from dbthermal.calibration._emissivity import NO_BIAS, Bias, fit_emissivity, reflector_emissivity
 from dbthermal.calibration._response import AMBIENT, MINIMUM_TEMPERATURES, fit_response
 
 __all__ = [
@@ -22,7 +17,4 @@ __all__ = [
     "fit_response",
     "reflector_emissivity",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.response import Curve, require_range
-
-Array = npt.NDArray[np.float64]
 
 _ITERATIONS: Final = 50
 _CONVERGED: Final = 1e-12
@@ -24,26 +22,17 @@ _CONVERGED: Final = 1e-12
 
 @dataclass(frozen=True)
 class Bias:
-    r"""
-    Errors that all readings of one series have in common, each uniform in a range.
+    r"""Errors that all readings of one series have in common, each uniform in a range.
 
     A range's middle is corrected for, and its standard deviation, the width over :math:`\sqrt{12}`,
     is carried into the result: a rectangular distribution, clause 4.3.7 of the Guide to the
     expression of uncertainty in measurement (JCGM 100:2008).
 
-    Attributes
-    ----------
-    object_tolerance, background_tolerance : float
-        Largest offset of the thermocouple's readings and of the reflected body's temperature,
-        either way [K].
-    contact : tuple of float
-        Least and largest fraction of the object's excess over the air that the thermocouple misses,
-        because it conducts heat away [1].
-    air_temperature : float
-        Temperature of the air, and of the room [K].
-    stray : tuple of float
-        Least and largest fraction of the reflection that comes from the room and not from the
-        blackbody: a surface that is not quite smooth, a blackbody not quite black [1].
+    The tolerances are the largest offset of the thermocouple's readings and of the reflected body's
+    temperature, either way [K]; `contact` the least and largest fraction of the object's excess
+    over the air, of a temperature [K] that is the room's too, which the thermocouple misses,
+    because it conducts heat away [1]; `stray` those of the reflection that comes from the room and
+    not from the blackbody [1]: a surface that is not quite smooth, a blackbody not quite black.
 
     Examples
     --------
@@ -90,8 +79,7 @@ class Bias:
         return self.air_temperature + (reading - self.air_temperature) / self._felt
 
     def emitted(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
-        """
-        Errors of the object's signal [count]: independent (n), and common (2, n).
+        """Errors of the object's signal [count]: independent (n), and common (2, n).
 
         Of n measurements at corrected temperatures [K], for a standard deviation of one reading
         [K]; the common ones by the offset and by the contact error.
@@ -122,8 +110,7 @@ NO_BIAS: Final = Bias()
 
 @dataclass(frozen=True)
 class _Signals:
-    """
-    Signals of one band and their errors, n measurements.
+    """Signals of one band and their errors, n measurements.
 
     `counts`, `emitted`, `reflected` (n): I, W_o, W_b [count]; `noise`: standard deviation of the
     counts [count]; `..._std` (n): independent errors of the other two; `..._bias` (term, n): effect
@@ -150,8 +137,7 @@ class _Signals:
         return self.counts - self.reflected
 
     def weighted(self, emissivity: float, values: Array) -> Array:
-        """
-        Inverse covariance of the residual y - e x, times values (n).
+        """Inverse covariance of the residual y - e x, times values (n).
 
         The covariance is diagonal but for the few common errors F (term, n), which the Woodbury
         identity inverts: (D + F'F)^-1 v = v/D - (F/D)' (1 + F (F/D)')^-1 F (v/D).
@@ -184,8 +170,7 @@ def fit_emissivity(
     reading_std: tuple[float, float],
     bias: Bias = NO_BIAS,
 ) -> xr.Dataset:
-    r"""
-    Emissivity of a material per band, by contact thermometry and a reflected blackbody.
+    r"""Emissivity of a material per band, by contact thermometry and a reflected blackbody.
 
     Each measurement i has counts :math:`I_i`, the object's temperature by thermocouple and the
     reflected blackbody's temperature (equation 10 of the paper [1]_, by least squares):
@@ -279,8 +264,7 @@ def reflector_emissivity(
     reading_std: tuple[float, float],
     bias: Bias = NO_BIAS,
 ) -> xr.Dataset:
-    r"""
-    Emissivity of a material per band by the reflector method of the standards.
+    r"""Emissivity of a material per band by the reflector method of the standards.
 
     A crumpled foil in the object's place gives the reflected signal :math:`W_r`, a contact
     thermometer the object's own :math:`W_o = U(T_o)`, and the camera the object's W [1]_ [2]_:

@@ -3,16 +3,14 @@
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from dbthermal import bands, planck, schema
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal.response import Curve
-
-Array = npt.NDArray[np.float64]
 
 AMBIENT: Final = 298.15
 """Ambient temperature [K]; a response refers to the calibrated temperature nearest to it."""
@@ -46,8 +44,7 @@ def fit_response(
     *,
     temperature_std: float = TEMPERATURE_STD,
 ) -> xr.Dataset:
-    r"""
-    Fit the response of each band to blackbody measurements.
+    r"""Fit the response of each band to blackbody measurements.
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
 
@@ -197,8 +194,7 @@ def _check_growth(band: str, temperature: Array, counts: Array, std: float) -> N
 
 
 def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float) -> None:
-    """
-    Refuse counts farther from their Planck curve than errors of a standard deviation explain.
+    """Refuse counts farther from their Planck curve than errors of a standard deviation explain.
 
     The nearest curve of any shape is no farther from the counts than the nearest one of the true
     shape, whose two linear parameters leave a chi-square of n - 2 degrees of freedom.

@@ -35,7 +35,4 @@ __all__ = [
     "undo_drift",
     "undo_lag",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

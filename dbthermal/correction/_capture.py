@@ -6,31 +6,24 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _rows, schema
-from dbthermal.correction._nonuniformity import (
-    DETECTOR_MAXIMUM,
-    OUTLIER,
-    correct,
-    renew_offset,
-)
+from dbthermal.correction._nonuniformity import DETECTOR_MAXIMUM, OUTLIER, correct, renew_offset
 from dbthermal.correction._pixels import mark_bad, mark_repeats
 from dbthermal.correction._shutter import find_shutter, mark_shutter
 from dbthermal.correction._temporal import undo_drift, undo_lag
 
 
-def correct_capture(  # noqa: PLR0913 - one option a step, by name
+def correct_capture(
     capture: xr.Dataset,
     correction: xr.Dataset,
     *,
     flat: xr.DataArray | None = None,
-    flat_after: xr.DataArray | None = None,
     shutter: bool = True,
     time_constant: float | xr.DataArray | None = None,
     bad_pixels: float | None = OUTLIER,
     drift_reference: xr.DataArray | None = None,
     lazy: bool = False,
 ) -> xr.Dataset:
-    """
-    Raw capture to corrected counts with a status: every correction, in the right order.
+    """Raw capture to corrected counts with a status: every correction, in the right order.
 
     1. `find_shutter` on the raw counts, where a frame that the camera repeats is an exact copy; the
        bit `schema.SHUTTER_CLOSED` of the recorded `frame_flags`, if there are any, adds the frames
@@ -54,9 +47,9 @@ def correct_capture(  # noqa: PLR0913 - one option a step, by name
     correction : Dataset
         From `fit_correction`, or `gain` [1], `offset` [count] and `bad` (bool) of your own, each
         (band, y, x); it may hold more bands.
-    flat, flat_after : DataArray, optional
-        Mean raw frames (band, y, x) [count] of a uniform view, taken before and after the capture.
-        The first renews the offsets; to the second they go in proportion to time.
+    flat : DataArray, optional
+        Mean raw frames (band, y, x) [count] of a uniform view, taken before the capture: they renew
+        the offsets.
     shutter : bool
         False if no camera had a shutter, and no frame was lost.
     time_constant : float or DataArray, optional
@@ -85,8 +78,7 @@ def correct_capture(  # noqa: PLR0913 - one option a step, by name
     Raises
     ------
     TypeError, ValueError
-        If capture or correction is not of its stage; as the steps; and if offsets are to change in
-        proportion to time across a shutter event, where the camera renews them.
+        If capture or correction is not of its stage; as the steps.
 
     Examples
     --------
@@ -116,22 +108,15 @@ def correct_capture(  # noqa: PLR0913 - one option a step, by name
     closed = _closed(capture)
     events = find_shutter(capture, closed=closed) if shutter else None
     before = correction if flat is None else renew_offset(correction, flat)
-    after = None if flat_after is None else renew_offset(correction, flat_after)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
 
     def measured(rows: slice) -> xr.Dataset:
         """Steps of some rows that need no others."""
-        last = None if after is None else after.isel(y=rows)
-        part = correct(capture.isel(y=rows), before.isel(y=rows), after=last, maximum=maximum)
+        part = correct(capture.isel(y=rows), before.isel(y=rows), maximum=maximum)
         part = _without_damaged(part if events is None else mark_shutter(part, events))
         return part if time_constant is None else undo_lag(part, time_constant)
 
     result = _by_rows(measured, capture["counts"]) if lazy else measured(slice(None))
-    if events is not None and after is not None and result["segment"].values[-1] > 0:
-        raise ValueError(
-            f"Invalid flat_after: {result.attrs['shutter_events']} shutter events renew the "
-            "offsets within the capture. Must have none, for offsets in proportion to time."
-        )
     result = mark_repeats(result, capture["counts"], shutter=shutter)
     if bad_pixels is not None:
         result = mark_bad(result, threshold=bad_pixels)

@@ -9,17 +9,14 @@ measurement but is not one.
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.stats import chi2
 
-from dbthermal import planck, schema
+from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 DETECTOR_MAXIMUM: Final = 65535
 """Largest count of a 16-bit detector; at this value, and at 0, a sample is saturated [count]."""
@@ -37,8 +34,7 @@ _ROUNDING = 0.01
 
 
 def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
-    r"""
-    Mean frames and temporal noise of movies of a blackbody.
+    r"""Mean frames and temporal noise of movies of a blackbody.
 
     The noise of a pixel, :math:`s^2 = \overline{d^2} / 2`, comes from the differences d of
     successive frames, so that a drift of the camera or of the blackbody does not enter. Its median
@@ -46,22 +42,10 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     freedom that n differences leave, :math:`2 n^2 / (3 n - 1)`: a median of few frames is otherwise
     too low (by 33 % for two frames, 5 % for ten).
 
-    Parameters
-    ----------
-    movies : Dataset
-        Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x) [count],
-        raw, at least two frames.
-
-    Returns
-    -------
-    Dataset
-        Stage `blackbody_frames`: `counts` (band, temperature, y, x) [count], and `noise` (band)
-        [count], the standard deviation of one sample.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two frames, or they hold NaN or do not vary.
+    Of raw `counts` (band, temperature, frame, y, x) [count], stage `blackbody_movies` of `schema`,
+    at least two frames: stage `blackbody_frames`, `counts` (band, temperature, y, x) [count], and
+    `noise` (band) [count], the standard deviation of one sample. TypeError or ValueError if there
+    are fewer than two frames, or they hold NaN or do not vary.
 
     Examples
     --------
@@ -103,8 +87,7 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
 def fit_correction(
     blackbody: xr.Dataset, *, threshold: float = OUTLIER, maximum: int = DETECTOR_MAXIMUM
 ) -> xr.Dataset:
-    r"""
-    Fit gain and offset of each pixel to frames of a blackbody that fills the view.
+    r"""Fit gain and offset of each pixel to frames of a blackbody that fills the view.
 
     For each pixel, g and f minimise
 
@@ -199,8 +182,7 @@ def fit_correction(
 
 
 def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
-    r"""
-    One-point correction: new offsets from one image of a uniform view, the gains kept.
+    r"""One-point correction: new offsets from one image of a uniform view, the gains kept.
 
     .. math:: f' = f - [(g F + f) - \overline{g F + f}]
 
@@ -208,24 +190,11 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     image of unknown temperature says nothing of it (`undo_drift` does). `offset_std` becomes that
     of an image as noisy as one of the calibration's.
 
-    Parameters
-    ----------
-    correction : Dataset
-        From `fit_correction`.
-    flat : DataArray
-        Mean of raw frames of a uniform view, (band, y, x) [count], such as a lens cap or the
-        camera's shutter, of the bands of the correction.
-
-    Returns
-    -------
-    Dataset
-        The correction with other `offset` [count], and the attribute ``offset_renewed`` = 1.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the correction has no `bad`, a band is missing, the pixels are not the same, or a good
-        pixel of the image is not finite.
+    Of a correction from `fit_correction` and the mean of raw frames (band, y, x) [count] of a
+    uniform view, such as a lens cap or the camera's shutter, of the bands of the correction: the
+    correction with other `offset` [count], and the attribute ``offset_renewed`` = 1. TypeError or
+    ValueError if the correction has no `bad`, a band is missing, the pixels are not the same, or a
+    good pixel of the image is not finite.
     """
     schema.check(correction, "correction")
     if "bad" not in correction:
@@ -252,75 +221,34 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
 
 
 def correct(
-    capture: xr.Dataset,
-    correction: xr.Dataset,
-    *,
-    after: xr.Dataset | None = None,
-    maximum: int = DETECTOR_MAXIMUM,
+    capture: xr.Dataset, correction: xr.Dataset, *, maximum: int = DETECTOR_MAXIMUM
 ) -> xr.Dataset:
-    r"""
-    Apply gain and offset to a capture, and mark its bad and saturated pixels.
+    """Apply gain and offset to a capture, and mark its bad and saturated pixels.
 
-    With a second correction gain and offset go from the first to it in proportion to time,
+    Of a capture of stage `capture`, raw uint16, whose other variables are handed on, a correction
+    from `fit_correction` of the same pixels, which may hold more bands, and the largest count of
+    the detector: stage `corrected`, `counts` (band, time, y, x) [count], float32; `status` (y, x),
+    uint32, with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above,
+    or at 0) of `schema.Status`. The counts of these pixels are kept. `pattern_std` (band) [count]
+    where the correction has its deviations: what it leaves from pixel to pixel, constant in time,
+    root mean square over the levels of the capture. Attributes: ``gain_offset_corrected`` = 1, the
+    parameters of the fit (``gain_offset_...``), and the numbers of marked pixels.
 
-    .. math:: I' = (1 - w) (g_0 I + f_0) + w (g_1 I + f_1), \quad w = \frac{t - t_0}{t_1 - t_0}
-
-    from the first frame to the last, which is right for a pattern that drifts so, and wrong across
-    a shutter event, where a camera renews its offsets.
-
-    Parameters
-    ----------
-    capture : Dataset
-        Stage `capture` of `schema`, raw uint16. Other variables are handed on.
-    correction : Dataset
-        From `fit_correction`, of the same pixels; it may hold more bands.
-    after : Dataset, optional
-        Correction that holds after the capture, e.g. from `renew_offset`.
-    maximum : int
-        Largest count of the detector [count].
-
-    Returns
-    -------
-    Dataset
-        Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), uint32,
-        with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or
-        at 0) of `schema.Status`. The counts of these pixels are kept. `pattern_std` (band) [count]
-        where the correction has its deviations: what it leaves from pixel to pixel, constant in
-        time, root mean square over the levels of the capture. Attributes:
-        ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``),
-        ``offset_interpolated``, and the numbers of marked pixels.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not uint16 or was corrected before, a band is missing in the correction, a
-        gain or offset is not finite, or the pixels are not the same.
+    TypeError or ValueError if the capture is not uint16 or was corrected before, a band is missing
+    in the correction, a gain or offset is not finite, or the pixels are not the same.
     """
     counts = _require_raw(capture)
-    names = [str(name) for name in counts["band"].values]
     maps = _maps(correction, counts)
-    if after is not None:
-        last = _maps(after, counts)
-        time = counts["time"].values.astype(np.float64)
-        planck.require_positive("length of the capture [s]", time[-1] - time[0])
-        weight = (time - time[0]) / (time[-1] - time[0])
-        change = last[["gain", "offset"]] - maps
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
-    for band in range(len(names)):
+    for band in range(len(counts)):
         # One band at a time, written where it stays: no second movie in memory.
         raw = counts.isel(band=band).values
         gain, offset = maps["gain"].values[band], maps["offset"].values[band]
         np.multiply(raw, gain.astype(np.float32), out=corrected[band])
         corrected[band] += offset.astype(np.float32)
-        if after is not None:
-            gain, offset = change["gain"].values[band], change["offset"].values[band]
-            for frame, share in enumerate(weight):
-                corrected[band, frame] += share * (gain * raw[frame] + offset)
         saturated |= (raw.max(axis=0) >= maximum) | (raw.min(axis=0) <= 0)
     bad = maps["bad"].values.any(axis=0)
-    if after is not None:
-        bad |= last["bad"].values.any(axis=0)
     status = bad * np.uint32(Status.DEAD_PIXEL) | saturated * np.uint32(Status.SATURATED)
     result = capture.drop_vars("counts").assign(
         counts=(counts.dims, corrected, schema.STAGES["corrected"]["counts"].attrs),
@@ -335,7 +263,6 @@ def correct(
         result.assign_attrs(
             gain_offset_corrected=1,
             **done,
-            offset_interpolated=int(after is not None),
             detector_maximum=maximum,
             dead_pixels=int(bad.sum()),
             saturated_pixels=int(saturated.sum()),

@@ -11,15 +11,14 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import maximum_filter1d, median_filter
 
+from dbthermal import _rows, schema
 from dbthermal import _samples as samples
-from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.correction._nonuniformity import OUTLIER
 from dbthermal.noise import MAD, MINIMUM_FRAMES
 from dbthermal.schema import Status
 
-Array = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
-Mask = npt.NDArray[np.bool_]
 
 # A pixel is held against those around it: the median of a window this wide, and the eight nearest.
 _WINDOW = 5
@@ -38,8 +37,7 @@ _BLOCK = 8_000_000
 
 
 def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset:
-    r"""
-    Mark pixels that are noisy, stuck or jump by themselves, in any band.
+    r"""Mark pixels that are noisy, stuck or jump by themselves, in any band.
 
     Noise. A pixel's noise s is the mean magnitude of the smaller four fifths of its second
     differences in time, so that neither object nor walkers enter. With m the median of s over 5 by
@@ -106,7 +104,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         part = np.zeros(frames.size) if segment is None else segment[frames]
         movie, stepped = movie.isel(time=frames), np.diff(part) != 0
         level = np.empty(image)
-        for rows in _blocks(movie):
+        for rows in _rows.blocks(movie.shape, _BLOCK):
             level[rows] = samples.noise(_samples(movie, rows))
         known = np.isfinite(level)
         if not known.any():
@@ -152,8 +150,7 @@ def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> 
 
 
 def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
-    """
-    Pixels (y, x) of one band, raw counts (time, y, x), that are clipped, and that are frozen.
+    """Pixels (y, x) of one band, raw counts (time, y, x), that are clipped, and that are frozen.
 
     Judged are the measured frames (time).
 
@@ -165,7 +162,7 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
     grain = samples.grain(middle, np.ones(middle.shape, dtype=bool))
     clipped, frozen = np.zeros(image, dtype=bool), np.zeros(image, dtype=bool)
     ends = np.zeros((2, 3, *image))
-    for rows in _blocks(movie):
+    for rows in _rows.blocks(movie.shape, _BLOCK):
         counts = movie.isel(y=rows).values.reshape(len(movie), -1)
         valid = np.broadcast_to(frames[:, np.newaxis], counts.shape)
         still = samples.frozen(samples.repeated(counts, valid), grain.chance)
@@ -195,7 +192,7 @@ def _reach(time: Array) -> int:
 def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     """Positions of the frames of a band that are not NaN."""
     finite = np.zeros(movie.sizes["time"], dtype=bool)
-    for rows in _blocks(movie):
+    for rows in _rows.blocks(movie.shape, _BLOCK):
         finite |= np.isfinite(movie.isel(y=rows).values).any(axis=(1, 2))
     if finite.sum() < fewest:
         step = float(np.median(np.diff(movie["time"].values))) if finite.size > 1 else np.nan
@@ -213,13 +210,6 @@ def _samples(movie: xr.DataArray, rows: slice) -> Single:
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32)
 
 
-def _blocks(movie: xr.DataArray) -> list[slice]:
-    """Rows that are read at once."""
-    height = movie.sizes["y"]
-    rows = max(1, _BLOCK // (movie.sizes["time"] * movie.sizes["x"]))
-    return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
-
-
 def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
     """Pixels whose noise differs from that of their surroundings by more than the threshold."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -235,7 +225,7 @@ def _outliers(level: Array, usual: Array, threshold: float) -> Mask:
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
     """Pixels (y, x) that change by more than their limit [count] while no neighbour does."""
     jumping = np.zeros(limit.shape, dtype=bool)
-    for rows in _blocks(movie):
+    for rows in _rows.blocks(movie.shape, _BLOCK):
         # A row more on each side: the neighbours.
         top, bottom = max(rows.start - 1, 0), min(rows.stop + 1, limit.shape[0])
         changes = _changes(_samples(movie, slice(top, bottom)), stepped)

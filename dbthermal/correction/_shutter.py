@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import _rows, schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
-Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 # Fewest pixels that must change in a capture for an unchanged image to be a copy.
 _MINIMUM_PIXELS: Final = 16
@@ -33,21 +32,16 @@ _EVENT = ("band", "first_frame", "frames", "renewed")
 
 
 def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -> xr.Dataset:
-    """
-    Find the runs of frames in which a band repeats its image.
+    """Find the runs of frames in which a band repeats its image.
 
     A frame is a copy if no pixel differs from the frame before. Some thousands of pixels are
     compared first, then the whole of the remaining frames, in blocks of rows, so that a lazy
     dataset is never read at once. The search is exact only before anything is interpolated in time.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, or a raw `capture`: `counts` (band, time, y, x) [count].
-    closed : DataArray, optional
-        True in frames in which the shutter is known to be closed, (time) or (band, time), bool:
-        from the camera, or because they show the shutter itself. A run of copies that includes or
-        touches one is part of its event.
+    Of `counts` (band, time, y, x) [count], stage `corrected` of `schema` or a raw `capture`.
+    `closed`, (time) or (band, time), bool, is true in frames in which the shutter is known to be
+    closed: from the camera, or because they show the shutter itself. A run of copies that includes
+    or touches one is part of its event.
 
     Returns
     -------
@@ -90,8 +84,7 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
 
 
 def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.Dataset:
-    """
-    Set frames of a closed shutter or a repeated image to NaN, and number the segments.
+    """Set frames of a closed shutter or a repeated image to NaN, and number the segments.
 
     A `segment` is the stretch between two renewals of the offsets, at which every pixel of the band
     makes an offset step of its own, of tens of counts, which no camera reports. It is left in the
@@ -104,26 +97,13 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     Beside five functions over 35 s, one step in the middle raises the standard deviation of the
     smooth part by 1.9, two, at 11 and 24 s, by 2.7.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, not yet marked, before `alignment.align`. `counts` may be
-        lazy.
-    events : Dataset, optional
-        From `find_shutter`, or rows of it; by default `find_shutter(corrected)`.
-
-    Returns
-    -------
-    Dataset
-        The dataset with NaN in place of these samples, and `segment` (time), int32 [1]: number of
-        renewals of the offsets before the frame. Attributes: ``shutter_events``,
-        ``repeated_frames`` (runs that renew nothing) and ``frames_taken_out`` (by band).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the counts are whole numbers, which have no NaN, the dataset was marked before, or an
-        event lacks a variable, is of no band or of frames outside the dataset.
+    Of stage `corrected` of `schema`, not yet marked, before `alignment.align`, whose `counts` may
+    be lazy, and events from `find_shutter`, or rows of it, by default all: the dataset with NaN in
+    place of these samples, and `segment` (time), int32 [1]: number of renewals of the offsets
+    before the frame. Attributes: ``shutter_events``, ``repeated_frames`` (runs that renew nothing)
+    and ``frames_taken_out`` (by band). TypeError or ValueError if the counts are whole numbers,
+    which have no NaN, the dataset was marked before, or an event lacks a variable, is of no band or
+    of frames outside the dataset.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "segment" in corrected:
@@ -186,10 +166,9 @@ def _whole_copies(counts: xr.DataArray, candidates: Integers) -> Mask:
     """Candidates that repeat the frame before in all of the image, read in blocks of rows."""
     needed = np.union1d(candidates, candidates - 1)
     here, before = (np.searchsorted(needed, part) for part in (candidates, candidates - 1))
-    rows = max(1, _BLOCK // (needed.size * counts.sizes["x"]))
     copies = np.ones(candidates.size, dtype=bool)
-    for top in range(0, counts.sizes["y"], rows):
-        block = counts.isel(time=needed, y=slice(top, top + rows)).values
+    for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
+        block = counts.isel(time=needed, y=rows).values
         copies &= ~_changed(block[before], block[here])[0].any(axis=(1, 2))
     return copies
 

@@ -6,14 +6,12 @@ import xarray as xr
 
 from dbthermal import _rows, planck, schema
 from dbthermal import _smooth as smooth
+from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
-
-Array = npt.NDArray[np.float64]
 
 
 def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
-    r"""
-    Undo the thermal lag of the pixels, bodies with a time constant of their own.
+    r"""Undo the thermal lag of the pixels, bodies with a time constant of their own.
 
     A pixel follows :math:`\tau \dot I = z - I`. For z held from each frame to the next, exactly,
 
@@ -24,25 +22,12 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     frames then have the correlation :math:`-a / (1 + a^2)`: undo a lag that matters, not one that
     does not.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, after `mark_shutter`: a repeated frame is no measurement.
-    time_constant : float or DataArray
-        Time constant of the pixels [s], of all bands or (band), by name.
-
-    Returns
-    -------
-    Dataset
-        The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
-        ``lag_noise_amplification`` [1], each by band; a known noise must be multiplied by the
-        latter.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
-        or a time constant is not finite and positive or a band has none.
+    Of stage `corrected` of `schema`, after `mark_shutter`, for a repeated frame is no measurement,
+    and the time constant of the pixels [s], of all bands or (band), by name: the dataset with other
+    `counts` [count], and the attributes ``lag_time_constant`` [s] and ``lag_noise_amplification``
+    [1], each by band; a known noise must be multiplied by the latter. TypeError or ValueError if
+    there are fewer than two frames, the lag was undone before, the counts are whole numbers, or a
+    time constant is not finite and positive or a band has none.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:
@@ -58,11 +43,12 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
             # z_n = I_n + (I_n - I_n-1) a / (1 - a): a correction that is small where the lag is.
             gain = old[band, frame - 1] / new[band, frame - 1]
             signal[band, frame] = movie[frame] + (movie[frame] - movie[frame - 1]) * gain
-    middle = np.median(np.diff(counts["time"].values.astype(np.float64)))
     constants = _time_constants(time_constant, counts)
+    ratio = np.median(np.diff(counts["time"].values.astype(np.float64))) / constants
+    # z = (I_n - a I_n-1) / (1 - a), of independent noises: sqrt(1 + a^2) / (1 - a).
+    amplification = np.hypot(1.0, np.exp(-ratio)) / -np.expm1(-ratio)
     return corrected.assign(counts=(counts.dims, signal, counts.attrs)).assign_attrs(
-        lag_time_constant=constants.tolist(),
-        lag_noise_amplification=_noise_amplification(middle / constants).tolist(),
+        lag_time_constant=constants.tolist(), lag_noise_amplification=amplification.tolist()
     )
 
 
@@ -84,8 +70,7 @@ def lag_coefficients(
 def undo_drift(
     corrected: xr.Dataset, reference: xr.DataArray, *, order: int = 5, lazy: bool = False
 ) -> xr.Dataset:
-    r"""
-    Subtract from all of a band the drift that a patch of constant temperature shows.
+    r"""Subtract from all of a band the drift that a patch of constant temperature shows.
 
     The patch's mean is smoothed by polynomials in time, in each segment between two shutter events
     by itself, and
@@ -98,29 +83,13 @@ def undo_drift(
     the ends of a polynomial: 0.11 counts for 100 pixels of 4 counts and 350 frames. A motion in
     front of the patch, or reflected in it, is taken for drift.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, after `mark_shutter` if there were shutter events.
-    reference : DataArray
-        True on the patch, (y, x), bool: a blackbody, a wall. Pixels with a `status` are left out.
-    order : int
-        Number of polynomials in a segment, the constant included.
-    lazy : bool
-        As in `correct_capture`.
-
-    Returns
-    -------
-    Dataset
-        The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted;
-        and the attributes ``drift_order`` and ``drift_pixels``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the drift was undone before, the reference is no boolean of its pixels or marks no good
-        pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are
-        not.
+    Of stage `corrected` of `schema`, after `mark_shutter` if there were shutter events; a reference
+    (y, x), bool, true on the patch, a blackbody, a wall, of which pixels with a `status` are left
+    out; the number of polynomials in a segment, the constant included; and `lazy` as in
+    `correct_capture`: the dataset with other `counts` [count]; `drift` (band, time) [count], which
+    was subtracted; and the attributes ``drift_order`` and ``drift_pixels``. TypeError or ValueError
+    if the drift was undone before, the reference is no boolean of its pixels or marks no good
+    pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are not.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:
@@ -159,12 +128,6 @@ def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -
         return planck.require_positive("time_constant [s]", time_constant.values[places])
     value = planck.require_positive("time_constant [s]", time_constant)
     return np.full(len(names), float(value))
-
-
-def _noise_amplification(ratio: Array) -> Array:
-    """Factor of white noise when the lag is undone, by interval over time constant [1]."""
-    # z = (I_n - a I_n-1) / (1 - a), of independent noises: sqrt(1 + a^2) / (1 - a).
-    return np.asarray(np.hypot(1.0, np.exp(-ratio)) / -np.expm1(-ratio))
 
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:

@@ -6,8 +6,13 @@ from the `origin` and `radiometric` attributes of its data. `drawing` has the pa
 """
 
 from dbthermal.figures import drawing
-from dbthermal.figures._calibration import gain_offset_maps, response_fit
-from dbthermal.figures._emissivity import condition_matrix, emissivity_bars, emissivity_by_contact
+from dbthermal.figures._calibration import (
+    condition_matrix,
+    emissivity_bars,
+    emissivity_by_contact,
+    gain_offset_maps,
+    response_fit,
+)
 from dbthermal.figures._limits import plan
 from dbthermal.figures._live import LiveFigure, Panel
 from dbthermal.figures._scenes import (
@@ -38,7 +43,4 @@ __all__ = [
     "status",
     "truth_and_estimate",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

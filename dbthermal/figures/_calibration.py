@@ -1,10 +1,11 @@
-"""Figures of the calibration: gain and offset of the pixels, response of the bands."""
+"""Figures of the calibration: gain and offset of the pixels, response and emissivity of bands."""
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from scipy.constants import zero_Celsius
 
+from dbthermal._coordinates import laid_on
 from dbthermal.figures.drawing import (
     COLORS,
     band_label,
@@ -16,18 +17,9 @@ from dbthermal.figures.drawing import (
 
 
 def gain_offset_maps(correction: xr.Dataset) -> Figure:
-    """
-    Maps of gain and offset, one row per band, with the bad pixels marked.
+    """Maps of gain and offset, one row per band, with the bad pixels marked.
 
-    Parameters
-    ----------
-    correction : Dataset
-        From `correction.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
-
-    Returns
-    -------
-    Figure
-        Maps and marks.
+    Of `gain` [1], `offset` [count] and `bad`, all (band, y, x), from `correction.fit_correction`.
     """
     bands = correction["band"].values
     figure, axes = canvas(len(bands), 2, (8.0, 2.8 * len(bands)))
@@ -46,22 +38,13 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
 
 
 def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
-    """
-    Response of each band with the residuals of both fits.
+    """Response of each band with the residuals of both fits.
 
-    Parameters
-    ----------
-    response : Dataset
-        From `calibration.fit_response`.
-    fine : DataArray
-        Fitted counts (band, temperature) on a fine grid of temperatures, from `response.counts`.
-
-    Returns
-    -------
-    Figure
-        From above: counts over temperature, the line's residuals, and those of the
-        Sakuma-Hattori curve on a scale of their own, with the noise of one pixel and frame where
-        the response has it; residuals and noise over the slope of the line.
+    Of a response from `calibration.fit_response`, and the fitted counts (band, temperature) on a
+    fine grid of temperatures, from `response.counts`. From above: counts over temperature, the
+    line's residuals, and those of the Sakuma-Hattori curve on a scale of their own, with the noise
+    of one pixel and frame where the response has it; residuals and noise over the slope of the
+    line.
     """
     bands = response["band"].values
     figure, axes = canvas(3, len(bands), (4.6 * len(bands), 7.2))
@@ -87,4 +70,81 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
         for axis in (middle, bottom):
             axis.axhline(0.0, color="0.7", linewidth=0.8)
     figure.suptitle("Camera response" + provenance_note(response))
+    return figure
+
+
+def emissivity_bars(table: xr.Dataset) -> Figure:
+    """Band emissivities (material, band) [1] as bars, one group per material."""
+    materials, bands = table["material"].values, table["band"].values
+    figure, ((axis,),) = canvas(1, 1, (max(7.0, 0.62 * len(materials)), 4.6))
+    width = 0.8 / len(bands)
+    for index, band in enumerate(bands):
+        place = np.arange(len(materials)) + width * (index - (len(bands) - 1) / 2)
+        values = table["emissivity"].sel(band=band)
+        axis.bar(place, values, width, color=COLORS[index % len(COLORS)], label=band_label(band))
+    axis.margins(x=0.01)
+    axis.set_xticks(np.arange(len(materials)), materials, rotation=45, ha="right", fontsize=8)
+    axis.set(ylabel="band emissivity [1]", ylim=(0, 1.12))
+    axis.legend(frameon=False, ncols=len(bands), loc="upper center", fontsize=8)
+    axis.set_title("Planck-weighted band emissivity" + provenance_note(table))
+    return figure
+
+
+def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
+    """Condition number of the emissivity matrix for every pair of bands, with its numbers.
+
+    (first, second) [1], averaged over a number of materials; NaN or infinite on the diagonal.
+    """
+    figure, ((axis,),) = canvas(1, 1, (5.4, 4.6))
+    values = np.where(np.isfinite(summary.values), summary.values, np.nan)
+    drawn = axis.imshow(values, cmap="viridis_r")
+    middle = np.mean(limits_of(summary.copy(data=values)))
+    for row, column in np.ndindex(*values.shape):
+        if np.isfinite(values[row, column]):
+            color = "white" if values[row, column] > middle else "black"
+            axis.text(
+                column, row, f"{values[row, column]:.0f}", ha="center", va="center", color=color
+            )
+    for setter, dim in ((axis.set_xticks, "second"), (axis.set_yticks, "first")):
+        setter(np.arange(summary.sizes[dim]), [band_label(name) for name in summary[dim].values])
+    figure.colorbar(drawn, ax=axis, label="condition number [1]")
+    statistic = summary.attrs.get("statistic", "average")
+    axis.set_title(
+        f"Condition number of band pairs\n({statistic} of {materials} materials; low is good)"
+        + provenance_note(summary)
+    )
+    return figure
+
+
+def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
+    """Emissivities from thermocouple and blackbody with their standard deviations.
+
+    One point per band and material, of `emissivity` and `emissivity_std` (material, band) [1], with
+    tabulated values (material, band) [1] as crosses: of a simulation the truth.
+    """
+    figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
+    if table is not None:
+        table = laid_on(table, measured, "the table", "what was measured")
+    place = np.arange(measured.sizes["material"])
+    bands = measured["band"].values
+    for index, band in enumerate(bands):
+        here = measured.sel(band=band)
+        shifted = place + 0.14 * (index - (len(bands) - 1) / 2)
+        axis.errorbar(
+            shifted,
+            here["emissivity"],
+            here["emissivity_std"],
+            fmt="o",
+            markersize=4,
+            capsize=3,
+            color=COLORS[index],
+            label=band_label(band),
+        )
+        if table is not None:
+            label = "table" if index == 0 else None
+            axis.plot(shifted, table.sel(band=band), "x", color="black", markersize=7, label=label)
+    axis.set_xticks(place, [str(name).replace(" ", "\n") for name in measured["material"].values])
+    axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
+    figure.legend(frameon=False, loc="outside right center", fontsize=8)
+    axis.set_title("Emissivity by contact, one standard deviation" + provenance_note(measured))
     return figure

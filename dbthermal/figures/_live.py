@@ -50,20 +50,10 @@ class _Artists:
 
 
 class LiveFigure:
-    """
-    Figure whose pictures and texts are replaced while it stays the same.
+    """Figure whose pictures and texts are replaced while it stays the same.
 
-    Parameters
-    ----------
-    bands : sequence of str
-        Their names, in the order of the pictures.
-    shape : tuple of int
-        Rows and columns of every picture [pixel].
-
-    Attributes
-    ----------
-    figure : Figure
-        Of matplotlib.
+    Of bands by their names, in the order of the pictures, and of the rows and columns of every
+    picture [pixel]; `figure` is that of matplotlib.
 
     Examples
     --------

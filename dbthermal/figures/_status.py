@@ -45,24 +45,11 @@ _RIGHT: Final = "#a8d5b0"
 
 
 def status(result: xr.Dataset) -> Figure:
-    """
-    Map of the pixels without a flag, and of the most decisive flag of the others, in words.
+    """Map of the pixels without a flag, and of the most decisive flag of the others, in words.
 
-    Parameters
-    ----------
-    result : Dataset
-        From `separation.solve` or `complete`: `status` (y, x), bits of `schema.Status`.
-
-    Returns
-    -------
-    Figure
-        A map with a colour for each flag that is the first of a pixel's, in the order of `REASONS`,
-        and its share.
-
-    Raises
-    ------
-    ValueError
-        If a bit is not one of `schema.Status`.
+    Of a result of `separation.solve` or `complete` with `status` (y, x), bits of `schema.Status`
+    (ValueError for other bits): a map with a colour for each flag that is the first of a pixel's,
+    in the order of `REASONS`, and its share.
 
     Examples
     --------

@@ -22,16 +22,13 @@ __all__ = [
     "plain_ticks",
     "provenance_note",
 ]
+__dir__ = __all__.copy
 
 COLORS: Final = ("#1b6ca8", "#d1495b", "#66a182", "#edae49", "#6c4f77")
 """Colours of the bands, in their order."""
 
 MARKERS: Final = "osD^vPX*"
 """Markers of lines, in their order."""
-
-
-def __dir__() -> list[str]:
-    return __all__
 
 
 def canvas(
@@ -44,37 +41,15 @@ def canvas(
 
 
 def band_label(name: object) -> str:
-    """
-    Label of a band, with its unit.
-
-    Parameters
-    ----------
-    name : object
-        Name of the band.
-
-    Returns
-    -------
-    str
-        E.g. "9.5 um", with a micro sign.
-    """
+    """Label of a band by its name, with its unit: "9.5 um", with a micro sign."""
     return f"{name} \N{MICRO SIGN}m"
 
 
 def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
-    """
-    Origin of the data in brackets, for a title.
+    """Origin of the data in brackets, for a title: " (simulated)", " (not radiometric)", or empty.
 
-    Parameters
-    ----------
-    data : Dataset or DataArray
-        With the attributes `origin` ("simulated", "measured", ...), `twin` (name of the scene
-        that a simulation is a twin of) and `radiometric` (0 if the values are a picture's and
-        not counts).
-
-    Returns
-    -------
-    str
-        E.g. " (simulated)" or " (not radiometric)"; empty for measured radiometric data.
+    By their attributes `origin` ("simulated", "measured", ...), `twin` (name of the scene that a
+    simulation is a twin of) and `radiometric` (0 if the values are a picture's and not counts).
     """
     notes = []
     origin = str(data.attrs.get("origin", ""))
@@ -95,21 +70,10 @@ def draw_image(
     cmap: str = "inferno",
     limits: tuple[float, float] | None = None,
 ) -> None:
-    """
-    Draw an image with its colour bar; pixels without a value are gray.
+    """Draw an image (y, x) with its colour bar; pixels without a value are gray.
 
-    Parameters
-    ----------
-    figure, axis : Figure, Axes
-        Where to draw.
-    image : DataArray
-        (y, x).
-    title, label : str
-        Title, and label of the colour bar with its unit.
-    cmap : str
-        Colour map.
-    limits : tuple of float, optional
-        Values at the ends of the colour map; the image's own if not given.
+    The label is that of the colour bar, with its unit; `limits` are the values at the ends of the
+    colour map, the image's own if not given.
     """
     lowest, highest = limits if limits is not None else (None, None)
     drawn = axis.imshow(image.values, cmap=cmap, vmin=lowest, vmax=highest, interpolation="nearest")

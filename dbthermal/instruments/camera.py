@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from types import MappingProxyType
 from typing import Final, Protocol
 
@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import _text as texts
+from dbthermal.schema import Flags
 
 __all__ = [
     "DAMAGED",
@@ -29,7 +30,6 @@ __all__ = [
     "FRAME_TIMEOUT",
     "GOOD",
     "KINDS",
-    "MEANINGS",
     "UNTIMED",
     "CameraControl",
     "CameraKind",
@@ -49,6 +49,7 @@ __all__ = [
     "camera_kind",
     "next_shutter",
 ]
+__dir__ = __all__.copy
 
 Counts = npt.NDArray[np.uint16]
 Identity = Mapping[str, str | bool]
@@ -67,48 +68,28 @@ FFC_READING: Final = "ffc "
 """Prefix of the name of a reading of the `FfcStatus`; the band follows."""
 
 KINDS: Final = MappingProxyType(
-    {
-        "boson": "dbthermal.instruments.boson",
-        "y16": "dbthermal.instruments.y16",
-    }
+    {"boson": "dbthermal.instruments.boson", "y16": "dbthermal.instruments.y16"}
 )
 """Module of each kind of camera; its ``KIND`` is a `CameraKind`."""
 
 
-class FrameFlag(IntFlag):
-    """State of one frame; `MEANINGS` has a sentence for each bit."""
+class FrameFlag(Flags):
+    """State of one frame; the driver sets the first three bits, the recorder the others."""
 
-    DRIVER_ERROR = 1
-    WRONG_SIZE = 2
-    FOREIGN_CLOCK = 4
-    SHUTTER_CLOSED = 8
-    FRAMES_LOST_BEFORE = 16
-    SEQUENCE_STANDS = 32
-    TIME_STANDS = 64
-    TIME_WRONG = 128
-    PADDED = 256
-    IMAGE_REPEATED = 512
+    DRIVER_ERROR = 1, "the driver reports damaged data"
+    WRONG_SIZE = 2, "fewer or more bytes than a frame has: missing ones are 0"
+    FOREIGN_CLOCK = 4, "the device time is not on the host's monotonic clock"
+    SHUTTER_CLOSED = 8, "the shutter is closed, or the offsets were just renewed"
+    FRAMES_LOST_BEFORE = 16, "the sequence number leaps: frames are missing before it"
+    SEQUENCE_STANDS = 32, "the sequence number does not rise: repeated, or started anew"
+    TIME_STANDS = 64, "the device time does not rise, or is not known"
+    TIME_WRONG = 128, "the device time is before the start, or after the host's"
+    PADDED = 256, "no frame: the band has fewer than another, and its last one is repeated"
+    IMAGE_REPEATED = 512, "no pixel differs from the frame before: frozen, or saturated"
 
 
 GOOD: Final = FrameFlag(0)
 """No flag."""
-
-MEANINGS: Final = MappingProxyType(
-    {
-        FrameFlag.DRIVER_ERROR: "the driver reports damaged data",
-        FrameFlag.WRONG_SIZE: "fewer or more bytes than a frame has: missing ones are 0",
-        FrameFlag.FOREIGN_CLOCK: "the device time is not on the host's monotonic clock",
-        FrameFlag.SHUTTER_CLOSED: "the shutter is closed, or the offsets were just renewed",
-        FrameFlag.FRAMES_LOST_BEFORE: "the sequence number leaps: frames are missing before it",
-        FrameFlag.SEQUENCE_STANDS: "the sequence number does not rise: repeated, or started anew",
-        FrameFlag.TIME_STANDS: "the device time does not rise, or is not known",
-        FrameFlag.TIME_WRONG: "the device time is before the start, or after the host's",
-        FrameFlag.PADDED: "no frame: the band has fewer than another, and its last one is repeated",
-        FrameFlag.IMAGE_REPEATED: "no pixel differs from the frame before: frozen, or saturated",
-    }
-)
-"""The first three are set by the driver, the others by the recorder, which sees the frame before.
-"""
 
 UNTIMED: Final = (
     FrameFlag.DRIVER_ERROR
@@ -175,8 +156,7 @@ class Metadata:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """
-    One frame as it came.
+    """One frame as it came.
 
     No driver writes to the counts again. A leap of the sequence number is a loss. Metadata are
     missing without telemetry, or if the frame is damaged.
@@ -261,12 +241,6 @@ class CameraControl(Protocol):
     def fpa_temperature(self) -> float:
         """Temperature of the focal-plane array [K]."""
 
-    def ffc_mode(self) -> FfcMode:
-        """Trigger of a flat-field correction."""
-
-    def gain_mode(self) -> GainMode:
-        """Sensitivity."""
-
     def close(self) -> None:
         """Release the port; a second call does nothing."""
 
@@ -277,8 +251,7 @@ OpenControl = Callable[[str, object | None], AbstractContextManager[CameraContro
 
 @dataclass(frozen=True)
 class CameraKind:
-    """
-    One kind of camera, as its module names it in ``KIND``.
+    """One kind of camera, as its module names it in ``KIND``.
 
     `open_frames` opens the frames of a hardware address in a format, `open_control` the command
     port of an address, given the emulated bench or None.
@@ -315,41 +288,27 @@ def next_shutter(
     last_ffc_frame: int | None = None,
     ffc_status: FfcStatus | None = None,
 ) -> Shutter:
-    """
-    State of a camera's shutter after one more frame, from telemetry, serial line and image.
+    """State of a camera's shutter after one more frame, from telemetry, serial line and image.
 
     A camera freezes its image while the shutter is closed. A frame counts as closed if
 
     - by its telemetry the offsets were renewed since the frame before (`last_ffc_frame`
       changed), be it at the start or at the end of the correction: then one frame more is lost, but
       no renewal is missed, even where the frozen frames were lost on the way; or
-    - it repeats the image, and the frame before counted as closed, or by the serial line a
-      correction is imminent or in progress (a reading is older than its frame, so that it does not
-      count against an image that changes); or
+    - it repeats the image (no pixel differs), and the frame before counted as closed, or by the
+      serial line a correction is imminent or in progress (a reading is older than its frame, so
+      that it does not count against an image that changes); or
     - it is the `FEWEST_COPIES`-th copy in a row or a later one, of a camera without telemetry. A
       serial line alone may miss an event: it is read once a second, and stalls meanwhile.
 
-    The flag is per band and frame, and is known with the frame. It marks an event, not
-    always from its first copy: `dbthermal.correction.find_shutter(capture, closed=...)` takes
-    ``(frame_flags & SHUTTER_CLOSED) != 0`` (band, time) as `closed`, and every run of copies that
-    holds or touches a flagged frame becomes one event with renewed offsets, which
-    `dbthermal.correction.mark_shutter` takes out.
+    The flag is per band and frame, and is known with the frame. It marks an event, not always from
+    its first copy: `dbthermal.correction.find_shutter(capture, closed=...)` takes ``(frame_flags &
+    SHUTTER_CLOSED) != 0`` (band, time) as `closed`, and every run of copies that holds or touches a
+    flagged frame becomes one event with renewed offsets, which `dbthermal.correction.mark_shutter`
+    takes out.
 
-    Parameters
-    ----------
-    before : Shutter
-        After the frame before; ``Shutter()`` before the first.
-    repeated : bool
-        No pixel differs from the frame before.
-    last_ffc_frame : int, optional
-        From the frame's telemetry (`Metadata`); None without any, or if the frame is damaged.
-    ffc_status : FfcStatus, optional
-        Latest reading of the serial line; None without any, or if it is too old.
-
-    Returns
-    -------
-    Shutter
-        After this frame.
+    `last_ffc_frame` is None without telemetry, or if the frame is damaged, and `ffc_status` without
+    a reading of the serial line, or if it is too old.
     """
     known = before.last_ffc_frame if last_ffc_frame is None else last_ffc_frame
     renewed = before.last_ffc_frame not in {None, known}
@@ -358,7 +317,3 @@ def next_shutter(
     frozen = known is None and copies >= FEWEST_COPIES
     closed = renewed or (repeated and (before.closed or announced or frozen))
     return Shutter(closed, copies, known)
-
-
-def __dir__() -> list[str]:
-    return __all__

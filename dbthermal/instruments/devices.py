@@ -37,6 +37,7 @@ from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 
 __all__ = ["Devices", "ReadingError", "Thermocouples", "open_devices"]
+__dir__ = __all__.copy
 
 SCAN_AGE: Final = 1.0
 """Longest time for which a scan of all thermocouples gives the readings of its channels [s]."""
@@ -44,11 +45,8 @@ SCAN_AGE: Final = 1.0
 FLUSH_TIMEOUT: Final = 2.0
 """Longest time in which the frames that a driver holds are read and discarded [s]."""
 
-WHEEL: Final = "filter_wheel"
-"""Name of the wheel, and of the reading of its slot."""
-
-THERMOCOUPLE: Final = "T"
-"""Letter of the rig's thermocouples."""
+WHEEL: Final = "filter_wheel"  # name of the wheel, and of the reading of its slot
+THERMOCOUPLE: Final = "T"  # letter of the rig's thermocouples
 
 
 class ReadingError(RuntimeError):
@@ -57,8 +55,7 @@ class ReadingError(RuntimeError):
 
 @dataclass
 class Thermocouples:
-    """
-    The logger's channels, of which one scan gives the readings of all.
+    """The logger's channels, of which one scan gives the readings of all.
 
     `names` maps channel to the place of its tip; `clock` is the host's [s], that of the logger.
     """
@@ -73,8 +70,7 @@ class Thermocouples:
         self._read: set[int] = set()
 
     def read(self, channel: int) -> float:
-        """
-        Temperature of one channel [K]; each reading of a channel is a measurement of its own.
+        """Temperature of one channel [K]; each reading of a channel is a measurement of its own.
 
         `ReadingError` if it is no temperature, or the logger fails.
         """
@@ -112,8 +108,7 @@ class Devices:
     thermocouples: Thermocouples | None = None  # readings of the logger
 
     def readings(self) -> dict[str, Reading]:
-        """
-        Instruments that are read beside the frames, for `recording.record`.
+        """Instruments that are read beside the frames, for `recording.record`.
 
         Each thermocouple by its name [K]; ``fpa <band>``, the temperature of the focal-plane array
         [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam. They
@@ -131,8 +126,7 @@ class Devices:
         return readings
 
     def identities(self) -> dict[str, Identity]:
-        """
-        Names and numbers of the devices, for the record of a recording.
+        """Names and numbers of the devices, for the record of a recording.
 
         Keys are the bands, ``filter_wheel`` and ``thermocouples``; each says ``is_simulated``.
         ValueError if frames and command port of a band are those of two cameras; RuntimeError or
@@ -177,8 +171,7 @@ class Devices:
             camera.run_ffc()
 
     def select(self, band: str) -> "Devices":
-        """
-        Turn one of the session's filters into the beam; as `FilterWheel.select`.
+        """Turn one of the session's filters into the beam; as `FilterWheel.select`.
 
         Returns the same devices, of which the camera behind the wheel is that of this band;
         ValueError if the session has no wheel, or no such filter.
@@ -199,8 +192,7 @@ class Devices:
         )
 
     def flush(self) -> None:
-        """
-        Discard the frames that the drivers hold, which show the scene as it was before.
+        """Discard the frames that the drivers hold, which show the scene as it was before.
 
         `SourceLostError` if a camera is gone.
         """
@@ -221,28 +213,16 @@ def open_devices(
     world: Any = None,
     pictures: Mapping[str, Callable[[float], Counts]] | None = None,
 ) -> Iterator[Devices]:
-    """
-    Open the devices of a session: the real ones, or, by its one switch, the emulated ones.
+    """Open the devices of a session: the real ones, or, by its one switch, the emulated ones.
 
     Addresses are ``v4l2:///dev/video0``, ``serial:///dev/ttyACM0`` and ``tc08:``; and in an
     emulated session ``sim://<kind>/<name>``, with the kind of camera and its name in the world, for
     frames and commands alike, ``sim://apt/<any>`` and ``sim://tc08``.
 
-    Parameters
-    ----------
-    session : Session
-        Description of the devices.
-    world : `emulated.world.World`, optional
-        The emulated bench; by default one at room temperature.
-    pictures : mapping, optional
-        Band to the counts that an emulated camera sees in it, at a time of the scene [s]; by
-        default, with the default world, its blackbody, see
-        `dbthermal.instruments.emulated.blackbody`.
-
-    Yields
-    ------
-    Devices
-        Closed in the end.
+    `world` is the emulated bench, an `emulated.world.World`, by default one at room temperature,
+    and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
+    [s]; by default, with the default world, its blackbody, see
+    `dbthermal.instruments.emulated.blackbody`. The devices are closed in the end.
 
     Raises
     ------
@@ -348,7 +328,3 @@ def _require_same(band: str, source: Identity, control: Identity) -> None:
             f"Invalid cameras {numbers} of band '{band}': frames come from the first, commands go "
             "to the second. Must be one camera."
         )
-
-
-def __dir__() -> list[str]:
-    return __all__

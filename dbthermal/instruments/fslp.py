@@ -28,6 +28,7 @@ __all__ = [
     "encode",
     "next_sequence",
 ]
+__dir__ = __all__.copy
 
 COMMAND_CHANNEL: Final = 0x00
 """Channel of commands and their replies; a receiver discards the frames of all others."""
@@ -76,29 +77,11 @@ def encode(
     *,
     channel: int = COMMAND_CHANNEL,
 ) -> bytes:
-    """
-    Bytes of a frame, ready to send.
+    """Bytes of a frame, 17 or more, ready to send.
 
     Header, data and checksum are all escaped, so that start and end bytes occur nowhere else.
-
-    Parameters
-    ----------
-    sequence, command, status : int
-        As in `Frame`, each in [0, 2^32).
-    data : bytes
-        At most `MAXIMUM_DATA` bytes.
-    channel : int
-        In [0, 256).
-
-    Returns
-    -------
-    bytes
-        17 bytes or more.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a number is not whole, or does not fit its field, or there are too many data.
+    Numbers are as in `Frame`: sequence, command and status in [0, 2^32), the channel in [0, 256),
+    and at most `MAXIMUM_DATA` bytes of data; TypeError or ValueError for any other.
 
     Examples
     --------
@@ -127,8 +110,7 @@ def _escaped(content: bytes) -> bytes:
 
 
 def next_sequence(sequence: int) -> int:
-    """
-    Sequence number that follows another, with no byte that would be escaped.
+    """Sequence number that follows another, with no byte that would be escaped.
 
     The vendor's software avoids such numbers too, perhaps because one of its receivers does not
     unescape the header. The numbers increase, so that none returns within 32 bits.
@@ -142,8 +124,7 @@ def next_sequence(sequence: int) -> int:
 
 
 class Decoder:
-    """
-    Finds the frames in a stream of bytes, however it is cut into pieces.
+    """Finds the frames in a stream of bytes, however it is cut into pieces.
 
     Bytes between frames are ignored. A start byte always begins anew. A frame that is cut short,
     too long or too short, holds an illegal escape or has the wrong checksum is dropped and counted
@@ -211,7 +192,3 @@ class Decoder:
         """Give up the open frame."""
         self.damaged += 1
         self._content, self._escaping = None, False
-
-
-def __dir__() -> list[str]:
-    return __all__

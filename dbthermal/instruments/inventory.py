@@ -23,6 +23,7 @@ import usb.util
 from serial.tools import list_ports
 
 __all__ = ["KINDS", "Device", "Kind", "LibusbMissingError", "describe", "find"]
+__dir__ = __all__.copy
 
 
 @dataclass(frozen=True)
@@ -65,25 +66,13 @@ class LibusbMissingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Device:
-    """
-    One device that is plugged in.
+    """One device that is plugged in.
 
-    Attributes
-    ----------
-    kind : Kind
-        Its type.
-    bus : int
-        Number of its bus.
-    ports : tuple of int
-        Port of each hub on the way, the root's first.
-    speed : str
-        One of `SPEEDS`, or ``"unknown"``.
-    serial : str or None
-        USB serial number; from its serial port where the device itself may not be opened.
-    video_nodes, serial_nodes : tuple of str
-        ``/dev/video0``, ``/dev/ttyACM0``. A camera has several video nodes, one with images.
-    warnings : tuple of str
-        Obstacles to its use, each with the remedy.
+    `bus` is the number of its bus, `ports` the port of each hub on the way, the root's first,
+    `speed` one of `SPEEDS` or ``"unknown"``; `serial` its USB serial number, from its serial port
+    where the device itself may not be opened. Of its nodes, ``/dev/video0`` and ``/dev/ttyACM0``, a
+    camera has several for video, one with images. `warnings` are obstacles to its use, each with
+    the remedy.
     """
 
     kind: Kind
@@ -113,31 +102,12 @@ def find(
     dev: Path = Path("/dev"),
     frame_rate: float = 60.0,
 ) -> list[Device]:
-    """
-    List the rig's devices that are plugged in.
+    """List the rig's devices that are plugged in, in the order of `KINDS`, then of bus and ports.
 
-    Parameters
-    ----------
-    backend : IBackend, optional
-        Backend of pyusb; by default the libusb that is installed.
-    serial_ports : iterable of ListPortInfo, optional
-        Serial ports; by default those that pyserial lists.
-    sysfs, dev : Path
-        Linux's trees of devices and nodes; replaced in tests.
-    frame_rate : float
-        Frame rate of the cameras [Hz], for the bandwidth.
-
-    Returns
-    -------
-    list of Device
-        In the order of `KINDS`, then of bus and ports; empty if nothing is plugged in.
-
-    Raises
-    ------
-    LibusbMissingError
-        If no backend is given and no libusb is installed.
-    usb.core.USBError
-        If the bus itself cannot be listed.
+    By default with the libusb that is installed as the `backend` of pyusb, and the serial ports
+    that pyserial lists; these and Linux's trees of devices and nodes are replaced in tests. The
+    frame rate of the cameras [Hz] is for the bandwidth. LibusbMissingError without a libusb,
+    usb.core.USBError if the bus itself cannot be listed.
     """
     terminals = list(list_ports.comports() if serial_ports is None else serial_ports)
     devices = []
@@ -152,8 +122,7 @@ def find(
 
 
 def describe(devices: Iterable[Device]) -> str:
-    """
-    Text with a line for each device, its warnings below it, and one for each missing kind.
+    """Text with a line for each device, its warnings below it, and one for each missing kind.
 
     Examples
     --------
@@ -331,7 +300,3 @@ def _udev_advice(kind: Kind, subsystem: str) -> str:
         f"Type this, and plug it in again: echo '{rule}' | sudo tee -a {RULES} "
         "&& sudo udevadm control --reload"
     )
-
-
-def __dir__() -> list[str]:
-    return __all__

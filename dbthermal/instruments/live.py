@@ -37,11 +37,7 @@ if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does
     from dbthermal.figures import LiveFigure
 
 __all__ = ["Display", "Picture", "Status", "View", "Watch"]
-
-
-def __dir__() -> list[str]:
-    return __all__
-
+__dir__ = __all__.copy
 
 _WINDOW: Final = 3.0  # time over which a frame rate is measured [s]
 _PERIOD: Final = 1.0  # least time from picture to picture [s]; one takes a tenth of it
@@ -102,8 +98,7 @@ def _at(share: float, counts: int, meaning: str) -> str:
 
 
 class Watch:
-    """
-    Numbers of a recording while it goes on, from its previews.
+    """Numbers of a recording while it goes on, from its previews.
 
     `window` is the time over which frame rates are measured [s]; ValueError if not positive.
     """
@@ -242,24 +237,13 @@ class Picture:
 
 
 class View:
-    """
-    Live view: an instance is the `preview` of a recording, or of several.
+    """Live view: an instance is the `preview` of a recording, or of several.
 
     One update of two bands of 640 x 512 takes about a tenth of a second of one core; the fetching
-    threads go on meanwhile.
-
-    Parameters
-    ----------
-    display : Display, optional
-        Where it is shown; without one the figure is only kept.
-    is_simulated : bool
-        Whether the cameras are emulated; the title says so.
-    title : str
-        Name of the recording.
-    period : float
-        Least time from update to update [s], not negative.
-    window : float
-        Time over which frame rates are measured [s], positive.
+    threads go on meanwhile. It is shown on a `display`; without one the figure is only kept.
+    `title` is the name of the recording, beside which the figure says if it `is_simulated`;
+    `period` is the least time from update to update [s], not negative, and `window` that over which
+    frame rates are measured [s], positive.
 
     Examples
     --------

@@ -20,30 +20,15 @@ import numpy as np
 from dbthermal import store
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.recording import (
-    Limits,
-    Preview,
-    Summary,
-    record,
-)
+from dbthermal.instruments.recording import Limits, Preview, Summary, record
 from dbthermal.instruments.recording._capture import mean_reading
-from dbthermal.instruments.recording._sweep import (
-    BLACKBODY,
-    is_complete,
-    require_filter,
-    step_path,
-)
+from dbthermal.instruments.recording._sweep import BLACKBODY, is_complete, require_filter, step_path
 from dbthermal.instruments.session import Session
 
 __all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]
+__dir__ = __all__.copy
 
-
-def __dir__() -> list[str]:
-    return __all__
-
-
-STABILITY_PERIOD: Final = 1.0
-"""Time from reading to reading while a temperature is awaited [s]."""
+STABILITY_PERIOD: Final = 1.0  # time from reading to reading while a temperature is awaited [s]
 
 
 @dataclass(frozen=True)
@@ -65,8 +50,7 @@ def wait_stable(
     clock: Callable[[], float] = system_time.monotonic,
     sleep: Callable[[float], None] = system_time.sleep,
 ) -> float:
-    """
-    Wait until a temperature is stable near its set point [K], and return its mean [K].
+    """Wait until a temperature is stable near its set point [K], and return its mean [K].
 
     Within the session's `window` the readings must lie within its `stability` of one another, and
     their mean within its `tolerance` of the set point. TimeoutError after its `timeout`, ValueError
@@ -100,42 +84,27 @@ def record_sweep(
     limits: Limits | None = None,
     preview: Callable[[Preview], None] | None = None,
 ) -> list[Step]:
-    """
-    Record a blackbody at each of its temperatures, once it is stable, through each filter.
+    """Record a blackbody at each of its temperatures, once it is stable, through each filter.
 
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep,
     and a scene too is recorded after a correction. Recordings of this sweep that are in the folder
     and complete are kept, so that a sweep that was interrupted goes on where it was. If the folder
     is renamed or moved meanwhile the sweep goes on in it. Call `Devices.prepare` before.
 
-    Parameters
-    ----------
-    devices : Devices
-        Of a session with a blackbody, which the thermocouple of that name reads.
-    folder : str or Path
-        Where the recordings go: ``<name>_<step>_<band>.zarr``.
-    set_temperature : callable
-        Sets the blackbody [K], or asks the user to set it.
-    limits, preview : optional
-        As for `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of
-        the filter in the beam.
-
-    Returns
-    -------
-    list of Step
-        In the order of the session, with those that were recorded before.
+    Of the devices of a session with a blackbody, which the thermocouple of that name reads, and a
+    folder for the recordings ``<name>_<step>_<band>.zarr``; `set_temperature` sets the blackbody
+    [K], or asks the user to, and limits and preview are those of
+    `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of the filter
+    in the beam. The steps are in the order of the session, with those that were recorded before.
 
     Raises
     ------
     ValueError
         If the session has no blackbody, or no reading of it; or a recording exists that is
         incomplete, of another temperature, or during which the wheel turned.
-    TimeoutError
-        As `wait_stable`; the recordings before are kept.
-    SourceLostError
-        If a camera is lost on the way.
-    FileNotFoundError
-        If the folder was deleted meanwhile.
+    TimeoutError, SourceLostError, FileNotFoundError
+        As `wait_stable`, where the recordings before are kept; if a camera is lost on the way; if
+        the folder was deleted meanwhile.
     """
     session = devices.session
     readings = devices.readings()
@@ -168,22 +137,11 @@ def record_scene(
     preview: Callable[[Preview], None] | None = None,
     stop: threading.Event | None = None,
 ) -> Summary:
-    """
-    Record a scene with all devices; an emulated scene begins with the recording.
+    """Record a scene with all devices; an emulated scene begins with the recording.
 
-    Parameters
-    ----------
-    devices : Devices
-        Of any session; call `Devices.prepare` before.
-    path : str or Path
-        Folder ``*.zarr`` to make.
-    limits, preview, stop : optional
-        As for `dbthermal.instruments.recording.record`, whose errors it raises.
-
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames.
+    Of any session, after `Devices.prepare`, into a folder ``*.zarr`` to make; limits, preview, stop
+    and errors are those of `dbthermal.instruments.recording.record`. The summary says how it ended,
+    and the numbers of frames.
 
     Examples
     --------

@@ -58,11 +58,7 @@ from dbthermal.instruments import filterwheel, telemetry
 from dbthermal.instruments.camera import FFC_READING, FPA_READING, camera_kind
 
 __all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
-
-
-def __dir__() -> list[str]:
-    return __all__
-
+__dir__ = __all__.copy
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
@@ -183,8 +179,7 @@ class Wheel(filterwheel.Settings):
 
 @dataclass(frozen=True, config=_CHECKED)
 class Session:
-    """
-    Description of a recording: devices, procedure and duration; see the module.
+    """Description of a recording: devices, procedure and duration; see the module.
 
     All protocols but ``scene`` go through the blackbody's temperatures. Invalid values raise
     pydantic's ValidationError, a ValueError.
@@ -292,45 +287,14 @@ class Session:
         return device.simulated if self.simulated else device.hardware
 
     @classmethod
-    def from_yaml(cls, text: str) -> Self:
-        """
-        Read a session from YAML, see the module; ValueError as from `load`.
-
-        Examples
-        --------
-        >>> text = '''
-        ... {name: pot, simulated: true, protocol: scene, duration: 60, cameras: {"8-14":
-        ...   {video: {simulated: "sim://boson/wide", hardware: "v4l2:///dev/video0"}}}}
-        ... '''
-        >>> session = Session.from_yaml(text)
-        >>> session.url(session.cameras["8-14"].video)
-        'sim://boson/wide'
-        >>> Session.from_yaml(text.replace("60", "-60"))
-        Traceback (most recent call last):
-        ValueError: session: Invalid duration -60. Must be greater than 0.
-        """
-        return cls._checked(texts.parse_yaml(text, "session"), {}, "session")
-
-    @classmethod
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
-        """
-        Read a session from a file, and from the file that it names as its ``rig``.
+        """Read a session from YAML, see the module, and from the file that it names as its ``rig``.
 
-        Parameters
-        ----------
-        path : str or Path
-            YAML; see the module. Keys that several sessions share, such as the addresses, may stand
-            in another file, whose name relative to this one is the key ``rig``.
-        changes : mapping, optional
-            Values in place of those in the files, by key; of ``blackbody``, key by key.
-
-        Raises
-        ------
-        FileNotFoundError
-            If a file does not exist.
-        ValueError
-            If it is not YAML, or a key is missing, unknown, repeated or in both files, or a value
-            is invalid: one line for each error, with file, place in it, value and rule.
+        Keys that several sessions share, such as the addresses, may stand in another file, whose
+        name relative to this one is the key ``rig``. `changes` are values in place of those in the
+        files, by key; of ``blackbody``, key by key. FileNotFoundError if a file does not exist;
+        ValueError if it is not YAML, or a key is missing, unknown, repeated or in both files, or a
+        value is invalid: one line for each error, with file, place in it, value and rule.
         """
         content = texts.read_yaml(path)
         files = {}

@@ -13,11 +13,7 @@ from types import FrameType
 from typing import Any, Final
 
 __all__ = ["SignalExit", "raised_signals"]
-
-
-def __dir__() -> list[str]:
-    return __all__
-
+__dir__ = __all__.copy
 
 _ENDING: Final = tuple(
     number for name in ("SIGTERM", "SIGHUP") if (number := getattr(signal, name, None)) is not None
@@ -35,8 +31,7 @@ class SignalExit(SystemExit):
 
 @contextmanager
 def raised_signals() -> Iterator[None]:
-    """
-    Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
+    """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
 
     The first one is raised, those after it are passed over: a closed terminal sends several, and
     what is being closed must be left to end. Nothing changes in other threads, nor for a signal

@@ -31,6 +31,7 @@ from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.transport import Closing
 
 __all__ = ["ERRORS", "TC08", "Flag", "Identity", "Scan", "TC08Error", "load"]
+__dir__ = __all__.copy
 
 Library = Any
 """A library bound by `load`, or an object with the same functions, such as the emulated one.
@@ -117,17 +118,11 @@ class Flag(IntFlag):
 
 @dataclass(frozen=True)
 class Scan:
-    """
-    One reading of all nine channels; index 0 is the cold junction.
+    """One reading of all nine channels, of which index 0 is the cold junction.
 
-    Attributes
-    ----------
-    time : float
-        Middle of the scan on the host's clock [s]; the channels are converted one after another.
-    temperature : ndarray, shape (9,)
-        Temperature [K], NaN unless `flag` is 0.
-    flag : ndarray of uint8, shape (9,)
-        See `Flag`; channels that are off are `Flag.MISSING`.
+    `time` is the middle of the scan on the host's clock [s], for the channels are converted one
+    after another; `temperature` (9,) [K] is NaN unless the `flag` (9,) is 0: see `Flag`; channels
+    that are off are `Flag.MISSING`.
     """
 
     time: float
@@ -148,15 +143,10 @@ class Identity:
 
 
 class TC08(Closing):
-    """
-    A TC-08, for one thread at a time; opened by `from_url`, `open` or ``with``.
+    """A TC-08, for one thread at a time; opened by `from_url`, `open` or ``with``.
 
-    Parameters
-    ----------
-    library : Library
-        From `load`, or an emulated one.
-    clock, sleep : callable
-        The host's clock [s], and waiting [s]; replaced in tests.
+    The library is from `load`, or an emulated one; the host's clock [s] and its sleep are replaced
+    in tests.
     """
 
     def __init__(
@@ -173,23 +163,12 @@ class TC08(Closing):
 
     @classmethod
     def from_url(cls, url: str = "tc08:", *, world: object | None = None) -> Self:
-        """
-        Load the library and open the first free unit.
+        """Load the library and open the first free unit.
 
-        Parameters
-        ----------
-        url : str
-            ``tc08:``, the library being found as by `load`, or ``sim://tc08`` for an emulated
-            unit. No address names a library: only the variable `ENVIRONMENT` does.
-        world : object, optional
-            Emulated bench, needed for ``sim://tc08`` alone.
-
-        Raises
-        ------
-        ValueError
-            If the URL is another one, or the world is missing, or given to a real unit.
-        OSError, TC08Error, TimeoutError
-            As `load` and `open`.
+        The address is ``tc08:``, the library being found as by `load`, or ``sim://tc08`` for a unit
+        of an emulated bench, the `world`. No address names a library: only the variable
+        `ENVIRONMENT` does. ValueError if it is another one, or the world is missing, or given to a
+        real unit; else the errors of `load` and `open`.
 
         Examples
         --------
@@ -217,15 +196,10 @@ class TC08(Closing):
         return bool(getattr(self._library, "is_simulated", False))
 
     def open(self, *, timeout: float = OPEN_TIMEOUT) -> Self:
-        """
-        Open the first free unit, within `timeout` [s].
+        """Open the first free unit, within `timeout` [s].
 
-        Raises
-        ------
-        RuntimeError, ConnectionError
-            If it is open already, or no unit is free.
-        TC08Error, TimeoutError
-            If the library reports an error, or the firmware is not downloaded in time.
+        RuntimeError or ConnectionError if it is open already, or no unit is free; TC08Error or
+        TimeoutError if the library reports an error, or the firmware is not downloaded in time.
         """
         if self._handle:
             raise RuntimeError("The TC-08 is open already. Must be closed first.")
@@ -250,8 +224,7 @@ class TC08(Closing):
         return self
 
     def close(self) -> None:
-        """
-        Close the unit; a second call does nothing.
+        """Close the unit; a second call does nothing.
 
         TC08Error if the library could not, as after unplugging; the unit counts as closed.
         """
@@ -275,21 +248,11 @@ class TC08(Closing):
         return Identity(serial, date, driver, *versions, self.is_simulated)
 
     def set_channels(self, kinds: Mapping[int, str]) -> None:
-        """
-        Set the type of each thermocouple; all other sockets are switched off.
+        """Set the type of each thermocouple, a letter of B E J K N R S T by its channel, 1 to 8.
 
-        Parameters
-        ----------
-        kinds : mapping
-            Channel, 1 to 8, to the type's letter, one of B E J K N R S T. The cold junction is
-            always read.
-
-        Raises
-        ------
-        ValueError
-            If a channel or a letter is another one, or no channel is given.
-        TC08Error, RuntimeError
-            If the library fails, or the unit is not open.
+        All other sockets are switched off; the cold junction is always read. ValueError if a
+        channel or a letter is another one, or no channel is given; TC08Error or RuntimeError if the
+        library fails, or the unit is not open.
         """
         if not kinds:
             raise ValueError("Invalid channels {}. Must be one at least.")
@@ -309,13 +272,10 @@ class TC08(Closing):
         self._has_channels = True
 
     def single(self) -> Scan:
-        """
-        Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
+        """Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
 
-        Raises
-        ------
-        TC08Error, RuntimeError
-            If the library fails, the unit is not open, or no channels are set.
+        TC08Error or RuntimeError if the library fails, the unit is not open, or no channels are
+        set.
         """
         handle = self._open_handle()
         if not self._has_channels:
@@ -349,23 +309,11 @@ def flagged(
 
 
 def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -> Library:
-    """
-    Load the vendor's library and declare the types of its functions.
+    """Load the vendor's library and declare the types of its functions.
 
-    Parameters
-    ----------
-    path : str, optional
-        File of the library. Without it, the variable `ENVIRONMENT` names the file, and without
-        that, the system's own search must find ``usbtc08``.
-    environment : mapping
-        Where the variable is looked up.
-
-    Raises
-    ------
-    FileNotFoundError
-        If no library is named and none is found.
-    OSError
-        If the file cannot be loaded, or lacks a function.
+    Without its `path` the variable `ENVIRONMENT` names the file, and without that the system's own
+    search must find ``usbtc08``: else FileNotFoundError. OSError if the file cannot be loaded, or
+    lacks a function.
     """
     name = path or environment.get(ENVIRONMENT) or ctypes.util.find_library("usbtc08")
     if name is None:
@@ -380,7 +328,3 @@ def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -
         getattr(library, function).restype = c_int16
         getattr(library, function).argtypes = arguments
     return library
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -23,6 +23,7 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments.camera import Counts, Metadata
 
 __all__ = ["FIELDS", "ROWS", "WORDS", "Field", "decode", "encode", "metadata"]
+__dir__ = __all__.copy
 
 ROWS: Final = 2
 """Rows of telemetry on USB: 514 rows of the frame are requested instead of 512."""
@@ -77,26 +78,11 @@ FIELDS: Final = MappingProxyType(
 
 
 def decode(rows: Counts, *, high_word_first: bool = True) -> dict[str, float]:
-    """
-    Read the fields from telemetry rows.
+    """Read the value of each of `FIELDS` from telemetry rows, uint16 (row, x) or (word,).
 
-    Parameters
-    ----------
-    rows : ndarray of uint16, shape (row, x) or (word,)
-        The rows as they came, words in the host's order.
-    high_word_first : bool
-        Order of the words of a longer number: likely, not certain.
-
-    Returns
-    -------
-    dict
-        Value of each of `FIELDS`. Any content is read as if it were telemetry: there is no
-        checksum.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the rows are not of uint16, or hold fewer than `WORDS` words.
+    The rows are as they came, and `high_word_first` is the order of the words of a longer number:
+    likely, not certain. Any content is read as if it were telemetry: there is no checksum.
+    TypeError or ValueError if the rows are not of uint16, or hold fewer than `WORDS` words.
     """
     words = _checked(rows)
     values: dict[str, float] = {}
@@ -119,8 +105,7 @@ def metadata(rows: Counts) -> Metadata:
 
 
 def encode(values: Mapping[str, float], columns: int, rows: int = ROWS) -> Counts:
-    """
-    Write fields as telemetry (rows, columns), 0 elsewhere, as an emulated camera does.
+    """Write fields as telemetry (rows, columns), 0 elsewhere, as an emulated camera does.
 
     ValueError if these are too few, or a value does not fit its field.
     """
@@ -145,7 +130,3 @@ def _checked(rows: Counts) -> Counts:
     if rows.size < WORDS:
         raise ValueError(f"Invalid telemetry of {rows.size} words. Must hold {WORDS} or more.")
     return rows.ravel()
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -18,9 +18,11 @@ import numpy.typing as npt
 from numpy.polynomial.polynomial import polyder, polyval
 from scipy.constants import zero_Celsius
 
-__all__ = ["EMF", "TEMPERATURE", "emf", "temperature"]
+from dbthermal._arrays import Array
 
-Array = npt.NDArray[np.float64]
+__all__ = ["EMF", "TEMPERATURE", "emf", "temperature"]
+__dir__ = __all__.copy
+
 Coefficients = npt.NDArray[np.floating] | tuple[float, ...]
 
 TEMPERATURE: Final = (3.15, 673.15)
@@ -54,25 +56,12 @@ _STEPS = 3
 
 
 def emf(temperature: npt.ArrayLike) -> Array:
-    r"""
-    Voltage of a type-T thermocouple whose cold junction is at 0 °C.
+    r"""Voltage [mV] of a type-T thermocouple whose terminals are at 0 °C, by the ITS-90 [1]_ [2]_.
 
     .. math:: E = \sum_i c_i t^i, \quad t = T - 273.15\,\mathrm{K}
 
-    Parameters
-    ----------
-    temperature : array_like
-        Temperature of the tip [K], in 3.15 to 673.15.
-
-    Returns
-    -------
-    ndarray
-        Voltage [mV], same shape.
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the range or is NaN; the error names the first.
+    Of temperatures T of the tip [K], an array of any shape, in 3.15 to 673.15. ValueError if one
+    lies outside or is NaN; it names the first.
 
     References
     ----------
@@ -89,27 +78,13 @@ def emf(temperature: npt.ArrayLike) -> Array:
 
 
 def temperature(emf_mV: npt.ArrayLike, junction_temperature: npt.ArrayLike) -> Array:  # noqa: N803
-    """
-    Temperature of the tip from the voltage at the terminals: the exact inverse of `emf`.
+    """Temperature [K] of the tip from the voltage at the terminals: the exact inverse of `emf`.
 
-    Parameters
-    ----------
-    emf_mV : array_like
-        Voltage at the terminals [mV].
-    junction_temperature : array_like
-        Temperature of the terminals, the cold junction [K]; broadcast against the voltage.
-
-    Returns
-    -------
-    ndarray
-        Temperature [K], of the broadcast shape, to within rounding (1e-9 K). The range ends at
-        20.872 mV, as NIST's does, which is 400 °C rounded up: there the result is 673.1505 K.
-
-    Raises
-    ------
-    ValueError
-        If a cold junction lies outside 3.15 to 673.15 K, or a voltage, referred to 0 °C, outside
-        -5.603 to 20.872 mV, or one of them is NaN, as for an open thermocouple.
+    Of the voltage [mV] and the temperature of the terminals, the cold junction [K], arrays that are
+    broadcast against one another; to within rounding (1e-9 K). The range ends at 20.872 mV, as
+    NIST's does, which is 400 °C rounded up: there the result is 673.1505 K. ValueError if a cold
+    junction lies outside 3.15 to 673.15 K, or a voltage, referred to 0 °C, outside -5.603 to 20.872
+    mV, or one of them is NaN, as for an open thermocouple.
 
     Examples
     --------
@@ -148,7 +123,3 @@ def _inside(name: str, value: npt.ArrayLike, limits: tuple[float, float], unit: 
             f"Must lie in {limits[0]} to {limits[1]} {unit}."
         )
     return values
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -18,23 +18,13 @@ from dbthermal.instruments import _addresses as addresses
 if TYPE_CHECKING:
     import serial
 
-__all__ = [
-    "EMULATORS",
-    "Closing",
-    "SerialTransport",
-    "Transport",
-    "TransportError",
-    "open_serial",
-]
+__all__ = ["EMULATORS", "Closing", "SerialTransport", "Transport", "TransportError", "open_serial"]
+__dir__ = __all__.copy
 
-WRITE_TIMEOUT: Final = 1.0
-"""Longest wait until the operating system took the bytes to send [s]."""
+WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
 
 EMULATORS: Final = MappingProxyType(
-    {
-        "boson": "dbthermal.instruments.emulated.boson",
-        "apt": "dbthermal.instruments.emulated.apt",
-    }
+    {"boson": "dbthermal.instruments.emulated.boson", "apt": "dbthermal.instruments.emulated.apt"}
 )
 """Module of each emulator, imported when it is started: its ``start(options, world)`` returns an
 object with `path` and `close`."""
@@ -44,8 +34,7 @@ _NO_LINE = (errno.ENOTTY, errno.EINVAL)
 
 
 class Closing:
-    """
-    Context manager that closes at its end, without hiding an error inside it.
+    """Context manager that closes at its end, without hiding an error inside it.
 
     A failure to close is raised if there was no other error, and else added to it as a note.
     """
@@ -86,8 +75,7 @@ class Transport(Protocol):
         """Send all bytes; `TransportError` if the device is gone."""
 
     def read(self, size: int, timeout: float) -> bytes:
-        """
-        Wait until bytes came, or `timeout` [s] went by.
+        """Wait until bytes came, or `timeout` [s] went by.
 
         Return at most `size` bytes and often fewer; none only if `timeout` went by.
         `TransportError` if the device is gone.
@@ -98,8 +86,7 @@ class Transport(Protocol):
 
 
 class SerialTransport(Closing):
-    """
-    A serial port, or a pseudo-terminal, that is open already; see `open_serial`.
+    """A serial port, or a pseudo-terminal, that is open already; see `open_serial`.
 
     `port` is open, of pyserial; `url` is its name in messages; `after` is called once the port is
     closed, to end an emulator.
@@ -163,26 +150,14 @@ class SerialTransport(Closing):
 
 
 def open_serial(
-    url: str,
-    *,
-    baudrate: int,
-    rtscts: bool = False,
-    world: object | None = None,
+    url: str, *, baudrate: int, rtscts: bool = False, world: object | None = None
 ) -> SerialTransport:
-    """
-    Open the line to a device by its name, for this program alone; nothing is sent.
+    """Open the line to a device by its name, for this program alone; nothing is sent.
 
-    Parameters
-    ----------
-    url : str
-        ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, with the options of
-        the emulator; ``sim://boson/wide`` is ``sim://boson?name=wide``.
-    baudrate : int
-        Speed of the line [bit/s].
-    rtscts : bool
-        Flow control by the lines RTS and CTS.
-    world : object, optional
-        Emulated bench that a ``sim://`` device is part of; by default one of its own.
+    The name is ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, with the
+    options of the emulator; ``sim://boson/wide`` is ``sim://boson?name=wide``. `baudrate` [bit/s]
+    is the speed of the line, `rtscts` its flow control by RTS and CTS, and `world` the emulated
+    bench that a ``sim://`` device is part of; by default one of its own.
 
     Raises
     ------
@@ -232,7 +207,3 @@ def _open_port(path: str, *, baudrate: int, rtscts: bool) -> "serial.Serial":
             f"Could not open '{path}': {error}. It must exist, be yours to use, and in no "
             "other program's use."
         ) from error
-
-
-def __dir__() -> list[str]:
-    return __all__

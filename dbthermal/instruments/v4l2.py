@@ -41,6 +41,7 @@ except ImportError as missing:  # Windows
     raise ImportError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.") from missing
 
 __all__ = ["BUFFERS", "Y16", "Capture", "Kernel", "open_url"]
+__dir__ = __all__.copy
 
 Y16: Final = 0x20363159
 """Pixel format ``Y16 ``: 16 bits a pixel, little-endian, before any gain control."""
@@ -118,8 +119,7 @@ class Kernel:
 
 
 class Capture(Closing):
-    """
-    A camera's node that streams Y16 frames, a `camera.FrameSource`; see `Capture.open`.
+    """A camera's node that streams Y16 frames, a `camera.FrameSource`; see `Capture.open`.
 
     Its identity is the node, the driver's name of the camera, the bus it is plugged in, and the
     driver with its version, on which a stamp's meaning depends.
@@ -147,8 +147,7 @@ class Capture(Closing):
         kernel: Kernel | None = None,
         decode: Decode | None = None,
     ) -> Self:
-        """
-        Open a node, agree on format and rate, and start the stream; nothing is reset.
+        """Open a node, agree on format and rate, and start the stream; nothing is reset.
 
         `decode` reads the metadata of a frame from its telemetry rows. OSError if the node cannot
         be opened, is busy, or this is not Linux; ValueError if it gives no Y16, or the driver
@@ -323,7 +322,3 @@ def _formats(file: int, kernel: Kernel) -> list[int]:
 def _buffer(index: int) -> bytearray:
     """Argument for a buffer of this number."""
     return bytearray(BUFFER.pack(index, CAPTURE, 0, 0, 0, 0, 0, 0, MMAP, 0, 0))
-
-
-def __dir__() -> list[str]:
-    return __all__

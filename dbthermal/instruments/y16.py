@@ -11,6 +11,7 @@ from typing import Final
 from dbthermal.instruments.camera import CameraKind, FrameSource, Stream
 
 __all__ = ["KIND"]
+__dir__ = __all__.copy
 
 
 def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:
@@ -21,7 +22,3 @@ def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource
 
 KIND: Final = CameraKind(_open_frames)
 """The kind of camera of a session's ``kind: y16``."""
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -18,7 +18,4 @@ __all__ = [
     "ratio_variance_bound",
     "reflection_ratio",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

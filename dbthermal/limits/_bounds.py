@@ -11,7 +11,8 @@ import xarray as xr
 
 from dbthermal import mixing, schema
 from dbthermal import response as responses
-from dbthermal.limits._fisher import QUANTITIES, Array, Mask, Truth, deviations, smallest_order
+from dbthermal._arrays import Array, Mask
+from dbthermal.limits._fisher import QUANTITIES, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
 _UNIFORM: Final = 1.0 / np.sqrt(12.0)
@@ -19,18 +20,9 @@ _UNIFORM: Final = 1.0 / np.sqrt(12.0)
 
 
 def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
-    r"""
-    Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` of the reflections in the two bands.
+    r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` [1] of the reflections in two bands.
 
-    Parameters
-    ----------
-    emissivity : array_like, shape (2, ...)
-        Emissivities [1].
-
-    Returns
-    -------
-    ndarray
-        Ratio [1].
+    Of emissivities (2, ...) [1].
 
     Examples
     --------
@@ -42,34 +34,17 @@ def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
 
 
 def ratio_variance_bound(
-    emissivity: tuple[float, float],
-    noise: tuple[float, float],
-    background: Array,
-    functions: Array,
+    emissivity: tuple[float, float], noise: tuple[float, float], background: Array, functions: Array
 ) -> Array:
-    r"""
-    Cramer-Rao bound of the reflection ratio of two linear bands.
+    r"""Cramer-Rao bound of the reflection ratio of two linear bands.
 
     .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
               {\sum_t [(1 - e_1) P y(t)]^2}
 
-    with P the projection orthogonal to the smooth subspace, in which the object may do anything.
-
-    Parameters
-    ----------
-    emissivity : tuple of float
-        Emissivities of the two bands [1].
-    noise : tuple of float
-        Standard deviations of the noise [K].
-    background : ndarray, shape (time, ...)
-        Background temperature [K].
-    functions : ndarray, shape (time, order)
-        Orthonormal functions that span the smooth subspace.
-
-    Returns
-    -------
-    ndarray
-        Smallest variance [1] of an unbiased estimate.
+    with P the projection orthogonal to the smooth subspace, in which the object may do anything:
+    that of the orthonormal functions (time, order). Of the emissivities [1] and the noise [K] of
+    the two bands, and the background temperature (time, ...) [K], the smallest variance [1] of an
+    unbiased estimate.
 
     Examples
     --------
@@ -96,8 +71,7 @@ def bounds(
     emissivity_std: float = np.inf,
     response_kind: str = "exact",
 ) -> xr.Dataset:
-    r"""
-    Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
+    r"""Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
 
     The inverse Fisher information [1]_ of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` +
     white noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a known smooth
@@ -223,8 +197,7 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
 
 
 def _most_frequent(background: Array) -> Mask:
-    """
-    Frames (time, pixel) in which a pixel's background has its most frequent temperature.
+    """Frames (time, pixel) in which a pixel's background has its most frequent temperature.
 
     No frame where no two share a temperature; the lowest of several that are as frequent.
     """

@@ -15,11 +15,10 @@ import numpy.typing as npt
 
 from dbthermal import _smooth as smooth
 from dbthermal import mixing
+from dbthermal._arrays import Array, Mask
 from dbthermal.bands import Band
 from dbthermal.response import Curve
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Indices = npt.NDArray[np.intp]
 
 QUANTITIES: Final = (
@@ -73,8 +72,7 @@ class Sensitivity:
         return Sensitivity(*(getattr(self, field.name)[..., pixels] for field in fields(self)))
 
     def projection(self) -> Array:
-        r"""
-        Projection (band, band, time, pixel) that eliminates the free background of a frame.
+        r"""Projection (band, band, time, pixel) that eliminates the free background of a frame.
 
         .. math:: W = 1 - v v^T / v^T v \qquad (2)
 
@@ -119,8 +117,7 @@ class Truth:
 
 
 def smallest_order(truth: Truth, sensitivity: Sensitivity) -> Indices:
-    r"""
-    Order (pixel) of the smallest smooth subspace that holds the object within the noise.
+    r"""Order (pixel) of the smallest smooth subspace that holds the object within the noise.
 
     A subspace leaves :math:`r = x - \Phi \Phi^T x`, whose energy must satisfy
 
@@ -158,8 +155,7 @@ def deviations(
     *,
     emissivity_std: float = np.inf,
 ) -> dict[str, Array]:
-    """
-    Smallest standard deviations of `QUANTITIES`, with ratios over the reference band.
+    """Smallest standard deviations of `QUANTITIES`, with ratios over the reference band.
 
     Temperatures (time, pixel) [K], emissivity and ratios (band, pixel) [1]; infinite where the
     capture holds no information. A prior deviation of 0 means known emissivities.
@@ -214,8 +210,7 @@ def _deviations(
 
 
 def _background(sensitivity: Sensitivity, functions: Array) -> tuple[Array, Array]:
-    r"""
-    Gradient (pixel, time, unknown) of each frame's background, and its variance given them.
+    r"""Gradient (pixel, time, unknown) of each frame's background, and its variance given them.
 
     In a free frame y follows the other unknowns: :math:`dy = -v^T (g\,de + p\,dx) / v^T v`, with
     the variance :math:`1 / v^T v` of its own; at rest it is the level.
@@ -241,8 +236,7 @@ class FisherInverse:
     information: Array  # along them (pixel, direction) [1]
 
     def variance(self, gradient: Array) -> Array:
-        """
-        Smallest variance (pixel, quantity) for gradients (pixel or 1, quantity, unknown).
+        """Smallest variance (pixel, quantity) for gradients (pixel or 1, quantity, unknown).
 
         Infinite where a quantity depends on a direction without information.
         """
@@ -255,8 +249,7 @@ class FisherInverse:
 
 
 def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.0) -> FisherInverse:
-    """
-    Inverse information about emissivities (band), object (order) [K] and resting level [K].
+    """Inverse information about emissivities (band), object (order) [K] and resting level [K].
 
     The functions (time, order) are the object's smooth subspace; the prior is the information about
     each emissivity from elsewhere, one over its variance [1].
@@ -279,12 +272,7 @@ def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.
     information = np.block([[ee, ec, el], [ce, cc, cl], [le, lc, ll]])
     # Information about each unknown, were it the only one: no background to eliminate.
     alone = np.concatenate(
-        [
-            np.sum(g**2, axis=1).T + prior,
-            np.sum(p**2, axis=0).T @ functions**2,
-            ll[..., 0],
-        ],
-        axis=1,
+        [np.sum(g**2, axis=1).T + prior, np.sum(p**2, axis=0).T @ functions**2, ll[..., 0]], axis=1
     )
     scale = np.sqrt(np.divide(1.0, alone, out=np.ones_like(alone), where=alone > 0))
     scaled = information * scale[:, np.newaxis] * scale[..., np.newaxis]

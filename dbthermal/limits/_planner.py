@@ -9,8 +9,9 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import mixing, planck, schema
+from dbthermal._arrays import Array
 from dbthermal.bands import FILTERS, Band
-from dbthermal.limits._fisher import Array, TopHat, Truth, deviations, smallest_order
+from dbthermal.limits._fisher import TopHat, Truth, deviations, smallest_order
 
 # Entry of a material without a best filter: none of them determines its temperature.
 _NO_FILTER: Final = "none"
@@ -20,32 +21,16 @@ _TIME_CONSTANT: Final = 1.0 / 3.0
 
 @dataclass(frozen=True)
 class CaptureDesign:
-    """
-    Capture conditions: a warming object before a background of regular pulses.
+    """Capture conditions: a warming object before a background of regular pulses.
 
     The object's time constant is a third of the capture. The background is warmer for the end of
     each period, as if someone stood there, and rests before.
 
-    Attributes
-    ----------
-    seconds : float
-        Length [s].
-    rate : float
-        Frame rate [1/s].
-    start, span : float
-        First temperature of the object, and its rise until the last frame [K].
-    level : float
-        Temperature of the background at rest [K].
-    amplitude : float
-        Height of a pulse [K].
-    period, duration : float
-        From pulse to pulse, and of one pulse [s].
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite, or not positive (all but `span` and `amplitude`), a pulse is
-        longer than the period, or there are fewer than two frames.
+    `seconds` is the length [s], `rate` that of the frames [1/s]; `start` and `span` are the first
+    temperature of the object and its rise until the last frame [K]; `level` is the temperature of
+    the background at rest and `amplitude` the height of a pulse [K], which lasts for its `duration`
+    of a `period` [s]. ValueError if a number is not finite, or not positive (all but `span` and
+    `amplitude`), a pulse is longer than the period, or there are fewer than two frames.
     """
 
     seconds: float = 35.0
@@ -86,8 +71,7 @@ def plan(
     filters: Mapping[str, Band] = FILTERS,
     temperature: float = 300.0,
 ) -> xr.Dataset:
-    r"""
-    Expected accuracy of one pixel for each material and filter, and the best filter.
+    r"""Expected accuracy of one pixel for each material and filter, and the best filter.
 
     The Cramer-Rao bound of `bounds` for a designed capture, with the response of Planck's law over
     each band. Those of n pixels of one material share their ratios and emissivities, whose
@@ -141,7 +125,7 @@ def plan(
     emissivity = _emissivities(table)
     names = [str(name) for name in table["band"].values]
     sets = _combinations(names, beside, together)
-    std = _noise(noise, names)
+    std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     for name in names:
         if name not in filters:
             raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
@@ -171,27 +155,12 @@ def plan_durations(
     seconds: Sequence[float],
     design: CaptureDesign | None = None,
 ) -> xr.Dataset:
-    """
-    Expected accuracy of captures of several lengths, of one filter at a time.
+    """Expected accuracy of captures of several lengths, of one filter at a time.
 
-    Parameters
-    ----------
-    table, noise
-        See `plan`.
-    seconds : sequence of float
-        Lengths [s], strictly increasing. The object's rise and the pulses are the same in all.
-    design : CaptureDesign, optional
-        All conditions but the length.
-
-    Returns
-    -------
-    Dataset
-        That of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all.
-
-    Raises
-    ------
-    ValueError
-        As `plan`, or if the lengths do not increase.
+    Of a table and noise as in `plan`, lengths [s], strictly increasing, and a design of all
+    conditions but the length: the object's rise and the pulses are the same in all. The result is
+    that of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all. ValueError
+    as `plan`, or if the lengths do not increase.
 
     Examples
     --------
@@ -257,13 +226,6 @@ def _combinations(names: list[str], beside: str, together: int) -> list[list[int
             f"Invalid together {together}. Must lie in [1, {len(others)}], the number of filters."
         )
     return [[names.index(beside), *chosen] for chosen in combinations(others, together)]
-
-
-def _noise(noise: xr.DataArray, names: list[str]) -> Array:
-    """Noise [K] of the named bands."""
-    schema.check_variable(noise, replace(schema.NOISE, units="K"), "the noise")
-    places = schema.band_positions(noise, names, "the noise")
-    return planck.require_positive("noise [K]", noise.values[places])
 
 
 def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str, Array]:

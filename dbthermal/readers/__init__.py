@@ -9,7 +9,4 @@ from dbthermal.readers._spectra import ecostress, slum, ucsb
 from dbthermal.readers._videos import masked_palette_video, palette_video
 
 __all__ = ["ecostress", "masked_palette_video", "palette_video", "read_yaml", "slum", "ucsb"]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from dbthermal import _text as texts
 
-MEMORY: Final = 2.0**30
-"""Largest memory that a video may take, by default [byte]."""
+MEMORY: Final = 2.0**30  # largest memory that a video may take, by default [byte]
 
 PIXEL: Final = 9
 """Memory of a pixel of a frame: number of its colour, position in the palette, mask [byte]."""

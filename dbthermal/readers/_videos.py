@@ -38,14 +38,9 @@ _COLOURED: Final = 30  # least difference between the channels of a coloured pix
 
 
 def palette_video(
-    path: str | Path,
-    palette: str = "plasma",
-    *,
-    memory: float = MEMORY,
-    sha256: str | None = None,
+    path: str | Path, palette: str = "plasma", *, memory: float = MEMORY, sha256: str | None = None
 ) -> xr.DataArray:
-    """
-    Video drawn in a palette, as positions in the palette.
+    """Video drawn in a palette, as positions in the palette.
 
     Each pixel gets the position of the nearest point on the line through the palette's colours in
     Y'CbCr, finer than its steps. Luma counts whole and chroma half: in these videos four pixels
@@ -123,35 +118,18 @@ def masked_palette_video(
     memory: float = MEMORY,
     sha256: str | None = None,
 ) -> xr.Dataset:
-    """
-    Video whose object is drawn in a palette while the rest is gray.
+    """Video whose object is drawn in a palette while the rest is gray.
 
     A pixel is valid where its colour is nearer to the palette than to gray, in the measure of
     `palette_video`. Compression pulls single pixels between strong colours over that line, so the
     object's outline is best taken from the share of frames in which a pixel is valid.
 
-    Parameters
-    ----------
-    path : str or Path
-        File as for `palette_video`.
-    palette : str
-        Name of a continuous colour map of matplotlib.
-    width : int, optional
-        Columns to keep [pixel], left of a printed colour bar.
-    memory, sha256 : optional
-        As for `palette_video`.
-
-    Returns
-    -------
-    Dataset
-        `value` (time, y, x), float32 in [0, 1], a position also where it is not valid; `valid`
-        (time, y, x), bool. Attributes of `value` as in `palette_video`, but ``palette_residual`` is
-        the median over the coloured pixels.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        As `palette_video`; also if the video is narrower than `width`, or has no coloured pixel.
+    Of a file, a palette, memory and checksum as for `palette_video`, and a number of columns to
+    keep [pixel], left of a printed colour bar: `value` (time, y, x), float32 in [0, 1], a position
+    also where it is not valid, and `valid` (time, y, x), bool. Attributes of `value` as in
+    `palette_video`, but ``palette_residual`` is the median over the coloured pixels.
+    FileNotFoundError or ValueError as `palette_video`; also if the video is narrower, or has no
+    coloured pixel.
 
     Examples
     --------

@@ -9,11 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
-from dbthermal.separation._reflection import (
-    reflected_change,
-    uncalibrated_reflection,
-    unscaled,
-)
+from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection, unscaled
 from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
 
@@ -42,6 +38,7 @@ __all__ = [
     "uncalibrated_reflection",
     "unscaled",
 ]
+__dir__ = __all__.copy
 
 # The settings are imported with their method when they are first used: one needs torch.
 _SETTINGS: Final = {
@@ -58,7 +55,3 @@ def __getattr__(name: str) -> Any:
     if name in _SETTINGS:
         return getattr(importlib.import_module(f"{__name__}.{_SETTINGS[name]}"), name)
     raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -51,8 +51,7 @@ class Frames:
 def solve(
     tile: Tile, emissivity: Array, level: Array, fluctuation: Array, *, apart: bool = False
 ) -> Frames:
-    """
-    Solve every frame by Newton's method, at emissivities (band, pixel).
+    """Solve every frame by Newton's method, at emissivities (band, pixel).
 
     The background has a level (pixel) [K] and a variance about it (pixel) [K^2]. Of cameras apart,
     what fluctuates in the other bands is another part of it: noise.
@@ -117,8 +116,7 @@ def through(sensitivity: Array, covariance: Array) -> Array:
 
 
 def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Array, Array]:
-    """
-    Smooth curves (time, pixel) of white noise of a variance (time, pixel), at valid samples.
+    """Smooth curves (time, pixel) of white noise of a variance (time, pixel), at valid samples.
 
     Returns the curves and the variances that are left.
     """

@@ -12,6 +12,7 @@ from dbthermal import _samples as samples
 from dbthermal import noise as noises
 from dbthermal import planck, schema
 from dbthermal import response as responses
+from dbthermal._arrays import Array
 from dbthermal._coordinates import laid_on
 from dbthermal.response import Curve
 from dbthermal.schema import Status
@@ -19,7 +20,6 @@ from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._displaced import Displacement
 
-Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.intp]
 
 # Pixels from which the noise is estimated where the response has none, and a clock is judged.

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from numpy.polynomial import Polynomial
-from scipy.ndimage import convolve, gaussian_filter1d
+from scipy.ndimage import convolve, gaussian_filter, gaussian_filter1d
 from scipy.sparse import csr_array, diags_array
 
 from dbthermal import _smooth as smooth
@@ -61,6 +61,8 @@ _MOST: Final = 0.99
 # from which the iteration is taken to grow.
 _DRAWS: Final = 64
 _GROWN: Final = 1e3
+# Deviation of the neighbourhood that tells an emissivity, over the image's smaller side.
+_AROUND: Final = 0.125
 # Share of an error that a step may leave.
 _LARGEST: Final = 0.95
 # Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
@@ -194,6 +196,7 @@ def solve(
         first, steps, change, variance = _first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
         shares = _coefficients(inputs, raw, solved)
+        told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
 
         @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread it runs in
         def both(alone: Array, change: Array) -> tuple[Array, Array, Array]:
@@ -220,7 +223,11 @@ def solve(
             by_steps = (line.kernel(own) * steps).sum(axis=0)
             told = np.hypot(np.sqrt(line.variance), by_steps) / steep
             known = line.energy > _LEAST_CHANGE**2 * len(some)
+            likely = 1.0 - _ratio(raw) * (1.0 - slope)
+            known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
             slope = np.where(known, slope, emissivity[0])
+            error = np.where(known & (line.variance > 0), line.variance / steep**2, np.inf)
+            slope = _shared(slope, error, result["status"].shape)
             before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - slope))
             coefficients = _coefficients(inputs, emissivity, solved)
             own = np.where(solved, emissivity[0], 1.0)
@@ -255,6 +262,25 @@ def _emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
     # That of a constant object is taken from the middle of what its ratios leave.
     middle = 1.0 - ratio * (0.5 / np.maximum(ratio.max(axis=0), 1.0))
     return np.where(np.isfinite(emissivity), emissivity, middle)
+
+
+def _shared(slope: Array, variance: Array, shape: tuple[int, ...]) -> Array:
+    """
+    Slopes (pixel) [1] that lean on those around, the more the less they are known.
+
+    The mean of their posterior, of a normal prior with the mean and variance of the neighbourhood.
+    """
+
+    def around(part: Array) -> Array:
+        image = np.where(weight > 0, weight * part, 0.0).reshape(shape)
+        filtered = gaussian_filter(image, _AROUND * min(shape), mode="constant")
+        return np.asarray(filtered).ravel()
+
+    weight = 1.0 / variance
+    total = around(np.ones_like(weight))
+    mean = np.where(total > 0, around(slope) / total, slope)
+    own = weight * np.nan_to_num(around((slope - mean) ** 2) / total)
+    return np.asarray((own * slope + mean) / (own + 1.0))
 
 
 def _ratio(emissivity: Array) -> Array:

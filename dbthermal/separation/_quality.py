@@ -9,20 +9,14 @@ import xarray as xr
 
 from dbthermal import _samples as samples
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.schema import Status
 
-Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.uint32]
-Mask = npt.NDArray[np.bool_]
 
-MOST_MISSING: Final = 0.5
-"""Share of the frames without which a pixel is not solved."""
-
-LONGEST_GAP: Final = 2
-"""Frames in a row that may be bridged in a pixel."""
-
-MOST_BRIDGED: Final = 0.15
-"""Share of the frames from which a pixel lacks too many to be bridged."""
+MOST_MISSING: Final = 0.5  # share of the frames without which a pixel is not solved
+LONGEST_GAP: Final = 2  # frames in a row that may be bridged in a pixel
+MOST_BRIDGED: Final = 0.15  # share of the frames from which a pixel lacks too many to be bridged
 
 # Frames from which fewer pixels are sampled, of as many samples together.
 _LONG: Final = 2048
@@ -56,8 +50,7 @@ def read(
     known: list[samples.Grain] | None = None,
     most_missing: float = MOST_MISSING,
 ) -> tuple[Array, Mask, Bits]:
-    """
-    Read the samples of a part of the capture, and judge its pixels.
+    """Read the samples of a part of the capture, and judge its pixels.
 
     Returns the counts (band, time, pixel) [count], zero where they are invalid and in unusable
     pixels; the samples that are valid in all bands (time, pixel), by their values and by the
@@ -104,8 +97,7 @@ def too_few(valid: Mask, fewest: int, most_missing: float = MOST_MISSING) -> Mas
 
 
 def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
-    """
-    Bridge short gaps of single pixels by a line in all bands.
+    """Bridge short gaps of single pixels by a line in all bands.
 
     A line between the same two frames in all bands holds the same mixture of object and
     background, so nothing is biased, and all pixels of a tile keep the same frames. Bridged are
@@ -150,8 +142,7 @@ def frame_sets(valid: Mask, status: Bits) -> Iterator[tuple[Mask, Mask]]:
 def common_frames(
     counts: Array, valid: Mask, status: Bits, fewest: int = 1
 ) -> list[tuple[Mask, Mask]]:
-    """
-    Frames (time) that most pixels have, and the pixels (pixel) that have them all.
+    """Frames (time) that most pixels have, and the pixels (pixel) that have them all.
 
     For methods that need the same frames of all pixels. A usable pixel that lacks one gets the bit
     of invalid samples and counts of zero, in place; so do all where the frames are fewer than
@@ -169,8 +160,7 @@ def common_frames(
 
 
 def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
-    """
-    Read about so many good pixels, evenly spaced over the image; fewer of a long capture.
+    """Read about so many good pixels, evenly spaced over the image; fewer of a long capture.
 
     Returns the counts (band, time, pixel) [count] of pixels without any bit but that of frozen
     frames, at the frames that most of them have, and these frames (time).

@@ -3,15 +3,12 @@
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Magnitude of the correlation below which a pixel shows noise alone, and the fewest such pixels.
 _UNCORRELATED: Final = 0.1
@@ -23,8 +20,7 @@ _TINY: Final = np.finfo(np.float64).tiny
 
 
 def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
-    r"""
-    Change of the first band's apparent temperature that the reflection causes.
+    r"""Change of the first band's apparent temperature that the reflection causes.
 
     .. math:: (1 - e_1) (y - \bar y)
 
@@ -32,23 +28,10 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     its emissivity is undefined, but all that changes is reflected: the apparent temperature less
     its mean.
 
-    Parameters
-    ----------
-    apparent : DataArray
-        Apparent temperature of the inputs (band, time, y, x) [K], from
-        `response.apparent_temperature`.
-    result : Dataset
-        From `solve`, of the same capture.
-
-    Returns
-    -------
-    DataArray
-        (time, y, x) [K], float32; NaN where the reflection is unknown.
-
-    Raises
-    ------
-    ValueError
-        If the first bands, sizes or coordinates differ.
+    Of the apparent temperature of the inputs (band, time, y, x) [K], from
+    `response.apparent_temperature`, and a result of `solve` of the same capture: (time, y, x) [K],
+    float32; NaN where the reflection is unknown. ValueError if the first bands, sizes or
+    coordinates differ.
 
     Examples
     --------
@@ -93,8 +76,7 @@ def uncalibrated_reflection(
     order: int = 9,
     correlated: float = 0.5,
 ) -> xr.Dataset:
-    r"""
-    Separate rapid, correlated changes from slow ones in two bands of any unit.
+    r"""Separate rapid, correlated changes from slow ones in two bands of any unit.
 
     Without a response there are no temperatures, but the rapid changes are still the background's.
     Smooth functions of time, which hold the object's change, are projected out of both bands. Frame
@@ -196,8 +178,7 @@ def uncalibrated_reflection(
 
 
 def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
-    r"""
-    Undo the scale of each frame of two pictures, from surroundings that do not change.
+    r"""Undo the scale of each frame of two pictures, from surroundings that do not change.
 
     A picture that is scaled anew in each frame, as between its extremes, shows still surroundings
     :math:`s(p)` as :math:`o(t) + g(t) s(p)`. Offset and gain are fitted robustly, with Cauchy's
@@ -205,24 +186,12 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     of the weighted variance over time; else its scale is nearly constant, or the surroundings
     change themselves, and it stays as it is.
 
-    Parameters
-    ----------
-    signal : DataArray
-        (band, time, y, x), two bands in units of their own.
-    still : DataArray of bool
-        Pixels (y, x) off the object; a third of them may change after all.
-
-    Returns
-    -------
-    DataArray
-        The signal, in units of its mean over time; the coordinate `gain` (band, time) [1], by which
-        the noise was divided, 1 in a band that is not undone. Attributes `scale_undone`, the bands
-        that are, and `scale_explained`, each band's explained share.
-
-    Raises
-    ------
-    ValueError
-        If dims or bands are wrong, a value is not finite, or fewer than 200 pixels are still.
+    Of a signal (band, time, y, x), two bands in units of their own, and the pixels (y, x), bool,
+    off the object, of which a third may change after all: the signal, in units of its mean over
+    time; the coordinate `gain` (band, time) [1], by which the noise was divided, 1 in a band that
+    is not undone. Attributes `scale_undone`, the bands that are, and `scale_explained`, each band's
+    explained share. ValueError if dims or bands are wrong, a value is not finite, or fewer than 200
+    pixels are still.
 
     References
     ----------
@@ -334,8 +303,7 @@ def _scaling(rapid: Array, mean: Array, quiet: Mask) -> Array:
 
 
 def _deming(rapid: Array, power: Array, noise_ratio: float) -> Array:
-    r"""
-    Slope (pixel) of Deming's regression of the second band on the first.
+    r"""Slope (pixel) of Deming's regression of the second band on the first.
 
     The principal axis of the scatter S whitened by the noise, :math:`k = \sqrt\lambda \tan\phi`
     with :math:`\tan 2\phi = 2 \sqrt\lambda S_{12} / (\lambda S_{11} - S_{22})`.

@@ -37,8 +37,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     workers: int = 2,
     progress: bool = False,
 ) -> xr.Dataset:
-    """
-    Separate emission and reflection in a capture, with an answer at every pixel.
+    """Separate emission and reflection in a capture, with an answer at every pixel.
 
     Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
     reflections move, once more with the shift between the two cameras' reflections

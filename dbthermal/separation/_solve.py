@@ -366,11 +366,7 @@ def _separate(
 
 
 def _survey(
-    inputs: Inputs,
-    rows: slice,
-    selected: Mask,
-    bar: "tqdm[Any]",
-    material: Material | None = None,
+    inputs: Inputs, rows: slice, selected: Mask, bar: "tqdm[Any]", material: Material | None = None
 ) -> list[tuple[Labels, Survey]]:
     """Survey the selected pixels of a block; with their numbers in the image."""
     surveys = []
@@ -401,7 +397,7 @@ def _pool(inputs: Inputs, surveys: list[tuple[Labels, Survey]]) -> Material | No
     if labels is None or not surveys:
         return None
     numbers = np.concatenate([number for number, _ in surveys])
-    survey = tiles.join([part for _, part in surveys])
+    survey = surveys[0][1].join([part for _, part in surveys[1:]])
     noise = inputs.noise[inputs.bands]
     materials = pooling.estimate(labels[numbers], int(labels.max()) + 1, survey, noise)
     return pooling.expand(materials, labels)

@@ -8,7 +8,7 @@ emissivity needs a quiet ordinate.
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -66,17 +66,13 @@ class _Pixels:
                 parts[field.name][..., selected] = getattr(part, field.name)
         return replace(self, **parts)
 
-
-Record = TypeVar("Record", bound=_Pixels)
-
-
-def join(parts: Sequence[Record]) -> Record:
-    """Record of the pixels of all parts, one after another."""
-    values = (([getattr(part, one.name) for part in parts], one.name) for one in fields(parts[0]))
-    joined: dict[str, Any] = {
-        name: None if value[0] is None else np.concatenate(value, axis=-1) for value, name in values
-    }
-    return replace(parts[0], **joined)
+    def join(self, others: Sequence[Self]) -> Self:
+        """Return the record with the pixels of others after its own."""
+        joined: dict[str, Any] = {}
+        for field in fields(self):
+            values = [getattr(part, field.name) for part in (self, *others)]
+            joined[field.name] = None if values[0] is None else np.concatenate(values, axis=-1)
+        return replace(self, **joined)
 
 
 @dataclass(frozen=True)
@@ -272,7 +268,7 @@ def numbers(window: Window, width: int) -> Whole:
 
 def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterator[Cut]:
     """Read a block of rows and cut it into tiles; with the material of each pixel of the image."""
-    displacement, method, bands = inputs.displacement, inputs.method, inputs.bands
+    displacement, method = inputs.displacement, inputs.method
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
     width = block.sizes["x"]
@@ -282,11 +278,10 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     size = block.sizes["y"] * width if method.whole_image else size
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None
-    curves = tuple(inputs.curves[band] for band in bands)
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
     grains = None
     for window in windows(rows, width, size):
-        rng, places = generator(inputs.seed, window), numbers(window, width)
+        places = numbers(window, width)
         grains = grains or quality.grains(block, inputs.noise * slopes)
         gain = np.ones(places.size)
         if displacement is None:
@@ -302,31 +297,9 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
             sets = list(quality.frame_sets(usable, status))
-        emissivity, covariance = (
-            None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)
-            for known in (inputs.emissivity, inputs.emissivity_covariance)
-        )
-        if emissivity is not None and covariance is not None:
-            emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
-        tile = Tile(
-            # The linearised signals (see `response`), less the reference temperature.
-            signals=np.stack(
-                [
-                    curve.linearise(counts[band]) - curve.reference
-                    for band, curve in zip(bands, curves, strict=True)
-                ]
-            ),
-            time=time,
-            curves=curves,
-            noise=tuple(float(inputs.noise[band]) for band in bands),
-            shape=(window[0].stop - window[0].start, window[1].stop - window[1].start),
-            rng=rng,
-            pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
-            segment=segment,
-            material=None if material is None else material.select_pixels(places),
-            emissivity=emissivity,
-            emissivity_covariance=covariance,
-        )
+        tile = _tile(inputs, counts, time, window, segment)
+        if material is not None:
+            tile = replace(tile, material=material.select_pixels(places))
         if inputs.difference is not None:
             tile.signals[1:] -= inputs.difference(window[0])
         parts = []
@@ -337,6 +310,35 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
         if displacement is not None:
             parts = [alike for one in parts for alike in _of_one_noise(*one, gain, most)]
         yield Cut(window, status, valid, parts)
+
+
+def _tile(
+    inputs: Inputs, counts: Array, time: Array, window: Window, segment: Whole | None
+) -> Tile:
+    """Tile of the counts (band, time, pixel) [count] of a window, the quietest band first."""
+    bands = inputs.bands
+    curves = tuple(inputs.curves[band] for band in bands)
+    emissivity, covariance = (
+        None if known is None else known[(..., *window)].reshape(*known.shape[:-2], -1)
+        for known in (inputs.emissivity, inputs.emissivity_covariance)
+    )
+    if emissivity is not None and covariance is not None:
+        emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
+    # The linearised signals (see `response`), less the reference temperature.
+    pairs = zip(bands, curves, strict=True)
+    signals = np.stack([curve.linearise(counts[band]) - curve.reference for band, curve in pairs])
+    return Tile(
+        signals=signals,
+        time=time,
+        curves=curves,
+        noise=tuple(float(inputs.noise[band]) for band in bands),
+        shape=(window[0].stop - window[0].start, window[1].stop - window[1].start),
+        rng=generator(inputs.seed, window),
+        pattern=None if inputs.pattern is None else tuple(inputs.pattern[bands]),
+        segment=segment,
+        emissivity=emissivity,
+        emissivity_covariance=covariance,
+    )
 
 
 def _of_one_noise(

@@ -1,4 +1,4 @@
-"""Simulated captures with known truth, to test a claim: scenes, cameras, nuisances, bench.
+"""Simulated captures with known truth, to test a claim: scenes, cameras, nuisances.
 
 Begin with `walkers` and `observe`: a scene, and the counts that a `Rig` records of it. Nuisances
 of real cameras are added one by one (`fire_shutter`, `spoil_pixels`, `lag`, ...). For a scene of
@@ -9,19 +9,8 @@ one's own there are transient temperatures (`heat`), and reflections of moving b
 import importlib
 from types import ModuleType
 
-from dbthermal.simulation._bench import (
-    OBJECTS,
-    Bench,
-    Sample,
-    band_emissivity,
-    bench_series,
-    contact_measurements,
-    reflector_series,
-)
 from dbthermal.simulation._nuisances import (
     SPOILED,
-    drift_pattern,
-    drop_frames,
     expose,
     fire_shutter,
     lag,
@@ -29,7 +18,15 @@ from dbthermal.simulation._nuisances import (
     repeat_frames,
     spoil_pixels,
 )
-from dbthermal.simulation._rig import Rig, blackbody_movies, capture, digitise, observe, pattern
+from dbthermal.simulation._rig import (
+    Rig,
+    blackbody_movies,
+    capture,
+    contact_measurements,
+    digitise,
+    observe,
+    pattern,
+)
 from dbthermal.simulation._scenes import (
     Background,
     heating,
@@ -40,20 +37,13 @@ from dbthermal.simulation._scenes import (
 )
 
 __all__ = [
-    "OBJECTS",
     "SPOILED",
     "Background",
-    "Bench",
     "Rig",
-    "Sample",
-    "band_emissivity",
-    "bench_series",
     "blackbody_movies",
     "capture",
     "contact_measurements",
     "digitise",
-    "drift_pattern",
-    "drop_frames",
     "expose",
     "fire_shutter",
     "heat",
@@ -64,7 +54,6 @@ __all__ = [
     "observe",
     "pattern",
     "rays",
-    "reflector_series",
     "repeat_frames",
     "scene",
     "side_by_side",
@@ -72,6 +61,7 @@ __all__ = [
     "surroundings",
     "walkers",
 ]
+__dir__ = __all__.copy
 
 
 def __getattr__(name: str) -> ModuleType:
@@ -79,7 +69,3 @@ def __getattr__(name: str) -> ModuleType:
     if name in {"heat", "rays", "surroundings"}:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -17,29 +17,17 @@ _SLOPE_TEMPERATURE: Final = 300.0
 
 @dataclass(frozen=True)
 class Rig:
-    """
-    Simulated cameras, one a band: response, noise and fixed pattern.
+    """Simulated cameras, one a band: response, noise and fixed pattern.
 
     The defaults are round figures for the camera of the paper: a 16-bit 640x512 microbolometer,
     about 115 counts/K near 300 K and NETD 20-40 mK without a filter; behind a filter the counts
     shrink with the band's share of dB/dT while the noise in counts stays.
 
-    Attributes
-    ----------
-    bands : tuple of str
-        Names in `bands.FILTERS`.
-    noise : tuple of float
-        Noise of each band, as NETD near 25 degrees Celsius [K].
-    counts_per_kelvin : float
-        Slope of the 8-14 um band at 300 K [count/K].
-    offset : float
-        Counts of a body at 0 K [count].
-    lowest, highest : float
-        Range of the simulated response [K].
-    gain_std, offset_std : float
-        Fixed pattern from pixel to pixel: relative gain [1] and offset [count].
-    bad_fraction : float
-        Fraction of dead pixels [1].
+    Bands are names in `bands.FILTERS`, each with a noise, as NETD near 25 degrees Celsius [K].
+    `counts_per_kelvin` is the slope of the 8-14 um band at 300 K [count/K], `offset` the counts of
+    a body at 0 K, and `lowest` to `highest` the range of the simulated response [K]. The fixed
+    pattern from pixel to pixel has a relative `gain_std` [1], an `offset_std` [count], and a
+    `bad_fraction` of dead pixels [1].
 
     Examples
     --------
@@ -70,8 +58,7 @@ class Rig:
             raise ValueError(f"Invalid bad_fraction {self.bad_fraction}. Must lie in [0, 1).")
 
     def response(self) -> xr.Dataset:
-        """
-        Response of the rig, from Planck's law in each band: the stage `response` with `noise`.
+        """Response of the rig, from Planck's law in each band: the stage `response` with `noise`.
 
         The Sakuma-Hattori curve through exact in-band radiances, which it meets within 0.05 mK
         between -10 and 80 degrees Celsius.
@@ -111,33 +98,16 @@ def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarr
 def observe(
     scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator, dtype: str = "float32"
 ) -> xr.Dataset:
-    r"""
-    Counts of a scene in a perfectly corrected rig: the stage `corrected`.
+    r"""Counts of a scene in a perfectly corrected rig: the stage `corrected`.
 
     .. math:: I_m = e_m U_m(x) + (1 - e_m) U_m(y) + \mathrm{noise}
 
-    Parameters
-    ----------
-    scene : Dataset
-        As from `scene`: object and background temperature (time, y, x) [K], emissivity
-        (band, y, x) [1]. The background may be one for each band, (band, time, y, x), as two
-        cameras see it that stand side by side.
-    response : Dataset
-        With `noise`, e.g. from `Rig.response`.
-    rng : Generator
-        Source of the noise.
-    dtype : str
-        Floating dtype of the counts.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, time, y, x) [count], `origin = "simulated"`, and of a twin its `twin`.
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the response, or a band is missing.
+    Of a scene, as from `scene`: object and background temperature (time, y, x) [K], emissivity
+    (band, y, x) [1], where the background may be one for each band, (band, time, y, x), as two
+    cameras see it that stand side by side; and of a response with `noise`, e.g. from
+    `Rig.response`: `counts` (band, time, y, x) [count] of a floating dtype, `origin = "simulated"`,
+    and of a twin its `twin`. ValueError if a temperature lies outside the response, or a band is
+    missing.
 
     Examples
     --------
@@ -171,8 +141,7 @@ def observe(
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
-    """
-    Random fixed pattern of the rig's detectors, of a shape (rows, columns).
+    """Random fixed pattern of the rig's detectors, of a shape (rows, columns).
 
     `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies, relative to
     the mean of the live pixels, a smooth vignette (narcissus) included; `dead` (band, y, x).
@@ -199,25 +168,11 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
 
 
 def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
-    """
-    Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
+    """Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        From `observe`.
-    detector : Dataset
-        From `pattern`, with the same bands and shape.
-
-    Returns
-    -------
-    Dataset
-        Stage `capture`: `counts` uint16 (band, time, y, x).
-
-    Raises
-    ------
-    ValueError
-        If the detector lacks a band, or a count does not fit into 16 bits (no silent saturation).
+    Of counts from `observe` and a detector from `pattern`, with the same bands and shape: the stage
+    `capture`, `counts` uint16 (band, time, y, x) [count]. ValueError if the detector lacks a band,
+    or a count does not fit into 16 bits (no silent saturation).
 
     Examples
     --------
@@ -238,32 +193,12 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
 
 
 def blackbody_movies(
-    rig: Rig,
-    temperatures: np.ndarray,
-    frames: int,
-    detector: xr.Dataset,
-    rng: np.random.Generator,
+    rig: Rig, temperatures: np.ndarray, frames: int, detector: xr.Dataset, rng: np.random.Generator
 ) -> xr.Dataset:
-    """
-    Raw movies of a blackbody that fills the view, at several temperatures.
+    """Raw movies of a blackbody that fills the view, at several temperatures.
 
-    Parameters
-    ----------
-    rig : Rig
-        The rig.
-    temperatures : ndarray
-        Blackbody temperatures [K], increasing, within the rig's range.
-    frames : int
-        Frames at each.
-    detector : Dataset
-        From `pattern`.
-    rng : Generator
-        Source of the noise.
-
-    Returns
-    -------
-    Dataset
-        `counts` uint16 (band, temperature, frame, y, x) [count].
+    Of a rig, blackbody temperatures [K], increasing, within the rig's range, a number of frames at
+    each, and a detector from `pattern`: `counts` uint16 (band, temperature, frame, y, x) [count].
 
     Examples
     --------
@@ -294,9 +229,44 @@ def blackbody_movies(
     )
 
 
-def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
+def contact_measurements(
+    response: xr.Dataset,
+    emissivity: xr.DataArray,
+    object_temperature: np.ndarray,
+    background_temperature: np.ndarray,
+    stds: tuple[float, float],
+    rng: np.random.Generator,
+) -> xr.Dataset:
+    """Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
+
+    Of a response with `noise`, a true emissivity (band) [1], the true temperatures (measurement)
+    [K] of object and background, and the standard deviations [K] of a reading of thermocouple and
+    blackbody: `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
+    (measurement) [K], as read. ValueError if a temperature lies outside the response, or the
+    emissivity lacks a band.
     """
-    Raw counts of one band, uint16 (..., y, x): fixed pattern, rounding, dead pixels at 0.
+    names = [str(name) for name in response["band"].values]
+    places = schema.band_positions(emissivity, names, "the emissivity")
+    true = {
+        "object_temperature": object_temperature,
+        "background_temperature": background_temperature,
+    }
+    emitted, reflected = (
+        np.stack(_blackbody(response, xr.DataArray(level, dims="measurement", name="temperature")))
+        for level in true.values()
+    )
+    clean = mixing.leaving(emissivity.values[places][:, np.newaxis], emitted, reflected)
+    noise = responses.noise(response, names)[:, np.newaxis] * rng.standard_normal(clean.shape)
+    read = {
+        name: ("measurement", level + rng.normal(0, std, len(level)), {"units": "K"})
+        for (name, level), std in zip(true.items(), stds, strict=True)
+    }
+    counts = (("band", "measurement"), clean + noise, {"units": "count"})
+    return xr.Dataset({"counts": counts, **read}, {"band": names}, {"origin": "simulated"})
+
+
+def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
+    """Raw counts of one band, uint16 (..., y, x): fixed pattern, rounding, dead pixels at 0.
 
     Takes corrected counts (..., y, x) [count] and the `pattern` (y, x) of this band. Raises a
     ValueError if a count does not fit into 16 bits.

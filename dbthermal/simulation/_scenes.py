@@ -9,34 +9,21 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
-
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
 
 _BACKGROUNDS: Final = ("pulses", "random walk", "still")
 
 
 @dataclass(frozen=True)
 class Background:
-    """
-    Temporal variation of the background.
+    """Temporal variation of the background.
 
-    Attributes
-    ----------
-    kind : {"pulses", "random walk", "still"}
-        People who walk by now and then; a background that never rests (a first-order
-        autoregressive process); or a constant one.
-    level : float
-        Resting temperature [K].
-    amplitude : float
-        Height of a pulse, or standard deviation of the walk [K].
-    count : tuple of int
-        Fewest and most pulses in the capture.
-    duration : tuple of float
-        Shortest and longest pulse [s].
-    correlation_time : float
-        Correlation time of the walk [s].
-    drift : float
-        Change of the resting temperature over the capture, linear in time [K].
+    Its kind is "pulses", people who walk by now and then; "random walk", a background that never
+    rests (a first-order autoregressive process); or "still". `level` is the resting temperature
+    [K], and `drift` its change over the capture, linear in time [K]; `amplitude` the height of a
+    pulse, or the standard deviation of the walk [K]; `count` the fewest and most pulses in the
+    capture, `duration` the shortest and longest one [s], and `correlation_time` that of the walk
+    [s].
     """
 
     kind: str = "pulses"
@@ -93,27 +80,13 @@ class Background:
 
 
 def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike) -> Array:
-    r"""
-    Temperature of a body that relaxes exponentially, from start to stop over the capture.
+    r"""Temperature of a body that relaxes exponentially, from start to stop over the capture.
 
     .. math:: T(t) = T_0 + (T_1 - T_0) \frac{1 - e^{-t / \tau}}{1 - e^{-t_1 / \tau}}
 
     the solution of Newton's law of heating, the object prior of the paper
-    (doi:10.48550/arXiv.2509.11334).
-
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s], two or more, increasing.
-    start, stop : float
-        First and last temperature [K].
-    time_constant : array_like, shape (...)
-        Time constants, positive [s].
-
-    Returns
-    -------
-    ndarray, shape (time, ...)
-        Temperature [K].
+    (doi:10.48550/arXiv.2509.11334). Of times (time,) [s], two or more, increasing, the first and
+    the last temperature [K], and positive time constants (...) [s]: temperatures (time, ...) [K].
 
     Examples
     --------
@@ -130,8 +103,7 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
 def scene(
     time: Array, object_temperature: Array, background_temperature: Array, emissivity: xr.DataArray
 ) -> xr.Dataset:
-    """
-    Scene of given temperatures (time, y, x) [K] and emissivity (band) or (band, y, x) [1].
+    """Scene of given temperatures (time, y, x) [K] and emissivity (band) or (band, y, x) [1].
 
     The truth of a simulated capture: names, dims and units of the stage `separated` without its
     deviations. Raises a ValueError unless the times (time,) [s] are two or more and increase.
@@ -183,30 +155,10 @@ def independent_pixels(
     stop: float,
     time_constant: tuple[float, float] = (8.0, 20.0),
 ) -> xr.Dataset:
-    """
-    Scene of many pixels of one material, each with its own heating curve and background.
+    """Scene of many pixels of one material, each with its own heating curve and background.
 
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s].
-    emissivity : DataArray
-        (band) [1].
-    background : Background
-        Variation of the background.
-    pixels : int
-        Number of pixels.
-    rng : Generator
-        Source of randomness.
-    start, stop : float
-        First and last object temperature [K].
-    time_constant : tuple of float
-        Range of the heating's time constant [s].
-
-    Returns
-    -------
-    Dataset
-        A scene one row high, see `scene`.
+    At times (time,) [s], of an emissivity (band) [1], warming from `start` to `stop` [K] with a
+    time constant within a range [s]: a scene one row high, see `scene`.
     """
     constants = rng.uniform(*time_constant, pixels)
     warm = heating(time, start, stop, constants)
@@ -224,33 +176,14 @@ def walkers(
     crossings: int = 7,
     time_constant: float = 12.0,
 ) -> xr.Dataset:
-    """
-    Simulated twin of a plate heated in its middle that reflects people who walk by.
+    """Simulated twin of a plate heated in its middle that reflects people who walk by.
 
-    Each person is an upright ellipse with a head, warmer than the room, that crosses the view
-    once at a steady pace. Along an edge of the silhouette the reflection is abrupt.
+    Each person is an upright ellipse with a head, warmer than the room, that crosses the view once
+    at a steady pace. Along an edge of the silhouette the reflection is abrupt.
 
-    Parameters
-    ----------
-    time : ndarray, shape (time,)
-        Times [s].
-    shape : tuple of int
-        Rows and columns.
-    emissivity : DataArray
-        (band) or (band, y, x) [1].
-    rng : Generator
-        Source of the paths.
-    temperatures : sequence of float
-        Temperatures of the room, of people, and of the plate's middle at the end [K].
-    crossings : int
-        Number of people.
-    time_constant : float
-        Time constant of the heating [s].
-
-    Returns
-    -------
-    Dataset
-        The scene, see `scene`.
+    At times (time,) [s], of rows and columns, an emissivity (band) or (band, y, x) [1], and
+    temperatures of the room, of people, and of the plate's middle at the end [K], with a number of
+    crossings, and the time constant of the heating [s]: the scene, see `scene`.
 
     Examples
     --------

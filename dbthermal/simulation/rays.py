@@ -16,6 +16,7 @@ import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 __all__ = ["MISSED", "Camera", "Caster", "Hits", "mirror", "unit", "vertex_normals"]
+__dir__ = __all__.copy
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -32,23 +33,12 @@ _LIFT: Final = 1e-4
 _SAME: Final = 1e-3
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
 @dataclass(frozen=True)
 class Camera:
-    """
-    A pinhole camera with square pixels.
+    """A pinhole camera with square pixels.
 
-    Attributes
-    ----------
-    position, target : tuple of float
-        Position of the camera, and the point at the middle of its view [m].
-    shape : tuple of int
-        Rows and columns.
-    field_of_view : float
-        Horizontal field of view [degrees]; 24 in the paper.
+    At a position, with a target at the middle of its view [m], of a shape (rows, columns) and a
+    horizontal field of view [degrees]; 24 in the paper.
     """
 
     position: Point
@@ -84,8 +74,7 @@ class Camera:
         return float(2.0 * np.tan(np.radians(self.field_of_view) / 2.0) / self.shape[1])
 
     def directions(self, places: npt.ArrayLike | None = None) -> Array:
-        """
-        Unit vectors (..., 3) of the rays through rows and columns (..., 2) [pixel].
+        """Unit vectors (..., 3) of the rays through rows and columns (..., 2) [pixel].
 
         By default through the pixels' middles, (pixel, 3) in C order.
         """
@@ -96,8 +85,7 @@ class Camera:
         return unit(np.stack([right, down, np.ones_like(right)], axis=-1) @ self.axes)
 
     def project(self, points: npt.ArrayLike) -> Array:
-        """
-        Row and column (..., 2) [pixel] at which points (..., 3) [m] appear.
+        """Row and column (..., 2) [pixel] at which points (..., 3) [m] appear.
 
         The inverse of `directions`; whole numbers are the middles of pixels. Raises a ValueError
         if a point lies behind the camera.
@@ -117,17 +105,11 @@ class Camera:
 
 @dataclass(frozen=True)
 class Hits:
-    """
-    First intersections of rays with a mesh.
+    """First intersections of rays with a mesh.
 
-    Attributes
-    ----------
-    face : ndarray of int, shape (ray,)
-        Face that is met, or `MISSED`.
-    distance : ndarray, shape (ray,)
-        Distance from the ray's origin [m], infinite where nothing is met.
-    weights : ndarray, shape (ray, 3)
-        Barycentric weights of the face's corners [1], zero where nothing is met.
+    `face` (ray) is the face that is met, or `MISSED`; `distance` (ray) that from the ray's origin
+    [m], infinite where nothing is met; `weights` (ray, 3) the barycentric weights of the face's
+    corners [1], zero where nothing is met.
     """
 
     face: npt.NDArray[np.int64]
@@ -145,14 +127,7 @@ class Hits:
 
 
 class Caster:
-    """
-    Ray caster for one mesh.
-
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        The mesh [m]; its normals point outward.
-    """
+    """Ray caster for one mesh [m], whose normals point outward."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.faces = np.asarray(mesh.faces)
@@ -163,8 +138,7 @@ class Caster:
         self._intersector = RayMeshIntersector(mesh)
 
     def cast(self, origins: Array, directions: Array) -> Hits:
-        """
-        First intersection of each ray, of origins [m] and unit directions (ray, 3).
+        """First intersection of each ray, of origins [m] and unit directions (ray, 3).
 
         The face is found in single precision, the point on it in double.
         """
@@ -200,8 +174,7 @@ class Caster:
         return np.asarray(sum(part * hits.weights[:, corner] for corner, part in enumerate(parts)))
 
     def mirrored(self, hits: Hits, directions: Array) -> tuple[Array, Array]:
-        """
-        Origins [m] and directions (ray, 3) of rays that the mesh reflects, on either side.
+        """Origins [m] and directions (ray, 3) of rays that the mesh reflects, on either side.
 
         All rays must meet the mesh. The reflected ones start a little off the surface. Where the
         interpolated normal would send one into its own face, as it may at a silhouette, the
@@ -237,8 +210,7 @@ def vertex_normals(mesh: trimesh.Trimesh) -> Array:
 
 
 def mirror(directions: Array, normals: Array) -> Array:
-    r"""
-    Mirror law :math:`r = d - 2 (d \cdot n) n` for directions and unit normals (..., 3).
+    r"""Mirror law :math:`r = d - 2 (d \cdot n) n` for directions and unit normals (..., 3).
 
     Examples
     --------

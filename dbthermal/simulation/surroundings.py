@@ -14,30 +14,17 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from dbthermal._arrays import Array
 from dbthermal.simulation._scenes import increasing
 from dbthermal.simulation.rays import Caster, Hits
 
 __all__ = ["Actor", "Pose", "gliding", "hinged", "incident", "painted"]
-
-Array = npt.NDArray[np.float64]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy
 
 
 @dataclass(frozen=True)
 class Pose:
-    """
-    Position and orientation of a rigid body: its point p is at R p + t in the world.
-
-    Attributes
-    ----------
-    rotation : scipy.spatial.transform.Rotation
-        Rotation R.
-    translation : array_like, shape (3,)
-        Translation t [m].
-    """
+    """Position and orientation of a rigid body: its point p is at R p + t [m] in the world."""
 
     rotation: Rotation = field(default_factory=Rotation.identity)
     translation: npt.ArrayLike = (0.0, 0.0, 0.0)
@@ -56,10 +43,8 @@ class Pose:
         return (origins - np.asarray(self.translation)) @ matrix, directions @ matrix
 
 
-Motion = Callable[[float], Pose]
-"""Pose at a time [s]."""
-Warmth = Callable[[float], Array]
-"""Temperature of each vertex (vertex,) [K] at a time [s]."""
+Motion = Callable[[float], Pose]  # pose at a time [s]
+Warmth = Callable[[float], Array]  # temperature of each vertex (vertex,) [K] at a time [s]
 
 
 def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:
@@ -69,8 +54,7 @@ def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:
 
 
 def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
-    """
-    Motion in straight lines between places (stop, 3) [m] at times (stop,) [s], without turning.
+    """Motion in straight lines between places (stop, 3) [m] at times (stop,) [s], without turning.
 
     Before and after, the pose is that of the nearest stop. Raises a ValueError if the times do not
     increase, or the places are not finite, one for each time.
@@ -86,17 +70,10 @@ def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
 
 @dataclass(frozen=True)
 class Actor:
-    """
-    A rigid body of the surroundings.
+    """A rigid body of the surroundings: a mesh in its own frame [m], and its temperature [K].
 
-    Attributes
-    ----------
-    mesh : trimesh.Trimesh
-        Its mesh, in its own frame [m].
-    temperature : ndarray, shape (vertex,), or function of time
-        Temperature [K], finite.
-    motion : function of time, optional
-        Its pose; without one it stands still, its own frame being the world's.
+    One for each vertex (vertex,), finite, or a function of time [s]. Without a motion, its pose as
+    a function of time, it stands still, its own frame being the world's.
     """
 
     mesh: trimesh.Trimesh
@@ -172,19 +149,10 @@ class _Target:
 def incident(
     origins: Array, directions: Array, time: Array, room: float, actors: Sequence[Actor]
 ) -> Array:
-    """
-    Blackbody temperature (time, ray) [K] that rays meet, frame by frame.
+    """Blackbody temperature (time, ray) [K] that rays meet, frame by frame.
 
-    Parameters
-    ----------
-    origins, directions : ndarray, shape (ray, 3)
-        Origins [m] and unit vectors of the rays, the same in all frames.
-    time : ndarray, shape (time,)
-        Times [s].
-    room : float
-        Temperature of the walls behind all actors [K].
-    actors : sequence of Actor
-        Bodies; the nearest hides the others.
+    Of rays (ray, 3), the same in all frames, by their origins [m] and unit vectors, at times
+    (time,) [s], before the walls of a room [K] and actors, of which the nearest hides the others.
 
     Examples
     --------

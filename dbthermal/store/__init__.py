@@ -37,7 +37,4 @@ __all__ = [
     "save_video",
     "to_disk",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

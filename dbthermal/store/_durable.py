@@ -23,22 +23,11 @@ _THREADS: Final = 8
 
 
 class HeldFolder:
-    """
-    A folder held by its descriptor, wherever it is renamed or moved on its disk.
+    """A folder held by its descriptor, wherever it is renamed or moved on its disk.
 
-    Parameters
-    ----------
-    folder : Path
-        That exists (OSError otherwise).
-    path : Path, optional
-        Where it will be moved next, if that is another place.
-
-    Attributes
-    ----------
-    root : Path
-        Leads into it, wherever it is; without a /proc, as on macOS, its path.
-    close : callable
-        Lets it go.
+    It exists (OSError otherwise), and `path` is where it will be moved next, if that is another
+    place. `root` leads into it, wherever it is; without a /proc, as on macOS, it is its path.
+    `close` lets it go.
     """
 
     def __init__(self, folder: Path, path: Path | None = None) -> None:
@@ -61,8 +50,7 @@ class HeldFolder:
 
 
 class DurableStore(SummedStore):
-    """
-    Zarr store in a folder in which an existing file is replaced in one step.
+    """Zarr store in a folder in which an existing file is replaced in one step.
 
     New files are written as `SummedStore` does, and are brought to the disk by `tree_to_disk`, for
     many at once take the time of one.
@@ -89,8 +77,7 @@ class DurableStore(SummedStore):
 
 
 def replace(path: Path, content: bytes, part: Path, before: Iterable[Path] = ()) -> None:
-    """
-    Replace a file in one step: a power loss leaves the old content or the new one.
+    """Replace a file in one step: a power loss leaves the old content or the new one.
 
     The new content is written to `part`, on the same file system. If that fails, the old file
     stays, and nothing beside it. The files `before` are brought to the disk with it.
@@ -124,8 +111,7 @@ def made_beside(path: Path) -> Iterator[Path]:
 
 
 def to_disk(paths: Iterable[Path]) -> None:
-    """
-    Wait until files and folders are on the disk, and not only in its cache.
+    """Wait until files and folders are on the disk, and not only in its cache.
 
     All are synced at the same time, for a file system then writes its journal once. What is in a
     folder is not synced with it. OSError, FileNotFoundError among them, if one cannot be.

@@ -55,8 +55,7 @@ class SummedStore(LocalStore):
 
 
 class CheckedStore(SummedStore):
-    """
-    Zarr store in a folder, to be read: all that differs from what was written is a ValueError.
+    """Zarr store in a folder, to be read: all that differs from what was written is a ValueError.
 
     `attrs` are the attributes of the store; a recording that is not `closed` has to have its valid
     part alone, without `time`. A store without checksums, of dbthermal 0.1.0, opens with a warning.

@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,13 +22,7 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal.schema import COORDINATES, Variable
-from dbthermal.store._durable import (
-    DurableStore,
-    HeldFolder,
-    made_beside,
-    replace,
-    tree_to_disk,
-)
+from dbthermal.store._durable import DurableStore, HeldFolder, made_beside, replace, tree_to_disk
 from dbthermal.store._integrity import (
     GROUP,
     GROWING,
@@ -48,8 +42,7 @@ _COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), 
 
 
 class Recording:
-    """
-    A recording that is being written, in a new folder ``*.zarr``; FileExistsError if it exists.
+    """A recording that is being written, in a new folder ``*.zarr``; FileExistsError if it exists.
 
     `variables` are of dims (band, time, ...), frame by frame, or (log,), row by row, and `sizes`
     has their other dims. `chunk` is the number of frames that a kill costs at most, `attrs` are
@@ -129,8 +122,7 @@ class Recording:
             raise
 
     def append(self, band: str, block: Mapping[str, Values]) -> None:
-        """
-        Write a chunk of frames of one band behind its others; valid with the next `commit`.
+        """Write a chunk of frames of one band behind its others; valid with the next `commit`.
 
         `block` holds every variable of frames, (frame, ...): a whole chunk, or at last less.
         """
@@ -169,8 +161,7 @@ class Recording:
             self._store.replace(GROUP, text.encode(), self._part(GROUP))
 
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
-        """
-        Bring all bands to one number of frames, with `time` [s] as coordinate; set attributes.
+        """Bring all bands to one number of frames, with `time` [s] as coordinate; set attributes.
 
         A band with fewer frames than another gets copies of its last one, without stamps, as from
         a driver that lost frames. A second call does nothing.
@@ -184,8 +175,8 @@ class Recording:
                 if 0 < recorded < frames:
                     self._repeat_last(place, recorded, frames)
             for array in self._arrays.values():
-                shape = {"time": frames, "log": self.rows}
-                sizes = zip(_dims(array), array.shape, strict=True)
+                shape, metadata = {"time": frames, "log": self.rows}, cast("Any", array.metadata)
+                sizes = zip(metadata.dimension_names, array.shape, strict=True)
                 array.resize(tuple(shape.get(dim, size) for dim, size in sizes))
             if time is not None:
                 zarr.create_array(
@@ -246,10 +237,6 @@ def _create(
         dimension_names=variable.dims,
         attributes=dict(variable.attrs),
     )
-
-
-def _dims(array: Any) -> tuple[str, ...]:
-    return tuple(array.metadata.dimension_names)
 
 
 def _grow(array: Any, axis: int, size: int) -> None:

@@ -50,8 +50,7 @@ _ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str
 
 
 def _chunks(variable: xr.Variable | xr.DataArray, *, even: bool = False) -> tuple[int, ...]:
-    """
-    Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
+    """Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
 
     Every stage works pixel by pixel on all frames and bands, so a chunk holds the full story of a
     nearly square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression; `even`
@@ -71,17 +70,10 @@ def _chunks(variable: xr.Variable | xr.DataArray, *, even: bool = False) -> tupl
 
 
 def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """
-    Save a dataset as zarr (format 3, not consolidated), in place of an earlier one.
+    """Save a dataset as zarr (format 3, not consolidated), in place of an earlier one.
 
-    Parameters
-    ----------
-    dataset : Dataset
-        Of any stage; it is not changed.
-    path : str or Path
-        Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`; becomes ``attrs["provenance"]``.
+    The path is a folder ``*.zarr`` (ValueError if it has another suffix), whose parents are made.
+    The provenance, from `dbthermal.store.provenance`, becomes ``attrs["provenance"]``.
 
     Examples
     --------
@@ -94,39 +86,14 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
     [20310, 20750]
     """
-    # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
-    plain = _with_text_as(dataset.drop_encoding(), "U", np.dtypes.StringDType())
-    plain.attrs = {**MARK, **dataset.attrs, "provenance": json.loads(_json(provenance))}
-    encoding = {
-        name: {"chunks": _chunks(variable), "compressors": _COMPRESSORS}
-        for name, variable in plain.variables.items()
-    }
-    with _whole(path, ".zarr") as part:
-        part.mkdir()
-        plain.to_zarr(
-            SummedStore(part),
-            mode="w-",
-            encoding=encoding,
-            zarr_format=3,
-            consolidated=False,
-            write_empty_chunks=True,
-        )
-        (part / SUMS).write_bytes(last_sums(part))
+    _save_rows([dataset], path, provenance, even=False)
 
 
 def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """
-    Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
+    """Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
 
-    Parameters
-    ----------
-    parts : iterable of Dataset
-        Rows from the first to the last, made when they are asked for: no more than one is held.
-        What has no y, and the attributes, are those of the first.
-    path : str or Path
-        Folder ``*.zarr``; see `save`.
-    provenance : mapping
-        See `save`.
+    The parts are the rows from the first to the last, made when they are asked for: no more than
+    one is held. What has no y, and the attributes, are those of the first.
 
     Examples
     --------
@@ -139,18 +106,25 @@ def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
+    _save_rows(parts, path, provenance, even=True)
+
+
+def _save_rows(
+    parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any], *, even: bool
+) -> None:
+    """Save parts that follow one another along y; their chunks divide the rows if `even`."""
+    options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
     with _whole(path, ".zarr") as folder:
         folder.mkdir()
         for number, part in enumerate(parts):
+            # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
             plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
-            options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
+            encoding = {
+                name: {"chunks": _chunks(variable, even=even), "compressors": _COMPRESSORS}
+                for name, variable in plain.variables.items()
+            }
             if number == 0:
                 plain.attrs = {**MARK, **part.attrs, "provenance": json.loads(_json(provenance))}
-                encoding = {
-                    name: {"chunks": _chunks(variable, even=True), "compressors": _COMPRESSORS}
-                    for name, variable in plain.variables.items()
-                }
-                options = {"mode": "w-", "encoding": encoding}
             else:
                 rest = [name for name, one in plain.variables.items() if "y" not in one.dims]
                 plain = plain.drop_vars(rest).drop_attrs(deep=False)
@@ -159,28 +133,18 @@ def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping
                 zarr_format=3,
                 consolidated=False,
                 write_empty_chunks=True,
-                **options,
+                **(options if number else {"mode": "w-", "encoding": encoding}),
             )
         (folder / SUMS).write_bytes(last_sums(folder))
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
-    """
-    Open a saved dataset or a recording; values are read when they are used.
+    """Open a saved dataset or a recording, a folder ``*.zarr``; values are read when they are used.
 
-    A recording that was cut short, or is being written, opens as far as all bands are valid; its
-    attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
-
-    Parameters
-    ----------
-    path : str or Path
-        Folder ``*.zarr``.
-
-    Returns
-    -------
-    Dataset
-        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
-        fixed-length kind.
+    It is identical to the one saved, with ``attrs["provenance"]`` added; text is of NumPy's
+    fixed-length kind. A recording that was cut short, or is being written, opens as far as all
+    bands are valid; its attributes have ``complete`` = False and, in ``frames_written``, the end of
+    each band.
 
     Raises
     ------
@@ -240,18 +204,10 @@ def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
 def save_numbers(
     numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
 ) -> None:
-    """
-    Save headline numbers as strict JSON, with sorted names.
+    """Save headline numbers as strict JSON (``*.json``), with sorted names, and their provenance.
 
-    Parameters
-    ----------
-    numbers : mapping
-        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean;
-        TypeError or ValueError for any other value.
-    path : str or Path
-        File ``*.json``. Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`.
+    A name, unit included (``"object_rmse_K"``), has a finite number, a string or a boolean;
+    TypeError or ValueError for any other value.
 
     Examples
     --------
@@ -273,8 +229,7 @@ def save_numbers(
 
 
 def read_numbers(path: str | Path) -> dict[str, Number]:
-    """
-    Read a file of `save_numbers`: name to value.
+    """Read a file of `save_numbers`: name to value.
 
     ValueError, with file and line, if it is not such a file, a name is listed twice, a number is
     not finite, or it differs from what was written. A file without a checksum, of dbthermal 0.1.0,
@@ -310,19 +265,10 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
 def save_figure(
     figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
 ) -> None:
-    """
-    Save a figure as PNG, the same bytes for the same figure.
+    """Save a figure of matplotlib as PNG (``*.png``), the same bytes for the same figure.
 
-    Parameters
-    ----------
-    figure : Figure
-        Of matplotlib; it stays open.
-    path : str or Path
-        File ``*.png``. Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`; becomes the text chunk ``Comment``, as JSON.
-    dpi : int
-        Resolution [pixel/inch].
+    It stays open; its resolution is `dpi` [pixel/inch]. The provenance becomes the text chunk
+    ``Comment``, as JSON.
 
     Examples
     --------
@@ -348,23 +294,13 @@ def save_video(
     rate: float,
     codec: Literal["vp9", "h264"] = "vp9",
 ) -> None:
-    """
-    Save a film in MP4, as browsers play it.
+    """Save a film in MP4 (``*.mp4``), as browsers play it, at a frame rate [Hz].
 
-    Parameters
-    ----------
-    frames : iterable of ndarray of uint8, shape (rows, columns, 3)
-        Colours; at least one frame, all of one size, both sizes even, else ValueError.
-    path : str or Path
-        File ``*.mp4``. Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`; becomes the file's comment, as JSON.
-    rate : float
-        Frame rate [Hz].
-    codec : {"vp9", "h264"}
-        Compression. VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of
-        H.264, x264, is under the GPL, and patents may ask for a licence where films are passed on
-        (see docs/licences.md). ValueError for any other.
+    Frames are uint8 (rows, columns, 3), colours; ValueError unless there is one at least, and all
+    are of one size, both sizes even. The provenance becomes the file's comment, as JSON. Of the
+    codecs VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of H.264,
+    x264, is under the GPL, and patents may ask for a licence where films are passed on (see
+    docs/licences.md). ValueError for any other.
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 import xarray as xr
-from captures import still
+from captures import drop_frames, still
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BarycentricInterpolator
 
 from dbthermal import alignment, separation, simulation
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.simulation import Background, Rig, drop_frames, expose, repeat_frames
+from dbthermal.simulation import Background, Rig, expose, repeat_frames
 
 RIG = Rig()
 FRAMES, STEPS, START = 350, 20, 80

@@ -10,14 +10,13 @@ import xarray as xr
 
 from dbthermal import calibration, response, schema
 from dbthermal.calibration import Bias
-from dbthermal.simulation import (
+from dbthermal.simulation import Rig, contact_measurements
+from reproduction.experiments.bench import (
     OBJECTS,
     Bench,
-    Rig,
     Sample,
     band_emissivity,
     bench_series,
-    contact_measurements,
     reflector_series,
 )
 from reproduction.experiments.procedures import compare_procedures, reflector_sensitivity

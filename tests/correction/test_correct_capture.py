@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import drift
 
 from dbthermal import schema, simulation
 from dbthermal.correction import blackbody_statistics, correct_capture, fit_correction
@@ -39,7 +40,7 @@ def recorded() -> Recorded:
     # In the order of the instrument: thermal lag, read-out noise, drift, bad pixels, shutter.
     seen = simulation.lag(clean, LAG)
     noise = rng.normal(0.0, NOISE, seen["counts"].shape).astype(np.float32)
-    seen = simulation.drift_pattern(seen.assign(counts=seen["counts"] + noise), rng, common=60.0)
+    seen = drift(seen.assign(counts=seen["counts"] + noise), 60.0)
     seen = simulation.spoil_pixels(seen, 0.01, rng)
     seen = simulation.fire_shutter(seen, SHUTTER, rng, duration=0.2)
     detector = simulation.pattern(rig, SHAPE, rng)
@@ -163,17 +164,3 @@ def test_damaged_frames_are_left_out(recorded: Recorded) -> None:
     assert np.flatnonzero(lost[0]).tolist() == [0, 50, 51]
     assert np.flatnonzero(lost[1]).tolist() == [0]
     assert corrected.attrs["damaged_frames"] == [1, 0]
-
-
-def test_offsets_in_proportion_to_time(recorded: Recorded) -> None:
-    """Offsets are interpolated linearly in time; interpolation over a shutter event raises."""
-    raw, flat = recorded.raw.isel(time=slice(100)), recorded.options["flat"]
-    later = flat + np.random.default_rng(1).normal(0.0, 30.0, flat.shape)
-    corrected = correct_capture(raw, recorded.correction, flat=flat, flat_after=later)
-    ends = [correct_capture(raw, recorded.correction, flat=one)["counts"] for one in (flat, later)]
-    middle = corrected["counts"] - 0.5 * (ends[0] + ends[1])
-    weight = (raw["time"] - raw["time"][0]) / (raw["time"][-1] - raw["time"][0])
-    expected = (weight - 0.5) * (ends[1] - ends[0])
-    np.testing.assert_allclose(middle, expected.transpose(*middle.dims), rtol=0, atol=0.02)  # count
-    with pytest.raises(ValueError, match="2 shutter events renew the offsets"):
-        correct_capture(recorded.raw, recorded.correction, flat_after=later)

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
-from captures import RIG, movie, still
+from captures import RIG, drift, movie, still
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -37,7 +37,7 @@ def test_common_drift_is_undone() -> None:
 def test_drift_leaves_the_steps() -> None:
     """Each segment is undone by itself; frames taken out stay out, and steps stay in."""
     capture = still(count=300)
-    drifting = simulation.drift_pattern(capture, np.random.default_rng(0), common=50.0)
+    drifting = drift(capture, 50.0)
     stepped = simulation.fire_shutter(drifting, 15.0, np.random.default_rng(1))
     marked = mark_shutter(stepped)
     undone = undo_drift(marked, patch(), order=2)

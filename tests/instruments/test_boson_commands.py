@@ -93,7 +93,7 @@ def test_the_message_of_a_wrong_value_names_the_right_ones() -> None:
 
 def test_no_identifier_is_used_twice() -> None:
     """All readings, settings and actions have different identifiers."""
-    used = [reading.command for reading in commands.READINGS]
+    used = [identifier for identifier, _ in READINGS.values()]
     used += [number for s in commands.SETTINGS for number in (s.reading.command, s.set_command)]
     used.append(commands.RUN_FFC)
     assert len({*used}) == len(used)

@@ -10,11 +10,11 @@ import pytest
 
 from dbthermal import store
 from dbthermal.instruments import telemetry
-from dbthermal.instruments.camera import DAMAGED, GOOD, MEANINGS, Frame, FrameFlag
+from dbthermal.instruments.camera import DAMAGED, GOOD, Frame, FrameFlag
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import notes
-from dbthermal.instruments.recording._capture_file import NOTES, CaptureFile, Note
+from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 
 SHAPE, RATE, BANDS = (4, 80), 100.0, ("8-14", "9.5")
 IMAGE = np.full(SHAPE, 5000, dtype=np.uint16)
@@ -140,7 +140,7 @@ def test_flags_explain_themselves(tmp_path: Path) -> None:
     names = [name.upper() for name in attrs["flag_meanings"].split()]
     found = {FrameFlag[name]: mask for name, mask in zip(names, attrs["flag_masks"], strict=True)}
     assert found == {flag: int(flag) for flag in FrameFlag}
-    assert all(text in attrs["comment"] for text in MEANINGS.values())
+    assert all(flag.meaning in attrs["comment"] for flag in FrameFlag)
 
 
 def test_the_store_explains_itself(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_the_store_explains_itself(tmp_path: Path) -> None:
     kinds = opened["log_kind"].attrs
     assert kinds["flag_meanings"].split() == list(opened.attrs["log_kinds"])
     assert kinds["flag_values"] == list(opened.attrs["log_kinds"].values())
-    assert all(NOTES[kind] in kinds["comment"] for kind in Note)
+    assert all(kind.meaning in kinds["comment"] for kind in Note)
     assert "frame_counter 42 to 43, " in opened["telemetry"].attrs["comment"]
 
 

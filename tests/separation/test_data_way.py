@@ -20,7 +20,7 @@ import dbthermal
 from dbthermal import separation, simulation
 
 PACKAGE = Path(dbthermal.__file__).parent
-MOST_ROOMS, MOST_RETURNS = 14, 10
+MOST_ROOMS, MOST_RETURNS = 14, 8
 
 
 def functions_read(capture: xr.Dataset, response: xr.Dataset) -> list[tuple[str, str]]:
@@ -45,7 +45,7 @@ def functions_read(capture: xr.Dataset, response: xr.Dataset) -> list[tuple[str,
 
 @pytest.mark.parametrize("jump", [0.0, 6.0])
 def test_way_of_the_data_is_short(jump: float) -> None:
-    """The default method crosses at most 14 modules, with at most 10 returns."""
+    """The default method crosses at most 14 modules, with at most 8 returns."""
     rig, rng = simulation.Rig(), np.random.default_rng(1)
     emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
     scene = simulation.walkers(np.arange(200) / 10.0, (8, 16), emissivity, rng, crossings=3)

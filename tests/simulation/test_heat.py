@@ -26,7 +26,7 @@ Array = npt.NDArray[np.float64]
 THICKNESS = 0.003
 AMBIENT = 295.0
 CAPACITY = heat.GLASS.density * heat.GLASS.specific_heat * THICKNESS
-ALPHA = heat.GLASS.diffusivity
+ALPHA = heat.GLASS.conductivity / (heat.GLASS.density * heat.GLASS.specific_heat)  # [m^2/s]
 SPOT = trimesh.creation.icosphere(0, 0.01)
 
 

@@ -22,7 +22,6 @@ def test_steps_leave_their_input() -> None:
     capture, rng = still(), np.random.default_rng(0)
     before = capture.copy(deep=True)
     made = [simulation.lag(capture, 0.01), simulation.spoil_pixels(capture, 0.01, rng)]
-    made += [simulation.drift_pattern(capture, rng, pattern_std=5.0)]
     xr.testing.assert_identical(capture, before)
     assert all(one is not capture for one in made)
 
@@ -39,7 +38,7 @@ def test_simulated_nuisances_refuse_nonsense() -> None:
         simulation.fire_shutter(capture, 9.0, rng, bands=("10.6",))
 
 
-@pytest.mark.parametrize("name", ["fire_shutter", "drift_pattern", "spoil_pixels", "lag"])
+@pytest.mark.parametrize("name", ["fire_shutter", "spoil_pixels", "lag"])
 def test_whole_numbers_are_refused(name: str) -> None:
     """Integer counts raise an error: a lagging pixel of 1000 counts would wrap to 57,580."""
     counts = np.full((2, 5, 2, 2), 1000, dtype=np.uint16)
@@ -50,7 +49,6 @@ def test_whole_numbers_are_refused(name: str) -> None:
     rng = np.random.default_rng(0)
     arguments = {
         "fire_shutter": ([0.2], rng),
-        "drift_pattern": (rng,),
         "spoil_pixels": (0.1, rng),
         "lag": (0.05,),
     }

@@ -66,7 +66,4 @@ __all__ = [
     "encode",
     "is_enabled",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

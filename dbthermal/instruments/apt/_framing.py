@@ -90,24 +90,10 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """
-    Bytes of a message, ready to send.
+    """Bytes of a message, ready to send: the header, and the data; with data in the long form.
 
-    Parameters
-    ----------
-    message : Message
-        With data it takes the long form, which has no parameters.
-
-    Returns
-    -------
-    bytes
-        The header, and the data.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a number is not whole, or does not fit its field, the data are too long, or there are
-        both parameters and data.
+    TypeError or ValueError if a number is not whole, or does not fit its field, the data are too
+    long, or there are both data and parameters, which the long form does not have.
 
     Examples
     --------
@@ -137,24 +123,12 @@ def encode(message: Message) -> bytes:
 def command(
     identifier: Id, channel: int = 0, value: int = 0, *, data: bytes = b"", destination: int
 ) -> bytes:
-    """
-    Bytes of a message from the computer to a controller.
+    """Bytes of a message from the computer to a controller.
 
-    Parameters
-    ----------
-    identifier : Id
-        Kind of message.
-    channel, value : int
-        Its two parameters in the short form: channel from 1, which in a rack is 1 in every bay.
-    data : bytes
-        Its data in the long form, from the ``pack`` of a record.
-    destination : int
-        Address; a controller silently ignores messages to another one.
-
-    Raises
-    ------
-    ValueError
-        If a number does not fit its field, or the message never has data of this length.
+    Short, it has two parameters, the `channel` from 1, which in a rack is 1 in every bay, and a
+    `value`; long, the `data` from the ``pack`` of a record. A controller silently ignores messages
+    to another `destination`. ValueError if a number does not fit its field, or the message never
+    has data of this length.
 
     Examples
     --------
@@ -170,23 +144,12 @@ def command(
 
 
 class Decoder:
-    """
-    Finds the messages in a stream of bytes, however it is cut into pieces.
+    """Finds the messages in a stream of bytes, however it is cut into pieces.
 
-    A byte with which no possible message begins is dropped and counted, and the search goes on
-    with the next. Each received byte belongs to a message that was returned, is counted in
-    `dropped`, or is `pending`.
-
-    Parameters
-    ----------
-    destinations, sources : collection of int
-        Addresses that are possible; by default all, so that a line is read in both directions.
-        The fewer, the less noise passes for a message.
-
-    Attributes
-    ----------
-    dropped : int
-        Number of bytes that belonged to no message so far.
+    A byte with which no possible message begins is dropped and counted, and the search goes on with
+    the next. Each received byte belongs to a message that was returned, is counted in `dropped`, or
+    is `pending`. The fewer `destinations` and `sources` are possible, the less noise passes for a
+    message; by default all are, so that a line is read in both directions.
 
     Examples
     --------
@@ -199,9 +162,7 @@ class Decoder:
     """
 
     def __init__(
-        self,
-        destinations: Collection[int] = ADDRESSES,
-        sources: Collection[int] = ADDRESSES,
+        self, destinations: Collection[int] = ADDRESSES, sources: Collection[int] = ADDRESSES
     ) -> None:
         self.dropped = 0
         self._destinations = frozenset(destinations)
@@ -214,8 +175,7 @@ class Decoder:
         return len(self._buffer)
 
     def feed(self, received: bytes) -> list[Message]:
-        """
-        Messages that the next bytes of the stream complete.
+        """Messages that the next bytes of the stream complete.
 
         An unknown identifier, or one of `Id` with a length that it never has, is not a message.
         """

@@ -13,8 +13,7 @@ from dbthermal.instruments.apt._framing import NO, YES, Id, Message
 
 
 class StatusBits(IntFlag):
-    """
-    State of a motor: the bits on which public sources agree; others are kept as they come.
+    """State of a motor: the bits on which public sources agree; others are kept as they come.
 
     Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here. The
     jogging bits of one controller were seen to stick: nothing here relies on them.
@@ -80,8 +79,7 @@ class VelocityParameters(Record):
 
 @dataclass(frozen=True)
 class HomeParameters(Record):
-    """
-    Search for the home switch.
+    """Search for the home switch.
 
     `direction` is 1 forward, 2 reverse; `limit_switch` 1 the reverse one, 4 the forward one;
     `offset` [count] is from the switch to the position 0. `velocity` is near 0 when some
@@ -120,8 +118,7 @@ class Status(Record):
 
 @dataclass(frozen=True)
 class Info:
-    """
-    Identity of a controller.
+    """Identity of a controller.
 
     `model` is such as ``BSC201``, or ``SCC201``, which some that were sold as BSC201 say; `type`
     is 44 for brushless, 45 for a rack, others are not certain; `firmware` is

@@ -31,7 +31,6 @@ from dbthermal.instruments.camera import (
     FfcMode,
     FfcStatus,
     FrameSource,
-    GainMode,
     Identity,
     Stream,
 )
@@ -46,24 +45,19 @@ __all__ = [
     "BosonTimeoutError",
     "commands",
 ]
+__dir__ = __all__.copy
 
 T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
 
-BAUDRATE: Final = 921600
-"""Speed of the line [bit/s]; over USB probably without effect."""
-
-REPLY_TIMEOUT: Final = 1.0
-"""Longest wait for a reply [s], as in the vendor's own software."""
+BAUDRATE: Final = 921600  # speed of the line [bit/s]; over USB probably without effect
+REPLY_TIMEOUT: Final = 1.0  # longest wait for a reply [s], as in the vendor's own software
 
 REPEATS: Final = 2
 """Repetitions of a reading without a reply; a command that changes the camera is sent once."""
 
-FFC_TIMEOUT: Final = 10.0
-"""Longest wait for a flat-field correction [s]."""
-
-POLL: Final = 0.05
-"""Time between two questions while waiting [s]."""
+FFC_TIMEOUT: Final = 10.0  # longest wait for a flat-field correction [s]
+POLL: Final = 0.05  # time between two questions while waiting [s]
 
 MAXIMUM_RECEIVED: Final = 65536
 """Most bytes to search for one reply: a line that talks without end is an error."""
@@ -101,8 +95,7 @@ class Statistics:
 
 
 class Boson(Closing):
-    """
-    One camera's command port, a `camera.CameraControl`; for any number of threads.
+    """One camera's command port, a `camera.CameraControl`; for any number of threads.
 
     Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
     `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is
@@ -150,7 +143,7 @@ class Boson(Closing):
             self._transport.close()
 
     def read(self, reading: Reading[T], *, repeats: int = REPEATS) -> T:
-        """Value of one of `commands.READINGS`, in the unit that its name says."""
+        """Value of one of the readings of `commands`, in the unit that its name says."""
         reply = self._exchange(reading.name, reading.command, repeats=repeats)
         try:
             return reading.value(reply)
@@ -176,8 +169,8 @@ class Boson(Closing):
             "sensor_serial_number": str(self.read(commands.SENSOR_SERIAL_NUMBER)),
             "part_number": self.read(commands.PART_NUMBER),
             "software_revision": self.read(commands.SOFTWARE_REVISION),
-            "gain_mode": self.gain_mode().name.lower(),
-            "ffc_mode": self.ffc_mode().name.lower(),
+            "gain_mode": self.get(commands.GAIN_MODE).name.lower(),
+            "ffc_mode": self.get(commands.FFC_MODE).name.lower(),
             "is_simulated": self.is_simulated,
         }
 
@@ -188,14 +181,6 @@ class Boson(Closing):
     def ffc_status(self) -> FfcStatus:
         """State of the flat-field correction."""
         return self.read(commands.FFC_STATUS)
-
-    def ffc_mode(self) -> FfcMode:
-        """Trigger of a flat-field correction."""
-        return self.get(commands.FFC_MODE)
-
-    def gain_mode(self) -> GainMode:
-        """Sensitivity."""
-        return self.get(commands.GAIN_MODE)
 
     def prepare(self, telemetry_rows: int) -> None:
         """Set 16-bit counts, FFC on command only, and telemetry below the image; read all back."""
@@ -216,8 +201,7 @@ class Boson(Closing):
                 )
 
     def run_ffc(self, *, timeout: float = FFC_TIMEOUT) -> int:
-        """
-        Run a flat-field correction, wait until it is complete, return its frame number.
+        """Run a flat-field correction, wait until it is complete, return its frame number.
 
         When it starts the camera still says "complete" of the one before. So another status has to
         be seen, or the frame number of the last correction has to change. While the shutter is
@@ -324,7 +308,3 @@ def _open_control(url: str, world: object | None) -> Boson:
 
 KIND: Final = CameraKind(_open_frames, _open_control, telemetry_rows=(0, telemetry.ROWS))
 """The kind of camera of a session's ``kind: boson``."""
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -29,7 +29,6 @@ __all__ = [
     "IR16_MODE",
     "LAST_FFC_FRAME",
     "PART_NUMBER",
-    "READINGS",
     "RUN_FFC",
     "SENSOR_SERIAL_NUMBER",
     "SERIAL_NUMBER",
@@ -44,6 +43,7 @@ __all__ = [
     "Switch",
     "TelemetryLocation",
 ]
+__dir__ = __all__.copy
 
 T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
@@ -132,18 +132,6 @@ FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, ">h", Switch)
 FFC_STATUS: Final = Reading("FFC status", 0x00050054, ">i", FfcStatus)
 LAST_FFC_FRAME: Final = Reading("frame of the last FFC", 0x0005005D, ">I", int)
 
-READINGS: Final[tuple[Reading[Any], ...]] = (
-    SERIAL_NUMBER,
-    PART_NUMBER,
-    SENSOR_SERIAL_NUMBER,
-    SOFTWARE_REVISION,
-    FPA_TEMPERATURE,
-    FFC_IN_PROGRESS,
-    FFC_STATUS,
-    LAST_FFC_FRAME,
-)
-"""All readings."""
-
 FFC_MODE: Final = Setting("FFC mode", 0x00050012, FfcMode)
 GAIN_MODE: Final = Setting("gain mode", 0x00050014, GainMode)
 IR16_MODE: Final = Setting("IR16 mode", 0x000E000D, Ir16Mode)
@@ -190,7 +178,3 @@ STATUSES: Final = MappingProxyType(
     }
 )
 """Meaning of each status of a refusal."""
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -6,19 +6,3 @@ frames, of pictures that a program hands it, such as those of `blackbody`. All s
 emulated: `is_simulated` is True, and so do names and identities. They were built from public
 descriptions and checked against public byte vectors; real devices may do more than these say.
 """
-
-import importlib
-from types import ModuleType
-
-__all__ = ["apt", "blackbody", "boson", "camera", "port", "tc08", "world"]
-
-
-def __getattr__(name: str) -> ModuleType:
-    """Import the module `name` of this package when it is first used (PEP 562)."""
-    if name in __all__:
-        return importlib.import_module(f"{__name__}.{name}")
-    raise AttributeError(f"Unknown module {name!r} in {__name__}. Must be one of {__all__}.")
-
-
-def __dir__() -> list[str]:
-    return __all__

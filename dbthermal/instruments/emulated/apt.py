@@ -79,8 +79,7 @@ class Drive:
 
 
 class EmulatedApt:
-    """
-    A controller and a wheel; a `Device` of `dbthermal.instruments.emulated.port`.
+    """A controller and a wheel; a `Device` of `dbthermal.instruments.emulated.port`.
 
     It uses the world's clock and turns the world's wheel, whose slot 1 is `slot_offset` [deg] from
     the home switch. `position` counts the commanded steps, `wheel` is the place of the wheel from
@@ -239,8 +238,7 @@ class EmulatedApt:
 
 
 def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
-    """
-    Start an emulated wheel for ``sim://apt``, on a pseudo-terminal of its own.
+    """Start an emulated wheel for ``sim://apt``, on a pseudo-terminal of its own.
 
     Its options are ``model``, ``sn`` (serial number), ``offset`` (of slot 1 from the home switch
     [deg]) and ``name``, without effect; ValueError if one is unknown or invalid.

@@ -12,15 +12,13 @@ from dbthermal.bands import FILTERS
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.session import Session
 
-NETD = 0.1
-"""Noise of the emulated cameras near 25 degrees Celsius [K]."""
+NETD = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
 
 Counts = npt.NDArray[np.uint16]
 
 
 def pictures(session: Session, world: World) -> dict[str, Callable[[float], Counts]]:
-    """
-    Raw frames, by band, of the world's blackbody as the cameras of a session see it.
+    """Raw frames, by band, of the world's blackbody as the cameras of a session see it.
 
     The detectors have a fixed pattern and noise of `NETD`; see `of_rig`. Bands that are not in
     `dbthermal.bands.FILTERS` get no picture.
@@ -37,8 +35,7 @@ def pictures(session: Session, world: World) -> dict[str, Callable[[float], Coun
 def of_rig(
     rig: simulation.Rig, detector: xr.Dataset, seed: int, world: World
 ) -> dict[str, Callable[[float], Counts]]:
-    """
-    Raw frames, by band, of the world's blackbody as a simulated rig records them.
+    """Raw frames, by band, of the world's blackbody as a simulated rig records them.
 
     Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise from the
     seed, the fixed pattern of the detector (see `dbthermal.simulation.pattern`) and 16 bits.

@@ -19,10 +19,7 @@ from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.emulated.port import EmulatedPort, number, require_known
 from dbthermal.instruments.emulated.world import FPA, SERIAL_NUMBERS, World
 
-__all__ = ["DEFAULTS", "FRAME_RATE", "EmulatedBoson", "start"]
-
-FRAME_RATE: Final = 60
-"""Frames per second of a camera whose frames no source counts [Hz]."""
+FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source counts [Hz]
 
 DEFAULTS: Final = MappingProxyType(
     {
@@ -40,8 +37,7 @@ Handler = tuple[int, Callable[[bytes], bytes | None]]
 
 
 class EmulatedBoson:
-    """
-    One emulated camera of a world, as an `emulated.port.Device`.
+    """One emulated camera of a world, as an `emulated.port.Device`.
 
     Its clock is the world's; KeyError if the world has no camera of this name.
     """
@@ -153,8 +149,7 @@ def _packed(layout: str, values: Callable[[], tuple[int | bytes, ...]]) -> Calla
 
 
 def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
-    """
-    Start an emulated camera for ``sim://boson``, on a pseudo-terminal of its own.
+    """Start an emulated camera for ``sim://boson``, on a pseudo-terminal of its own.
 
     Options are ``name``, its name in the world (``"boson"`` by default), and without a world also
     ``sn``, its serial number, and ``fpa``, the temperature of its focal-plane array [K]. ValueError
@@ -171,7 +166,3 @@ def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     elif {"sn", "fpa"} & options.keys():
         raise ValueError(f"Invalid options sn, fpa of camera '{name}'. Must be set in its world.")
     return EmulatedPort(EmulatedBoson(world, name))
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -12,7 +12,7 @@ import time as system_time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -31,17 +31,6 @@ from dbthermal.instruments.emulated.port import number, require_known
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.transport import Closing
 
-__all__ = [
-    "BUFFERS",
-    "CLOSED",
-    "FFC_PERIODS",
-    "MODELS",
-    "EmulatedCamera",
-    "Model",
-    "Picture",
-    "open_frames",
-]
-
 Picture = Callable[[float], Counts]
 
 BUFFERS: Final = 32
@@ -50,21 +39,10 @@ BUFFERS: Final = 32
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
 
-
-class Model(NamedTuple):
-    """Name of an emulated model, and options that its address may have."""
-
-    name: str
-    options: tuple[str, ...] = ()
-
-
-MODELS: Final = MappingProxyType(
-    {
-        "boson": Model("emulated Boson"),
-        "y16": Model("emulated Y16 camera", ("ffc",)),
-    }
+MODELS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = MappingProxyType(
+    {"boson": ("emulated Boson", ()), "y16": ("emulated Y16 camera", ("ffc",))}
 )
-"""Model of the emulated camera by its kind, as in its address ``sim://boson/wide``."""
+"""Kind of camera, as in ``sim://boson/wide``, to its model and to the options of its address."""
 
 FFC_PERIODS: Final = (1.0, math.inf)
 """Shortest and longest time between corrections that a camera starts by itself [s]."""
@@ -72,8 +50,7 @@ FFC_PERIODS: Final = (1.0, math.inf)
 
 @dataclass
 class EmulatedCamera(Closing):
-    """
-    A `camera.FrameSource` without a camera; its frames begin with the first `read`.
+    """A `camera.FrameSource` without a camera; its frames begin with the first `read`.
 
     It shows a camera of the world by its name: through a filter of its own, or, where `band` is
     None, through the one in the beam of the wheel.
@@ -105,7 +82,7 @@ class EmulatedCamera(Closing):
         """Device, model and number, labelled as emulated."""
         return {
             "device": f"sim://{self.kind}/{self.name}",
-            "model": MODELS[self.kind].name,
+            "model": MODELS[self.kind][0],
             "serial_number": str(self._state.serial_number),
         }
 
@@ -192,7 +169,7 @@ def open_frames(
             f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
             f"one of {sorted(MODELS)}."
         )
-    require_known(address.options, MODELS[address.target].options)
+    require_known(address.options, MODELS[address.target][1])
     return EmulatedCamera(
         world,
         address.name,
@@ -204,7 +181,3 @@ def open_frames(
         kind=address.target,
         ffc_period=number(address.options, "ffc", math.inf, FFC_PERIODS),
     )
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -14,8 +14,6 @@ from typing import Final, Protocol, TypeVar
 
 from dbthermal.instruments.transport import Closing
 
-__all__ = ["TICK", "Device", "EmulatedPort", "number", "require_known"]
-
 Number = TypeVar("Number", bound=float)
 
 TICK: Final = 0.01
@@ -42,8 +40,7 @@ class Device(Protocol):
 
 
 class EmulatedPort(Closing):
-    """
-    A raw pseudo-terminal on which a thread lets an emulated device answer.
+    """A raw pseudo-terminal on which a thread lets an emulated device answer.
 
     `path` is of the end for the driver, as in ``/dev/pts/3``. If the device is pulled out, or an
     error in it ends the thread, the terminal hangs up, as a real one does. Bytes that a driver does
@@ -119,7 +116,3 @@ def number(
             f"Must be a number ({type(default).__name__}) in {lowest} to {highest}."
         )
     return value
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -14,18 +14,14 @@ from dbthermal.instruments import thermocouple
 from dbthermal.instruments.emulated.world import ROOM, World
 from dbthermal.instruments.tc08 import CHANNELS, KELVIN
 
-Numbers = MutableSequence[Any]
-"""A ctypes array of the caller, written in place."""
-
-CONVERSION: Final = 0.1
-"""Conversion time of one channel [s]."""
+Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
+CONVERSION: Final = 0.1  # conversion time of one channel [s]
 
 _HANDLE = 1
 
 
 class EmulatedTC08:
-    """
-    The library and one unit, with type-T thermocouples whatever letter they are set to.
+    """The library and one unit, with type-T thermocouples whatever letter they are set to.
 
     `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open;
     `junction_temperature` is that of the terminals [K]; `sleep` waits while a reading is converted.

@@ -18,22 +18,14 @@ from typing import Any, Final
 from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.session import Session
 
-__all__ = ["FFC_DURATION", "FPA", "POSITIONS", "ROOM", "CameraState", "World", "emulated_world"]
-
-POSITIONS: Final = 6
-"""Slots of the wheel, numbered from 1."""
-
-ROOM: Final = 296.15
-"""Default temperature of the room [K]."""
-
-FPA: Final = 308.15
-"""Default temperature of a focal-plane array [K]."""
+POSITIONS: Final = 6  # slots of the wheel, numbered from 1
+ROOM: Final = 296.15  # default temperature of the room [K]
+FPA: Final = 308.15  # default temperature of a focal-plane array [K]
 
 FFC_DURATION: Final = 0.5
 """Duration of an emulated flat-field correction [s]; the real one is not documented publicly."""
 
-SERIAL_NUMBERS: Final = 93588
-"""Number of the first emulated camera of a session; the others follow."""
+SERIAL_NUMBERS: Final = 93588  # number of the first emulated camera of a session; the others follow
 
 
 @dataclass
@@ -53,34 +45,14 @@ class CameraState:
 
 class World:
     """
-    One emulated bench: wheel, blackbody, scene and cameras, on one clock.
+    One emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch` on.
 
-    Single attributes may be read and set from any thread. To change several together, hold `lock`,
-    which is re-entrant, or call a method, which does.
-
-    Parameters
-    ----------
-    clock : callable
-        Gives the time [s]; injected by tests. The world begins at its `epoch`.
-    filters : mapping, optional
-        Band in each slot of the wheel, by its number 1 to 6. Slots left out hold no filter.
-    wheel_position : int
-        The slot in the beam at the start.
-    blackbody_temperature : float
-        Of the blackbody [K].
-    scene : callable, optional
-        Temperatures of the objects in the scene [K], by name, at a time of the scene [s].
-    waits : bool
-        Whether the scene stands at its beginning until `begin` sets `scene_began` [s]; else it
-        begins with the world.
-
-    Attributes
-    ----------
-    thermocouples : dict
-        Place of each channel, 1 to 8, of the thermocouple logger: a name in `scene`, or
-        ``"blackbody"``, ``"room"`` or ``"open"``.
-    cameras : dict
-        `CameraState` of each camera by its name; see `add_camera`.
+    `filters` has the band in each slot of the wheel, 1 to 6; slots left out have none. `scene` has
+    temperatures [K] by name at a time of the scene [s]; if it `waits` it stands at its beginning
+    until `begin` sets `scene_began`. `thermocouples` has the place of each channel, 1 to 8: a name
+    in the scene, ``"blackbody"``, ``"room"`` or ``"open"``; `cameras` the `CameraState` of each
+    camera by its name. Single attributes may be read and set from any thread. To change several
+    together, hold `lock`, which is re-entrant, or call a method, which does.
     """
 
     is_simulated: Final = True
@@ -141,8 +113,7 @@ class World:
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:
-        """
-        Temperature of the tip of one thermocouple [K]; NaN if it is open or missing.
+        """Temperature of the tip of one thermocouple [K]; NaN if it is open or missing.
 
         KeyError if its place is not in the scene.
         """
@@ -193,8 +164,7 @@ class World:
 
 
 def emulated_world(session: Session, **settings: Any) -> World:
-    """
-    Bench with the cameras, filters and thermocouples of an emulated session.
+    """Bench with the cameras, filters and thermocouples of an emulated session.
 
     The thermocouples are at the places that they are named after, all at room temperature but the
     blackbody, unless the settings of the `World` say otherwise.
@@ -210,7 +180,3 @@ def _slot(position: int) -> int:
     if position not in range(1, POSITIONS + 1):
         raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
     return position
-
-
-def __dir__() -> list[str]:
-    return __all__

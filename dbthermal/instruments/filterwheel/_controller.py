@@ -55,8 +55,7 @@ class NotHomedError(WheelError):
 
 
 class Controller:
-    """
-    One motor of a controller at the other end of a line, for one thread at a time.
+    """One motor of a controller at the other end of a line, for one thread at a time.
 
     `unit` and `motor` are its addresses, `info` and `scale` its identity and its units: valid
     after `find`. The line stays the caller's to close.
@@ -91,8 +90,7 @@ class Controller:
         return self._identified()[1]
 
     def find(self) -> apt.Info:
-        """
-        Search for a controller at each address, and check its model and serial number.
+        """Search for a controller at each address, and check its model and serial number.
 
         NoReplyError if nothing replies, WrongDeviceError if the device is another one,
         TransportError if it is gone.
@@ -116,8 +114,7 @@ class Controller:
         raise NoReplyError(f"No APT controller answered at {tried}. It must be on.")
 
     def prepare(self) -> None:
-        """
-        Set the speeds, read them back, and enable the motor.
+        """Set the speeds, read them back, and enable the motor.
 
         WheelError if the controller does not take the speeds, does not enable the motor, or
         reports an error; NoReplyError, TransportError if it is silent or gone.
@@ -144,8 +141,7 @@ class Controller:
         self._send(Id.MOT_MOVE_HOME, CHANNEL)
 
     def start_move(self, target: int) -> None:
-        """
-        Begin a move to an absolute place [count].
+        """Begin a move to an absolute place [count].
 
         WheelError if the controller has reported an error, and then nothing is sent.
         """
@@ -247,8 +243,7 @@ class Controller:
         channel: int | None = None,
         attempts: int = ATTEMPTS,
     ) -> apt.Message:
-        """
-        Send a request and wait for its reply; events that come between are kept.
+        """Send a request and wait for its reply; events that come between are kept.
 
         Only requests are repeated, never what moves the wheel. Messages that came before the
         request are not its reply. A reply that comes after its limit may be taken for that of the

@@ -47,17 +47,9 @@ class Identity:
 
 
 class FilterWheel(Closing):
-    """
-    A filter wheel whose line is open, for one thread at a time; see `from_url`.
+    """A filter wheel whose line is open, for one thread at a time; see `from_url`.
 
-    Parameters
-    ----------
-    transport : Transport
-        Open; closed with the wheel.
-    settings : Settings
-        Properties of this wheel.
-    clock, sleep : callable
-        Time [s], and waiting [s]; replaced in tests.
+    The line is closed with the wheel; clock [s] and sleep [s] are replaced in tests.
     """
 
     def __init__(
@@ -76,24 +68,12 @@ class FilterWheel(Closing):
 
     @classmethod
     def from_url(cls, url: str, settings: Settings, *, world: object | None = None) -> Self:
-        """
-        Open the line and `connect`; the wheel does not move.
+        """Open the line and `connect`; the wheel does not move.
 
-        Parameters
-        ----------
-        url : str
-            ``serial:///dev/ttyUSB0``, ``pty:///dev/pts/3`` or ``sim://apt``.
-        settings : Settings
-            Properties of this wheel.
-        world : object, optional
-            Emulated bench of a ``sim://`` wheel.
-
-        Raises
-        ------
-        ValueError, TransportError
-            As `dbthermal.instruments.transport.open_serial`.
-        WheelError
-            As `connect`; the line is closed again.
+        The address is ``serial:///dev/ttyUSB0``, ``pty:///dev/pts/3`` or ``sim://apt``, of an
+        emulated bench, the `world`. Errors are those of
+        `dbthermal.instruments.transport.open_serial`, and of `connect`, after which the line is
+        closed again.
         """
         transport = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
         wheel = cls(transport, settings)
@@ -106,15 +86,10 @@ class FilterWheel(Closing):
         return wheel
 
     def connect(self) -> apt.Info:
-        """
-        Find the controller, check its identity, set the speeds and enable the motor.
+        """Find the controller, check its identity, set the speeds and enable the motor.
 
-        Raises
-        ------
-        NoReplyError, WrongDeviceError
-            If nothing replies, or the device is another one.
-        WheelError, TransportError
-            If the controller does not take the speeds or enable the motor, or is gone.
+        NoReplyError or WrongDeviceError if nothing replies, or the device is another one;
+        WheelError or TransportError if it does not take the speeds or enable the motor, or is gone.
         """
         info = self._controller.find()
         self._controller.prepare()
@@ -136,21 +111,14 @@ class FilterWheel(Closing):
         return self._controller.status()
 
     def home(self) -> None:
-        """
-        Search for the home switch, from which all places count.
+        """Search for the home switch, from which all places count.
 
         The speeds are set before: where they are near 0, as in some controllers that were just
-        switched on, homing does nothing and says nothing.
-
-        Raises
-        ------
-        StalledWheelError, WheelTimeoutError
-            If the wheel does not start or stops before the switch, the controller reports a fault,
-            or it takes longer than the settings' `home_timeout`; the wheel was stopped.
-        WheelError
-            If it is still moving, or the controller reports an error or does not take the speeds.
-        NoReplyError, TransportError
-            If the controller falls silent, or the device is gone.
+        switched on, homing does nothing and says nothing. StalledWheelError or WheelTimeoutError if
+        the wheel does not start or stops before the switch, the controller reports a fault, or it
+        takes longer than the settings' `home_timeout`; the wheel was stopped. WheelError if it is
+        still moving, or the controller reports an error or does not take the speeds; NoReplyError
+        or TransportError if that falls silent, or the device is gone.
         """
         self._controller.prepare()
         self._require_rest()
@@ -162,24 +130,14 @@ class FilterWheel(Closing):
         self._is_lost = False
 
     def move_to(self, position: int) -> None:
-        """
-        Turn a slot, 1 to 6, into the beam, and confirm that it is there.
+        """Turn a slot, 1 to 6, into the beam, and confirm that it is there.
 
-        Raises
-        ------
-        ValueError
-            If the slot is not 1 to 6.
-        NotHomedError
-            If the controller was not homed since it was switched on, or steps may be lost since.
-        StalledWheelError
-            If the wheel does not move, stops elsewhere, or the controller reports a fault: steps
-            may be lost, and it must be homed before the next move.
-        WheelTimeoutError
-            If it takes longer than the settings' `move_timeout`; the wheel was stopped.
-        WheelError
-            If it is still moving, or the controller reports an error.
-        NoReplyError, TransportError
-            If the controller falls silent, or the device is gone.
+        ValueError if the slot is not 1 to 6; NotHomedError if the controller was not homed since it
+        was switched on, or steps may be lost since; StalledWheelError if the wheel does not move,
+        stops elsewhere, or the controller reports a fault: steps may be lost, and it must be homed
+        before the next move; WheelTimeoutError if it takes longer than the settings'
+        `move_timeout`, and was stopped; WheelError if it is still moving, or the controller reports
+        an error; NoReplyError or TransportError if that falls silent, or the device is gone.
         """
         scale, settings = self._controller.scale, self.settings
         target = scale.target(position, settings.home_offset)
@@ -203,13 +161,10 @@ class FilterWheel(Closing):
         self.move_to(self.settings.position(band))
 
     def position(self) -> int:
-        """
-        Slot in the beam, 1 to 6.
+        """Slot in the beam, 1 to 6.
 
-        Raises
-        ------
-        WheelError, TransportError
-            If the wheel is between two slots, moving, or not homed, or the device is gone.
+        WheelError or TransportError if the wheel is between two slots, moving, or not homed, or the
+        device is gone.
         """
         status = self._require_rest()
         self._require_home(status)

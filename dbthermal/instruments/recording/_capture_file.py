@@ -10,12 +10,12 @@ reader may have no more than the store.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from enum import IntEnum, IntFlag
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from pathlib import Path
 from time import monotonic
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,6 @@ from dbthermal.instruments.camera import (
     DAMAGED,
     FFC_READING,
     GOOD,
-    MEANINGS,
     UNTIMED,
     Counts,
     FfcStatus,
@@ -40,8 +39,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.schema import EXPOSURE_TIME, FRAME_FLAGS, STAGES, Variable
 
-CHUNK: Final = 30
-"""Frames of a chunk: half a second at 60 Hz, the most that a kill may cost."""
+CHUNK: Final = 30  # frames of a chunk: half a second at 60 Hz, the most that a kill may cost
 
 _AHEAD: Final = 1e-3  # by how much a stamp may be later than the frame's arrival [s]
 _STALE: Final = 3.0  # age at which a reading of the serial line says no more of the shutter [s]
@@ -53,50 +51,28 @@ _FILLS: Final = MappingProxyType(
 
 
 class Note(IntEnum):
-    """Kinds of notes in the log; `NOTES` has the meaning of the value of each."""
+    """Kinds of notes in the log, each with the meaning of its value."""
 
-    READING = 0
-    READING_FAILED = 1
-    FRAMES_LOST = 2
-    FRAMES_REFUSED = 3
-    SEQUENCE_STANDS = 4
-    DAMAGED = 5
-    SHUTTER_CLOSED = 6
-    SHUTTER_OPEN = 7
-    CORRECTION = 8
-    NO_FRAME = 9
-    SOURCE_LOST = 10
-    FOLDER_MOVED = 11
+    meaning: str
 
+    def __new__(cls, value: int, meaning: str) -> Self:
+        """Make a kind from its number and its sentence."""
+        member = int.__new__(cls, value)
+        member._value_, member.meaning = value, meaning
+        return member
 
-NOTES: Final = MappingProxyType(
-    {
-        Note.READING: "the reading",
-        Note.READING_FAILED: "NaN, the instrument gave none",
-        Note.FRAMES_LOST: "number of frames missing by the driver's numbers",
-        Note.FRAMES_REFUSED: "number of frames that came, but for which the queue was full",
-        Note.SEQUENCE_STANDS: "step of the driver's number, 0 or less",
-        Note.DAMAGED: "flags of the frame",
-        Note.SHUTTER_CLOSED: "driver's number of the first frame with a closed shutter",
-        Note.SHUTTER_OPEN: "driver's number of the first frame with an open one",
-        Note.CORRECTION: "frame_counter at which the camera renewed its offsets, from telemetry",
-        Note.NO_FRAME: "time without a frame [s]",
-        Note.SOURCE_LOST: "NaN, the source gives no more frames",
-        Note.FOLDER_MOVED: "NaN, the recording's folder was moved or renamed; it went on in it",
-    }
-)
-"""Kind of a note to the meaning of its value."""
-
-
-@dataclass(frozen=True)
-class _Explained(Variable):
-    """A variable with more attributes than unit and meaning."""
-
-    more: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def attrs(self) -> dict[str, Any]:
-        return {**super().attrs, **self.more}
+    READING = 0, "the reading"
+    READING_FAILED = 1, "NaN, the instrument gave none"
+    FRAMES_LOST = 2, "number of frames missing by the driver's numbers"
+    FRAMES_REFUSED = 3, "number of frames that came, but for which the queue was full"
+    SEQUENCE_STANDS = 4, "step of the driver's number, 0 or less"
+    DAMAGED = 5, "flags of the frame"
+    SHUTTER_CLOSED = 6, "driver's number of the first frame with a closed shutter"
+    SHUTTER_OPEN = 7, "driver's number of the first frame with an open one"
+    CORRECTION = 8, "frame_counter at which the camera renewed its offsets, from telemetry"
+    NO_FRAME = 9, "time without a frame [s]"
+    SOURCE_LOST = 10, "NaN, the source gives no more frames"
+    FOLDER_MOVED = 11, "NaN, the recording's folder was moved or renamed; it went on in it"
 
 
 def _of_frames(dtype: str, units: str, long_name: str) -> Variable:
@@ -107,16 +83,15 @@ def _of_log(dtype: str, long_name: str, units: str = "1") -> Variable:
     return Variable(("log",), dtype, units, long_name)
 
 
-def _coded(variable: Variable, meanings: Mapping[Any, str]) -> Variable:
+def _coded(variable: Variable, codes: type[FrameFlag] | type[Note]) -> Variable:
     """Variable with CF attributes of its codes, and a sentence for each."""
-    sentences = {str(code.name).lower(): text for code, text in meanings.items()}
-    masks = all(isinstance(code, IntFlag) for code in meanings)
+    sentences = {str(code.name).lower(): code.meaning for code in codes}
     attrs = {
-        "flag_masks" if masks else "flag_values": [int(code) for code in meanings],
+        "flag_masks" if codes is FrameFlag else "flag_values": [int(code) for code in codes],
         "flag_meanings": " ".join(sentences),
         "comment": "; ".join(f"{name}: {text}" for name, text in sentences.items()),
     }
-    return _Explained(variable.dims, variable.dtype, variable.units, variable.long_name, attrs)
+    return replace(variable, more=attrs)
 
 
 ABOUT: Final = (
@@ -151,9 +126,9 @@ VARIABLES: Final = MappingProxyType(
         "device_time": _of_frames("float64", "s", "device's stamp of the frame, as it came"),
         "host_time": _of_frames("float64", "s", "arrival at the host, since clock_origin"),
         "sequence": _of_frames("int64", "1", "number of the frame by its driver"),
-        "frame_flags": _coded(FRAME_FLAGS, MEANINGS),
+        "frame_flags": _coded(FRAME_FLAGS, FrameFlag),
         "log_time": _of_log("float64", "time of the note, since clock_origin", "s"),
-        "log_kind": _coded(_of_log("int16", "kind of the note"), NOTES),
+        "log_kind": _coded(_of_log("int16", "kind of the note"), Note),
         "log_source": _of_log("int16", "source of the note: place in attribute log_sources"),
         "log_value": _of_log("float64", "value by kind of the note; see attribute log_units"),
     }
@@ -162,7 +137,7 @@ VARIABLES: Final = MappingProxyType(
 
 TELEMETRY: Final = MappingProxyType(
     {
-        "telemetry": _Explained(
+        "telemetry": Variable(
             ("band", "time", "telemetry_row", "x"),
             "uint16",
             "1",
@@ -196,8 +171,7 @@ class _Band:
 
 
 class CaptureFile:
-    """
-    A new recording at `path` that takes frames and notes in the order in which they come.
+    """A new recording at `path` that takes frames and notes in the order in which they come.
 
     `readings` has the unit of each further instrument, `origin` is the host's clock at time 0 [s],
     `attrs` are attributes of the recording (JSON), and `chunk` is the number of frames that are
@@ -253,8 +227,7 @@ class CaptureFile:
         self._origin, self._start = origin, {"clock_origin": origin, "started": started}
 
     def frame(self, band: str, frame: Frame, refused: int = 0) -> FrameFlag:
-        """
-        Take a frame, write the chunk if it is full, and return all flags of the frame.
+        """Take a frame, write the chunk if it is full, and return all flags of the frame.
 
         `refused` is the number of frames of this band that came before it and were not taken.
         """

@@ -45,8 +45,7 @@ _BYTES: Final = 2  # of a pixel
 
 @dataclass(frozen=True)
 class Reading:
-    """
-    Another instrument that is read beside the frames; `read` may take its time.
+    """Another instrument that is read beside the frames; `read` may take its time.
 
     OSError, RuntimeError and ValueError of it are noted as a failed reading; any other error ends
     the recording.
@@ -71,8 +70,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Preview:
-    """
-    State of a recording while it goes on.
+    """State of a recording while it goes on.
 
     `totals` has numbers of frames for each band: ``frames``, ``lost``, ``refused``, ``damaged``.
     """
@@ -86,8 +84,7 @@ class Preview:
 
 @dataclass(frozen=True)
 class Summary:
-    """
-    Result of a recording, with `totals` as in `Preview`.
+    """Result of a recording, with `totals` as in `Preview`.
 
     `ended` is ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is
     lost), or ``"no frames"`` if a band had none. `path` is where the recording lies now.
@@ -109,8 +106,7 @@ def record(
     preview: Callable[[Preview], None] | None = None,
     stop: threading.Event | None = None,
 ) -> Summary:
-    """
-    Record until the end of the session's duration, a stop, or the loss of the last camera.
+    """Record until the end of the session's duration, a stop, or the loss of the last camera.
 
     Frames that a driver buffered before the start, by their stamps, are not recorded: they show
     another filter, or another scene. Two seconds after the start such a stamp counts as wrong.
@@ -126,10 +122,9 @@ def record(
         Band to an open source, in the session's order; they stay open.
     path : str or Path
         Folder ``*.zarr`` to make; see `open_capture`.
-    readings : mapping, optional
-        Name to another instrument: thermocouples, the cameras' temperatures, the blackbody.
-    identities : mapping, optional
-        Band, or name of another device, to model and numbers, beside those of the sources.
+    readings, identities : mapping, optional
+        Name to another instrument: thermocouples, the cameras' temperatures, the blackbody; and
+        band, or name of another device, to model and numbers, beside those of the sources.
     limits : Limits, optional
         Sizes and waiting times.
     preview : callable, optional
@@ -137,26 +132,19 @@ def record(
     stop : Event, optional
         Ends the recording when it is set.
 
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames; also in the store.
-
     Raises
     ------
-    FileExistsError
-        If `path` exists.
+    FileExistsError, ValueError
+        If `path` exists; if the sources are not those of the session, or are emulated and the
+        session is not.
     OSError
         If there is too little space, before or on the way; or the folder, or one of an array in
         it, was deleted, replaced or taken to another disk, or that of an array moved.
-    ValueError
-        If the sources are not those of the session, or are emulated and the session is not.
-    Exception
-        Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
-        what was recorded is kept. A second interrupt ends the wait, not the writing.
-    SignalExit
-        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell; also kept. A
-        signal that the program handles or ignores is left alone.
+    SignalExit, Exception
+        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell (a signal that
+        the program handles or ignores is left alone); error of a source, a reading or the preview,
+        or an interrupt by the keyboard. In all cases what was recorded is kept. A second interrupt
+        ends the wait, not the writing.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
@@ -275,8 +263,7 @@ class _Run:
         return not (self.over.is_set() or self.stop.is_set() or monotonic() >= self.end)
 
     def fetch(self, band: str, source: FrameSource) -> None:
-        """
-        Put the frames of one source into the queue, until the end.
+        """Put the frames of one source into the queue, until the end.
 
         If the queue has no room for the band a frame is refused; the next one that is accepted
         carries the number of refused ones.
@@ -331,8 +318,7 @@ class _Run:
                 preview(Preview(time, frames, totals, readings, units))
 
     def write(self) -> None:
-        """
-        Start the other threads, write frames and notes until the end, and close the file.
+        """Start the other threads, write frames and notes until the end, and close the file.
 
         Errors go to `errors`. After an error of writing itself the file stays as it is on the disk.
         """

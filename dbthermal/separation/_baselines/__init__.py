@@ -21,8 +21,7 @@ def point_estimate(
     emissivity: Array | None = None,
     background_temperature: Array | None = None,
 ) -> Estimate:
-    """
-    Estimate of a tile without standard deviations; quantities that are not given are NaN.
+    """Estimate of a tile without standard deviations; quantities that are not given are NaN.
 
     Temperatures (time, pixel) [K], `status` (pixel), `emissivity` (band, pixel) [1].
     """

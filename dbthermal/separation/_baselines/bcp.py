@@ -33,8 +33,7 @@ from dbthermal.separation._tiles import Array, Estimate, Tile
 
 @dataclass(frozen=True)
 class BcpSettings:
-    """
-    Options of the blackbody channel prior; none is published.
+    """Options of the blackbody channel prior; none is published.
 
     Attributes
     ----------
@@ -83,8 +82,7 @@ class BcpSettings:
 
 
 def separate(tile: Tile, settings: BcpSettings) -> Estimate:
-    """
-    Remove the reflection from a whole image, each frame by itself.
+    """Remove the reflection from a whole image, each frame by itself.
 
     Object temperature from the quieter band; the background's is that of A, the same in all pixels;
     emissivity of each band is the mean over time of its own t. Pixels without a temperature, as
@@ -143,8 +141,7 @@ def _transmission(image: Array, level: float, settings: BcpSettings) -> Array:
 
 
 def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Array:
-    r"""
-    Smooth an image (y, x) along the edges of a guide (y, x), mirrored at the border.
+    r"""Smooth an image (y, x) along the edges of a guide (y, x), mirrored at the border.
 
     In every window of that side [pixel] the result is :math:`a\,\mathrm{guide} + b` with
     :math:`a = \mathrm{cov}(\mathrm{guide}, \mathrm{image}) / (\mathrm{var}(\mathrm{guide}) +
@@ -159,10 +156,5 @@ def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Ar
     return np.asarray(uniform_filter(slope, window) * guide + uniform_filter(intercept, window))
 
 
-METHOD: Final = Method(
-    separate,
-    settings=BcpSettings,
-    whole_image=True,
-    not_estimated=WITHOUT_STD,
-)
+METHOD: Final = Method(separate, settings=BcpSettings, whole_image=True, not_estimated=WITHOUT_STD)
 """The reconstructed blackbody channel prior, for `solve`."""

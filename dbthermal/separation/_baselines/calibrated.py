@@ -33,8 +33,7 @@ _ANY: Final = 1e12
 
 @dataclass(frozen=True)
 class CalibratedSettings:
-    """
-    Options of the method "calibrated".
+    """Options of the method "calibrated".
 
     Attributes
     ----------
@@ -79,8 +78,7 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
 
 
 def _gray(emissivity: Array, covariance: Array) -> Mask:
-    r"""
-    Pixels (pixel) of which no band differs for certain from the first.
+    r"""Pixels (pixel) of which no band differs for certain from the first.
 
     The system is singular where :math:`\kappa_m = (1 - e_m) / (1 - e_1)` is 1, whose error counts.
     """

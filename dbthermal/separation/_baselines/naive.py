@@ -40,8 +40,7 @@ _LONGEST: Final = 3.0
 
 @dataclass(frozen=True)
 class NaiveSettings:
-    """
-    Options of the naive baseline.
+    """Options of the naive baseline.
 
     Attributes
     ----------
@@ -159,8 +158,7 @@ def _step(tile: Tile, signals: Array, state: _State, tolerance: float) -> _State
 
 
 def _solve(tile: Tile, signals: Array, state: _State) -> tuple[Array, Array]:
-    """
-    Steps of the logits and of the logarithms, from the damped normal equations.
+    """Steps of the logits and of the logarithms, from the damped normal equations.
 
     With T the 2x2 block of a frame's temperatures, S its columns of the border and B the border's
     own block, the logits solve :math:`(B - S^T T^{-1} S) l = b - S^T T^{-1} f`.
@@ -209,9 +207,5 @@ def _symmetric(matrix: tuple[Array, Array, Array], right: Array) -> Array:
     )
 
 
-METHOD: Final = Method(
-    separate,
-    settings=NaiveSettings,
-    not_estimated=WITHOUT_STD,
-)
+METHOD: Final = Method(separate, settings=NaiveSettings, not_estimated=WITHOUT_STD)
 """Least squares without a prior, for `solve`."""

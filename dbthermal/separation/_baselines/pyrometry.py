@@ -45,8 +45,7 @@ def apparent(tile: Tile) -> Estimate:
 
 @dataclass(frozen=True)
 class RatioSettings:
-    r"""
-    Options of dual-wavelength pyrometry.
+    r"""Options of dual-wavelength pyrometry.
 
     Attributes
     ----------

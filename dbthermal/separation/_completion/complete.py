@@ -40,8 +40,7 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     reflection_shift: xr.Dataset | None = None,
     workers: int = 2,
 ) -> xr.Dataset:
-    r"""
-    Complete a result: a temperature with its deviation wherever both cameras have data.
+    r"""Complete a result: a temperature with its deviation wherever both cameras have data.
 
     Where a pixel has no value of its own, the posterior of the image formation (`mixing`) is taken
     with a prior on what the pixel cannot tell: its emissivities e, and the level c of its
@@ -227,8 +226,7 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
 
 
 def _bridge(value: Array, std: Array, time: Array) -> Mask:
-    """
-    Bridge gaps of curves (time, pixel) by lines, in place; pixels (pixel) that had any.
+    """Bridge gaps of curves (time, pixel) by lines, in place; pixels (pixel) that had any.
 
     The deviation grows as that of a random walk of the curve's own steps.
     """

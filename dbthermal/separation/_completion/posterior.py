@@ -215,8 +215,7 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
 
 
 def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Array:
-    """
-    Log-likelihoods as quadratic functions about zero, near emissivities e and a level c.
+    """Log-likelihoods as quadratic functions about zero, near emissivities e and a level c.
 
     (6, band - 1, grid, pixel): value; slopes with e_m, with c; curvatures with e_m, both, c.
     """
@@ -247,8 +246,7 @@ def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Arra
 def _eliminate(
     likelihood: Array, mean: Array, variance: Array, level: Level
 ) -> tuple[Array, Array, Array]:
-    """
-    Evidence (component, grid, pixel), mean and covariance of (e_m, c).
+    """Evidence (component, grid, pixel), mean and covariance of (e_m, c).
 
     Given c the e_m are independent, so they are eliminated first, and c last.
     """
@@ -293,8 +291,7 @@ def _average(
 
 
 def fluctuation(tile: Tile, static: Moments, means: Bins, valid: Mask, expected: float) -> Array:
-    """
-    Variance (pixel) [K^2] of the background over time: what bins show beyond noise.
+    """Variance (pixel) [K^2] of the background over time: what bins show beyond noise.
 
     Weighed against what is expected, as uncertain as it is large.
     """

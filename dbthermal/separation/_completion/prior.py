@@ -43,8 +43,7 @@ class Mixture:
         return grid, np.gradient(grid, axis=0)
 
     def conditional(self, grid: Array) -> tuple[Array, Array, Array]:
-        """
-        Log-density of the first emissivity, mean and variance of the others given it.
+        """Log-density of the first emissivity, mean and variance of the others given it.
 
         (component, grid, pixel), (component, band - 1, grid, pixel), and of ones for the grid. The
         others are taken as independent given the first.
@@ -83,14 +82,14 @@ def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> M
         if missing := {"emissivity", "emissivity_std"} - set(prior):
             raise ValueError(f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}.")
         prior, std = prior["emissivity"], prior["emissivity_std"]
-    values = _numbers(prior, bands, "prior")
+    values = schema.band_values(prior, bands, "prior", "1")
     if not np.all((values > 0) & (values < 1)):
         raise ValueError(
             f"Invalid emissivities {values.tolist()} of the prior. Must lie in (0, 1)."
         )
     stds = np.full(len(bands), SAMPLE_STD)
     if std is not None:
-        stds = _numbers(std, bands, "emissivity_std of the prior")
+        stds = schema.band_values(std, bands, "emissivity_std of the prior", "1")
     if not np.all((stds > 0) & (stds < 1)):
         raise ValueError(
             f"Invalid emissivity_std {stds.tolist()} of the prior. Must lie in (0, 1)."
@@ -98,12 +97,3 @@ def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> M
     return Mixture(
         np.ones(1), values[np.newaxis, :, np.newaxis], np.diag(stds**2)[np.newaxis, ..., np.newaxis]
     )
-
-
-def _numbers(array: xr.DataArray, bands: list[str], label: str) -> Array:
-    """Values (band,) of an array in the order of some bands."""
-    schema.check_numbers(array, label, "1")
-    if array.dims != ("band",):
-        raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")
-    places = schema.band_positions(array, bands, label)
-    return array.values[places].astype(np.float64)

@@ -8,6 +8,7 @@ import xarray as xr
 
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
+from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
@@ -35,14 +36,12 @@ _COLDEST: Final = 150.0
 # Residual, in standard deviations of the noise, from which a result is of another capture.
 _STRANGE: Final = 8.0
 _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
-# Median of the absolute deviations of a normal distribution, inverse; variance of its median.
-_MAD: Final = 1.4826
+# Variance of the median of normal values, relative to that of their mean.
 _MEDIAN: Final = np.pi / 2.0
 # Precision of a level that a pixel does not show [1/K^2].
 _NOTHING: Final = 1e-9
 
-Values = dict[str, Array]
-"""Completed values of some pixels by their names in the stage `separated`."""
+Values = dict[str, Array]  # completed values of some pixels by their names in the stage `separated`
 
 
 @dataclass(frozen=True)
@@ -180,8 +179,7 @@ def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Leve
 def solve(
     scene: Scene, tile: Tile, valid: Mask, source: int, places: Whole
 ) -> tuple[Values, Array]:
-    """
-    Complete the pixels of a tile whose emissivities come from one source.
+    """Complete the pixels of a tile whose emissivities come from one source.
 
     Beside the values, the posterior mean and variance of the background's level, the prior's
     variance, and the variance of the background over time (4, pixel).
@@ -216,8 +214,7 @@ def solve(
 
 
 def find_level(scene: Scene) -> Level:
-    """
-    Level of the background over the pixels, from those that show it, beside what is known.
+    """Level of the background over the pixels, from those that show it, beside what is known.
 
     Each pixel's posterior without the prior in it is a measurement; their weighted median, and the
     scatter that they do not explain, which is how much pixels differ.
@@ -246,7 +243,7 @@ def find_level(scene: Scene) -> Level:
     order = np.argsort(value)
     share = np.cumsum(weight[order]) / weight.sum()
     middle = float(value[order][np.searchsorted(share, 0.5)])
-    scatter = (_MAD * float(np.median(np.abs(value - middle)))) ** 2
+    scatter = (MAD * float(np.median(np.abs(value - middle)))) ** 2
     between = max(scatter - float(np.median(variance)), 0.0)
     own = between + _MEDIAN / float(np.sum(1.0 / variance)) + _LEAST[0] ** 2
     signal = (middle * wide + room * own) / (wide + own)

@@ -141,8 +141,7 @@ def tensors(tile: Tile, columns: int, settings: DbvtSettings) -> Images:
 
 
 def _starts(tile: Tile, settings: DbvtSettings) -> tuple[Unknowns, Mask]:
-    """
-    Starts, and those of them (column,) that are the subspace separator's.
+    """Starts, and those of them (column,) that are the subspace separator's.
 
     Columns are the pixels of the first start, of the second, and so on.
     """
@@ -203,8 +202,7 @@ def _search(tile: Tile, settings: DbvtSettings) -> Minimum:
 
 
 def _nonlinearity(tile: Tile, unknowns: Unknowns, images: Images, bend: Array) -> Array:
-    r"""
-    Departure of the second band from the linear identities (time, column) [K].
+    r"""Departure of the second band from the linear identities (time, column) [K].
 
     .. math:: e_2 [u_2(x) - u_1(x)] + (1 - e_2) [u_2(y) - u_1(y)]
 

@@ -102,11 +102,7 @@ def _terms(
         terms.append(_huber_term(part, slopes, images, settings, band, share))
     # r = p_2 - k_2 p_1
     weight = settings.reconstruction * images.share / images.sigma[1] ** 2
-    of_error = of_second | {
-        _FIRST: reflection,
-        _SMOOTH: reflection - emission,
-        _REFLECTION: -first,
-    }
+    of_error = of_second | {_FIRST: reflection, _SMOOTH: reflection - emission, _REFLECTION: -first}
     return [*terms, _Term(of_error, weight * error, weight)]
 
 
@@ -127,8 +123,7 @@ def _huber_term(
 
 
 class _System:
-    r"""
-    Newton's equations of a step, the noise of each frame eliminated.
+    r"""Newton's equations of a step, the noise of each frame eliminated.
 
     With N the 2x2 block of a frame's noise, c its coupling to another unknown and f the forces
     (negative gradients), :math:`H - c^T N^{-1} c` and :math:`f - c^T N^{-1} f_n` are left.
@@ -264,8 +259,7 @@ def bending(signal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def whittaker(diagonal: Tensor, stiffness: Tensor, right: Tensor) -> Tensor:
-    r"""
-    Solutions (time, side, column) of Whittaker's smoother for many pixels at once.
+    r"""Solutions (time, side, column) of Whittaker's smoother for many pixels at once.
 
     .. math:: (\mathrm{diag}(d) + \lambda D^T D)\, x = b
 

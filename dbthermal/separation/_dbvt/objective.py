@@ -62,8 +62,7 @@ def ratios(emissivity: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def second_smooth(unknowns: Unknowns) -> Tensor:
-    r"""
-    Smooth signal of the second band (time, column) [K].
+    r"""Smooth signal of the second band (time, column) [K].
 
     .. math:: \tilde I_2(t) = \tilde I_2(t-1) + k_1 [\tilde I_1(t) - \tilde I_1(t-1)]
               = \tilde I_2(0) + k_1 [\tilde I_1(t) - \tilde I_1(0)] \qquad (1)
@@ -73,8 +72,7 @@ def second_smooth(unknowns: Unknowns) -> Tensor:
 
 
 def deviation(signals: Tensor, noise: Tensor, sigma: Tensor, floor: float) -> Tensor:
-    r"""
-    Standard deviation over time (2, column) [K] of the corrected signals, at least the noise.
+    r"""Standard deviation over time (2, column) [K] of the corrected signals, at least the noise.
 
     The corrected signal is :math:`\ddot I_m = I_m - n_m`; the mean drops out of a comparison.
     """
@@ -82,8 +80,7 @@ def deviation(signals: Tensor, noise: Tensor, sigma: Tensor, floor: float) -> Te
 
 
 def departures(unknowns: Unknowns, images: Images) -> tuple[Tensor, Tensor, Tensor]:
-    r"""
-    Departures from the smooth signals, and the error of the reconstruction, (time, column) [K].
+    r"""Departures from the smooth signals, and the error of the reconstruction, (time, column) [K].
 
     .. math:: p_m = \ddot I_m - \tilde I_m, \quad
               \hat I_2 = \tilde I_2 + k_2 (\ddot I_1 - \tilde I_1), \quad

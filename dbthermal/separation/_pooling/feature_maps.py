@@ -16,10 +16,9 @@ from scipy import ndimage
 
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.noise import MAD
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 Labels = npt.NDArray[np.intp]
 
 # Rows of a capture that are read at a time.
@@ -37,8 +36,7 @@ _EMPTY: Final = 1e-3
 def mean_signals(
     corrected: xr.Dataset, response: xr.Dataset, bands: list[int], noise: Array
 ) -> tuple[Array, Array]:
-    """
-    Mean linearised signals (band, y, x) [K] of the bands, reference first, and variances [K^2].
+    """Mean linearised signals (band, y, x) [K] of the bands, reference first, and variances [K^2].
 
     NaN without a sample. Where neighbours differ by more than the noise (band) [K] explains, as by
     a residual fixed pattern, that is added to the variance.
@@ -111,8 +109,7 @@ def _pixel_scatter(image: Array) -> float:
 
 
 def edges(maps: Array, variances: Array) -> Array:
-    r"""
-    Strength (y, x) of an edge through each pixel of maps (feature, y, x) [standard deviation].
+    r"""Strength (y, x) of an edge through each pixel of maps (feature, y, x) [standard deviation].
 
     Weighted means before and after a pixel are compared, along y and along x; the larger of
 
@@ -144,8 +141,7 @@ def _contrast(mean: Array, variance: Array, axis: int) -> Array:
 
 
 def superpixels(strength: Array, valid: Mask, spacing: int) -> Labels:
-    """
-    Connected cells of about `spacing` by `spacing` pixels, numbered from 1; 0 where not valid.
+    """Connected cells of about `spacing` by `spacing` pixels, numbered from 1; 0 where not valid.
 
     Waterpixels of the edge strength: Machairas et al. (2015), IEEE Trans. Image Process. 24, 3707,
     doi:10.1109/TIP.2015.2451011.

@@ -19,21 +19,17 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.stats import chi2
 
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.separation._pooling import feature_maps, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
 
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
-NONE: Final = -1
-"""Label of pixels that belong to no material: they are pooled with nobody."""
+NONE: Final = -1  # label of pixels that belong to no material: they are pooled with nobody
 
 # Sizes of the cells, and of those that a mixed cell is cut into [pixel].
 _SPACINGS: Final = (8, 4, 2)
@@ -73,8 +69,7 @@ def materials(
     error_rate: float = 0.01,
     resolution: float = 0.1,
 ) -> xr.DataArray:
-    r"""
-    Label the pixels by material, for `solve(..., pool=labels)`.
+    r"""Label the pixels by material, for `solve(..., pool=labels)`.
 
     Parameters
     ----------
@@ -168,8 +163,7 @@ def regions(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
 
 
 def joined(labels: xr.DataArray, pooled: xr.Dataset, *, resolution: float = 0.1) -> xr.DataArray:
-    """
-    Regions (y, x) joined with those they touch, if what was pooled over each agrees.
+    """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
 
     A material is cut where ratios of single pixels are biased by what their order leaves of the
     object; pooled ratios are not.
@@ -264,8 +258,7 @@ def _cells(
 def _links(
     cells: Labels, pairs: Labels, emitted: Array, variances: Array, change: Array
 ) -> tuple[Labels, Array]:
-    """
-    Pairs of cells with no step between them in the emitted maps, and the steps' significances.
+    """Pairs of cells with no step between them in the emitted maps, and the steps' significances.
 
     A border shows in proportion to the object's change: no step is no proof without one.
     """
@@ -286,8 +279,7 @@ def _links(
 def step(
     places: tuple[Labels, Labels], values: Array, variance: Array, first: int, least: float
 ) -> float:
-    r"""
-    Significance of a step between two cells, beside a cubic function of the place.
+    r"""Significance of a step between two cells, beside a cubic function of the place.
 
     .. math:: f(x, y) = \sum_{i + j \le 3} c_{ij} x^i y^j + h [p \in \mathrm{second}]
 

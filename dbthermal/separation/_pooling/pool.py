@@ -46,8 +46,7 @@ def expand(materials: Material, labels: Labels) -> Material:
 
 
 def estimate(labels: Labels, count: int, survey: Survey, noise: Array) -> Material:
-    r"""
-    Ratios and emissivity of so many materials from surveyed pixels and their labels (pixel,).
+    r"""Ratios and emissivity of so many materials from surveyed pixels and their labels (pixel,).
 
     The scatters of the pixels are added, and their principal axis gives the material's ratios: the
     maximum of the likelihood, without the bias of a mean of ratios. The emissivity is the mean of
@@ -100,8 +99,7 @@ class _Ratios:
 
 
 def _ratios(labels: Labels, count: int, survey: Survey, noise: Array) -> _Ratios:
-    """
-    Ratios of the summed scatters, at the order of each pixel unless the largest contradicts it.
+    """Ratios of the summed scatters, at the order of each pixel unless the largest contradicts it.
 
     Then at that; and what four functions less would change, beyond noise, is a variance.
     """
@@ -135,8 +133,7 @@ def _at_order(
 def _apart(
     one: tuple[Array, Array], other: tuple[Array, Array], noise: Array
 ) -> tuple[Array, Array]:
-    """
-    Difference of the ratios at two orders in standard deviations, and its excess [1/K^2].
+    """Difference of the ratios at two orders in standard deviations, and its excess [1/K^2].
 
     The estimate at the smaller order is the more certain one, and their difference has the
     difference of their variances (Hausman 1978, doi:10.2307/1913827).
@@ -148,8 +145,7 @@ def _apart(
 
 
 def _outliers(labels: Labels, material: _Ratios, survey: Survey, noise: Array) -> Mask:
-    """
-    Pixels whose ratio, at the order of their material, is not the material's.
+    """Pixels whose ratio, at the order of their material, is not the material's.
 
     Both by its own deviation, and by that of the material's ratio in the pixel: near black, pixels
     that tell little have ratios of a wide and skew distribution. Those far off pull the ratio, and

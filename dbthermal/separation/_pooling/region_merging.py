@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import chi2
 
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array, Mask
+
 Labels = npt.NDArray[np.intp]
-Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,7 @@ def neighbours(cells: Labels) -> Labels:
 
 
 class Regions:
-    r"""
-    Regions of cells (y, x), numbered from 1, that are joined while their features agree.
+    r"""Regions of cells (y, x), numbered from 1, that are joined while their features agree.
 
     The statistic of two regions a and b, with pooled features :math:`\bar f`,
 
@@ -108,8 +107,7 @@ class Regions:
         return np.asarray(self._total[0] > 0)
 
     def compare(self, first: Labels, second: Labels) -> tuple[Array, Array]:
-        """
-        Statistic over its limit, and resolution, of pairs (pair,) of regions by their roots.
+        """Statistic over its limit, and resolution, of pairs (pair,) of regions by their roots.
 
         The statistic is 0 where no feature can be compared. The resolution is the relative
         difference of the first feature that would reach the limit, infinite where it is unknown.

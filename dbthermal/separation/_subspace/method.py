@@ -65,7 +65,7 @@ from dbthermal.separation._subspace import clock, pieces, reflection_ratio, resi
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace.emission import Emission
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
-from dbthermal.separation._tiles import Array, Estimate, Mask, Survey, Tile, join
+from dbthermal.separation._tiles import Array, Estimate, Mask, Survey, Tile
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -138,6 +138,7 @@ class _Solution:
     straight: Tile  # the tile with signals of proportional reflections
     gray: Mask  # the signals as they are may be those of a gray body (pixel)
     by_pattern: tuple[Array | float, Array | float]  # variances, see `pattern_variances`
+    bend: Array  # of the signals as they are, see `emission.bend` (band - 1, time, pixel) [K]
 
 
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
@@ -177,7 +178,7 @@ def _exact(
     result = finish(tile, functions, solution)
     part, removed, places = tile, np.zeros(1), np.arange(solution.gray.size)
     for _ in range(_BENDS):
-        bend = emissions.bend(part, solution.emission, solution.background)
+        bend = solution.bend
         change = bend - removed
         change -= change.mean(axis=1, keepdims=True)
         energy = np.einsum("btp,btp->bp", change, change)
@@ -216,7 +217,8 @@ def _steps(
     emission = emissions.estimate(straight, functions, ratios, settings.background_drift)
     background, variance = emissions.estimate_background(tile, emission, ratios)
     by_pattern = emissions.pattern_variances(tile, emission, ratios, background)
-    return _Solution(ratios, emission, background, variance, straight, gray, by_pattern)
+    bend = emissions.bend(tile, emission, background)
+    return _Solution(ratios, emission, background, variance, straight, gray, by_pattern, bend)
 
 
 def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Estimate:
@@ -379,7 +381,7 @@ def _divided(
     for places in groups:
         functions = smooth.piecewise(tile.time, first[:, places[0]], order, segment=tile.segment)
         parts.append(_exact(tile.select_pixels(places), functions, settings, finish, least))
-    return join(parts).select_pixels(np.argsort(np.concatenate(groups)))
+    return parts[0].join(parts[1:]).select_pixels(np.argsort(np.concatenate(groups)))
 
 
 METHOD: Final = Method(

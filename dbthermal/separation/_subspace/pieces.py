@@ -44,7 +44,6 @@ _AT_ONCE: Final = 2**20
 # Standard deviations between two axes that are told apart.
 _APART: Final = 6.0
 
-
 Piece = tuple[slice, Array, int]
 """Frames of a piece, its functions, orthonormal, and how many of them are used to choose."""
 

@@ -5,13 +5,7 @@ exchanges; `simulate` states the balance and steps it through time.
 """
 
 from dbthermal.simulation.heat._exchange import Convection, Exchange, Heating, Radiation
-from dbthermal.simulation.heat._shell import (
-    BOROSILICATE,
-    CERAMIC,
-    GLASS,
-    Shell,
-    Solid,
-)
+from dbthermal.simulation.heat._shell import BOROSILICATE, CERAMIC, GLASS, Shell, Solid
 from dbthermal.simulation.heat._transient import TOLERANCE, simulate
 
 __all__ = [
@@ -27,7 +21,4 @@ __all__ = [
     "Solid",
     "simulate",
 ]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__dir__ = __all__.copy

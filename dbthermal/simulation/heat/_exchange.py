@@ -10,18 +10,17 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy.constants import Stefan_Boltzmann
 
-Array = npt.NDArray[np.float64]
+from dbthermal._arrays import Array
+
 Varying: TypeAlias = float | Array | Callable[[float], float | Array]
 """A number, one for each vertex, or a function of time [s] that returns either."""
 
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """
-    Flux a - b T - s T^4 into a shell at one time, as a function of its temperature T.
+    """Flux a - b T - s T^4 into a shell at one time, as a function of its temperature T.
 
     Of a, b and s (vertex,) in [W m^-2], [W m^-2 K^-1] and [W m^-2 K^-4].
     """
@@ -44,8 +43,7 @@ class Exchange(ABC):
 
     @abstractmethod
     def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
-        """
-        Terms a, b, s of `Balance` at a time [s] for a number of vertices.
+        """Terms a, b, s of `Balance` at a time [s] for a number of vertices.
 
         Raises a ValueError if an attribute does not fit the vertices or is not physical.
         """
@@ -53,17 +51,11 @@ class Exchange(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Convection(Exchange):
-    """
-    Exchange with a fluid, or through a contact: h (T_fluid - T).
+    """Exchange with a fluid, or through a contact: h (T_fluid - T).
 
-    With a very large coefficient, such as 1e9 W m^-2 K^-1, a prescribed temperature.
-
-    Attributes
-    ----------
-    coefficient : float, ndarray (vertex,) or function of time
-        Coefficient of heat transfer h, not negative [W m^-2 K^-1].
-    temperature : float, ndarray (vertex,) or function of time
-        Temperature of the fluid [K].
+    The coefficient of heat transfer h [W m^-2 K^-1], not negative, and the temperature of the fluid
+    [K] are numbers, one for each vertex (vertex,), or functions of time. With a very large
+    coefficient, such as 1e9 W m^-2 K^-1, a prescribed temperature.
     """
 
     coefficient: Varying
@@ -78,15 +70,10 @@ class Convection(Exchange):
 
 @dataclass(frozen=True, eq=False)
 class Radiation(Exchange):
-    """
-    Exchange of one side with large surroundings: emissivity sigma (T_s^4 - T^4).
+    """Exchange of one side with large surroundings: emissivity sigma (T_s^4 - T^4).
 
-    Attributes
-    ----------
-    emissivity : float, ndarray (vertex,) or function of time
-        Total hemispherical emissivity, in [0, 1].
-    temperature : float, ndarray (vertex,) or function of time
-        Radiant temperature T_s of the surroundings [K].
+    The total hemispherical emissivity, in [0, 1], and the radiant temperature T_s of the
+    surroundings [K] are numbers, one for each vertex (vertex,), or functions of time.
     """
 
     emissivity: Varying
@@ -108,13 +95,9 @@ class Radiation(Exchange):
 
 @dataclass(frozen=True, eq=False)
 class Heating(Exchange):
-    """
-    Prescribed flux into the shell, such as absorbed light; negative if it cools.
+    """Prescribed flux into the shell, such as absorbed light; negative if it cools.
 
-    Attributes
-    ----------
-    flux : float, ndarray (vertex,) or function of time
-        Heat per area and time q [W m^-2].
+    Heat per area and time [W m^-2]: a number, one for each vertex (vertex,), or a function of time.
     """
 
     flux: Varying

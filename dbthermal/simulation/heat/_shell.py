@@ -9,9 +9,8 @@ import numpy.typing as npt
 import robust_laplacian
 from scipy import sparse
 
+from dbthermal._arrays import Array
 from dbthermal.planck import require_positive
-
-Array = npt.NDArray[np.float64]
 
 _FLATTEST: Final = 1e-9
 """A face whose area falls below this fraction of its longest edge squared is degenerate [1]."""
@@ -19,17 +18,10 @@ _FLATTEST: Final = 1e-9
 
 @dataclass(frozen=True)
 class Solid:
-    """
-    Thermal properties of a solid, constant over the temperatures of a scene.
+    """Thermal properties of a solid, constant over the temperatures of a scene.
 
-    Attributes
-    ----------
-    conductivity : float
-        Thermal conductivity k [W m^-1 K^-1].
-    density : float
-        Density [kg m^-3].
-    specific_heat : float
-        Specific heat at constant pressure c [J kg^-1 K^-1].
+    Conductivity k [W m^-1 K^-1], density [kg m^-3], and specific heat at constant pressure [J kg^-1
+    K^-1].
     """
 
     conductivity: float
@@ -40,11 +32,6 @@ class Solid:
         """Refuse a property that is not finite and positive."""
         for field in fields(self):
             require_positive(f"{field.name} of a solid", getattr(self, field.name))
-
-    @property
-    def diffusivity(self) -> float:
-        r"""Thermal diffusivity :math:`\alpha = k / \rho c` [m^2 s^-1]."""
-        return self.conductivity / (self.density * self.specific_heat)
 
 
 # At 300 K, from table A.3 of Bergman, Lavine, Incropera, DeWitt (2011), Fundamentals of Heat and
@@ -62,31 +49,17 @@ CERAMIC: Final = Solid(conductivity=1.5, density=2400.0, specific_heat=1050.0)
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    r"""
-    A shell so thin that its temperature is uniform through it.
+    r"""A shell so thin that its temperature is uniform through it.
 
-    That holds while the Biot number :math:`h d / k` is far below 1: 0.02 for 3 mm of glass in
-    still air, but 1 where hot water wets it. There the half wall up to the middle belongs in
-    series with the fluid, :math:`1 / (1/h + d / 2k)`, and the outer face still lags by some
-    :math:`d^2 / 2 \alpha` (6 s). The arrays are kept as read-only copies.
+    That holds while the Biot number :math:`h d / k` is far below 1: 0.02 for 3 mm of glass in still
+    air, but 1 where hot water wets it. There the half wall up to the middle belongs in series with
+    the fluid, :math:`1 / (1/h + d / 2k)`, and the outer face still lags by some :math:`d^2 / 2
+    \alpha` (6 s). The arrays are kept as read-only copies.
 
-    Attributes
-    ----------
-    vertices : ndarray, shape (vertex, 3)
-        Positions [m].
-    faces : ndarray, shape (face, 3)
-        Three vertex numbers a face. Their sense does not matter; edges may be open (insulated)
-        or shared by more than two faces.
-    thickness : float
-        Thickness d [m].
-    solid : Solid
-        Material.
-
-    Raises
-    ------
-    ValueError
-        If a shape or a number is wrong, a vertex belongs to no face, or a face is repeated or
-        has no area.
+    Vertices (vertex, 3) are positions [m], faces (face, 3) three vertex numbers each, whose sense
+    does not matter; edges may be open (insulated) or shared by more than two faces. The thickness d
+    is in metres. ValueError if a shape or a number is wrong, a vertex belongs to no face, or a face
+    is repeated or has no area.
     """
 
     vertices: Array
@@ -116,17 +89,11 @@ class Shell:
     @cached_property
     def _operators(self) -> tuple[Any, Array]:
         r"""
-        Weak Laplacian [1] and lumped area of the mesh [m^2].
-
-        .. math:: (L T)_i = \int \nabla \varphi_i \cdot \nabla T \, dA
+        Weak Laplacian [1], :math:`(L T)_i = \int \nabla \varphi_i \cdot \nabla T dA`, area [m^2].
 
         Built on intrinsic Delaunay triangles, so no off-diagonal element is positive (but for
-        rounding) and the step obeys the maximum principle whatever the triangles are [1]_.
-
-        References
-        ----------
-        .. [1] Sharp, Crane (2020), A Laplacian for Nonmanifold Triangle Meshes, Computer
-           Graphics Forum 39(5), doi:10.1111/cgf.14069
+        rounding) and the step obeys the maximum principle whatever the triangles are: Sharp, Crane
+        (2020), Computer Graphics Forum 39(5), doi:10.1111/cgf.14069.
         """
         laplacian, mass = robust_laplacian.mesh_laplacian(
             np.array(self.vertices), np.array(self.faces)
@@ -140,8 +107,7 @@ class Shell:
 
     @cached_property
     def stiffness(self) -> Any:
-        r"""
-        Conduction :math:`k d L` as a sparse matrix, (vertex, vertex) [W/K].
+        r"""Conduction :math:`k d L` as a sparse matrix, (vertex, vertex) [W/K].
 
         Symmetric, positive semidefinite: heat leaves vertex i at the rate :math:`(k d L T)_i`;
         its rows add up to zero.

@@ -10,11 +10,10 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from dbthermal._arrays import Array
 from dbthermal.planck import require_positive
 from dbthermal.simulation.heat._exchange import Balance, Exchange, combine
 from dbthermal.simulation.heat._shell import Shell
-
-Array = npt.NDArray[np.float64]
 
 TOLERANCE: Final = 1e-6
 """Largest error of the iteration in a stage of a step [K]."""
@@ -25,8 +24,7 @@ _GAMMA: Final = 1.0 - np.sqrt(0.5)
 _CONTRACTION: Final = 0.5
 """Contraction of the error above which an iteration gets a new factorisation [1]."""
 
-_ITERATIONS: Final = 40
-"""Largest number of iterations of a stage; each at least halves the error."""
+_ITERATIONS: Final = 40  # largest number of iterations of a stage; each at least halves the error
 
 _EVEN: Final = 1e-7
 """Relative difference below which two steps, or a step and its limit, are the same [1]."""
@@ -41,45 +39,23 @@ def simulate(
     step: float | None = None,
     tolerance: float = TOLERANCE,
 ) -> Array:
-    r"""
-    Transient temperature of a thin shell.
+    r"""Transient temperature (time, vertex) [K] of a thin shell.
 
     .. math:: \rho c d \, \dot T = \nabla \cdot (k d \, \nabla T) + \sum_i h_i (T_i - T)
               + \sum_j \varepsilon_j \sigma (T_j^4 - T^4) + q
 
-    In space, the intrinsic Laplacian with a lumped mass (`Shell`): second order in the edge
-    length. In time, Alexander's stiffly accurate two-stage scheme (SDIRK2) [1]_, L-stable and of
-    second order in the step; where a function of time jumps within a step, of first. Both stages
-    share one sparse factorisation, which is reused for all steps of one length. An edge of the
-    mesh is insulated.
+    In space, the intrinsic Laplacian with a lumped mass (`Shell`): second order in the edge length.
+    In time, Alexander's stiffly accurate two-stage scheme (SDIRK2) [1]_, L-stable and of second
+    order in the step; where a function of time jumps within a step, of first. Both stages share one
+    sparse factorisation, which is reused for all steps of one length. An edge of the mesh is
+    insulated.
 
-    Parameters
-    ----------
-    shell : Shell
-        The body.
-    time : array_like, shape (time,)
-        Increasing times [s]; the first is that of the initial temperature.
-    initial : float or array_like, shape (vertex,)
-        Initial temperature [K].
-    exchanges : sequence of Exchange
-        Heat exchanges; one record for each side and cause, none for an insulated body.
-    step : float, optional
-        Longest internal step [s]: every interval of `time` is cut evenly into as few steps as
-        this allows. One step an interval if left out.
-    tolerance : float
-        Largest error of the iteration in a stage [K].
-
-    Returns
-    -------
-    ndarray, shape (time, vertex)
-        Temperature [K].
-
-    Raises
-    ------
-    ValueError
-        If a parameter has the wrong shape or is not physical, or an exchange at some time is not.
-    ArithmeticError
-        If a temperature falls to 0 K or below, or a stage does not converge.
+    At increasing times (time,) [s], from an initial temperature, of all or (vertex,) [K], with an
+    exchange for each side and cause, none for an insulated body. `step` is the longest internal
+    step [s]: every interval of times is cut evenly into as few as this allows, by default one.
+    `tolerance` is the largest error of the iteration in a stage [K]. ValueError if a parameter has
+    the wrong shape or is not physical, or an exchange at some time is not; ArithmeticError if a
+    temperature falls to 0 K or below, or a stage does not converge.
 
     References
     ----------
@@ -117,8 +93,7 @@ def simulate(
 
 
 class _Stepper:
-    r"""
-    Steps of one shell, with the factorisation they share.
+    r"""Steps of one shell, with the factorisation they share.
 
     A stage solves :math:`C (T - B) = w (A f(T) - K T)` for T, with the capacity C, the base B,
     the weight w (a time), the vertices' areas A, the flux f and the stiffness K, by
@@ -145,8 +120,7 @@ class _Stepper:
         return temperature
 
     def advance(self, temperature: Array, begin: float, end: float) -> Array:
-        r"""
-        Temperature [K] at the end of a step from a time to another [s].
+        r"""Temperature [K] at the end of a step from a time to another [s].
 
         .. math:: T_1 = T + \gamma \tau F(t + \gamma \tau, T_1), \quad
                   T_2 = T + (1 - \gamma) \tau F(t + \gamma \tau, T_1)

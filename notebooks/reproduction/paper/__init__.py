@@ -6,14 +6,7 @@ of simulations, of simulated twins of its scenes, of spectral libraries and of i
 videos, and every row says of which.
 """
 
-from reproduction.paper.published import (
-    EMISSIVITIES,
-    PEAKS,
-    REDUCTIONS,
-    SCENE_ERRORS,
-    Numbers,
-    Row,
-)
+from reproduction.paper.published import EMISSIVITIES, PEAKS, REDUCTIONS, SCENE_ERRORS, Numbers, Row
 from reproduction.paper.table import COLUMNS, compare, markdown, rows
 
 __all__ = [

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import calibration, mixing, planck, schema
+from dbthermal import calibration, mixing, planck
 from dbthermal import response as responses
 from dbthermal.emissivity import embedded_table
 from dbthermal.response import Curve, require_range
@@ -48,8 +48,7 @@ _CAMERA_BAND: Final = "8-14"
 
 @dataclass(frozen=True)
 class Sample:
-    """
-    An object on the bench.
+    """An object on the bench.
 
     Attributes
     ----------
@@ -91,8 +90,7 @@ its reference values for 8-14 um; the rest is this project's choice."""
 
 
 def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
-    """
-    True emissivity (band) [1] of a sample in bands of `bands.FILTERS`.
+    """True emissivity (band) [1] of a sample in bands of `bands.FILTERS`.
 
     The sample's own value for 8-14 um times the ratio of its kin's: of the emissivities where the
     value is below 0.5 as a metal's, of the reflectances above as a dielectric's, so that the
@@ -109,8 +107,7 @@ def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
 
 @dataclass(frozen=True)
 class Bench:
-    """
-    Steps and errors of the bench; each `tolerance` is the half width of a uniform error.
+    """Steps and errors of the bench; each `tolerance` is the half width of a uniform error.
 
     Attributes
     ----------
@@ -192,63 +189,10 @@ class Bench:
         )
 
 
-def contact_measurements(
-    response: xr.Dataset,
-    emissivity: xr.DataArray,
-    object_temperature: np.ndarray,
-    background_temperature: np.ndarray,
-    stds: tuple[float, float],
-    rng: np.random.Generator,
-) -> xr.Dataset:
-    """
-    Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
-
-    Parameters
-    ----------
-    response : Dataset
-        With `noise`.
-    emissivity : DataArray
-        True emissivity (band) [1].
-    object_temperature, background_temperature : ndarray, shape (measurement,)
-        True temperatures [K].
-    stds : tuple of float
-        Standard deviation of a reading of thermocouple and blackbody [K].
-    rng : Generator
-        Source of the errors.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
-        (measurement) [K], as read.
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the response, or the emissivity lacks a band.
-    """
-    curves = _curves(response)
-    names = [curve.band for curve in curves]
-    schema.band_positions(emissivity, names, "the emissivity")
-    share = emissivity.sel(band=names).values[:, np.newaxis]
-    true = {
-        "object_temperature": object_temperature,
-        "background_temperature": background_temperature,
-    }
-    emitted, reflected = (_blackbody(curves, level) for level in true.values())
-    counts = _noisy(response, mixing.leaving(share, emitted, reflected), rng)
-    read = {
-        name: level + rng.normal(0, std, len(level))
-        for (name, level), std in zip(true.items(), stds, strict=True)
-    }
-    return _dataset(response, {"counts": counts}, read)
-
-
 def bench_series(
     response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
 ) -> xr.Dataset:
-    """
-    One series of measurements on the paper's bench, with all its errors: the stage `contact`.
+    """One series of measurements on the paper's bench, with all its errors: the stage `contact`.
 
     Parameters
     ----------
@@ -265,9 +209,9 @@ def bench_series(
     The emissivity of a chrome ball, 0.10, from a series with all errors of the bench:
 
     >>> from dbthermal import calibration, simulation
-    >>> bench, ball = simulation.Bench(), simulation.OBJECTS[0]
+    >>> bench, ball = Bench(), OBJECTS[0]
     >>> response, rng = simulation.Rig().response(), np.random.default_rng(1)
-    >>> series = simulation.bench_series(response, ball, bench, rng)
+    >>> series = bench_series(response, ball, bench, rng)
     >>> stds = (bench.reading_std, bench.blackbody_std)  # K
     >>> fitted = calibration.fit_emissivity(series, response, stds, bench.bias(ball))
     >>> fitted["emissivity"].values.round(2).tolist()
@@ -294,8 +238,7 @@ def bench_series(
 def reflector_series(
     response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
 ) -> xr.Dataset:
-    """
-    One series by the reflector method, with all its errors: the stage `reflector`.
+    """One series by the reflector method, with all its errors: the stage `reflector`.
 
     The foil gives the mean of the room, and a little of its own emission. Of the object's
     reflection all but the stray part is mirror-like, of a temperature higher by
@@ -307,9 +250,9 @@ def reflector_series(
     A chrome ball of emissivity 0.10 seems to have 0.3, for it reflects what the foil does not:
 
     >>> from dbthermal import calibration, simulation
-    >>> bench, ball = simulation.Bench(), simulation.OBJECTS[0]
+    >>> bench, ball = Bench(), OBJECTS[0]
     >>> response, rng = simulation.Rig().response(), np.random.default_rng(1)
-    >>> series = simulation.reflector_series(response, ball, bench, rng)
+    >>> series = reflector_series(response, ball, bench, rng)
     >>> stds = (bench.reading_std, bench.foil_std)  # K
     >>> fitted = calibration.reflector_emissivity(series, response, stds, bench.bias(ball))
     >>> fitted["emissivity"].values.round(1).tolist()
@@ -334,10 +277,7 @@ def reflector_series(
     foil = mixing.leaving(bench.foil_emissivity, emitted, uneven)
     return _dataset(
         response,
-        {
-            "counts": _noisy(response, counts, rng),
-            "reflected_counts": _noisy(response, foil, rng),
-        },
+        {"counts": _noisy(response, counts, rng), "reflected_counts": _noisy(response, foil, rng)},
         {"object_temperature": _thermocouple(warm, bench, rng)},
     )
 
