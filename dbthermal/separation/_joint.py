@@ -212,26 +212,28 @@ def solve(
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
         if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
-        told = np.zeros(solved.size)
+        of_slope = np.zeros(solved.size)
         for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
             # A gradient as steep as the object's own change turns the step round: divide by it.
             own = here.T.astype(np.float64)
             line = residuals.regress(own, first, inputs.noise[inputs.bands[0]])
             steep = np.maximum(_slope(here, beside), 1.0)
             slope = emissivity[0] + (line.slope - emissivity[0]) / steep
-            # Its deviation: of the noise, and what the steps of the camera are as a slope.
+            # Its variance: of the noise, and what the steps of the camera are as a slope.
             by_steps = (line.kernel(own) * steps).sum(axis=0)
-            told = np.hypot(np.sqrt(line.variance), by_steps) / steep
+            of_slope = (line.variance + by_steps**2) / steep**2
             known = line.energy > _LEAST_CHANGE**2 * len(some)
             likely = 1.0 - _ratio(raw) * (1.0 - slope)
             known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
+            error = np.where(known & (line.variance > 0), of_slope, np.inf)
             slope = np.where(known, slope, emissivity[0])
-            error = np.where(known & (line.variance > 0), line.variance / steep**2, np.inf)
             slope = _shared(slope, error, result["status"].shape)
             before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - slope))
-            coefficients = _coefficients(inputs, emissivity, solved)
-            own = np.where(solved, emissivity[0], 1.0)
-            equations = replace(equations, first=own, shares=coefficients)
+            equations = replace(
+                equations,
+                first=np.where(solved, emissivity[0], 1.0),
+                shares=_coefficients(inputs, emissivity, solved),
+            )
             here, beside, _ = both(looked_at, change[:, some])
             if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
                 break
@@ -244,10 +246,10 @@ def solve(
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
             )
             unsettled |= step > 10.0 * _CONVERGED
-        size = np.where(solved, np.sqrt(np.mean(std**2, axis=0)), 0.0)
         # An error of e_1 is one of all c: dq = de_1 w_1 [u(x(r)) - u(x(p))].
-        off = _weights(inputs, emissivity)[0] * told * np.sqrt(np.mean((beside - here) ** 2, 1))
-        factor = _factor(inputs, equations, np.stack([size, np.nan_to_num(off) * solved]), variance)
+        off = _weights(inputs, emissivity)[0] ** 2 * of_slope * np.mean((beside - here) ** 2, 1)
+        size = np.where(solved, np.sqrt(np.nan_to_num([np.mean(std**2, axis=0), off])), 0.0)
+        factor = _factor(inputs, equations, size, variance)
         unsettled |= np.isnan(factor)
     return Joint(inputs, result, emissivity, factor, unsettled)
 
