@@ -68,29 +68,17 @@ def band_table(
     does not cover the whole band both integrals run over the covered part, whose share is
     `coverage`; nothing is extrapolated.
 
-    Parameters
-    ----------
-    spectra : mapping of str to Dataset
-        Material to stage `spectrum` of `schema`: `emissivity` (wavelength) [1], wavelength [m].
-    bands : mapping or iterable of Band or str
-        Bands, or names of `bands.FILTERS`.
-    temperature : float
-        Temperature of the material [K].
-    minimum_coverage : float
-        Share of the band's blackbody radiance that each spectrum must cover, in (0, 1].
-
-    Returns
-    -------
-    Dataset
-        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]. Values of the
-        libraries' spectra outside (0, 1] are averaged as they are.
+    Of spectra by material, stage `spectrum` of `schema`, `emissivity` (wavelength) [1], wavelength
+    [m]; bands, or names of `bands.FILTERS`; the temperature of the material [K]; and the share of
+    the band's blackbody radiance that each spectrum must cover, in (0, 1]: stage
+    `emissivity_table`, `emissivity` and `coverage` (material, band) [1]. Values of the libraries'
+    spectra outside (0, 1] are averaged as they are.
 
     Raises
     ------
-    KeyError
-        If a band's name is unknown.
-    TypeError
-        If the spectra are no mapping, or a band is neither a Band nor a name.
+    KeyError, TypeError
+        If a band is unknown; if the spectra are no mapping, or a band is neither a Band nor a
+        name.
     ValueError
         If there is no spectrum or no band, a band repeats, a spectrum is not as `schema` has it or
         holds NaN, the temperature is outside `bands.TEMPERATURE_RANGE`, or a spectrum covers less

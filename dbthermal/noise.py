@@ -67,23 +67,9 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     is too high: for glass by up to a half, at a correlation time near 10 s, at emissivities 0.3/0.5
     by up to three times, at 30 s.
 
-    Parameters
-    ----------
-    first, second : ndarray, shape (time, pixel)
-        Signals of the two bands, each in a unit of its own.
-    time : array_like, shape (time,)
-        Times [s].
-
-    Returns
-    -------
-    tuple of float
-        Standard deviations of the noise, in the signals' units.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or
-        a noise comes out as zero.
+    Of signals (time, pixel) of the two bands, each in a unit of its own, at times (time,) [s]:
+    standard deviations of the noise, in these units. ValueError if there are fewer than
+    `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or a noise comes out as zero.
 
     Examples
     --------

@@ -303,25 +303,13 @@ def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
 
 
 def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
-    """Check a dataset against its stage, and return it unchanged.
+    """Check a dataset against its stage, one of `STAGES`, and return it unchanged.
 
     A missing `units` attribute is taken as the agreed unit; a different one is an error. Of the
-    values only those of the coordinates are read.
-
-    Parameters
-    ----------
-    dataset : Dataset
-        Data of a stage.
-    stage : str
-        One of `STAGES`.
-
-    Raises
-    ------
-    TypeError
-        If it is not a Dataset, or a variable's dtype is not a real number.
-    ValueError
-        If a variable, dimension or coordinate is missing, misnamed or out of order, a unit is
-        another one, a coordinate does not increase strictly, or bands repeat.
+    values only those of the coordinates are read. TypeError if it is not a Dataset, or a variable's
+    dtype is not a real number; ValueError if a variable, dimension or coordinate is missing,
+    misnamed or out of order, a unit is another one, a coordinate does not increase strictly, or
+    bands repeat.
 
     Examples
     --------

@@ -48,8 +48,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     # z = (I_n - a I_n-1) / (1 - a), of independent noises: sqrt(1 + a^2) / (1 - a).
     amplification = np.hypot(1.0, np.exp(-ratio)) / -np.expm1(-ratio)
     return corrected.assign(counts=(counts.dims, signal, counts.attrs)).assign_attrs(
-        lag_time_constant=constants.tolist(),
-        lag_noise_amplification=amplification.tolist(),
+        lag_time_constant=constants.tolist(), lag_noise_amplification=amplification.tolist()
     )
 
 
@@ -84,29 +83,13 @@ def undo_drift(
     the ends of a polynomial: 0.11 counts for 100 pixels of 4 counts and 350 frames. A motion in
     front of the patch, or reflected in it, is taken for drift.
 
-    Parameters
-    ----------
-    corrected : Dataset
-        Stage `corrected` of `schema`, after `mark_shutter` if there were shutter events.
-    reference : DataArray
-        True on the patch, (y, x), bool: a blackbody, a wall. Pixels with a `status` are left out.
-    order : int
-        Number of polynomials in a segment, the constant included.
-    lazy : bool
-        As in `correct_capture`.
-
-    Returns
-    -------
-    Dataset
-        The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted;
-        and the attributes ``drift_order`` and ``drift_pixels``.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the drift was undone before, the reference is no boolean of its pixels or marks no good
-        pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are
-        not.
+    Of stage `corrected` of `schema`, after `mark_shutter` if there were shutter events; a reference
+    (y, x), bool, true on the patch, a blackbody, a wall, of which pixels with a `status` are left
+    out; the number of polynomials in a segment, the constant included; and `lazy` as in
+    `correct_capture`: the dataset with other `counts` [count]; `drift` (band, time) [count], which
+    was subtracted; and the attributes ``drift_order`` and ``drift_pixels``. TypeError or ValueError
+    if the drift was undone before, the reference is no boolean of its pixels or marks no good
+    pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are not.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:

@@ -287,25 +287,6 @@ class Session:
         return device.simulated if self.simulated else device.hardware
 
     @classmethod
-    def from_yaml(cls, text: str) -> Self:
-        """Read a session from YAML, see the module; ValueError as from `load`.
-
-        Examples
-        --------
-        >>> text = '''
-        ... {name: pot, simulated: true, protocol: scene, duration: 60, cameras: {"8-14":
-        ...   {video: {simulated: "sim://boson/wide", hardware: "v4l2:///dev/video0"}}}}
-        ... '''
-        >>> session = Session.from_yaml(text)
-        >>> session.url(session.cameras["8-14"].video)
-        'sim://boson/wide'
-        >>> Session.from_yaml(text.replace("60", "-60"))
-        Traceback (most recent call last):
-        ValueError: session: Invalid duration -60. Must be greater than 0.
-        """
-        return cls._checked(texts.parse_yaml(text, "session"), {}, "session")
-
-    @classmethod
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
         """Read a session from YAML, see the module, and from the file that it names as its ``rig``.
 

@@ -26,26 +26,11 @@ class CaptureDesign:
     The object's time constant is a third of the capture. The background is warmer for the end of
     each period, as if someone stood there, and rests before.
 
-    Attributes
-    ----------
-    seconds : float
-        Length [s].
-    rate : float
-        Frame rate [1/s].
-    start, span : float
-        First temperature of the object, and its rise until the last frame [K].
-    level : float
-        Temperature of the background at rest [K].
-    amplitude : float
-        Height of a pulse [K].
-    period, duration : float
-        From pulse to pulse, and of one pulse [s].
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite, or not positive (all but `span` and `amplitude`), a pulse is
-        longer than the period, or there are fewer than two frames.
+    `seconds` is the length [s], `rate` that of the frames [1/s]; `start` and `span` are the first
+    temperature of the object and its rise until the last frame [K]; `level` is the temperature of
+    the background at rest and `amplitude` the height of a pulse [K], which lasts for its `duration`
+    of a `period` [s]. ValueError if a number is not finite, or not positive (all but `span` and
+    `amplitude`), a pulse is longer than the period, or there are fewer than two frames.
     """
 
     seconds: float = 35.0

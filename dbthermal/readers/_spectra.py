@@ -48,29 +48,16 @@ _HEADER_RULES: Final = {
 def ecostress(path: str | Path) -> xr.Dataset:
     r"""Spectrum of an ECOSTRESS (or ASTER) library file, ``*.spectrum.txt``.
 
-    The file gives the hemispherical reflectance R [%] of an opaque sample, so that by Kirchhoff's
-    law its emissivity is 1 - R / 100. Header and values are compared: units, kind of measurement,
-    number of values, first and last wavelength.
+    The file, in Latin-1, with either line end and either order of wavelengths, gives the
+    hemispherical reflectance R [%] of an opaque sample, so that by Kirchhoff's law its emissivity
+    is 1 - R / 100. Header and values are compared: units, kind of measurement, number of values,
+    first and last wavelength. The result is `emissivity` (wavelength) [1] over wavelength [m];
+    attributes: what the library says of the sample (``name``, ``class``, ...), ``source`` and
+    ``unphysical_values``.
 
-    Parameters
-    ----------
-    path : str or Path
-        File in Latin-1, with either line end and either order of wavelengths.
-
-    Returns
-    -------
-    Dataset
-        `emissivity` (wavelength) [1] over wavelength [m]; attributes: what the library says of the
-        sample (``name``, ``class``, ...), ``source`` and ``unphysical_values``.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If it is truncated or longer than declared, is no hemispherical reflectance in percent over
-        micrometres, an emissivity is outside `schema.EMISSIVITY_LIMITS`, or a wavelength is outside
-        0.001 to 1000 um or out of order.
+    FileNotFoundError if the file does not exist; ValueError if it is truncated or longer than
+    declared, is no hemispherical reflectance in percent over micrometres, an emissivity is outside
+    `schema.EMISSIVITY_LIMITS`, or a wavelength is outside 0.001 to 1000 um or out of order.
 
     References
     ----------

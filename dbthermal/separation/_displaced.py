@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.ndimage import distance_transform_edt, map_coordinates, uniform_filter
 from scipy.sparse import csr_array
 
 from dbthermal import _samples as samples
@@ -34,6 +34,8 @@ _UNSOLVED: Final = 1e-2
 _OUTSIDE: Final = 0.1
 # Weight of pixels without a value that the others may take over [1].
 _LOST_WEIGHT: Final = 0.25
+# Pixels of which the noise of a resampled sample is measured, along either side.
+_AROUND: Final = 5
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
 
@@ -211,7 +213,20 @@ def read(
             status[share @ holds > _NO_WEIGHT] |= np.uint32(bit)
     counts[:, :, quality.unusable(status)] = 0.0
     gain = np.sqrt(np.asarray((weights**2).sum(axis=1)).ravel())
+    if "noise_factor" in block and np.any(block["noise_factor"].values[others] < 1.0):
+        # Neighbours that a registration has interpolated share noise: measured, not computed.
+        usual = np.mean(_roughness(seen)[:, ~quality.unusable(flags)] ** 2, axis=1) ** 0.5
+        found = (_roughness(counts[others]) / usual[:, np.newaxis]).mean(axis=0)
+        shape = (-1, displacement.shape[1])
+        ratio = np.divide(found, gain, out=np.zeros_like(gain), where=gain > 0.0).reshape(shape)
+        mean, share = (uniform_filter(it, _AROUND) for it in (ratio, (ratio > 0.0) * 1.0))
+        gain *= np.divide(mean, share, out=np.ones_like(mean), where=ratio > 0.0).ravel()
     return counts, valid, status, gain
+
+
+def _roughness(counts: Array) -> Array:
+    """Median change (band, pixel) [count] of counts (band, time, pixel) from frame to frame."""
+    return np.asarray(np.median(np.abs(np.diff(counts, axis=1)), axis=1))
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:

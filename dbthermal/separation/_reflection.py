@@ -186,24 +186,12 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     of the weighted variance over time; else its scale is nearly constant, or the surroundings
     change themselves, and it stays as it is.
 
-    Parameters
-    ----------
-    signal : DataArray
-        (band, time, y, x), two bands in units of their own.
-    still : DataArray of bool
-        Pixels (y, x) off the object; a third of them may change after all.
-
-    Returns
-    -------
-    DataArray
-        The signal, in units of its mean over time; the coordinate `gain` (band, time) [1], by which
-        the noise was divided, 1 in a band that is not undone. Attributes `scale_undone`, the bands
-        that are, and `scale_explained`, each band's explained share.
-
-    Raises
-    ------
-    ValueError
-        If dims or bands are wrong, a value is not finite, or fewer than 200 pixels are still.
+    Of a signal (band, time, y, x), two bands in units of their own, and the pixels (y, x), bool,
+    off the object, of which a third may change after all: the signal, in units of its mean over
+    time; the coordinate `gain` (band, time) [1], by which the noise was divided, 1 in a band that
+    is not undone. Attributes `scale_undone`, the bands that are, and `scale_explained`, each band's
+    explained share. ValueError if dims or bands are wrong, a value is not finite, or fewer than 200
+    pixels are still.
 
     References
     ----------

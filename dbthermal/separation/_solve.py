@@ -366,11 +366,7 @@ def _separate(
 
 
 def _survey(
-    inputs: Inputs,
-    rows: slice,
-    selected: Mask,
-    bar: "tqdm[Any]",
-    material: Material | None = None,
+    inputs: Inputs, rows: slice, selected: Mask, bar: "tqdm[Any]", material: Material | None = None
 ) -> list[tuple[Labels, Survey]]:
     """Survey the selected pixels of a block; with their numbers in the image."""
     surveys = []

@@ -23,22 +23,11 @@ class Rig:
     about 115 counts/K near 300 K and NETD 20-40 mK without a filter; behind a filter the counts
     shrink with the band's share of dB/dT while the noise in counts stays.
 
-    Attributes
-    ----------
-    bands : tuple of str
-        Names in `bands.FILTERS`.
-    noise : tuple of float
-        Noise of each band, as NETD near 25 degrees Celsius [K].
-    counts_per_kelvin : float
-        Slope of the 8-14 um band at 300 K [count/K].
-    offset : float
-        Counts of a body at 0 K [count].
-    lowest, highest : float
-        Range of the simulated response [K].
-    gain_std, offset_std : float
-        Fixed pattern from pixel to pixel: relative gain [1] and offset [count].
-    bad_fraction : float
-        Fraction of dead pixels [1].
+    Bands are names in `bands.FILTERS`, each with a noise, as NETD near 25 degrees Celsius [K].
+    `counts_per_kelvin` is the slope of the 8-14 um band at 300 K [count/K], `offset` the counts of
+    a body at 0 K, and `lowest` to `highest` the range of the simulated response [K]. The fixed
+    pattern from pixel to pixel has a relative `gain_std` [1], an `offset_std` [count], and a
+    `bad_fraction` of dead pixels [1].
 
     Examples
     --------
@@ -113,28 +102,12 @@ def observe(
 
     .. math:: I_m = e_m U_m(x) + (1 - e_m) U_m(y) + \mathrm{noise}
 
-    Parameters
-    ----------
-    scene : Dataset
-        As from `scene`: object and background temperature (time, y, x) [K], emissivity
-        (band, y, x) [1]. The background may be one for each band, (band, time, y, x), as two
-        cameras see it that stand side by side.
-    response : Dataset
-        With `noise`, e.g. from `Rig.response`.
-    rng : Generator
-        Source of the noise.
-    dtype : str
-        Floating dtype of the counts.
-
-    Returns
-    -------
-    Dataset
-        `counts` (band, time, y, x) [count], `origin = "simulated"`, and of a twin its `twin`.
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the response, or a band is missing.
+    Of a scene, as from `scene`: object and background temperature (time, y, x) [K], emissivity
+    (band, y, x) [1], where the background may be one for each band, (band, time, y, x), as two
+    cameras see it that stand side by side; and of a response with `noise`, e.g. from
+    `Rig.response`: `counts` (band, time, y, x) [count] of a floating dtype, `origin = "simulated"`,
+    and of a twin its `twin`. ValueError if a temperature lies outside the response, or a band is
+    missing.
 
     Examples
     --------

@@ -18,23 +18,12 @@ _BACKGROUNDS: Final = ("pulses", "random walk", "still")
 class Background:
     """Temporal variation of the background.
 
-    Attributes
-    ----------
-    kind : {"pulses", "random walk", "still"}
-        People who walk by now and then; a background that never rests (a first-order
-        autoregressive process); or a constant one.
-    level : float
-        Resting temperature [K].
-    amplitude : float
-        Height of a pulse, or standard deviation of the walk [K].
-    count : tuple of int
-        Fewest and most pulses in the capture.
-    duration : tuple of float
-        Shortest and longest pulse [s].
-    correlation_time : float
-        Correlation time of the walk [s].
-    drift : float
-        Change of the resting temperature over the capture, linear in time [K].
+    Its kind is "pulses", people who walk by now and then; "random walk", a background that never
+    rests (a first-order autoregressive process); or "still". `level` is the resting temperature
+    [K], and `drift` its change over the capture, linear in time [K]; `amplitude` the height of a
+    pulse, or the standard deviation of the walk [K]; `count` the fewest and most pulses in the
+    capture, `duration` the shortest and longest one [s], and `correlation_time` that of the walk
+    [s].
     """
 
     kind: str = "pulses"

@@ -139,21 +139,12 @@ def _save_rows(
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
-    """Open a saved dataset or a recording; values are read when they are used.
+    """Open a saved dataset or a recording, a folder ``*.zarr``; values are read when they are used.
 
-    A recording that was cut short, or is being written, opens as far as all bands are valid; its
-    attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
-
-    Parameters
-    ----------
-    path : str or Path
-        Folder ``*.zarr``.
-
-    Returns
-    -------
-    Dataset
-        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
-        fixed-length kind.
+    It is identical to the one saved, with ``attrs["provenance"]`` added; text is of NumPy's
+    fixed-length kind. A recording that was cut short, or is being written, opens as far as all
+    bands are valid; its attributes have ``complete`` = False and, in ``frames_written``, the end of
+    each band.
 
     Raises
     ------

@@ -78,8 +78,7 @@ def execute(
     values: Mapping[str, Any],
     runner: Callable[[str, Path, Mapping[str, Any]], None] = run_papermill,
 ) -> Path:
-    """
-    Path of the executed notebook, when it and all that it wrote are whole and on the disk.
+    """Path of the executed notebook, when it and all that it wrote are whole and on the disk.
 
     It is as old as its start, so that whatever changed while it ran is newer. Raises what the
     runner raises for a cell that fails.

@@ -32,8 +32,7 @@ _PARTS: Final = 5  # of a capture, in which the still edges are registered
 
 
 def edges_shift(movie: xr.DataArray) -> xr.Dataset:
-    """
-    Displacement (axis) [pixel] of the still edges: the second band shows at p the first's p + d.
+    """Displacement (axis) [pixel] of the still edges: the second band shows at p the first's p + d.
 
     From `alignment.register` of the mean pictures of five parts of the capture: `shift` is their
     median, `low` and `high` their extremes. Parts without edges, as before anything is warm, are
@@ -51,8 +50,7 @@ def edges_shift(movie: xr.DataArray) -> xr.Dataset:
 
 
 def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.Dataset:
-    """
-    Displacement (axis) [pixel] of the reflections: the second band shows at p the first's p + d.
+    """Displacement (axis) [pixel] of the reflections: the second band shows at p the first's p + d.
 
     That of the largest correlation of the bands' rapid changes over the object, between whole
     pixels by a parabola. `low` and `high` are the 10 and 90 % quantiles of the neighbourhoods with
@@ -139,8 +137,7 @@ def _neighbourhoods(
 
 
 def moved(movie: xr.DataArray, displacement: xr.Dataset) -> xr.DataArray:
-    """
-    Movie with the first band taken at p + d, so that both show a reflection at one pixel.
+    """Movie with the first band taken at p + d, so that both show a reflection at one pixel.
 
     Raises a ValueError if the displacement is not known.
     """

@@ -40,8 +40,7 @@ def defaults(stem: str) -> dict[str, Any]:
 
 
 def read(stem: str, files: Iterable[Path], texts: Iterable[tuple[str, str]] = ()) -> dict[str, Any]:
-    """
-    Values for a notebook from YAML files, a later one over an earlier one, and from texts.
+    """Values for a notebook from YAML files, a later one over an earlier one, and from texts.
 
     The file in ``params/`` must have all of them. `texts` are pairs of name and text. Raises
     a ValueError that names file and parameter for what `check` refuses, for a file that

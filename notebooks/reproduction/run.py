@@ -28,8 +28,7 @@ Numbers = Mapping[str, store.Number | np.generic]
 
 
 class Run:
-    """
-    One run of a notebook, with its results in ``results/<name>/<stem>*``.
+    """One run of a notebook, with its results in ``results/<name>/<stem>*``.
 
     Each result is saved with the provenance: the notebook's parameters, versions, commit, and the
     checksums of the inputs that were opened before.

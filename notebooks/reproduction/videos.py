@@ -58,8 +58,7 @@ class Scene:
 
 
 def scene(files: Mapping[str, Path], inputs_name: str, results_name: str) -> Scene:
-    """
-    Read a scene of `manifest.local`, such as "incan-bulb" with the results' name "incan".
+    """Read a scene of `manifest.local`, such as "incan-bulb" with the results' name "incan".
 
     Where the results have fewer frames than the inputs, their first frame is found by `first_frame`
     on the authors' reflection. The object is what their results draw in more than half of the
@@ -75,8 +74,7 @@ def scene(files: Mapping[str, Path], inputs_name: str, results_name: str) -> Sce
 
 
 def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
-    """
-    Both bands (band, time, y, x) of a scene, in [0, 1], with `radiometric = 0`.
+    """Both bands (band, time, y, x) of a scene, in [0, 1], with `radiometric = 0`.
 
     Raises a FileNotFoundError without such a video, a ValueError if the two differ in shape.
     """
@@ -97,8 +95,7 @@ def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
 
 
 def authors_reflection(files: Mapping[str, Path], name: str, kind: str, width: int) -> xr.Dataset:
-    """
-    Magnitude of the background's change as published by the authors.
+    """Magnitude of the background's change as published by the authors.
 
     `kind` is one of `KINDS`; beyond the width of the input video [pixel] may lie a printed bar.
     `value` (time, y, x) in [0, 1], in units of the frame's own bar, and `valid`.
@@ -110,8 +107,7 @@ def authors_reflection(files: Mapping[str, Path], name: str, kind: str, width: i
 def first_frame(
     movie: xr.DataArray, theirs: xr.DataArray, outline: xr.DataArray
 ) -> tuple[int, float]:
-    """
-    First frame of the inputs (band, time, y, x) that the results show, and how it stands out.
+    """First frame of the inputs (band, time, y, x) that the results show, and how it stands out.
 
     Changes of both over two frames, of pictures without their own scale, are correlated over the
     object, in magnitude, for theirs have no sign; the median over time is largest where the frames
@@ -160,8 +156,7 @@ def still(outline: xr.DataArray) -> xr.DataArray:
 def agreement(
     reflection: xr.DataArray, theirs: xr.Dataset, frames: npt.NDArray[np.intp], pixels: xr.DataArray
 ) -> xr.DataArray:
-    """
-    Correlation (time) [1] of our reflection's magnitude with the authors', in some frames.
+    """Correlation (time) [1] of our reflection's magnitude with the authors', in some frames.
 
     Our reflection (time, y, x), smoothed by `SMOOTHING`, is compared over those of the pixels that
     the authors' map covers in all of these frames. Raises a ValueError if the frames differ in
@@ -202,8 +197,7 @@ class Comparison:
 
 
 def compare(scene: Scene, number: int) -> Comparison:
-    """
-    Separate a scene in all `WAYS`, and compare each with the authors' maps.
+    """Separate a scene in all `WAYS`, and compare each with the authors' maps.
 
     All are compared in the same frames, the `number` in which the reflection is strongest, and at
     the same pixels: all that show the object in both bands, and those of them where the bands

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from dbthermal import _text
 from dbthermal.instruments.camera import Counts
 from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.emulated.camera import Picture
@@ -44,6 +45,11 @@ sweep: [9.5, 11]
 thermocouples: {1: blackbody, 4: plate}
 blackbody: {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, timeout: 20}
 """
+
+
+def from_yaml(text: str) -> Session:
+    """A session as `Session.load` reads it, of a text."""
+    return Session._checked(_text.parse_yaml(text, "session"), {}, "session")
 
 
 def replaced(*changes: tuple[str, str], text: str = TEXT) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_session import LEVELS, TEXT, replaced, rig, scene_text
+from rig_session import LEVELS, TEXT, from_yaml, replaced, rig, scene_text
 
 from dbthermal import acquire
 from dbthermal.instruments import inventory, protocols, recording
@@ -144,7 +144,7 @@ def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     """A real blackbody is set by the user, who gets the temperature in degrees Celsius."""
     asked: list[str] = []
     monkeypatch.setattr("builtins.input", asked.append)
-    devices = Devices(Session.from_yaml(TEXT), {})
+    devices = Devices(from_yaml(TEXT), {})
     acquire._set_blackbody(devices, 300.0)
     assert asked == [
         "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
@@ -170,7 +170,7 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
         raise inventory.LibusbMissingError("no libusb")
 
     monkeypatch.setattr(inventory, "find", missing)
-    emulated = Session.from_yaml(TEXT)
+    emulated = from_yaml(TEXT)
     real = replace(emulated, simulated=False)
     assert acquire.plugged_in(real) == "The USB bus was not looked at: no libusb"
     assert "is emulated: the USB bus was not" in acquire.plugged_in(emulated)

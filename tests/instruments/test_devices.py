@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 from device_benches import BosonBench
-from rig_session import TEXT, bench, pictures, replaced, rig
+from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 
 from dbthermal.instruments.boson import Boson, BosonTimeoutError, commands
 from dbthermal.instruments.boson.commands import Ir16Mode, Switch
@@ -22,21 +22,20 @@ from dbthermal.instruments.devices import (
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import emulated_world
 from dbthermal.instruments.filterwheel import NotHomedError
-from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08, Flag, Scan
 
 
 @pytest.fixture
 def devices() -> Iterator[Devices]:
     """Open the whole rig on emulators."""
-    with rig(Session.from_yaml(TEXT)) as opened:
+    with rig(from_yaml(TEXT)) as opened:
         yield opened
 
 
 def test_whole_rig_is_opened_and_closed() -> None:
     """All devices of the file answer through their drivers, and are closed in the end."""
     before = threading.active_count()
-    with rig(Session.from_yaml(TEXT)) as devices:
+    with rig(from_yaml(TEXT)) as devices:
         assert list(devices.sources) == list(devices.cameras) == ["8-14", "9.5"]
         assert devices.wheel is not None
         assert devices.logger is not None
@@ -119,7 +118,7 @@ def test_setting_that_is_not_taken_is_an_error() -> None:
     bench.device.settings = Kept({**bench.device.settings, commands.IR16_MODE.set_command: 2})
     message = r"Invalid IR16 mode .*TLINEAR.* of camera 93588, set to .*COUNTS_16.* Must be"
     with pytest.raises(ValueError, match=message):
-        Devices(Session.from_yaml(TEXT), {}, {"9.5": bench.camera}).prepare()
+        Devices(from_yaml(TEXT), {}, {"9.5": bench.camera}).prepare()
 
 
 def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:
@@ -137,7 +136,7 @@ def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:
 
 def test_no_wheel_to_turn() -> None:
     """Selecting a filter without a wheel raises a ValueError."""
-    devices = Devices(Session.from_yaml(TEXT), {})
+    devices = Devices(from_yaml(TEXT), {})
     with pytest.raises(ValueError, match="Invalid band '11' of a session without a wheel"):
         devices.select("11")
 
@@ -234,11 +233,11 @@ VIDEO, CONTROL = (f'{key}: {{simulated: "sim://boson/wide"' for key in ("video",
 )
 def test_other_addresses_are_refused(change: tuple[str, str], message: str) -> None:
     """An address invalid for the rig or the kind is named, and no device stays open."""
-    world = bench(Session.from_yaml(TEXT))
+    world = bench(from_yaml(TEXT))
     before = threading.active_count()
     with (
         pytest.raises((ValueError, KeyError), match=message),
-        open_devices(Session.from_yaml(replaced(change)), world),
+        open_devices(from_yaml(replaced(change)), world),
     ):
         pass
     assert threading.active_count() == before
@@ -246,7 +245,7 @@ def test_other_addresses_are_refused(change: tuple[str, str], message: str) -> N
 
 def test_hardware_has_no_emulated_world() -> None:
     """A session of hardware with an emulated world raises an error."""
-    real = Session.from_yaml(replaced(("simulated: true", "simulated: false")))
+    real = from_yaml(replaced(("simulated: true", "simulated: false")))
     world = bench(real)
     for extra in ((world, None), (None, pictures(world))):
         with (
@@ -258,7 +257,7 @@ def test_hardware_has_no_emulated_world() -> None:
 
 def test_world_of_a_session() -> None:
     """Cameras, filters and thermocouples of the emulated bench are those of the session."""
-    session = Session.from_yaml(TEXT)
+    session = from_yaml(TEXT)
     world = emulated_world(session, wheel_position=3)
     assert (list(world.cameras), world.filter_name) == (["wide", "narrow"], "11")
     assert world.thermocouples == {1: "blackbody", 4: "plate"}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from file_operations import before_operation, operations_of
-from rig_session import rig
+from rig_session import from_yaml, rig
 from test_killed import BANDS, RATE, check, frame, two_bands
 from test_protocols import TWO, swept
 from test_record import SMALL, bench, session
@@ -16,7 +16,6 @@ from test_record import SMALL, bench, session
 from dbthermal import store
 from dbthermal.instruments.recording import Preview, notes, open_sweep, record
 from dbthermal.instruments.recording._capture_file import Note
-from dbthermal.instruments.session import Session
 
 FRAMES = 15
 
@@ -217,7 +216,7 @@ def test_a_sweep_follows_its_folder(tmp_path: Path) -> None:
         if (before / "plate_00_11.zarr").exists():
             before.rename(after)
 
-    with rig(Session.from_yaml(TWO)) as devices:
+    with rig(from_yaml(TWO)) as devices:
         devices.prepare()
         steps = swept(devices, before, preview=move)
     assert [step.summary.path.parent for step in steps] == [before, after, after, after]

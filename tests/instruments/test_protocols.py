@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 import xarray as xr
 from faulty_camera import Faults, FaultyCamera
-from rig_session import LEVELS, QUICK, SHAPE, TEXT, bench, pictures, replaced, rig, scene_text
+from rig_session import (
+    LEVELS,
+    QUICK,
+    SHAPE,
+    TEXT,
+    bench,
+    from_yaml,
+    pictures,
+    replaced,
+    rig,
+    scene_text,
+)
 
 from dbthermal import store
 from dbthermal.instruments import protocols, recording
@@ -17,7 +28,6 @@ from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.protocols import Step
 from dbthermal.instruments.recording import Preview, _sweep, notes, open_capture
-from dbthermal.instruments.session import Session
 
 QUICKLY = ("window: 3", "window: 0.02")
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)
@@ -70,7 +80,7 @@ def swept(
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Step]]:
     """Record two temperatures through two filters."""
     folder = tmp_path_factory.mktemp("sweep")
-    with rig(Session.from_yaml(TWO)) as devices:
+    with rig(from_yaml(TWO)) as devices:
         devices.prepare()
         return folder, swept(devices, folder)
 
@@ -168,7 +178,7 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         if len(log) > 1:
             raise KeyboardInterrupt
 
-    with rig(Session.from_yaml(TWO)) as devices:
+    with rig(from_yaml(TWO)) as devices:
         devices.prepare()
         with pytest.raises(KeyboardInterrupt):
             swept(devices, tmp_path, log, preview=interrupt)
@@ -188,14 +198,14 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         # Offsets are corrected before the sweep, and at each temperature that is recorded.
         assert devices.world is not None
         assert {camera.ffc_count for camera in devices.world.cameras.values()} == {4}
-    other = Session.from_yaml(replaced(("[300.0, 290.0, 310.0]", "[301.0, 290.0]")))
+    other = from_yaml(replaced(("[300.0, 290.0, 310.0]", "[301.0, 290.0]")))
     with rig(other) as devices, pytest.raises(ValueError, match=r"Must be of 301\.0 K"):
         swept(devices, tmp_path)
 
 
 def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
     """A wheel that turns during a recording raises an error, then and when the sweep is opened."""
-    with rig(Session.from_yaml(ONE)) as devices:
+    with rig(from_yaml(ONE)) as devices:
         devices.prepare()
         wheel = devices.wheel
         assert wheel is not None
@@ -210,7 +220,7 @@ def test_wheel_that_turns_away_is_told(tmp_path: Path) -> None:
 
 def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
     """An unplugged camera ends the sweep with an incomplete recording."""
-    with rig(Session.from_yaml(ONE)) as devices:
+    with rig(from_yaml(ONE)) as devices:
         devices.prepare()
         assert devices.world is not None
         world, form = devices.world, (devices.session.shape, 100.0, 2)
@@ -226,8 +236,8 @@ def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
 def test_blackbody_must_be_read(tmp_path: Path) -> None:
     """A sweep without a reading of the blackbody raises an error before it begins."""
     with pytest.raises(ValueError, match="Must have one named 'blackbody'"):
-        Session.from_yaml(replaced(("{1: blackbody, 4: plate}", "{4: plate}")))
-    with rig(Session.from_yaml(TEXT)) as devices:
+        from_yaml(replaced(("{1: blackbody, 4: plate}", "{4: plate}")))
+    with rig(from_yaml(TEXT)) as devices:
         silent = replace(devices, thermocouples=None)
         with pytest.raises(ValueError, match="Must have and read a blackbody"):
             swept(silent, tmp_path)
@@ -237,7 +247,7 @@ def test_sweep_without_a_wheel(tmp_path: Path) -> None:
     """Two cameras of fixed bands have one recording at each temperature."""
     lines = [line for line in ONE.splitlines() if "filter" not in line and "wheel" not in line]
     text = "\n".join(line for line in lines if not line.startswith("sweep"))
-    session = Session.from_yaml(text)
+    session = from_yaml(text)
     with rig(session) as devices:
         devices.prepare()
         steps = swept(devices, tmp_path)
@@ -248,7 +258,7 @@ def test_sweep_without_a_wheel(tmp_path: Path) -> None:
 
 def test_scene_begins_with_its_recording(tmp_path: Path) -> None:
     """Everything is recorded beside the frames, whose scene began just before the first of them."""
-    session = Session.from_yaml(scene_text())
+    session = from_yaml(scene_text())
     world = bench(session, waits=True)
     with rig(session, world) as devices:
         with pytest.raises(RuntimeError, match="Must be homed"):
@@ -271,7 +281,7 @@ def wait(readings: list[float], clock: Clock) -> float:
     """Wait for 300 K with these readings, one a second; the last one stays."""
     values = iter(readings)
     return protocols.wait_stable(
-        Session.from_yaml(TEXT),
+        from_yaml(TEXT),
         300.0,
         lambda: next(values, readings[-1]),
         clock=clock,
@@ -306,7 +316,7 @@ def test_blackbody_takes_its_time() -> None:
     clock = Clock()
     start = clock()
     found = protocols.wait_stable(
-        Session.from_yaml(TEXT),
+        from_yaml(TEXT),
         300.0,
         lambda: 300.0 - 10.0 * math.exp((start - clock()) / 2.0),
         clock=clock,

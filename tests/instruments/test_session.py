@@ -5,7 +5,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from rig_session import TEXT, replaced
+from rig_session import TEXT, from_yaml, replaced
 
 from dbthermal.instruments import session as description
 from dbthermal.instruments.session import Session
@@ -22,7 +22,7 @@ def test_session_is_read(tmp_path: Path) -> None:
     assert session.bands == ("8-14", "9.5")
     assert (session.url(wheel), session.url(video)) == ("sim://apt/wheel", "sim://boson/narrow")
     assert session.filters == {1: "9.5", 3: "11"}
-    real = Session.from_yaml(replaced(("simulated: true", "simulated: false")))
+    real = from_yaml(replaced(("simulated: true", "simulated: false")))
     assert real.url(wheel) == "serial:///dev/ttyUSB0"
     assert real.blackbody is not None
     assert real.blackbody.temperatures == (300.0, 290.0, 310.0)
@@ -95,7 +95,7 @@ def test_session_is_read(tmp_path: Path) -> None:
 def test_invalid_sessions_are_refused(old: str, new: str, message: str) -> None:
     """An invalid session raises a ValueError with the key, the value and the rule."""
     with pytest.raises(ValueError, match=re.escape(message)):
-        Session.from_yaml(replaced((old, new)))
+        from_yaml(replaced((old, new)))
 
 
 def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
     shared.remove("name: plate")
     (tmp_path / "a.yaml").write_text("\n".join(own), encoding="utf-8")
     (tmp_path / "rig.yaml").write_text("\n".join(shared), encoding="utf-8")
-    assert Session.load(tmp_path / "a.yaml") == Session.from_yaml(TEXT)
+    assert Session.load(tmp_path / "a.yaml") == from_yaml(TEXT)
     wrong = [line.replace("telemetry_rows: 2", "telemetry_rows: 1") for line in shared]
     (tmp_path / "rig.yaml").write_text("\n".join(wrong), encoding="utf-8")
     with pytest.raises(ValueError, match=r"rig\.yaml: Invalid telemetry_rows 1\. Must be 0 or 2"):
@@ -125,7 +125,7 @@ def test_described_session_is_valid() -> None:
     """The YAML of the module's docstring is a session, with settings that a wheel has."""
     assert description.__doc__ is not None
     (text,) = re.findall(r"::\n\n(.*?)\n\n\S", description.__doc__, re.DOTALL)
-    session = Session.from_yaml(textwrap.dedent(text))
+    session = from_yaml(textwrap.dedent(text))
     assert session.swept == ("9.5", "11")
     assert session.wheel.home_offset == 12.5
 
@@ -144,11 +144,11 @@ def test_kind_of_a_camera_is_that_of_its_simulated_address(kind: str) -> None:
 
 def test_camera_behind_the_wheel() -> None:
     """The camera behind the wheel is the one whose band is a filter of the wheel."""
-    session = Session.from_yaml(TEXT)
+    session = from_yaml(TEXT)
     assert (session.filtered, session.swept) == ("9.5", ("9.5", "11"))
-    alone = Session.from_yaml(replaced((SWEEP, "")))
+    alone = from_yaml(replaced((SWEEP, "")))
     assert (alone.filtered, alone.swept) == ("9.5", ("9.5",))
-    none = Session.from_yaml(replaced((SWEEP, ""), (FILTERS, "")))
+    none = from_yaml(replaced((SWEEP, ""), (FILTERS, "")))
     assert (none.filtered, none.swept) == (None, ())
 
 
@@ -156,9 +156,9 @@ def test_one_temperature_is_no_calibration_twice() -> None:
     """A bench may repeat a temperature of the blackbody; a calibration raises a ValueError."""
     twice = ("[300.0, 290.0, 310.0]", "[300.0, 290.0, 300.0]")
     bench = replaced(twice, ("protocol: response", "protocol: emissivity_bench"))
-    assert Session.from_yaml(bench).blackbody is not None
+    assert from_yaml(bench).blackbody is not None
     with pytest.raises(ValueError, match=r"Repeated temperature \[K\] '300\.0'"):
-        Session.from_yaml(replaced(twice))
+        from_yaml(replaced(twice))
 
 
 @pytest.mark.parametrize("name", ["response", "emissivity_bench", "scene"])

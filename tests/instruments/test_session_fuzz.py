@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
-from rig_session import TEXT, replaced
+from rig_session import TEXT, from_yaml, replaced
 
 from dbthermal import acquire
 from dbthermal.instruments.session import Session
@@ -75,7 +75,7 @@ def check(number: int) -> int:
     for _ in range(number):
         deed, key, content = mutant(rng, rng.choice(originals))
         try:
-            session = Session.from_yaml(yaml.safe_dump(content, allow_unicode=True))
+            session = from_yaml(yaml.safe_dump(content, allow_unicode=True))
         except ValueError as error:
             lines = str(error).splitlines()
             refused += 1
@@ -149,9 +149,9 @@ def test_invalid_content_ends_the_command_with_its_line(
 def test_one_device_is_not_two() -> None:
     """Two bands cannot have one camera's address; emulated ones are told apart by their world."""
     twice = ("v4l2:///dev/video2", "v4l2:///dev/video0")
-    assert Session.from_yaml(replaced(twice)).simulated
+    assert from_yaml(replaced(twice)).simulated
     with pytest.raises(ValueError, match="Repeated address 'v4l2:///dev/video0'"):
-        Session.from_yaml(replaced(twice, ("simulated: true", "simulated: false")))
+        from_yaml(replaced(twice, ("simulated: true", "simulated: false")))
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"\x00", b"name: \xff", b"", b"[" * 10_000])

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import separation, simulation
+from dbthermal import alignment, separation, simulation
 from dbthermal.schema import Status
-from reproduction.experiments.pictures import Picture, smooth_shift
+from dbthermal.separation import _displaced as displaced
+from dbthermal.separation import _quality as quality
+from reproduction.experiments.pictures import ROOM, Picture, smooth_shift
 
 RIG = simulation.Rig()
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
@@ -149,6 +151,50 @@ def test_known_emissivities_and_rapid_heating() -> None:
     assert got["apart"]["good"] > 0.85
     assert got["apart"]["rmse"] < 0.8 * got["one place"]["rmse"]
     assert 0.92 < got["apart"]["cover"] < 0.98
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("far", "cover"), [(7.0, 0.92), (9.0, 0.8)])
+def test_people_at_two_depths_in_a_flat_mirror(far: float, cover: float) -> None:
+    """Those near are displaced by 6 pixels, those behind by more: right or, of 3 more, flagged."""
+    shape, rng = (32, 72), np.random.default_rng(5)
+    picture, (rows, columns) = Picture(shape=shape, walkers=3), np.indices(shape, dtype=np.float64)
+    warm = picture._object(TIME, rng)
+    films = [np.full((TIME.size, *shape), ROOM)] * 2
+    for shift in (6.0, far):
+        mirror = picture._mirror(TIME, rng)
+        views = mirror(rows, columns), mirror(rows, columns + shift)
+        films = [np.maximum(one, other) for one, other in zip(films, views, strict=True)]
+    scene = simulation.scene(TIME, warm, films[0], GLASS)
+    background = scene["background_temperature"]
+    scene["background_temperature"] = (("band", *background.dims), np.stack(films))
+    scene["background_temperature"].attrs = background.attrs
+    capture = simulation.observe(scene, RIG.response(), np.random.default_rng(1))
+    found = alignment.reflection_shift(capture, RIG.response())
+    result = separation.solve(capture, RIG.response(), reflection_shift=found)
+    got = judged(scene, result)
+    apart = float(((result["status"] & int(Status.BANDS_APART)) != 0).mean())
+    print(f"behind {far} pixel: {got}, apart {apart:.2f}")
+    assert cover < got["cover"] < 0.98
+    assert got["rmse"] < 0.2
+    assert got["good"] > 0.7 or apart > 0.2
+
+
+def test_noise_of_a_registration_is_not_taken_for_white() -> None:
+    """Pixels that a registration has averaged share noise, which a resampling leaves: measured."""
+    shape, noise = (20, 48), np.random.default_rng(3).normal(20000.0, 10.0, (2, 300, 20, 49))
+    noise[1, ..., :-1] = 0.5 * (noise[1, ..., :-1] + noise[1, ..., 1:])
+    places = {"band": list(RIG.bands), "time": TIME}
+    capture = xr.Dataset({"counts": (("band", "time", "y", "x"), noise[..., :-1])}, places)
+    capture["noise_factor"] = "band", [1.0, 0.5**0.5]
+    moved = displaced.check(field(smooth_shift(shape, 2.5, 0.5)), capture, 0)
+    whole, grains = slice(0, 20), quality.grains(capture)
+    counts, _, _, gain = displaced.read(capture, moved, whole, whole, 1, grains)
+    paired = gain > 0
+    ratio = counts[1].std(axis=0)[paired] / (10.0 * 0.5**0.5 * gain[paired])
+    print(f"noise over what is said: {ratio.mean():.3f}")
+    assert abs(ratio.mean() - 1.0) < 0.03
+    assert ratio.std() < 0.1
 
 
 FIELD = field(np.zeros((2, *SMALL.shape)))

@@ -39,8 +39,10 @@ BUFFERS: Final = 32
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
 
-MODELS: Final = MappingProxyType({"boson": "emulated Boson", "y16": "emulated Y16 camera"})
-"""Model of the emulated camera by its kind, as in its address ``sim://boson/wide``."""
+MODELS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = MappingProxyType(
+    {"boson": ("emulated Boson", ()), "y16": ("emulated Y16 camera", ("ffc",))}
+)
+"""Kind of camera, as in ``sim://boson/wide``, to its model and to the options of its address."""
 
 FFC_PERIODS: Final = (1.0, math.inf)
 """Shortest and longest time between corrections that a camera starts by itself [s]."""
@@ -80,7 +82,7 @@ class EmulatedCamera(Closing):
         """Device, model and number, labelled as emulated."""
         return {
             "device": f"sim://{self.kind}/{self.name}",
-            "model": MODELS[self.kind],
+            "model": MODELS[self.kind][0],
             "serial_number": str(self._state.serial_number),
         }
 
@@ -167,7 +169,7 @@ def open_frames(
             f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
             f"one of {sorted(MODELS)}."
         )
-    require_known(address.options, ("ffc",) if address.target == "y16" else ())
+    require_known(address.options, MODELS[address.target][1])
     return EmulatedCamera(
         world,
         address.name,

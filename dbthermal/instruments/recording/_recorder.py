@@ -122,10 +122,9 @@ def record(
         Band to an open source, in the session's order; they stay open.
     path : str or Path
         Folder ``*.zarr`` to make; see `open_capture`.
-    readings : mapping, optional
-        Name to another instrument: thermocouples, the cameras' temperatures, the blackbody.
-    identities : mapping, optional
-        Band, or name of another device, to model and numbers, beside those of the sources.
+    readings, identities : mapping, optional
+        Name to another instrument: thermocouples, the cameras' temperatures, the blackbody; and
+        band, or name of another device, to model and numbers, beside those of the sources.
     limits : Limits, optional
         Sizes and waiting times.
     preview : callable, optional
@@ -133,26 +132,19 @@ def record(
     stop : Event, optional
         Ends the recording when it is set.
 
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames; also in the store.
-
     Raises
     ------
-    FileExistsError
-        If `path` exists.
+    FileExistsError, ValueError
+        If `path` exists; if the sources are not those of the session, or are emulated and the
+        session is not.
     OSError
         If there is too little space, before or on the way; or the folder, or one of an array in
         it, was deleted, replaced or taken to another disk, or that of an array moved.
-    ValueError
-        If the sources are not those of the session, or are emulated and the session is not.
-    Exception
-        Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
-        what was recorded is kept. A second interrupt ends the wait, not the writing.
-    SignalExit
-        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell; also kept. A
-        signal that the program handles or ignores is left alone.
+    SignalExit, Exception
+        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell (a signal that
+        the program handles or ignores is left alone); error of a source, a reading or the preview,
+        or an interrupt by the keyboard. In all cases what was recorded is kept. A second interrupt
+        ends the wait, not the writing.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)

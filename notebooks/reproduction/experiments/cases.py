@@ -27,8 +27,7 @@ _OPTIONAL: Final = frozenset(
 
 @dataclass(frozen=True)
 class Jump:
-    """
-    Change of the object that is not a smooth curve, as when a palm is laid on a bulb.
+    """Change of the object that is not a smooth curve, as when a palm is laid on a bulb.
 
     Attributes
     ----------
@@ -60,8 +59,7 @@ class Jump:
 
 
 def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
-    """
-    Errors of one separation, over the pixels that have a value.
+    """Errors of one separation, over the pixels that have a value.
 
     Of a scene as the truth and a result of `separation.solve`: `object_temperature_rmse` [K], root
     mean square over time, median over pixels; `emissivity_error` (band) [1], median magnitude;
@@ -94,8 +92,7 @@ def score(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
 def efficiency(
     truth: xr.Dataset, result: xr.Dataset, noise: tuple[float, float], order: int
 ) -> float:
-    """
-    Scatter of the reflection ratio over its Cramer-Rao bound [1]; 1 is the best possible.
+    """Scatter of the reflection ratio over its Cramer-Rao bound [1]; 1 is the best possible.
 
     Robust standard deviation over the pixels of a scene of one material. The noise is that of the
     two bands' signals [K], the order the size of the smooth subspace of
@@ -115,8 +112,7 @@ def efficiency(
 def run_case(
     case: Case, rig: Rig, time: np.ndarray, pixels: int, seed: int
 ) -> tuple[xr.Dataset, xr.Dataset]:
-    """
-    Scene and separation of one case.
+    """Scene and separation of one case.
 
     The case as for `simulate`, and `noise_known` (default true) and `response_kind` (default
     "exact") for the separation; times [s].
@@ -131,8 +127,7 @@ def run_case(
 def simulate(
     case: Case, rig: Rig, time: np.ndarray, pixels: int, seed: int
 ) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
-    r"""
-    Scene, capture and response of one case.
+    r"""Scene, capture and response of one case.
 
     Parameters
     ----------
@@ -231,13 +226,7 @@ def _draw(
 
 
 def sweep(
-    cases: Iterable[Case],
-    rig: Rig,
-    time: np.ndarray,
-    pixels: int,
-    seed: int,
-    *,
-    order: int = 5,
+    cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: int, *, order: int = 5
 ) -> xr.Dataset:
     """Scores (see `score`) and `efficiency` [1] over `case`, all with the same seed."""
     rows, names = [], []

@@ -21,8 +21,7 @@ Options = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Plate:
-    """
-    Size of the scene of `compare`.
+    """Size of the scene of `compare`.
 
     Frames, their rate [Hz], rows and columns, number of people who walk by, names of the two bands.
     """
@@ -43,8 +42,7 @@ def compare(
     pixels: int,
     seed: int,
 ) -> xr.Dataset:
-    """
-    Errors of several methods on one simulated scene: a heated plate, people walking by.
+    """Errors of several methods on one simulated scene: a heated plate, people walking by.
 
     The scene, of the fields of `Plate`, is an image, for methods that use a pixel's neighbours. All
     variants (label -> `method` of `separation.solve` and fields of its settings) are scored on the
@@ -75,8 +73,7 @@ def compare(
 
 
 def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
-    """
-    Errors of one separation, pixel by pixel, of a truth one row high.
+    """Errors of one separation, pixel by pixel, of a truth one row high.
 
     `object_temperature_rmse` (pixel) [K], NaN where a frame has no value; `emissivity_error`
     (band, pixel) [1], a magnitude; `status` (pixel).
@@ -95,8 +92,7 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
 
 
 def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
-    """
-    Median errors over pixels, of every variant over the pixels that the default can solve.
+    """Median errors over pixels, of every variant over the pixels that the default can solve.
 
     A pixel that a variant loses there counts as its worst. Over `seed` too the median is taken.
     `object_temperature_rmse` [K] and `emissivity_error` (band) [1]: medians, NaN where the default
@@ -151,8 +147,7 @@ def _known(scene: xr.Dataset, options: Options) -> dict[str, Any]:
 
 
 def arguments(variant: Options) -> dict[str, Any]:
-    """
-    Arguments of `separation.solve` for a variant, with the settings' fields in their record.
+    """Arguments of `separation.solve` for a variant, with the settings' fields in their record.
 
     The variant has `method`, fields of its settings, and other arguments of `solve`, side by side.
     """

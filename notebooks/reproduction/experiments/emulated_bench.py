@@ -11,8 +11,7 @@ from dbthermal.instruments.session import Session
 
 
 class Bench(World):
-    """
-    An emulated bench whose thermometers have errors, and whose samples are heated.
+    """An emulated bench whose thermometers have errors, and whose samples are heated.
 
     By name: standard deviations of one reading [K], 0 for others; lowest and highest temperature to
     which a sample is heated [K]; temperature (time) [K], over the scene's time [s], of other

@@ -34,8 +34,7 @@ _TRUTH: Final = "truth_"
 
 @dataclass(frozen=True)
 class Views:
-    """
-    Views of the cameras of a simulated rig.
+    """Views of the cameras of a simulated rig.
 
     Of a rig, a detector from `simulation.pattern`, and the seed of the noise.
     """
@@ -117,8 +116,7 @@ def _bench(
 
 
 def parallax(places: Mapping[str, float], shape: tuple[int, int]) -> Array:
-    r"""
-    Shift (2, y, x) [pixel] between what two cameras see mirrored in a flat plate.
+    r"""Shift (2, y, x) [pixel] between what two cameras see mirrored in a flat plate.
 
     .. math:: d = f b \left( \frac{1}{z} - \frac{1}{z + L} \right)
 
@@ -157,8 +155,7 @@ def _shown(scene: xr.Dataset, curve: Curve, band: str) -> Look:
 
 
 def shown(scene: xr.Dataset, capture: xr.Dataset) -> xr.Dataset:
-    """
-    Truth of a scene at the times of a capture, linear between its frames.
+    """Truth of a scene at the times of a capture, linear between its frames.
 
     The scene as for `Views.movie`, with attribute ``began``, its time 0 on the host's clock [s]; of
     cameras side by side, as the first one sees it.
@@ -189,8 +186,7 @@ def truth(folder: Path) -> dict[str, xr.Dataset]:
 
 
 def clear(folder: Path) -> None:
-    """
-    Remove emulated recordings with their truth, so that they can be made anew.
+    """Remove emulated recordings with their truth, so that they can be made anew.
 
     Raises a FileExistsError, and removes nothing, if the folder has anything that was not
     simulated.

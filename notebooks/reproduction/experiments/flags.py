@@ -50,8 +50,7 @@ def rates(
     clock: Sequence[float],
     seed: int,
 ) -> xr.Dataset:
-    """
-    Rates of each flag: of false alarms where nothing is wrong, of misses where it should come.
+    """Rates of each flag: of false alarms where nothing is wrong, of misses where it should come.
 
     Parameters
     ----------

@@ -39,8 +39,7 @@ def near_bound(
     pixels: int,
     seed: int,
 ) -> xr.Dataset:
-    r"""
-    Errors of the separation of independent pixels of one material, beside their bounds.
+    r"""Errors of the separation of independent pixels of one material, beside their bounds.
 
     Noise and smooth subspace are unknown to the method and known to the bounds. Of those there are
     three (`KNOWING`), by the knowledge of the background:
@@ -94,8 +93,7 @@ def near_bound(
 
 
 def summary(measured: xr.Dataset) -> xr.Dataset:
-    r"""
-    Errors in units of their bounds, over the pixels of `near_bound` that have a value.
+    r"""Errors in units of their bounds, over the pixels of `near_bound` that have a value.
 
     `reflection_ratio_error` [1] and `object_temperature_error` [K], root mean square over the
     pixels, and `reflection_ratio_bound`, `object_temperature_bound` (knowing) of the same pixels;
@@ -128,8 +126,7 @@ def pooled(
     pixels: int,
     seed: int,
 ) -> xr.Dataset:
-    r"""
-    Error of the reflection ratio in groups of pixels that are known to be of one material.
+    r"""Error of the reflection ratio in groups of pixels that are known to be of one material.
 
     All pixels are of one material, in whole groups of a size that share their ratio; 1 is no
     pooling. The error of a group should fall as :math:`1/\sqrt{n}` down to the bias that all pixels
@@ -179,8 +176,7 @@ def stressed(
     seed: int,
     aligned: bool = False,
 ) -> xr.Dataset:
-    """
-    Error bars and flags (`stress.judge`) of one case of `cases.simulate`.
+    """Error bars and flags (`stress.judge`) of one case of `cases.simulate`.
 
     Aligned, the bands are first brought onto one clock by `alignment.align`; `frames_lost` [1] is
     the number of frames that this leaves empty in a band.
@@ -203,8 +199,7 @@ def on_clock(truth: xr.Dataset, time: xr.DataArray) -> xr.Dataset:
 
 
 def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
-    """
-    Labels (y, x) of `separation.materials`, -1 for none, against the true panels (y, x).
+    """Labels (y, x) of `separation.materials`, -1 for none, against the true panels (y, x).
 
     `right` [1], share of the pixels farther than `BORDER` from a border that carry the label most
     frequent in their panel; `bleeding` [1], number of labels that are on both sides of a border,

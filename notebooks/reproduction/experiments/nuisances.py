@@ -38,8 +38,7 @@ _SHARE: Final = MappingProxyType({"units": "1"})
 
 @dataclass(frozen=True)
 class Pixels:
-    """
-    Independent pixels of one material before a moving background.
+    """Independent pixels of one material before a moving background.
 
     Emissivity in the two bands of the default `Rig` [1]; first and last temperature of the object
     [K]; number of frames and their rate [Hz]; number of pixels; fields of `simulation.Background`.
@@ -64,8 +63,7 @@ class Pixels:
 
 
 def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
-    """
-    Two bands recorded a delay [frame] apart: the delay estimated and undone.
+    """Two bands recorded a delay [frame] apart: the delay estimated and undone.
 
     The delay of the second band is rounded to 1 / `cases.STEPS`; `pixels` are fields of `Pixels`.
     `found` [frame] is the offset by `alignment.time_offset`; over `treatment` the variables of
@@ -98,8 +96,7 @@ def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
 def disturbed(
     name: str, *, pixels: Mapping[str, Any], nuisance: Mapping[str, Any], seed: int
 ) -> xr.Dataset:
-    """
-    A nuisance, one of `NUISANCES`, put into a capture, and marked by `correction.mark_shutter`.
+    """A nuisance, one of `NUISANCES`, put into a capture, and marked by `correction.mark_shutter`.
 
     Lost are a `share` of each band's frames [1], the driver returning the previous one; both
     cameras' shutters close at `shutter`, times as shares of the capture [1]. `pixels` are fields of
@@ -127,8 +124,7 @@ def parallax(
     shift: Sequence[float],
     seed: int,
 ) -> xr.Dataset:
-    """
-    Two cameras side by side: the object is registered, its reflection is not.
+    """Two cameras side by side: the object is registered, its reflection is not.
 
     A plate of glass, heated in its middle, people walking by; a second camera sees the plate
     shifted, and its reflection shifted by some pixels more. A registration (translation) brings
@@ -163,8 +159,7 @@ def parallax(
 
 
 def cost(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
-    """
-    Error and flags of one separation.
+    """Error and flags of one separation.
 
     `object_temperature_rmse` [K], root mean square over time, median over the pixels with a value;
     of them `flagged` [1], the share with any flag, and `covered` [1], share of the samples of the
@@ -188,10 +183,7 @@ def _with(value: xr.DataArray, attrs: Mapping[str, str]) -> xr.DataArray:
 
 
 def _compare(
-    scene: xr.Dataset,
-    captures: Iterable[xr.Dataset],
-    response: xr.Dataset,
-    names: tuple[str, ...],
+    scene: xr.Dataset, captures: Iterable[xr.Dataset], response: xr.Dataset, names: tuple[str, ...]
 ) -> xr.Dataset:
     """Cost of the separation of each capture of a scene."""
     results = [separation.solve(capture, response) for capture in captures]

@@ -24,8 +24,7 @@ _RISE: Final = 2.0 * np.log(9.0)
 
 @dataclass(frozen=True)
 class Picture:
-    """
-    What is drawn.
+    """What is drawn.
 
     Attributes
     ----------
@@ -61,8 +60,7 @@ class Picture:
         rng: np.random.Generator,
         shift: Array | None = None,
     ) -> xr.Dataset:
-        """
-        Scene, see `simulation.scene`; its background is (band, time, y, x) with a shift.
+        """Scene, see `simulation.scene`; its background is (band, time, y, x) with a shift.
 
         The shift (2, y, x) [pixel] is where the first band shows what the others show here: rows
         down and columns to the right, :math:`y_2(p) = y_1(p + d(p))`.

@@ -31,8 +31,7 @@ def compare_procedures(
     samples: tuple[Sample, ...] = OBJECTS,
     repeats: int = 100,
 ) -> xr.Dataset:
-    """
-    Statistics of many measurements of objects on the bench and by the reflector method.
+    """Statistics of many measurements of objects on the bench and by the reflector method.
 
     A series' common errors are drawn anew for each of two or more repeats. `true` (object, band);
     over (object, procedure, band): `mean` of the estimates, their standard deviation `spread`,
@@ -75,8 +74,7 @@ def reflector_sensitivity(
     samples: tuple[Sample, ...] = OBJECTS,
     repeats: int = 100,
 ) -> xr.Dataset:
-    """
-    Emissivity by the reflector method over the excess of the reflected direction over the room.
+    """Emissivity by the reflector method over the excess of the reflected direction over the room.
 
     The excesses [K] are the largest of a smooth object's reflection; a series' own is drawn evenly
     from 0. `mean` of the estimates (object, excess, band), `true` (object, band) [1]. With 0 K the

@@ -30,8 +30,7 @@ _INNER: Final = (0.1587, 0.8413)
 
 
 def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
-    r"""
-    Error bars and flags of one separation against the truth.
+    r"""Error bars and flags of one separation against the truth.
 
     A pixel is **bad** in its `object` where
 

@@ -39,8 +39,7 @@ def judge_twin(
     baseline: float = 0.0,
     registration: Registration = "perfect",
 ) -> xr.Dataset:
-    """
-    Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
+    """Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
 
     One of `twins.TWINS`, of a material of `emissivity.embedded_table`, of rows and columns, a
     number of frames and their rate [Hz], by two cameras a baseline apart [m], whose views are
@@ -99,8 +98,7 @@ def separate_twin(
     response: xr.Dataset,
     **options: Any,
 ) -> xr.Dataset:
-    """
-    Separate a twin, seen by the default rig with a fixed pattern, by the default method.
+    """Separate a twin, seen by the default rig with a fixed pattern, by the default method.
 
     The detector is from `simulation.pattern`, correction and response are calibrated; options are
     those of `twins.twin`. Returns the result of `separation.solve`, and in addition
@@ -124,8 +122,7 @@ def separate_twin(
 
 
 def over_the_image(scene: xr.Dataset, separated: xr.Dataset) -> xr.Dataset:
-    """
-    Errors of a separation over the object's pixels in which the background moves.
+    """Errors of a separation over the object's pixels in which the background moves.
 
     `good` [1], the share without a flag; of these `object_temperature_rmse` [K], root mean square
     over time, median; and `covered` [1], the share of samples whose 95 % interval holds the truth.
@@ -162,8 +159,7 @@ def at_thermocouple(
     reflection_shift: xr.Dataset | None = None,
     probes: int = 20,
 ) -> xr.Dataset:
-    """
-    Errors of several methods at the first thermocouple of a twin.
+    """Errors of several methods at the first thermocouple of a twin.
 
     The estimate is the mean over the pixels that the bead covers. The reading has the errors of a
     probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
@@ -238,8 +234,7 @@ def _mean(
 
 
 def share(estimate: xr.DataArray, cause: xr.DataArray) -> float:
-    r"""
-    Share of a change that another one holds: the slope of a regression through their means [1].
+    r"""Share of a change that another one holds: the slope of a regression through their means [1].
 
     .. math:: \sum a b / \sum b^2
 

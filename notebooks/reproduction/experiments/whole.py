@@ -44,8 +44,7 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
     steps: int,
     frames: int,
 ) -> Recording:
-    """
-    Record people mirrored in unevenly heated glass, `pictures.Picture`, by two cameras.
+    """Record people mirrored in unevenly heated glass, `pictures.Picture`, by two cameras.
 
     The clock is the number of frames and their rate [Hz]. The cameras stand apart, so that the
     second sees the reflections at a `shift` that varies, see `pictures.smooth_shift` [pixel]; it
@@ -113,8 +112,7 @@ def calibrate(movies: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 def score(scene: xr.Dataset, result: xr.Dataset) -> dict[str, float]:
-    """
-    Errors of a result of a scene, by name with unit.
+    """Errors of a result of a scene, by name with unit.
 
     Of the pixels that are measured, which a bridged frame leaves them, the median over pixels of
     the object's RMSE and the share of 95 % intervals that hold it; these of all that have a value,

@@ -27,8 +27,7 @@ _DOTS: Final = (COLORS[0], COLORS[3], COLORS[4], COLORS[2])
 
 
 def accuracy(sweep: xr.Dataset) -> Figure:
-    """
-    Errors of the object temperature and of the emissivities, case by case, as bars.
+    """Errors of the object temperature and of the emissivities, case by case, as bars.
 
     Of `object_temperature_rmse` [K] and `emissivity_error` (band) [1], over `case`.
     """
@@ -72,8 +71,7 @@ def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
 
 
 def validity(stress: xr.Dataset) -> Figure:
-    """
-    Pixels case by case: right, wrong without a warning, or flagged, with the reason.
+    """Pixels case by case: right, wrong without a warning, or flagged, with the reason.
 
     Left, a bar of all pixels: no flag and right; no flag and wrong, in red; flagged, by the most
     telling flag. Right, the share of the 95 % intervals that hold the truth, over the span from 92

@@ -19,8 +19,7 @@ from dbthermal.figures.drawing import (
 
 
 def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
-    """
-    Error of the object temperature over noise, a line a method, a panel a material.
+    """Error of the object temperature over noise, a line a method, a panel a material.
 
     The errors are medians (material, noise, variant) [K]; without the dimension `material`, one
     panel. `noise` is that of the quieter band [K]. Both axes are logarithmic; a missing value is
@@ -135,8 +134,7 @@ def sensitivity(errors: xr.DataArray, base: float) -> Figure:
 def emissivity_procedures(
     compared: xr.Dataset, published: Mapping[str, Mapping[str, float]], band: str
 ) -> Figure:
-    """
-    Emissivity of several objects by each procedure, beside the truth and the published values.
+    """Emissivity of several objects by each procedure, beside the truth and the published values.
 
     `true` (object, band), `mean` and `spread` (object, procedure, band) [1], drawn for one band
     with lines of one standard deviation; published: label -> object -> the paper's value [1].
@@ -172,8 +170,7 @@ def emissivity_procedures(
 
 
 def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.DataArray) -> Figure:
-    """
-    Our reflection beside the authors' published one, and their correlation frame by frame.
+    """Our reflection beside the authors' published one, and their correlation frame by frame.
 
     Both magnitudes (time, y, x) are in units of their own; `scores` (time) [1] of all compared
     frames.

@@ -21,8 +21,7 @@ _MICRO: Final = "\N{MICRO SIGN}m"
 
 
 def error_over_bound(measured: xr.Dataset) -> Figure:
-    """
-    Errors of an estimate over the noise, beside the bound that no estimate can beat.
+    """Errors of an estimate over the noise, beside the bound that no estimate can beat.
 
     Above, errors as markers and bounds as lines; below, errors in units of their bound. Over
     `noise` (that of the quieter band [K]): `reflection_ratio_error` [1] and
@@ -83,8 +82,7 @@ def pooling(measured: xr.Dataset) -> Figure:
 
 
 def error_over_bands(measured: xr.Dataset) -> Figure:
-    """
-    Gain of a third and a fourth band: error beside its bounds, and in units of them.
+    """Gain of a third and a fourth band: error beside its bounds, and in units of them.
 
     Over `bands`, names of the bands in use: `object_temperature_error` [K] and, over `case` too,
     `object_temperature_bound` [K].

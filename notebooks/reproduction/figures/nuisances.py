@@ -15,8 +15,7 @@ _RMSE_LABEL: Final = "RMSE of the object temperature [K]"
 
 
 def offsets(measured: xr.Dataset) -> Figure:
-    """
-    Bands exposed apart: error of the estimated offset; error and flags of the object.
+    """Bands exposed apart: error of the estimated offset; error and flags of the object.
 
     Over `delay`, the true offset [frame]: `found` [frame]; and over `treatment` too,
     `object_temperature_rmse` [K] and `flagged` [1].
@@ -38,8 +37,7 @@ def offsets(measured: xr.Dataset) -> Figure:
 
 
 def disturbances(measured: xr.Dataset) -> Figure:
-    """
-    Error with each nuisance as recorded, corrected, and without: bars, and the share flagged.
+    """Error with each nuisance as recorded, corrected, and without: bars, and the share flagged.
 
     Over `nuisance` and `treatment`: `object_temperature_rmse` [K] and `flagged` [1].
     """
@@ -62,8 +60,7 @@ def disturbances(measured: xr.Dataset) -> Figure:
 
 
 def parallax(measured: xr.Dataset) -> Figure:
-    """
-    Cost of the parallax of the reflection in two registered views: error, flags, coverage.
+    """Cost of the parallax of the reflection in two registered views: error, flags, coverage.
 
     Over `parallax` [pixel] and `treatment`: `object_temperature_rmse` [K], `flagged` and `covered`
     [1].

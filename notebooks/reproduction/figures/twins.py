@@ -11,8 +11,7 @@ from dbthermal.figures.drawing import COLORS, canvas, draw_image, limits_of, pro
 
 
 def thermocouples(scores: xr.Dataset) -> Figure:
-    """
-    Reading of the thermocouple and estimates of all methods there, a panel a scene.
+    """Reading of the thermocouple and estimates of all methods there, a panel a scene.
 
     `reading` (scene, time) and `temperature` (scene, variant, time) [K], `relative_error`
     (scene, variant) [percent of degrees Celsius].
@@ -42,8 +41,7 @@ def thermocouples(scores: xr.Dataset) -> Figure:
 
 
 def error_maps(picture: xr.DataArray, errors: Mapping[str, xr.DataArray]) -> Figure:
-    """
-    Maps of the error (y, x) [K] of each method, beside the apparent temperature (y, x) [K].
+    """Maps of the error (y, x) [K] of each method, beside the apparent temperature (y, x) [K].
 
     Pixels without a value are gray; each map has its own scale.
     """

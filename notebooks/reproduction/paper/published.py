@@ -38,8 +38,7 @@ _ON_A_TWIN: Final = ", on a twin"
 
 @dataclass(frozen=True)
 class Row:
-    """
-    One published number, or one figure without a number.
+    """One published number, or one figure without a number.
 
     Attributes
     ----------
@@ -86,8 +85,7 @@ class Row:
         return {label: float(measured[name]) for label, name in pairs if name in measured}
 
     def verdict(self, numbers: Numbers) -> str:
-        """
-        Verdict on ours against the paper's.
+        """Verdict on ours against the paper's.
 
         "agrees", "better", "worse" or "differs", of a twin with a note that says so, since theirs
         cannot be checked; "not measured"; or the row's note.

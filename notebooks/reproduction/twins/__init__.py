@@ -48,8 +48,7 @@ def __dir__() -> list[str]:
 
 
 def twin(name: str, capture: Capture, rng: np.random.Generator, **options: Any) -> xr.Dataset:
-    """
-    Scene (see `take`) of a twin of `TWINS`, with attribute `twin`.
+    """Scene (see `take`) of a twin of `TWINS`, with attribute `twin`.
 
     The rng is the source of all motion; options are `visitor` of "fingerprint" and `scan` of
     "bunny".

@@ -18,8 +18,7 @@ from reproduction.twins.stage import AMBIENT, TABLE, Capture, Stage, since
 
 @dataclass(frozen=True)
 class Pane:
-    """
-    An upright plate of glass in the plane y = 0, and the air on both of its sides.
+    """An upright plate of glass in the plane y = 0, and the air on both of its sides.
 
     Size, thickness and distance of the vertices [m]. The coefficient to still air [W m^-2 K^-1] is
     one of free convection in gases, 2 to 25, table 1.1 of Bergman et al. (2011), Fundamentals of
@@ -49,8 +48,7 @@ class Pane:
 
 @dataclass(frozen=True)
 class Gun:
-    """
-    A hot-air gun behind the plate.
+    """A hot-air gun behind the plate.
 
     Temperature of the jet at the plate [K]; coefficient in the middle [W m^-2 K^-1], 25 to 250 for
     forced convection in gases, table 1.1 of Bergman et al. (2011); standard deviation of its
@@ -93,8 +91,7 @@ WITHDRAWAL: Final = 1.0
 def glass_plate(
     capture: Capture, rng: np.random.Generator, *, writing: Writing | None = None
 ) -> Stage:
-    """
-    Plate heated by a hot-air gun, in which a board is reflected while somebody writes on it.
+    """Plate heated by a hot-air gun, in which a board is reflected while somebody writes on it.
 
     By default the letters CV with a cold, wet finger, begun at a random moment within 2 s.
     """
@@ -149,8 +146,7 @@ NEAR: Final = 0.15
 
 
 def fingers(capture: Capture, rng: np.random.Generator) -> Stage:
-    """
-    Plate at room temperature, in front of which fingers move: reflection only.
+    """Plate at room temperature, in front of which fingers move: reflection only.
 
     The plate's temperature is constant, so no method can tell its emissivity.
     """
@@ -179,8 +175,7 @@ def _waving(time: Array, rng: np.random.Generator) -> Motion:
 
 @dataclass(frozen=True)
 class Touch:
-    """
-    Skin pressed on an object before the capture.
+    """Skin pressed on an object before the capture.
 
     Beginning and length of the contact [s], over before the capture starts at 0; temperature of the
     skin [K]; conductance from the warm tissue to the surface [W m^-2 K^-1]: some 1 mm of outer skin
@@ -208,8 +203,7 @@ VISIT: Final = ((-2.2, -3.2), (2.6, -3.4))
 def fingerprint(
     capture: Capture, rng: np.random.Generator, *, visitor: bool = False, spacing: float = 0.003
 ) -> Stage:
-    """
-    Prints of a hand that fade on a plate, before a uniform background: emission only.
+    """Prints of a hand that fade on a plate, before a uniform background: emission only.
 
     With a visitor somebody walks by, 3 m away; without, nothing moves that is reflected, and the
     reflection ratio is undefined.

@@ -23,8 +23,7 @@ _FINE: Final = 0.004
 
 @dataclass(frozen=True)
 class Route:
-    """
-    Walk over the floor in straight lines, at a steady pace between its stops.
+    """Walk over the floor in straight lines, at a steady pace between its stops.
 
     Times at the stops [s], two or more; x and y of each (stop, 2) [m]; length of a step [m].
     """
@@ -60,8 +59,7 @@ def pacing(
     pace: tuple[float, float] = (0.5, 1.0),
     pause: tuple[float, float] = (0.3, 2.0),
 ) -> Route:
-    """
-    Route back and forth along corners (stop, 2) [m] that covers the times [s].
+    """Route back and forth along corners (stop, 2) [m] that covers the times [s].
 
     The first end, the pace of each leg, within its least and largest [m/s], and the pauses [s] are
     random.
@@ -79,8 +77,7 @@ def pacing(
 
 @dataclass(frozen=True)
 class Build:
-    """
-    Measures and temperatures of a person, who stands with the feet at z = 0 and walks along x.
+    """Measures and temperatures of a person, who stands with the feet at z = 0 and walks along x.
 
     Heights of shoulder, hip and crown, and breadth from shoulder to shoulder [m]; temperatures of
     face, hands and clothes [K]; largest angle of legs and arms [rad].
@@ -153,8 +150,7 @@ FINGERS: Final = (
 def hand(
     motion: Motion, skin: float = 306.15, *, flex: float = 0.0, rate: float = 0.8
 ) -> list[Actor]:
-    """
-    Hand on its forearm, flat in the plane y = 0: palm with forearm, and five fingers.
+    """Hand on its forearm, flat in the plane y = 0: palm with forearm, and five fingers.
 
     The motion is that of the palm, the skin's temperature in [K]. Each finger bends at its root by
     up to `flex` [rad]: the first at `rate` [1/s], each of the others a little more often.
@@ -176,8 +172,7 @@ def _finger(number: int, motion: Motion, skin: float, flex: float, rate: float) 
 
 
 def imprint(places: npt.ArrayLike, softness: float = 0.002) -> Array:
-    """
-    Contact of a flat hand with a surface: 1 under the hand, 0 beyond it, smooth between.
+    """Contact of a flat hand with a surface: 1 under the hand, 0 beyond it, smooth between.
 
     Of places (place, 2), x and z in the plane of the hand [m]; the edge is `softness` wide [m].
     """

@@ -34,8 +34,7 @@ def cup(
     lid: float = 299.15,
     drink: float = 335.15,
 ) -> Actor:
-    """
-    Cup with a hot drink, standing on z = 0, under a lid until it is uncovered at a time [s].
+    """Cup with a hot drink, standing on z = 0, under a lid until it is uncovered at a time [s].
 
     Its top is at the lid's temperature [K] before, at the drink's from then on.
     """
@@ -61,8 +60,7 @@ LETTERS: Final = {
 
 @dataclass(frozen=True)
 class Writing:
-    """
-    Letters that a cold, wet finger writes on a board, one after the other.
+    """Letters that a cold, wet finger writes on a board, one after the other.
 
     Attributes
     ----------
@@ -128,8 +126,7 @@ def _dense(points: Array, step: float) -> Array:
 def board(
     mesh: trimesh.Trimesh, places: Array, writing: Writing, temperature: float, motion: Motion
 ) -> Actor:
-    r"""
-    Board with cold strokes that appear as they are written, and fade.
+    r"""Board with cold strokes that appear as they are written, and fade.
 
     .. math:: T(t) = T_0 - d \, e^{-(t - t_w) / \tau} \quad (t \ge t_w)
 

@@ -94,8 +94,7 @@ LAMP_START, LAMP_RISE = -2.0, 2.0
 def bunny(
     capture: Capture, rng: np.random.Generator, *, scan: trimesh.Trimesh | None = None
 ) -> Stage:
-    """
-    The Stanford bunny, which looks to the left, or a built-in rabbit, which looks at the camera.
+    """The Stanford bunny, which looks to the left, or a built-in rabbit, which looks at the camera.
 
     It is heated by a lamp. A car runs to and fro, a toy is flown about by a hand, and two people
     walk near. A scan is y up, seen along -z, looking to negative x, in any unit; without one, the
@@ -180,8 +179,7 @@ RABBIT: Final = (
 
 
 def rabbit(spacing: float = 0.004) -> trimesh.Trimesh:
-    """
-    Rabbit of six ellipsoids that sits on the plane z = 0 and faces negative y.
+    """Rabbit of six ellipsoids that sits on the plane z = 0 and faces negative y.
 
     The parts are side by side; no heat flows from one to another.
     """

@@ -42,8 +42,7 @@ def clock(frames: int = 350, rate: float = 10.0) -> Array:
 
 @dataclass(frozen=True)
 class Capture:
-    """
-    Recording conditions of a twin: emissivity, image size, times, baseline and sharpness.
+    """Recording conditions of a twin: emissivity, image size, times, baseline and sharpness.
 
     Attributes
     ----------
@@ -85,8 +84,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class Stage:
-    """
-    Object, camera and surroundings of a twin.
+    """Object, camera and surroundings of a twin.
 
     Name; mesh of the object [m] and its temperature (time, vertex) [K]; first camera; bodies that
     move, or stand, around it; points (thermocouple, 3) of the surface with thermocouples [m]; how
@@ -103,8 +101,7 @@ class Stage:
 
 
 def take(stage: Stage, capture: Capture) -> xr.Dataset:
-    """
-    Scene of a stage, ray-traced, through the lens and averaged over the pixels.
+    """Scene of a stage, ray-traced, through the lens and averaged over the pixels.
 
     A scene for `observe`, and in addition `object_share` (y, x), the share of a pixel's light that
     comes from the object; `on_object` (y, x), where that is all; and `thermocouple_y`,
@@ -268,8 +265,7 @@ def thermocouple_readings(
     offset_std: float = 0.1,
     bead: int = 3,
 ) -> xr.DataArray:
-    """
-    Readings (thermocouple, time) [K] of the virtual thermocouples of a twin: means over a bead.
+    """Readings (thermocouple, time) [K] of the virtual thermocouples of a twin: means over a bead.
 
     The errors are of a single reading (`std`) and constant of a probe (`offset_std`) [K]; 0.1 is a
     probe that was compared with a reference, 0.5 one that was not. A bead covers a square of an odd
@@ -333,8 +329,7 @@ def since(
     time: Array,
     exchanges: Sequence[heat.Exchange],
 ) -> Array:
-    """
-    Temperature (time, vertex) [K] of a thin-walled object at the times [s] of a capture.
+    """Temperature (time, vertex) [K] of a thin-walled object at the times [s] of a capture.
 
     Until the start [s] all was at room temperature; from then on the wall, of a thickness [m] and
     a solid, has its exchanges.

@@ -52,8 +52,7 @@ _SAMPLES: Final = 400
 
 
 def plate(width: float, height: float, spacing: float) -> trimesh.Trimesh:
-    """
-    Upright rectangle in the plane y = 0, centred in x, from z = 0 up, with its normal along -y.
+    """Upright rectangle in the plane y = 0, centred in x, from z = 0 up, with its normal along -y.
 
     The vertices form a regular grid, row by row from below, with all diagonals parallel: there
     the Laplacian of the mesh is the five-point difference.
@@ -71,8 +70,7 @@ def plate(width: float, height: float, spacing: float) -> trimesh.Trimesh:
 
 
 def ellipsoid(semi_axes: Sequence[float], middle: npt.ArrayLike, spacing: float) -> trimesh.Trimesh:
-    """
-    Stretched geodesic sphere about a point; along its longest axis `spacing` is the largest.
+    """Stretched geodesic sphere about a point; along its longest axis `spacing` is the largest.
 
     The faces of an icosahedron are cut evenly, its edges into n pieces: 10 n^2 + 2 vertices.
     """
@@ -117,8 +115,7 @@ def vessel(profile: Profile, spacing: float, *, floor: bool) -> trimesh.Trimesh:
 
 
 def revolved(profile: npt.ArrayLike, spacing: float) -> trimesh.Trimesh:
-    """
-    Profile of radius and height (point, 2) [m] turned about the z axis, outside to its right.
+    """Profile of radius and height (point, 2) [m] turned about the z axis, outside to its right.
 
     It is cut into rows of equal distance between its corners, and every row holds as many vertices
     as its circle has room for. The radius is zero at a pole, which can only be an end; another end
@@ -157,8 +154,7 @@ def _rows(profile: Array, spacing: float) -> Array:
 
 
 def _band(first: int, lower: Array, upper: Array) -> npt.NDArray[np.int64]:
-    """
-    Faces (face, 3) between two neighbouring rings with vertices at angles [turns].
+    """Faces (face, 3) between two neighbouring rings with vertices at angles [turns].
 
     `first` is the number of the lower ring's first vertex; those of the upper follow. There is one
     face for each edge of either ring; a ring of one vertex is a pole and has no edge.
@@ -210,8 +206,7 @@ def _pieces(length: float, spacing: float) -> int:
 
 
 def on_wall(mesh: trimesh.Trimesh, height: float, angle: float) -> tuple[float, float, float]:
-    """
-    Point x, y, z [m] on the wall of a mesh of revolution, on the ring nearest to a height [m].
+    """Point x, y, z [m] on the wall of a mesh of revolution, on the ring nearest to a height [m].
 
     The angle about the axis is from negative y towards positive x [degrees].
     """

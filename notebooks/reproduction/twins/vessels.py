@@ -14,8 +14,7 @@ from reproduction.twins.stage import AMBIENT, Capture, Stage, passers_by, since,
 
 @dataclass(frozen=True)
 class Vessel:
-    r"""
-    A glass vessel, and how it is filled.
+    r"""A glass vessel, and how it is filled.
 
     The wall is a thin shell: below the level of the drink, heat passes from the drink through half
     of the wall to its middle, :math:`1 / h = 1 / h_\mathrm{drink} + d / 2k`; above it from warm,

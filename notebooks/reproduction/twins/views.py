@@ -30,8 +30,7 @@ def observe(scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator) -
 def registered(
     scene: xr.Dataset, corrected: xr.Dataset, registration: Registration = "perfect"
 ) -> xr.Dataset:
-    """
-    Capture with all views on the first camera's grid, by `alignment.align`.
+    """Capture with all views on the first camera's grid, by `alignment.align`.
 
     A registration is "perfect", by the surface's geometry: each pixel shows the same point of the
     surface in both bands, NaN where the second camera does not see it, and beside the object; or
