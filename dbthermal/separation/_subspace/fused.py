@@ -12,15 +12,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy.special import stdtrit
 
 from dbthermal import _smooth as smooth
 from dbthermal import planck
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels, pixel, reflection_ratio, residuals
+from dbthermal.separation._subspace import kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._subspace.pixel import Ratio
-from dbthermal.separation._subspace.shared import Model, Work, share, work_space
+from dbthermal.separation._subspace.shared import Model, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Tile
 
@@ -117,8 +118,8 @@ def _film(
 
 _NUMBERS: Final = (
     *("ratio", "inverse_energy", "first_weight", "second_weight", "null_variance", "order"),
-    *("contrast", "reduced_chi2", "first_emissivity", "second_emissivity", "epsilon", "level"),
-    *("noise_variance", "drift_variance", "correlation", "delay"),
+    *("contrast", "reduced_chi2", "first_emissivity", "second_emissivity", "epsilon"),
+    *("ratio_variance", "noise_variance", "drift_variance", "correlation", "delay"),
     *("object_lost", "object_missing", "background_lost", "background_missing"),
 )
 _CONDITIONS: Final = (
@@ -198,7 +199,9 @@ def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums
     record.contrast, record.reduced_chi2 = ratios.contrast, ratios.reduced_chi2
     record.pooled, record.gray = ratios.pooled, gray
     record.first_emissivity, record.second_emissivity = emission.emissivity
-    record.epsilon, record.level = emission.epsilon, emission.level
+    record.epsilon = emission.epsilon
+    error = model.noise[1] ** 2 + (ratios.ratio * model.noise[0]) ** 2  # eq. 4
+    record.ratio_variance = ratios.inverse_energy * error + emission.level**2
     record.noise_variance = emission.noise_variance
     record.drift_variance = emission.drift_variance
     record.constant, record.restless = emission.constant, emission.restless
@@ -260,11 +263,55 @@ _separate: Final = _compiled(
 )
 
 
+def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
+    """All that the pixels of a tile of two bands share."""
+    first, second = tile.curves
+    around = tile.reference + np.array([-0.5, 0.5])  # [K]
+    rates = np.diff(np.log(second.slope(around) / first.slope(around)))
+    temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
+    degrees = functions.rising.shape[1]
+    freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in emissions.OCTAVES]
+    edges, limits = residuals.blocks(tile.time.size)
+    return Model(
+        first=kernels.table(first),
+        second=kernels.table(second),
+        functions=np.ascontiguousarray(functions.functions.T),
+        object_part=np.ascontiguousarray(functions.object_part.T),
+        rising=np.ascontiguousarray(functions.rising.T),
+        leverage=np.ascontiguousarray(functions.leverage().T),
+        steps=functions.steps,
+        noise=(tile.noise[0], tile.noise[1]),
+        pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
+        drift=drift / np.sqrt(3.0),
+        rate=float(rates[0]),
+        gray=second.slope(temperatures) / first.slope(temperatures),
+        widened=(stdtrit(np.maximum(freedom, 1), 0.975) / emissions.NORMAL95) ** 2,
+        edges=edges,
+        limits=limits,
+        parts=pieces.blocks(tile.time.size),
+        lowest=first.lowest,
+        highest=first.highest,
+    )
+
+
+def _work_space(functions: smooth.Subspace) -> Work:
+    """Arrays for the signals and curves of one pixel."""
+    frames, columns = functions.functions.shape
+    rest: dict[str, Any] = {
+        "few": np.empty((6, frames), np.float32),
+        "coefficients": np.empty((2, columns)),
+        "scatter": np.empty((functions.orders, 3)),
+        "material": np.empty(5),
+    }
+    return Work(**{name: np.empty(frames) for name in Work._fields} | rest)
+
+
 def solve(
     tile: Tile, functions: smooth.Subspace, drift: float, least: float = emissions.BEND
 ) -> Solution:
     """As `steps.solve`, of two bands."""
-    shared, material = share(tile, functions, drift), tile.material
+    work, shared = _work_space(functions), _share(tile, functions, drift)
+    material = tile.material
     frames, pixels = tile.signals.shape[1:]
     materials = np.full((pixels, 5), np.nan)
     if material is not None:
@@ -272,14 +319,7 @@ def solve(
         materials[:] = np.stack([*numbers, material.noise_variance, material.drift_variance], 1)
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((pixels, 2, shared.parts.size - 1))
-    _separate(
-        shared, tile.signals, materials, least, work_space(shared), Solved(films, record, sums)
-    )
-    ratio = np.stack([np.ones(pixels), record["ratio"]])
-    variance = reflection_ratio.ratio_variance(
-        ratio, record["inverse_energy"], np.array(tile.noise)
-    )
-    variance[1] += record["level"] ** 2
+    _separate(shared, tile.signals, materials, least, work, Solved(films, record, sums))
     # The first, mixed and last element of a symmetric matrix (..., 3), as one (..., 2, 2, pixel).
     covariance, scatter, rapid = (
         np.moveaxis(record[name][..., [[0, 1], [1, 2]]], 0, -1)
@@ -294,8 +334,8 @@ def solve(
         named[name] = np.stack([record[f"object_{name}"], record[f"background_{name}"]])
     named |= zip(FILMS, films, strict=True)
     return Solution(
-        ratio=ratio,
-        ratio_variance=variance,
+        ratio=np.stack([np.ones(pixels), record["ratio"]]),
+        ratio_variance=np.stack([np.zeros(pixels), record["ratio_variance"]]),
         null_weights=np.stack([record["first_weight"], record["second_weight"]]),
         order=record["order"].astype(np.intp),
         scatter=scatter,

@@ -239,11 +239,12 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
     """
     functions, noise = _functions(tile), np.array(tile.noise)
     solution = _solve(tile, functions, settings)
-    result, used = _report(tile, functions, solution), solution.order + functions.steps
+    used = solution.order + functions.steps
     asked = pieces.asked(
         solution.sums[0], solution.sums[1], tile.time, solution.null_variance, used
     )
     asked |= solution.order > functions.orders - _LAST
+    result = _report(tile, functions, solution)
     suspect = np.flatnonzero(asked | ((result.status & _SUSPECT) != 0))
     first = np.zeros(tile.signals.shape[1:], dtype=bool)
     if suspect.size == 0:

@@ -4,12 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import stdtrit
 
-from dbthermal import _smooth as smooth
-from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels, pieces, reflection_ratio, residuals
-from dbthermal.separation._tiles import Tile
+from dbthermal.separation._subspace import kernels
 
 Array = npt.NDArray[np.float64]
 
@@ -72,46 +68,3 @@ class Work(NamedTuple):
     coefficients: Array  # of the signals on the functions (2, column)
     scatter: Array  # see `reflection_ratio`, first, mixed and last element (order, 3)
     material: Array  # ratio, inverse energy, emissivity, its two variances; NaN for none
-
-
-def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
-    """All that the pixels of a tile of two bands share."""
-    first, second = tile.curves
-    around = tile.reference + np.array([-0.5, 0.5])  # [K]
-    rates = np.diff(np.log(second.slope(around) / first.slope(around)))
-    temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
-    degrees = functions.rising.shape[1]
-    freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in emissions.OCTAVES]
-    edges, limits = residuals.blocks(tile.time.size)
-    return Model(
-        first=kernels.table(first),
-        second=kernels.table(second),
-        functions=np.ascontiguousarray(functions.functions.T),
-        object_part=np.ascontiguousarray(functions.object_part.T),
-        rising=np.ascontiguousarray(functions.rising.T),
-        leverage=np.ascontiguousarray(functions.leverage().T),
-        steps=functions.steps,
-        noise=(tile.noise[0], tile.noise[1]),
-        pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
-        drift=drift / np.sqrt(3.0),
-        rate=float(rates[0]),
-        gray=second.slope(temperatures) / first.slope(temperatures),
-        widened=(stdtrit(np.maximum(freedom, 1), 0.975) / emissions.NORMAL95) ** 2,
-        edges=edges,
-        limits=limits,
-        parts=pieces.blocks(tile.time.size),
-        lowest=first.lowest,
-        highest=first.highest,
-    )
-
-
-def work_space(model: Model) -> Work:
-    """Arrays for the signals and curves of one pixel."""
-    columns, frames = model.functions.shape
-    rest: dict[str, Any] = {
-        "few": np.empty((6, frames), np.float32),
-        "coefficients": np.empty((2, columns)),
-        "scatter": np.empty((len(model.leverage), 3)),
-        "material": np.empty(5),
-    }
-    return Work(**{name: np.empty(frames) for name in Work._fields} | rest)
