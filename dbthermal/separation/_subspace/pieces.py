@@ -277,6 +277,7 @@ def _first(chosen: list[Mask], edges: Whole) -> Mask:
     return result
 
 
+@lru_cache(maxsize=16)
 def blocks(frames: int) -> Whole:
     """Edges of the blocks of frames whose means tell whether pieces are asked for."""
     levels = min(int(np.log2(frames / _FUNCTIONS)), _COARSE + 2)

@@ -6,6 +6,7 @@ of an object that breaks the cue of its smoothness.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, TypeVar
 
 import numpy as np
@@ -160,6 +161,7 @@ def interband_delay(
     return np.asarray(np.maximum(score, _excess(residual, change, ratios.null_variance, noise)))
 
 
+@lru_cache(maxsize=16)
 def blocks(frames: int) -> tuple[Whole, tuple[float, float]]:
     """Edges of the blocks of `unexplained`, and the limits of its two statistics."""
     number = 2 ** int(np.log2(frames / _BLOCK))
