@@ -5,6 +5,7 @@ The equations of `steps`, whose results are repeated within rounding.
 
 import hashlib
 from collections.abc import Callable
+from contextlib import suppress
 from math import sqrt
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -236,7 +237,7 @@ def _return(turned: Any, start: int, size: int, samples: Any) -> None:
 def _compiled(digest: str) -> Callable[..., None]:
     """Steps of all pixels of a tile, compiled once for sources of one digest."""
 
-    @njit(cache=True, nogil=True, error_model="numpy")
+    @njit(nogil=True, error_model="numpy")
     def separate(
         model: Model, signals: Array, materials: Array, least: float, work: Work, solved: Solved
     ) -> None:
@@ -254,6 +255,8 @@ def _compiled(digest: str) -> Callable[..., None]:
                 _pixel(model, least, work, outside[:, p], solved.record[here], solved.sums[here])
             _return(outside, start, size, solved.films)
 
+    with suppress(RuntimeError):  # without a folder that may be written each process compiles
+        separate.enable_caching()
     return separate
 
 
