@@ -85,3 +85,19 @@ def test_options_are_explicit(name: str) -> None:
     if inspect.isfunction(value):
         kinds = {parameter.kind for parameter in inspect.signature(value).parameters.values()}
         assert inspect.Parameter.VAR_KEYWORD not in kinds
+
+
+SECTION = r"(?ms)^(?:Parameters|Attributes)\n-+\n(.*?)(?:\n\n[A-Z]\w+\n-|\Z)"
+DRIVERS = re.compile(r"dbthermal\.(acquire|instruments\.(?!protocols|recording|session))")
+
+
+@pytest.mark.parametrize("name", [name for name in public_functions() if not DRIVERS.match(name)])
+def test_parameters_have_a_section(name: str) -> None:
+    """Parameters of a function and fields of a record are listed in the docstring's section."""
+    value = public_functions()[name]
+    of_class = inspect.isclass(value)
+    names = inspect.get_annotations(value) if of_class else inspect.signature(value).parameters
+    section = "\n".join(re.findall(SECTION, inspect.getdoc(value) or ""))
+    lines = re.findall(r"(?m)^(\S.*?)(?: :|$)", section)
+    listed = {entry.lstrip("*") for line in lines for entry in line.split(", ")}
+    assert {each for each in names if not each.startswith("_")} <= listed
