@@ -27,8 +27,9 @@ __dir__ = __all__.copy
 _PIXELS: Final = 20_000
 _FRAMES: Final = 400
 _REGISTERED: Final = 200
-# Times that clock and shift of the reflections are estimated in turn.
-_ROUNDS: Final = 3
+# Times that clock and shift of the reflections are estimated in turn, at most, the step of the
+# clock at which that ends [frame], and the least share of a delay that is taken to be seen [1].
+_ROUNDS, _LATE, _FLAT = 6, 0.02, 0.125
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
 # Memory of the rows that are separated together, what a sample of a pixel takes there [byte], and
@@ -156,8 +157,22 @@ def _aligned(
     if "offset" not in options:
         # What moves one way is seen earlier by one of two cameras apart, as by an earlier clock:
         # the clocks are compared at places of the same reflection, whose shift is then found anew.
-        for _ in range(_ROUNDS - 1 if field is not None else 1):
-            aligned = align(corrected, reflection_shift=field, **options)
+        aligned = align(corrected, reflection_shift=field, **options)
+        field = _shift(aligned, response)
+        # Newton's steps are short beside noise: from the second on they are a secant's.
+        frame, slope, step, last = np.median(np.diff(aligned["time"].values)), 1.0, 0.0, 0.0
+        for _ in range(_ROUNDS):
+            if field is None:
+                break
+            late = field.attrs["delay"]
+            if step:
+                slope = float(np.clip((last - late) / step, _FLAT, 1.0))
+            step, last = late / slope, late
+            if not abs(step) >= _LATE * frame:  # or not known
+                break
+            behind = step * (names != field.attrs["reference_band"])
+            together.values[:] = aligned.attrs["time_offset"] + behind - behind[0]
+            aligned = align(corrected, **{**options, "offset": together})
             field = _shift(aligned, response)
     if field is None:
         return aligned, None

@@ -27,6 +27,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from dbthermal.alignment._resampling import interpolation
+from dbthermal.noise import MAD
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -39,7 +40,7 @@ BLUR: Final = 1.2
 
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
-_SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
+SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _TAPS: Final = 6  # neighbours a side, of which the blurred movies are interpolated
 _BORDER: Final = 4  # pixels by which they are mirrored at the border for it
 _AROUND: Final = (3, 3, 5)  # samples among which a residual is judged
@@ -189,6 +190,10 @@ class Movies:
         cls, movies: list[Movie], valid: Mask, noise: Array, freedom: float, factor: int
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's, blurred in place."""
+        # Interpolated in time, a movie holds less rapid noise than white noise of its size.
+        white = np.sqrt(freedom / movies[0].shape[2]) / factor
+        usual = [MAD * np.median(np.abs(movie[::2, ::2])) for movie in movies]
+        noise = np.minimum(noise, np.array(usual) / white)
         for movie in movies:
             gaussian_filter(movie, (BLUR, BLUR, 0.0), output=movie)
         mostly = binned(valid.astype(np.float64), factor) > 0.5
@@ -347,7 +352,7 @@ def _information(
         spread = misfit * floor if match is None else gaussian_filter(squares, WINDOW)
         found.append(_Match(ratio, np.maximum(spread, floor)))
         weight = used / (misfit * variance)
-        less = samples * (movies.noise[0] * _SLOPE_NOISE) ** 2
+        less = samples * (movies.noise[0] * SLOPE_NOISE) ** 2
         tensor += weight * ratio**2 * np.stack([yy - less, yx, xx - less])
         gradient += weight * ratio * np.stack([yh - ratio * my, xh - ratio * mx])
         chance += weight * ratio**2 * less

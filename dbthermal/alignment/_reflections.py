@@ -16,6 +16,7 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _matching as matching
+from dbthermal.alignment._delay import delay
 from dbthermal.alignment._matching import Field, Information, Movies, Spline
 from dbthermal.alignment._offset import sample
 from dbthermal.schema import Status
@@ -71,7 +72,7 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         Stage `reflection_shift` of `schema`: `shift` (axis, y, x) [pixel], rows down and columns to
         the right, `shift_std`, and `known` (y, x), where texture tells the shift. It is
         extrapolated near by, and NaN farther off and where p + d(p) leaves the image. Attributes:
-        `reference_band`, `bands` (the others).
+        `reference_band`, `bands` (the others); `delay` [s] of these, beside the shift.
 
     Raises
     ------
@@ -92,7 +93,14 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor)
         field, data = matching.refine(level, field)
         if factor == 1:
-            return _result(corrected, capture, field, data)
+            # The delay is seen in slower changes, too, in which there is more than noise.
+            period = max(period, _PERIODS[2])
+            freedom = _freedom(capture.frames.size, period) * used.size / capture.frames.size
+            pictures = capture.rapid(period, used)
+            level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
+            times = corrected["time"].values[capture.frames[used]]
+            late = delay(level, field.on(level.centres()), times)
+            return _result(corrected, capture, field, data).assign_attrs(delay=late)
 
 
 @dataclass(frozen=True)

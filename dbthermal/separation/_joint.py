@@ -193,7 +193,7 @@ def solve(
         emissivity = _inside(raw)
         equations = _equations(inputs, emissivity, solved)
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
-        first, change, variance = _first_band(inputs, equations.loose, some)
+        first, steps, change, variance = _first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
         shares = _coefficients(inputs, raw, solved)
         told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
@@ -212,22 +212,28 @@ def solve(
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
         if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
+        of_slope = np.zeros(solved.size)
         for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
             # A gradient as steep as the object's own change turns the step round: divide by it.
-            line = residuals.regress(
-                here.T.astype(np.float64), first, inputs.noise[inputs.bands[0]]
-            )
+            own = here.T.astype(np.float64)
+            line = residuals.regress(own, first, inputs.noise[inputs.bands[0]])
             steep = np.maximum(_slope(here, beside), 1.0)
             slope = emissivity[0] + (line.slope - emissivity[0]) / steep
+            # Its variance: of the noise, and what the steps of the camera are as a slope.
+            by_steps = (line.kernel(own) * steps).sum(axis=0)
+            of_slope = (line.variance + by_steps**2) / steep**2
             known = line.energy > _LEAST_CHANGE**2 * len(some)
             likely = 1.0 - _ratio(raw) * (1.0 - slope)
             known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
+            error = np.where(known & (line.variance > 0), of_slope, np.inf)
             slope = np.where(known, slope, emissivity[0])
-            error = np.where(known & (line.variance > 0), line.variance / steep**2, np.inf)
             slope = _shared(slope, error, result["status"].shape)
             before, emissivity = emissivity, _inside(1.0 - _ratio(raw) * (1.0 - slope))
-            coefficients, own = _coefficients(inputs, emissivity, solved), emissivity[0]
-            equations = replace(equations, first=np.where(solved, own, 1.0), shares=coefficients)
+            equations = replace(
+                equations,
+                first=np.where(solved, emissivity[0], 1.0),
+                shares=_coefficients(inputs, emissivity, solved),
+            )
             here, beside, _ = both(looked_at, change[:, some])
             if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
                 break
@@ -240,7 +246,9 @@ def solve(
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
             )
             unsettled |= step > 10.0 * _CONVERGED
-        size = np.where(solved, np.sqrt(np.mean(std**2, axis=0)), 0.0)
+        # An error of e_1 is one of all c: dq = de_1 w_1 [u(x(r)) - u(x(p))].
+        off = _weights(inputs, emissivity)[0] ** 2 * of_slope * np.mean((beside - here) ** 2, 1)
+        size = np.where(solved, np.sqrt(np.nan_to_num([np.mean(std**2, axis=0), off])), 0.0)
         factor = _factor(inputs, equations, size, variance)
         unsettled |= np.isnan(factor)
     return Joint(inputs, result, emissivity, factor, unsettled)
@@ -328,11 +336,12 @@ def _equations(inputs: Inputs, emissivity: Array, solved: Mask) -> _Equations:
     shares = _coefficients(inputs, emissivity, solved)
     there, linked = _among(displacement.resample, solved, displacement.shape[1])
     onward, reached = _among(displacement.onward, solved, displacement.shape[1])
-    strong = np.abs(shares[1:].sum(axis=0)) < np.abs(shares[0])
+    own, others = np.abs(shares[0]), shares[1:].sum(axis=0)
+    strong = np.abs(others) < own
     # The error of a step: only where it contracts, with the weights' signs, are places linked.
-    gain = np.abs(shares[1:].sum(axis=0) / shares[0])
-    forward, back = (np.asarray(abs(one).sum(axis=1)).ravel() for one in (there, onward))
-    linked &= np.where(strong, gain * forward < _LARGEST, reached & (back < _LARGEST * gain))
+    forward, back = abs(there).sum(axis=1) * np.abs(others), abs(onward) @ own
+    reached &= back < _LARGEST * np.abs(onward @ others)
+    linked &= np.where(strong, forward < _LARGEST * own, reached)
     backward = np.flatnonzero(linked & ~strong)
     return _Equations(
         first=np.where(solved, emissivity[0], 1.0),
@@ -354,18 +363,23 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
 
 
-def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Array, Array]:
+def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Signal, Array, Array]:
     """
     Signal (frame, pixel) [K] of the reference band at some frames, and how it changes to p.
 
-    The change from r to p (loose, time) [K] and its variance (loose): smoothed over time, it is
-    that of e_1 u_1(x) and holds little of that of the reflection.
+    Beside it the steps of the camera in it, which are no change. The change from r to p (loose,
+    time) [K] and its variance (loose): smoothed over time, it is that of e_1 u_1(x) and holds
+    little of that of the reflection.
     """
     displacement, capture = inputs.displacement, inputs.capture
     assert displacement is not None
     (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
     change = np.zeros((loose.size, capture.sizes["time"]))
-    first = np.empty((frames.size, height * width))
+    segment = capture["segment"].values if "segment" in capture else None
+    order = min(_ORDER, change.shape[1] // 4)
+    functions = smooth.subspace(capture["time"].values, order, segment=segment)
+    basis, own = functions.functions, functions.object_part
+    first, steps = np.empty((2, frames.size, height * width))
     for top in range(0, height, _ROWS):
         rows = slice(top, min(top + _ROWS, height))
         source, chosen = displacement.source(rows), (loose // width >= top)
@@ -374,37 +388,40 @@ def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Ar
         counts = np.where(schema.measured(counts), counts, np.nan).reshape(len(counts), -1)
         signal = curve.linearise(counts) - curve.reference
         inside = slice((top - source.start) * width, (rows.stop - source.start) * width)
-        first[:, top * width : rows.stop * width] = signal[frames, inside]
+        here = slice(top * width, rows.stop * width)
+        first[:, here] = signal[frames, inside]
         both = np.nan_to_num(_bridge(signal, np.ones(signal.shape[1], dtype=bool))).T
+        steps[:, here] = (basis - own)[frames] @ (both[inside] @ basis).T
         at = displacement.weights(rows, source)[loose[chosen] - top * width]
         change[chosen] = at @ both - both[loose[chosen] - source.start * width]
-    basis = smooth.polynomial_basis(capture["time"].values, min(_ORDER, change.shape[1] // 4))
-    smoothed = (change @ basis) @ basis.T
+    smoothed = (change @ basis) @ own.T
     # The mean of correlated errors: K / N, times (1 + rho) / (1 - rho).
-    error = change - smoothed
+    error = change - (change @ basis) @ basis.T
     energy = (error**2).sum(axis=1)
     lagged = np.clip((error[:, 1:] * error[:, :-1]).sum(axis=1) / energy, 0.0, 0.98)
     variance = energy * basis.shape[1] / change.shape[1] ** 2 * (1.0 + lagged) / (1.0 - lagged)
     # A sample that is no measurement is an outlier of the regression.
-    return np.nan_to_num(first), smoothed, np.nan_to_num(variance)
+    return np.nan_to_num(first), steps, smoothed, np.nan_to_num(variance)
 
 
 def _factor(inputs: Inputs, equations: _Equations, std: Array, variance: Array) -> Array:
     """
     Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
 
-    The `std` (pixel) [K] is that of a pixel alone; the `variance` (loose) [K^2] that of the change.
+    The `std` (2, pixel) [K] is that of a pixel alone, and of its target through the emissivity; the
+    `variance` (loose) [K^2] that of the change.
     """
     displacement = inputs.displacement
     assert displacement is not None
     rng = np.random.default_rng(inputs.seed)
-    size = std[:, np.newaxis]
+    size, off = std[..., np.newaxis]
     drawn = displacement.resample @ rng.standard_normal((size.size, _DRAWS))
     gain = np.sqrt(np.asarray((displacement.resample**2).sum(axis=1)).ravel())[:, np.newaxis]
     alone = np.where(gain > 0, size * drawn / gain, 0.0).astype(np.float32)
+    target = alone + off * rng.standard_normal(drawn.shape, dtype=np.float32)
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
     linear = replace(equations, bends=[Polynomial([0.0])] * len(equations.bends))
-    signal, _, _ = linear.solve(alone, alone, change)
+    signal, _, _ = linear.solve(target, alone, change)
     own, power = size[:, 0] > 0, (signal.astype(np.float64) ** 2).mean(axis=1)
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.

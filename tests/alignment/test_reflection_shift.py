@@ -49,6 +49,19 @@ def test_finds_a_smooth_field() -> None:
     assert field.attrs["bands"] == ["9.5"]
 
 
+def test_a_band_between_its_frames() -> None:
+    """The rapid noise of a band that is interpolated half-way between its frames is not white."""
+    rng, picture = np.random.default_rng(13), Picture(shape=(40, 56), walkers=5)
+    true = smooth_shift(picture.shape, 2.4, 1.2)
+    scene = picture.draw(np.arange(720) / 40.0, GLASS, rng, true)
+    seen = simulation.expose(scene, RESPONSE, rng, every=2, offsets=(0, 1), frames=359)
+    aligned = alignment.align(seen.drop_vars("exposure_time"), offset=0.025)  # [s]
+    error, _ = errors(alignment.reflection_shift(aligned, RESPONSE), true)
+    print(f"median error {np.median(np.abs(error[1])):.3f} pixel of {error.shape[1]} pixels")
+    assert error.shape[1] > 0.7 * true[0].size
+    assert np.median(np.abs(error[1])) < 0.1
+
+
 def test_opened_capture_with_steps_between_segments(tmp_path: Path) -> None:
     """Steps at shutter events are no reflection; a capture on disk is read block by block.
 

@@ -73,11 +73,8 @@ def estimate(
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
     omitted = smooth_variance * np.log(tile.time.size) / used
-    # The slope is sum k z_1, with k = w u / sum w u^2 of the curve u about its mean. Its variance:
-    # of the ordinate's noise, and of the abscissa's.
-    kernel = line.weights * fit.emitted
-    kernel -= line.weights * (kernel.sum(axis=0) / line.weights.sum(axis=0))
-    kernel /= line.energy
+    # Variance of the slope: of the ordinate's noise, and of the abscissa's.
+    kernel = line.kernel(fit.emitted)
     noise_variance = line.variance + first**2 * _curve_variance(kernel, functions, ratios)
     curve_std = first * np.sqrt(ratios.null_variance)
     walk, upper = walk_variance(line, fit.emitted, functions, noise[0], curve_std, used)

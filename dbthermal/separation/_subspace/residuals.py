@@ -59,6 +59,12 @@ class Line:
     variance: Array  # of the slope, with the residuals' correlation in time (pixel)
     weights: Array  # final weights in [0, 1] (time, pixel)
 
+    def kernel(self, abscissa: Array) -> Array:
+        """Weights k (time, pixel) of the ordinate z in the slope, sum k z."""
+        kernel = self.weights * abscissa
+        kernel -= self.weights * (kernel.sum(axis=0) / self.weights.sum(axis=0))
+        return np.asarray(kernel / self.energy)
+
 
 def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None = None) -> Line:
     r"""
