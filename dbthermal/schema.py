@@ -294,7 +294,7 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     flags : DataArray
         `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
         ``flag_meanings``.
-    names : str
+    *names : str
         Names of flags, in lower case.
 
     Returns
