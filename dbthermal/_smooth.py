@@ -112,9 +112,22 @@ def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Arr
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
     r"""Orthonormal polynomials over given times, the discrete Legendre polynomials.
 
-    Of times (time,) [s], strictly increasing, not necessarily evenly spaced, and a number of
-    functions, the constant included: (time, order), of which column j is a polynomial of degree j,
-    and :math:`\Phi^T \Phi = 1`. ValueError if the order is not in [1, number of times].
+    Parameters
+    ----------
+    time : array_like, shape (time,)
+        Times [s], strictly increasing, not necessarily evenly spaced.
+    order : int
+        Number of functions, the constant included.
+
+    Returns
+    -------
+    ndarray, shape (time, order)
+        Column j is a polynomial of degree j; :math:`\Phi^T \Phi = 1`.
+
+    Raises
+    ------
+    ValueError
+        If the order is not in [1, number of times].
     """
     time = np.asarray(time, dtype=np.float64)
     if not 1 <= order <= time.size:

@@ -28,7 +28,15 @@ _NEWTON_STEPS = 50
 
 @dataclass(frozen=True)
 class Band:
-    """A spectral band with a top-hat transmission: a name, and its lower and upper edge [m]."""
+    """A spectral band with a top-hat transmission.
+
+    Attributes
+    ----------
+    name : str
+        Its name, such as "9.5".
+    lower, upper : float
+        Lower and upper edge [m].
+    """
 
     name: str
     lower: float
@@ -147,7 +155,17 @@ doi:10.48550/arXiv.2509.11334): centre and full width at half maximum, as top ha
 
 
 def get(name: str) -> Band:
-    """Band of `FILTERS` by its name, e.g. "9.5"; KeyError lists the known ones.
+    """Band of `FILTERS` by its name.
+
+    Parameters
+    ----------
+    name : str
+        Name, e.g. "9.5".
+
+    Raises
+    ------
+    KeyError
+        If there is no such filter; the error lists those known.
 
     Examples
     --------

@@ -68,17 +68,29 @@ def band_table(
     does not cover the whole band both integrals run over the covered part, whose share is
     `coverage`; nothing is extrapolated.
 
-    Of spectra by material, stage `spectrum` of `schema`, `emissivity` (wavelength) [1], wavelength
-    [m]; bands, or names of `bands.FILTERS`; the temperature of the material [K]; and the share of
-    the band's blackbody radiance that each spectrum must cover, in (0, 1]: stage
-    `emissivity_table`, `emissivity` and `coverage` (material, band) [1]. Values of the libraries'
-    spectra outside (0, 1] are averaged as they are.
+    Parameters
+    ----------
+    spectra : mapping of str to Dataset
+        Material to stage `spectrum` of `schema`: `emissivity` (wavelength) [1], wavelength [m].
+    bands : mapping or iterable of Band or str
+        Bands, or names of `bands.FILTERS`.
+    temperature : float
+        Temperature of the material [K].
+    minimum_coverage : float
+        Share of the band's blackbody radiance that each spectrum must cover, in (0, 1].
+
+    Returns
+    -------
+    Dataset
+        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]. Values of the
+        libraries' spectra outside (0, 1] are averaged as they are.
 
     Raises
     ------
-    KeyError, TypeError
-        If a band is unknown; if the spectra are no mapping, or a band is neither a Band nor a
-        name.
+    KeyError
+        If a band's name is unknown.
+    TypeError
+        If the spectra are no mapping, or a band is neither a Band nor a name.
     ValueError
         If there is no spectrum or no band, a band repeats, a spectrum is not as `schema` has it or
         holds NaN, the temperature is outside `bands.TEMPERATURE_RANGE`, or a spectrum covers less
@@ -120,9 +132,14 @@ def embedded_table() -> xr.Dataset:
     """Table of 25 common materials that comes with the package.
 
     Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
-    [1]_ [2]_ [3]_, whose spectra are not redistributed: stage `emissivity_table`, `emissivity` and
-    `coverage` (material, band) [1]; some metals and tiles were measured up to 12.5 um only.
-    Coordinates `library` and `source` (material) name the library, and the file or sample in it.
+    [1]_ [2]_ [3]_, whose spectra are not redistributed.
+
+    Returns
+    -------
+    Dataset
+        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]; some metals and
+        tiles were measured up to 12.5 um only. Coordinates `library` and `source` (material) name
+        the library, and the file or sample in it.
 
     References
     ----------
@@ -158,9 +175,21 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
 
     .. math:: p(e) = \sum_k w_k N(e; \mu_k, C_k)
 
-    as `weight` (component) [1], `mean` (component, band) [1] and `covariance` (component, band,
-    other) [1], of bands of `bands.FILTERS` in the order that is wanted; ValueError if one is none
-    of the filters, or repeats.
+    Parameters
+    ----------
+    bands : iterable of str
+        Names of `bands.FILTERS`, in the order that is wanted.
+
+    Returns
+    -------
+    Dataset
+        `weight` (component) [1], `mean` (component, band) [1], `covariance` (component, band,
+        other) [1].
+
+    Raises
+    ------
+    ValueError
+        If a band is none of the filters, or repeats.
 
     Examples
     --------
@@ -203,10 +232,21 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
 def condition_numbers(table: xr.Dataset) -> xr.DataArray:
     """Condition number of the mixing matrix for each material and pair of bands.
 
-    Of a table (stage `emissivity_table`) of at least two bands, numbers (material, first, second)
-    [1], symmetric; infinite on the diagonal and where the two emissivities are equal. See
-    `mixing.condition_number`. TypeError or ValueError if the table is not as `schema` has it, or
-    has one band only.
+    Parameters
+    ----------
+    table : Dataset
+        Stage `emissivity_table`, of at least two bands.
+
+    Returns
+    -------
+    DataArray
+        Condition numbers (material, first, second) [1], symmetric; infinite on the diagonal and
+        where the two emissivities are equal. See `mixing.condition_number`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the table is not as `schema` has it, or has one band only.
 
     Examples
     --------
@@ -231,10 +271,18 @@ def condition_numbers(table: xr.Dataset) -> xr.DataArray:
 def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
     """Condition number of each pair of bands, over the materials.
 
-    Of the numbers (material, first, second) [1] of `condition_numbers`: `median` and `mean` (first,
-    second) [1], and `finite` (first, second), the number of materials in the mean. A gray material
-    counts in the median as infinite and not in the mean, which a few nearly gray ones govern:
-    choose by the median. Both are infinite where every material is gray, as on the diagonal.
+    Parameters
+    ----------
+    numbers : DataArray
+        Condition numbers (material, first, second) [1], from `condition_numbers`.
+
+    Returns
+    -------
+    Dataset
+        `median` and `mean` (first, second) [1], and `finite` (first, second), the number of
+        materials in the mean. A gray material counts in the median as infinite and not in the mean,
+        which a few nearly gray ones govern: choose by the median. Both are infinite where every
+        material is gray, as on the diagonal.
 
     Examples
     --------
@@ -261,10 +309,26 @@ def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.Da
 
     .. math:: s_m = s_1 \frac{dB_1 / dT}{dB_m / dT}
 
-    with the first of the bands, or names of `bands.FILTERS`, as the one that `netd` [K], the
-    noise-equivalent temperature difference, belongs to, at the object's temperature [K]. A filter's
-    emission and losses are left out. KeyError, TypeError or ValueError if a band is unknown or
-    repeats, or `netd` or the temperature is out of range.
+    with the first of the bands as the camera's own. A filter's emission and losses are left out.
+
+    Parameters
+    ----------
+    netd : float
+        Noise-equivalent temperature difference in the first band [K].
+    bands : mapping or iterable of Band or str
+        Bands, or names of `bands.FILTERS`; the first is the one that `netd` belongs to.
+    temperature : float
+        Temperature of the object [K].
+
+    Returns
+    -------
+    DataArray
+        Noise (band) [K].
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If a band is unknown or repeats, or `netd` or the temperature is out of range.
 
     Examples
     --------
@@ -293,13 +357,27 @@ def rank_filters(
     The second criterion settles it: the standard deviation of the object temperature from one
     frame. Both are medians over the materials, for a few nearly gray materials govern any mean.
 
-    Of a table (stage `emissivity_table`), the noise (band) [K] of its every band, such as from
-    `filter_noise`, and the name of the camera's own band: each (band), in the order of the first
-    criterion, `condition_number` [1]; `condition_number_mean` [1], over the materials where it is
-    finite; `object_temperature_std` [K]; `noise` [K]. Attributes `lowest_condition_number` and
-    `lowest_std` name the filter of each criterion. TypeError or ValueError if the table is not as
-    `schema` has it or has no band `beside` and another, or the noise lacks a band, is in another
-    unit, or is not finite and positive.
+    Parameters
+    ----------
+    table : Dataset
+        Stage `emissivity_table`.
+    noise : DataArray
+        Noise (band) [K] of every band of the table, such as from `filter_noise`.
+    beside : str
+        Name of the camera's own band.
+
+    Returns
+    -------
+    Dataset
+        Each (band), in the order of the first: `condition_number` [1]; `condition_number_mean` [1],
+        over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
+        `lowest_condition_number` and `lowest_std` name the filter of each criterion.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the table is not as `schema` has it or has no band `beside` and another, or the noise
+        lacks a band, is in another unit, or is not finite and positive.
 
     Examples
     --------

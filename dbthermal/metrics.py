@@ -22,9 +22,22 @@ def correlation(
 ) -> xr.DataArray:
     """Pearson's correlation [1] of two maps, frame by frame.
 
-    Of maps (..., y, x), each in a unit of its own, over the dims other than y and x; of the pixels
-    that count by a mask (y, x), bool, all by default. ValueError if coordinates differ, fewer than
-    two pixels count, one is not finite, or a map is constant.
+    Parameters
+    ----------
+    first, second : DataArray
+        Maps (..., y, x), each in a unit of its own.
+    mask : DataArray of bool, optional
+        Pixels (y, x) that count; all by default.
+
+    Returns
+    -------
+    DataArray
+        Correlation [1], in [-1, 1], over the dims other than y and x.
+
+    Raises
+    ------
+    ValueError
+        If coordinates differ, fewer than two pixels count, one is not finite, or a map is constant.
 
     Examples
     --------
@@ -55,9 +68,20 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     The zero of the Celsius scale is arbitrary, and so is this number; it is here to stand beside
     the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled.
 
-    Of temperatures [K], estimate and truth, of which one is broadcast; NaN where the estimate is
-    NaN. ValueError if coordinates differ, a unit is not K, or a true temperature is not above
-    273.15 K.
+    Parameters
+    ----------
+    estimate, truth : DataArray
+        Temperatures [K].
+
+    Returns
+    -------
+    DataArray
+        Error [percent], of the broadcast shape. NaN where the estimate is NaN.
+
+    Raises
+    ------
+    ValueError
+        If coordinates differ, a unit is not K, or a true temperature is not above 273.15 K.
 
     Examples
     --------

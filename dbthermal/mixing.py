@@ -22,8 +22,17 @@ __dir__ = __all__.copy
 def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:
     r"""Signal of a surface, :math:`e \Phi_x + (1 - e) \Phi_y`, without a check of the values.
 
-    Of its emissivity e [1] and the blackbody signals at the object's and at the background's
-    temperature, in one unit; arrays or tensors, which are broadcast.
+    Parameters
+    ----------
+    emissivity : array or tensor
+        Emissivity e [1].
+    emitted, reflected : array or tensor
+        Blackbody signals at the object's and at the background's temperature, in one unit.
+
+    Returns
+    -------
+    array or tensor
+        Signal in the same unit, of the broadcast shape.
 
     Examples
     --------
@@ -36,8 +45,17 @@ def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:
 def background(emissivity: Any, signal: Any, emitted: Any) -> Any:
     r"""Blackbody signal of the background, :math:`\Phi_y = (\Phi - e \Phi_x) / (1 - e)`.
 
-    Of the emissivity e [1], not 1, the signal of the surface and the blackbody signal at the
-    object's temperature, in one unit; arrays or tensors, which are broadcast.
+    Parameters
+    ----------
+    emissivity : array or tensor
+        Emissivity e [1], not 1.
+    signal, emitted : array or tensor
+        Signal of the surface, and blackbody signal at the object's temperature, in one unit.
+
+    Returns
+    -------
+    array or tensor
+        Signal in the same unit, of the broadcast shape.
     """
     return (signal - emissivity * emitted) / (1.0 - emissivity)
 
@@ -45,9 +63,22 @@ def background(emissivity: Any, signal: Any, emitted: Any) -> Any:
 def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.ArrayLike) -> Array:
     """Signal that leaves a surface: as `mixed`, but refuses emissivities outside [0, 1].
 
-    Of arrays, which are broadcast: the emissivity [1], and the blackbody signals at the object's
-    and at the background's temperature, in one unit. ValueError names an emissivity outside [0, 1],
-    or NaN.
+    Parameters
+    ----------
+    emissivity : array_like
+        Emissivity [1].
+    emitted, reflected : array_like
+        Blackbody signal at the object's and at the background's temperature, in one unit.
+
+    Returns
+    -------
+    ndarray
+        Signal in the same unit, of the broadcast shape.
+
+    Raises
+    ------
+    ValueError
+        If an emissivity lies outside [0, 1] or is NaN.
 
     Examples
     --------
@@ -64,9 +95,17 @@ def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.Ar
 
 
 def matrix(emissivity: npt.ArrayLike) -> Array:
-    r"""Mixing matrix E (..., band, 2) of emissivities (..., band) [1], rows :math:`(e_m, 1 - e_m)`.
+    r"""Mixing matrix E of several bands, rows :math:`(e_m, 1 - e_m)`.
 
-    Columns: weight of the object, weight of the background (equation 14 of the paper).
+    Parameters
+    ----------
+    emissivity : array_like, shape (..., band)
+        Emissivity a band [1].
+
+    Returns
+    -------
+    ndarray, shape (..., band, 2)
+        Columns: weight of the object, weight of the background (equation 14 of the paper).
     """
     emissivity = np.asarray(emissivity, dtype=np.float64)
     return np.stack([emissivity, 1.0 - emissivity], axis=-1)
@@ -75,8 +114,16 @@ def matrix(emissivity: npt.ArrayLike) -> Array:
 def condition_number(emissivity: npt.ArrayLike) -> Array:
     """Condition number of the mixing matrix in the 2-norm; infinite for a gray body.
 
-    Of emissivities (..., band) [1] of at least two bands, the ratio (...) of the largest to the
-    smallest singular value, 1 at best; NaN of an unknown emissivity.
+    Parameters
+    ----------
+    emissivity : array_like, shape (..., band)
+        Emissivity a band [1]; at least two bands.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Ratio of the largest to the smallest singular value, 1 at best; NaN of an unknown
+        emissivity.
 
     Examples
     --------

@@ -40,8 +40,23 @@ _CORRELATION_STD = np.sqrt(35.0 / 18.0)
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """Second difference in time of signals (time, pixel), in which white noise keeps its variance.
 
-    Each sample less the line through its two neighbours (time - 2, pixel), over the root of the sum
-    of the squared weights; times [s] need not be even. ValueError for an infinite sample.
+    Parameters
+    ----------
+    signal : Array
+        Signals (time, pixel).
+    time : array_like
+        Times (time,) [s], which need not be even.
+
+    Returns
+    -------
+    Array
+        Each sample less the line through its two neighbours (time - 2, pixel), over the root of the
+        sum of the squared weights.
+
+    Raises
+    ------
+    ValueError
+        If a sample is infinite.
     """
     if np.any(np.isinf(signal)):
         raise ValueError("Invalid signal: infinite. Must be finite, or NaN.")
@@ -67,9 +82,23 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     is too high: for glass by up to a half, at a correlation time near 10 s, at emissivities 0.3/0.5
     by up to three times, at 30 s.
 
-    Of signals (time, pixel) of the two bands, each in a unit of its own, at times (time,) [s]:
-    standard deviations of the noise, in these units. ValueError if there are fewer than
-    `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or a noise comes out as zero.
+    Parameters
+    ----------
+    first, second : ndarray, shape (time, pixel)
+        Signals of the two bands, each in a unit of its own.
+    time : array_like, shape (time,)
+        Times [s].
+
+    Returns
+    -------
+    tuple of float
+        Standard deviations of the noise, in the signals' units.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than `MINIMUM_FRAMES` frames, no pixel, a signal is NaN or beyond 1e9, or
+        a noise comes out as zero.
 
     Examples
     --------
@@ -124,8 +153,14 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
     """Noise (band) of two bands or more, each estimated beside the quietest; see `estimate`.
 
-    Signals (time, pixel) of more than two bands are all in one unit. The noise of the quietest band
-    is the median of the estimates beside each other band.
+    The noise of the quietest band is the median of the estimates beside each other band.
+
+    Parameters
+    ----------
+    signals : sequence of Array
+        Signals (time, pixel) of each band; of more than two bands all are in one unit.
+    time : array_like
+        Times (time,) [s].
     """
     if len(signals) == 2:
         return np.array(estimate(signals[0], signals[1], time))

@@ -34,7 +34,22 @@ Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 def require_positive(name: str, value: npt.ArrayLike) -> Array:
     """Value as a float array, of which every element must be finite and positive.
 
-    Raises ValueError with the name and the first element that is not.
+    Parameters
+    ----------
+    name : str
+        Name of the quantity, for the error.
+    value : array_like
+        Its values, of any shape.
+
+    Returns
+    -------
+    Array
+        The values as float64.
+
+    Raises
+    ------
+    ValueError
+        If an element is not finite and positive, with the name and the first such element.
     """
     array = np.asarray(value, dtype=np.float64)
     bad = ~(np.isfinite(array) & (array > 0))
@@ -51,8 +66,22 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
     The first equation of the paper (doi:10.48550/arXiv.2509.11334) has the factor :math:`\lambda^5`
     and the :math:`-1` on one level of the denominator; this is the law as Planck gave it.
 
-    Of wavelengths [m] and temperatures [K], arrays that are broadcast. ValueError if one is not
-    finite and positive.
+    Parameters
+    ----------
+    wavelength : array_like
+        Wavelength [m], broadcast against the temperature.
+    temperature : array_like
+        Temperature [K].
+
+    Returns
+    -------
+    ndarray
+        Spectral radiance [W m^-2 sr^-1 m^-1], of the broadcast shape.
+
+    Raises
+    ------
+    ValueError
+        If a wavelength or a temperature is not finite and positive.
 
     Examples
     --------
@@ -76,7 +105,14 @@ def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLik
     .. math:: \frac{\partial L}{\partial T} = L \, \frac{x}{T (1 - e^{-x})}, \quad
               x = c_2 / \lambda T
 
-    Wavelength [m], temperature [K] and errors as `spectral_radiance`.
+    Errors as `spectral_radiance`.
+
+    Parameters
+    ----------
+    wavelength : array_like
+        Wavelength [m].
+    temperature : array_like
+        Temperature [K].
     """
     radiance = spectral_radiance(wavelength, temperature)
     temperature = np.asarray(temperature, dtype=np.float64)
@@ -89,7 +125,14 @@ def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -
 
     .. math:: T = \frac{c_2}{\lambda \ln(1 + 2 h c^2 / \lambda^5 L)}
 
-    Wavelength [m], spectral radiance [W m^-2 sr^-1 m^-1] and errors as `spectral_radiance`.
+    Errors as `spectral_radiance`.
+
+    Parameters
+    ----------
+    wavelength : array_like
+        Wavelength [m].
+    radiance : array_like
+        Spectral radiance [W m^-2 sr^-1 m^-1].
 
     Examples
     --------

@@ -46,6 +46,23 @@ class Curve:
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O
 
+    Attributes
+    ----------
+    band : str
+        Name of the band.
+    amplitude : float
+        C [count].
+    wavelength : float
+        A, effective wavelength [m].
+    shift : float
+        B [m K].
+    offset : float
+        O [count].
+    reference : float
+        Reference temperature :math:`T_r` [K].
+    lowest, highest : float
+        Calibrated range [K].
+
     References
     ----------
     .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
@@ -53,14 +70,14 @@ class Curve:
     .. [2] Saunders, White (2003), Metrologia 40, 195, doi:10.1088/0026-1394/40/4/309
     """
 
-    band: str  # its name
-    amplitude: float  # C [count]
-    wavelength: float  # A, effective wavelength [m]
-    shift: float  # B [m K]
-    offset: float  # O [count]
-    reference: float  # reference temperature T_r [K]
-    lowest: float  # of the calibrated range [K]
-    highest: float  # of the calibrated range [K]
+    band: str
+    amplitude: float
+    wavelength: float
+    shift: float
+    offset: float
+    reference: float
+    lowest: float
+    highest: float
 
     def counts(self, temperature: npt.ArrayLike) -> Array:
         """Counts of a blackbody at a temperature [K] that fills the pixel, extrapolated [count]."""
@@ -119,8 +136,12 @@ class Curve:
 class LinearCurve(Curve):
     """The paper's linear response, counts = slope * T + intercept, with the methods of `Curve`.
 
-    `amplitude` is the slope [count/K], `offset` the intercept [count]; `wavelength` and `shift` are
-    not used.
+    Attributes
+    ----------
+    amplitude : float
+        Slope [count/K].
+    offset : float
+        Intercept [count]; `wavelength` and `shift` are not used.
     """
 
     def counts(self, temperature: npt.ArrayLike) -> Array:
@@ -139,7 +160,19 @@ class LinearCurve(Curve):
 def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
     """Temperatures [K] as float64, all of which must lie in the calibrated range of a curve.
 
-    Raises ValueError with the name and the first temperature that lies outside or is NaN.
+    Parameters
+    ----------
+    temperature : array_like
+        Temperatures [K], of any shape.
+    curve : Curve
+        Curve of a band.
+    name : str
+        Name of the temperatures, for the error.
+
+    Raises
+    ------
+    ValueError
+        With the name and the first temperature that lies outside or is NaN.
     """
     values = np.asarray(temperature, dtype=np.float64)
     bad = ~((values >= curve.lowest) & (values <= curve.highest))
@@ -154,9 +187,25 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
 def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
     """Curve of one band, by its name, of a response (stage `response` of `schema`).
 
-    The Sakuma-Hattori curve if its kind is "exact", a `LinearCurve` of the linear pair if "linear".
-    ValueError if the band is missing, the kind unknown, a coefficient not finite, or the slope not
-    positive.
+    Parameters
+    ----------
+    response : Dataset
+        Stage `response` of `schema`.
+    band : str
+        Name of the band.
+    kind : {"exact", "linear"}
+        Sakuma-Hattori, or the linear pair.
+
+    Returns
+    -------
+    Curve
+        Of the kind wanted; a `LinearCurve` if linear.
+
+    Raises
+    ------
+    ValueError
+        If the band is missing, the kind unknown, a coefficient not finite, or the slope not
+        positive.
     """
     if kind not in KINDS:
         raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
@@ -185,11 +234,20 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
 
 
 def noise(response: xr.Dataset, bands: list[str]) -> Array:
-    """
-    Noise (band) [count] of some bands of a response, the standard deviation of one pixel's counts.
+    """Noise (band) [count] of some bands of a response: standard deviation of one pixel's counts.
 
-    Raises TypeError or ValueError if there is no noise, its dims or unit are others, a band is
-    missing, or a value is not finite and positive.
+    Parameters
+    ----------
+    response : Dataset
+        Response of stage `response`.
+    bands : list of str
+        Names of the bands, in the order of the result.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there is no noise, its dims or unit are others, a band is missing, or a value is not
+        finite and positive.
     """
     if "noise" not in response:
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
@@ -208,8 +266,24 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
 def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact") -> xr.DataArray:
     """Counts (band, ...) [count] of a blackbody in every band of a response.
 
-    Of a response (stage `response` of `schema`), by its kind of curve, and temperatures [K] of any
-    dims but `band`. ValueError if one lies outside the calibrated range of the response.
+    Parameters
+    ----------
+    response : Dataset
+        Stage `response` of `schema`.
+    temperature : DataArray
+        Temperature [K], any dims but `band`.
+    kind : {"exact", "linear"}
+        Kind of response.
+
+    Returns
+    -------
+    DataArray
+        Counts (band, ...) [count].
+
+    Raises
+    ------
+    ValueError
+        If a temperature lies outside the calibrated range of the response.
     """
     names = [str(name) for name in response["band"].values]
     curves = [curve(response, name, kind) for name in names]
@@ -224,9 +298,25 @@ def apparent_temperature(
 ) -> xr.DataArray:
     """Temperature of the blackbody that would give the same counts, band by band.
 
-    Of a response (stage `response` of `schema`), by its kind of curve, and counts (band, ...)
-    [count] the apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN
-    where no temperature gives such counts. ValueError if a band is missing in the response.
+    Parameters
+    ----------
+    response : Dataset
+        Stage `response` of `schema`.
+    counts : DataArray
+        (band, ...) [count].
+    kind : {"exact", "linear"}
+        Kind of response.
+
+    Returns
+    -------
+    DataArray
+        Apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN where
+        no temperature gives such counts.
+
+    Raises
+    ------
+    ValueError
+        If a band is missing in the response.
 
     Examples
     --------

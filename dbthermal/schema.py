@@ -49,14 +49,23 @@ __dir__ = __all__.copy
 class Variable:
     """Definition of a variable: dimensions in order, type as written, unit, and meaning.
 
-    Read, any real type of the same kind passes.
+    Attributes
+    ----------
+    dims : tuple of str
+        Dimensions, in order.
+    dtype : str
+        Type as written; read, any real type of the same kind passes.
+    units, long_name : str
+        Unit and meaning.
+    more : mapping
+        Further attributes.
     """
 
     dims: tuple[str, ...]
     dtype: str
     units: str
     long_name: str
-    more: Mapping[str, Any] = field(default_factory=dict, hash=False)  # further attributes
+    more: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     @property
     def attrs(self) -> dict[str, Any]:
@@ -208,7 +217,13 @@ and -1.4 % relative to the reference."""
 
 
 class Flags(IntFlag):
-    """Bits with a name and a sentence each, written as CF `flag_masks` and `flag_meanings`."""
+    """Bits with a name and a sentence each, written as CF `flag_masks` and `flag_meanings`.
+
+    Attributes
+    ----------
+    meaning : str
+        The sentence.
+    """
 
     meaning: str
 
@@ -274,9 +289,23 @@ def status_attrs() -> dict[str, object]:
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """Mask of the places where any of some flags is set, by the CF attributes of the variable.
 
-    Of `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
-    ``flag_meanings``, and names of flags, in lower case: bool, of the shape of the flags.
-    ValueError if a name is not among the attributes.
+    Parameters
+    ----------
+    flags : DataArray
+        `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
+        ``flag_meanings``.
+    *names : str
+        Names of flags, in lower case.
+
+    Returns
+    -------
+    DataArray of bool
+        Of the shape of the flags.
+
+    Raises
+    ------
+    ValueError
+        If a name is not among the attributes.
 
     Examples
     --------
@@ -296,7 +325,13 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
 
 
 def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
-    """Mask of the samples that are numbers below `LARGEST` in magnitude: not NaN, not infinite."""
+    """Mask of the samples that are numbers below `LARGEST` in magnitude: not NaN, not infinite.
+
+    Parameters
+    ----------
+    values : array or DataArray
+        Samples, of any shape and unit.
+    """
     if values.dtype == np.float16:  # `LARGEST` is none, and all of its numbers are smaller
         return np.isfinite(values)
     return np.abs(values) < LARGEST
@@ -306,10 +341,22 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     """Check a dataset against its stage, one of `STAGES`, and return it unchanged.
 
     A missing `units` attribute is taken as the agreed unit; a different one is an error. Of the
-    values only those of the coordinates are read. TypeError if it is not a Dataset, or a variable's
-    dtype is not a real number; ValueError if a variable, dimension or coordinate is missing,
-    misnamed or out of order, a unit is another one, a coordinate does not increase strictly, or
-    bands repeat.
+    values only those of the coordinates are read.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Data of a stage.
+    stage : str
+        One of `STAGES`.
+
+    Raises
+    ------
+    TypeError
+        If it is not a Dataset, or a variable's dtype is not a real number.
+    ValueError
+        If a variable, dimension or coordinate is missing, misnamed or out of order, a unit is
+        another one, a coordinate does not increase strictly, or bands repeat.
 
     Examples
     --------
@@ -334,10 +381,17 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
 
 
 def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
-    """
-    Check a dataset against the stage `corrected`, see `check`, and that its counts are no raw ones.
+    """Check a dataset against the stage `corrected`, as `check`, and refuse raw counts.
 
-    Raises TypeError for whole numbers: those are raw, and corrected counts need NaN besides.
+    Parameters
+    ----------
+    dataset : Dataset
+        Capture, returned unchanged.
+
+    Raises
+    ------
+    TypeError
+        For whole numbers: those are raw, and corrected counts need NaN besides.
     """
     counts = check(dataset, "corrected")["counts"]
     if counts.dtype.kind != "f":
@@ -350,7 +404,17 @@ def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
-    """Check one array against its definition, as `check`; the label names it in the error."""
+    """Check one array against its definition, as `check`.
+
+    Parameters
+    ----------
+    array : DataArray
+        Array to be checked.
+    variable : Variable
+        Its definition.
+    label : str
+        Its name in the error.
+    """
     if array.dims != variable.dims:
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be {variable.dims}.")
     if array.size == 0:
@@ -371,7 +435,21 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
     """Check that an array holds real numbers, of a unit if it states one, and return it as it is.
 
-    Raises TypeError for another type or dtype, ValueError for another unit; the label names it.
+    Parameters
+    ----------
+    array : DataArray
+        Array to be checked.
+    label : str
+        Its name in the error.
+    units : str, optional
+        Unit that it has if it states one; any by default.
+
+    Raises
+    ------
+    TypeError
+        If the type or dtype is another one.
+    ValueError
+        If it states another unit.
     """
     if not isinstance(array, xr.DataArray):
         raise TypeError(f"Invalid {label} of type {type(array).__name__}. Must be a DataArray.")
@@ -383,9 +461,21 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
-    """Positions of bands on the dimension `band`, by name as text; the label names the array.
+    """Positions of bands on the dimension `band`, by name as text.
 
-    Raises ValueError if there is no coordinate `band`, or a band is missing or repeated.
+    Parameters
+    ----------
+    array : DataArray or Dataset
+        Array with a coordinate `band`.
+    wanted : list of str
+        Names of the bands.
+    label : str
+        Name of the array in the error.
+
+    Raises
+    ------
+    ValueError
+        If there is no coordinate `band`, or a band is missing or repeated.
     """
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
@@ -403,7 +493,19 @@ def band_values(
 ) -> npt.NDArray[np.float64]:
     """Values (band,) of an array of numbers over the bands alone, in the order of some bands.
 
-    Raises as `check_numbers` and `band_positions`, and ValueError for other dims.
+    Parameters
+    ----------
+    array : DataArray
+        Values (band).
+    wanted : list of str
+        Names of the bands, in the order of the result.
+    label, units : str
+        Name of the array in the error, and the unit that it has if it states one.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `check_numbers` and `band_positions`; ValueError for other dims, too.
     """
     if check_numbers(array, label, units).dims != ("band",):
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")

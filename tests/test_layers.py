@@ -20,7 +20,6 @@ PLACES = {
     "av": {"readers", "store"},
     "torch": {"separation"},
     "robust_laplacian": {"simulation"},
-    "trimesh": {"simulation"},
     "cv2": {"alignment"},
     "skimage": {"separation"},
     "serial": {"instruments"},

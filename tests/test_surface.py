@@ -1,6 +1,7 @@
 """The public surface: completion shows what a user types, and docstrings read plainly."""
 
 import ast
+import dataclasses
 import importlib
 import inspect
 import pkgutil
@@ -85,3 +86,20 @@ def test_options_are_explicit(name: str) -> None:
     if inspect.isfunction(value):
         kinds = {parameter.kind for parameter in inspect.signature(value).parameters.values()}
         assert inspect.Parameter.VAR_KEYWORD not in kinds
+
+
+SECTION = r"(?ms)^(?:Parameters|Attributes)\n-+\n(.*?)(?:\n\n[A-Z]\w+\n-|\Z)"
+DRIVERS = re.compile(r"dbthermal\.(acquire|instruments\.(?!protocols|recording|session))")
+
+
+@pytest.mark.parametrize("name", [name for name in public_functions() if not DRIVERS.match(name)])
+def test_parameters_have_a_section(name: str) -> None:
+    """Parameters, and fields of a record, are listed in the section that the site shows."""
+    value = public_functions()[name]
+    record = dataclasses.is_dataclass(value)
+    made_by = value if record else vars(value).get("__init__", value)
+    names = inspect.get_annotations(made_by).keys() - {"return"}
+    section = "\n".join(re.findall(SECTION, inspect.getdoc(value) or ""))
+    lines = re.findall(r"(?m)^(\S.*?)(?: :|$)", section)
+    listed = {entry.lstrip("*") for line in lines for entry in line.split(", ")}
+    assert {each for each in names if not each.startswith("_")} <= listed

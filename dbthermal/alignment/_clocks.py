@@ -88,9 +88,16 @@ class Interpolation:
 def exposure_times(corrected: xr.Dataset) -> Array:
     """Exposure times (band, time) [s] of each band's frames, NaN where there is no frame.
 
-    From `exposure_time` of a capture; without it `time`, in every band. Raises TypeError or
-    ValueError if the times have other dims or another unit, fewer than two of a band are finite, or
-    they do not increase.
+    Parameters
+    ----------
+    corrected : Dataset
+        Capture with `exposure_time`; without it `time` is taken, in every band.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the times have other dims or another unit, fewer than two of a band are finite, or they
+        do not increase.
     """
     counts = corrected["counts"]
     if "exposure_time" not in corrected:
@@ -107,6 +114,11 @@ def fill_times(stamps: Array) -> Array:
     """Exposure times (time) [s] of one camera, with those of missing frames (NaN) interpolated.
 
     They increase strictly; before the first and after the last frame by a frame period.
+
+    Parameters
+    ----------
+    stamps : Array
+        Times (time) [s], NaN where a frame is missing.
     """
     slots, step = np.arange(stamps.size), frame_period(stamps)
     recorded = np.flatnonzero(np.isfinite(stamps))

@@ -190,13 +190,15 @@ class Movies:
         cls, movies: list[Movie], valid: Mask, noise: Array, freedom: float, factor: int
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's, blurred in place."""
-        # Interpolated in time, a movie holds less rapid noise than white noise of its size.
-        white = np.sqrt(freedom / movies[0].shape[2]) / factor
-        usual = [MAD * np.median(np.abs(movie[::2, ::2])) for movie in movies]
-        noise = np.minimum(noise, np.array(usual) / white)
+        mostly = binned(valid.astype(np.float64), factor) > 0.5
+        some = tuple(part[::3] for part in np.nonzero(mostly))
+        if some[0].size:
+            # Interpolated in time, a movie holds less rapid noise than white noise of its size.
+            white = np.sqrt(freedom / movies[0].shape[2]) / factor
+            usual = [MAD * np.median(np.abs(movie[some])) for movie in movies]
+            noise = np.minimum(noise, np.array(usual) / white)
         for movie in movies:
             gaussian_filter(movie, (BLUR, BLUR, 0.0), output=movie)
-        mostly = binned(valid.astype(np.float64), factor) > 0.5
         return cls(movies[0], movies[1:], mostly, noise / factor, freedom, factor)
 
     @property

@@ -28,11 +28,19 @@ class Bias:
     is carried into the result: a rectangular distribution, clause 4.3.7 of the Guide to the
     expression of uncertainty in measurement (JCGM 100:2008).
 
-    The tolerances are the largest offset of the thermocouple's readings and of the reflected body's
-    temperature, either way [K]; `contact` the least and largest fraction of the object's excess
-    over the air, of a temperature [K] that is the room's too, which the thermocouple misses,
-    because it conducts heat away [1]; `stray` those of the reflection that comes from the room and
-    not from the blackbody [1]: a surface that is not quite smooth, a blackbody not quite black.
+    Attributes
+    ----------
+    object_tolerance, background_tolerance : float
+        Largest offset of the thermocouple's readings and of the reflected body's temperature,
+        either way [K].
+    contact : tuple of float
+        Least and largest fraction of the object's excess over the air that the thermocouple misses,
+        because it conducts heat away [1].
+    air_temperature : float
+        Temperature of the air, and of the room [K].
+    stray : tuple of float
+        Least and largest fraction of the reflection that comes from the room and not from the
+        blackbody: a surface that is not quite smooth, a blackbody not quite black [1].
 
     Examples
     --------

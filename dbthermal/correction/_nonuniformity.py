@@ -42,10 +42,22 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     freedom that n differences leave, :math:`2 n^2 / (3 n - 1)`: a median of few frames is otherwise
     too low (by 33 % for two frames, 5 % for ten).
 
-    Of raw `counts` (band, temperature, frame, y, x) [count], stage `blackbody_movies` of `schema`,
-    at least two frames: stage `blackbody_frames`, `counts` (band, temperature, y, x) [count], and
-    `noise` (band) [count], the standard deviation of one sample. TypeError or ValueError if there
-    are fewer than two frames, or they hold NaN or do not vary.
+    Parameters
+    ----------
+    movies : Dataset
+        Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x) [count],
+        raw, at least two frames.
+
+    Returns
+    -------
+    Dataset
+        Stage `blackbody_frames`: `counts` (band, temperature, y, x) [count], and `noise` (band)
+        [count], the standard deviation of one sample.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there are fewer than two frames, or they hold NaN or do not vary.
 
     Examples
     --------
@@ -190,11 +202,24 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     image of unknown temperature says nothing of it (`undo_drift` does). `offset_std` becomes that
     of an image as noisy as one of the calibration's.
 
-    Of a correction from `fit_correction` and the mean of raw frames (band, y, x) [count] of a
-    uniform view, such as a lens cap or the camera's shutter, of the bands of the correction: the
-    correction with other `offset` [count], and the attribute ``offset_renewed`` = 1. TypeError or
-    ValueError if the correction has no `bad`, a band is missing, the pixels are not the same, or a
-    good pixel of the image is not finite.
+    Parameters
+    ----------
+    correction : Dataset
+        From `fit_correction`.
+    flat : DataArray
+        Mean of raw frames of a uniform view, (band, y, x) [count], such as a lens cap or the
+        camera's shutter, of the bands of the correction.
+
+    Returns
+    -------
+    Dataset
+        The correction with other `offset` [count], and the attribute ``offset_renewed`` = 1.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the correction has no `bad`, a band is missing, the pixels are not the same, or a good
+        pixel of the image is not finite.
     """
     schema.check(correction, "correction")
     if "bad" not in correction:
@@ -225,17 +250,31 @@ def correct(
 ) -> xr.Dataset:
     """Apply gain and offset to a capture, and mark its bad and saturated pixels.
 
-    Of a capture of stage `capture`, raw uint16, whose other variables are handed on, a correction
-    from `fit_correction` of the same pixels, which may hold more bands, and the largest count of
-    the detector: stage `corrected`, `counts` (band, time, y, x) [count], float32; `status` (y, x),
-    uint32, with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above,
-    or at 0) of `schema.Status`. The counts of these pixels are kept. `pattern_std` (band) [count]
-    where the correction has its deviations: what it leaves from pixel to pixel, constant in time,
-    root mean square over the levels of the capture. Attributes: ``gain_offset_corrected`` = 1, the
-    parameters of the fit (``gain_offset_...``), and the numbers of marked pixels.
+    Parameters
+    ----------
+    capture : Dataset
+        Stage `capture` of `schema`, raw uint16. Other variables are handed on.
+    correction : Dataset
+        From `fit_correction`, of the same pixels; it may hold more bands.
+    maximum : int
+        Largest count of the detector [count].
 
-    TypeError or ValueError if the capture is not uint16 or was corrected before, a band is missing
-    in the correction, a gain or offset is not finite, or the pixels are not the same.
+    Returns
+    -------
+    Dataset
+        Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), uint32,
+        with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or
+        at 0) of `schema.Status`. The counts of these pixels are kept. `pattern_std` (band) [count]
+        where the correction has its deviations: what it leaves from pixel to pixel, constant in
+        time, root mean square over the levels of the capture. Attributes:
+        ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``), and the
+        numbers of marked pixels.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the capture is not uint16 or was corrected before, a band is missing in the correction, a
+        gain or offset is not finite, or the pixels are not the same.
     """
     counts = _require_raw(capture)
     maps = _maps(correction, counts)

@@ -38,10 +38,14 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     compared first, then the whole of the remaining frames, in blocks of rows, so that a lazy
     dataset is never read at once. The search is exact only before anything is interpolated in time.
 
-    Of `counts` (band, time, y, x) [count], stage `corrected` of `schema` or a raw `capture`.
-    `closed`, (time) or (band, time), bool, is true in frames in which the shutter is known to be
-    closed: from the camera, or because they show the shutter itself. A run of copies that includes
-    or touches one is part of its event.
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`, or a raw `capture`: `counts` (band, time, y, x) [count].
+    closed : DataArray, optional
+        True in frames in which the shutter is known to be closed, (time) or (band, time), bool:
+        from the camera, or because they show the shutter itself. A run of copies that includes or
+        touches one is part of its event.
 
     Returns
     -------
@@ -97,13 +101,26 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     Beside five functions over 35 s, one step in the middle raises the standard deviation of the
     smooth part by 1.9, two, at 11 and 24 s, by 2.7.
 
-    Of stage `corrected` of `schema`, not yet marked, before `alignment.align`, whose `counts` may
-    be lazy, and events from `find_shutter`, or rows of it, by default all: the dataset with NaN in
-    place of these samples, and `segment` (time), int32 [1]: number of renewals of the offsets
-    before the frame. Attributes: ``shutter_events``, ``repeated_frames`` (runs that renew nothing)
-    and ``frames_taken_out`` (by band). TypeError or ValueError if the counts are whole numbers,
-    which have no NaN, the dataset was marked before, or an event lacks a variable, is of no band or
-    of frames outside the dataset.
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`, not yet marked, before `alignment.align`. `counts` may be
+        lazy.
+    events : Dataset, optional
+        From `find_shutter`, or rows of it; by default `find_shutter(corrected)`.
+
+    Returns
+    -------
+    Dataset
+        The dataset with NaN in place of these samples, and `segment` (time), int32 [1]: number of
+        renewals of the offsets before the frame. Attributes: ``shutter_events``,
+        ``repeated_frames`` (runs that renew nothing) and ``frames_taken_out`` (by band).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the counts are whole numbers, which have no NaN, the dataset was marked before, or an
+        event lacks a variable, is of no band or of frames outside the dataset.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "segment" in corrected:

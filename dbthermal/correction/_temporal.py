@@ -22,12 +22,25 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     frames then have the correlation :math:`-a / (1 + a^2)`: undo a lag that matters, not one that
     does not.
 
-    Of stage `corrected` of `schema`, after `mark_shutter`, for a repeated frame is no measurement,
-    and the time constant of the pixels [s], of all bands or (band), by name: the dataset with other
-    `counts` [count], and the attributes ``lag_time_constant`` [s] and ``lag_noise_amplification``
-    [1], each by band; a known noise must be multiplied by the latter. TypeError or ValueError if
-    there are fewer than two frames, the lag was undone before, the counts are whole numbers, or a
-    time constant is not finite and positive or a band has none.
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`, after `mark_shutter`: a repeated frame is no measurement.
+    time_constant : float or DataArray
+        Time constant of the pixels [s], of all bands or (band), by name.
+
+    Returns
+    -------
+    Dataset
+        The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
+        ``lag_noise_amplification`` [1], each by band; a known noise must be multiplied by the
+        latter.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
+        or a time constant is not finite and positive or a band has none.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:
@@ -55,12 +68,22 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
 def lag_coefficients(
     time_constant: float | xr.DataArray, counts: xr.DataArray
 ) -> tuple[Array, Array]:
-    r"""
-    Weights of the frame before and of the new signal in a pixel that lags, each (band, time - 1).
+    r"""Weights of the frame before and of the new signal in a pixel that lags.
 
-    They are :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a` [1], both to full precision, for the
-    time constant :math:`\tau` [s] of all bands or (band), and counts (band, time, ...). Raises
-    ValueError if a time constant is not finite and positive, or a band has none.
+    They are :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a` (band, time - 1) [1], both to full
+    precision.
+
+    Parameters
+    ----------
+    time_constant : float or DataArray
+        Time constant :math:`\tau` [s], of all bands or (band).
+    counts : DataArray
+        Counts (band, time, ...), whose times are taken.
+
+    Raises
+    ------
+    ValueError
+        If a time constant is not finite and positive, or a band has none.
     """
     interval = np.diff(counts["time"].values.astype(np.float64))
     ratio = interval / _time_constants(time_constant, counts)[:, np.newaxis]
@@ -83,13 +106,29 @@ def undo_drift(
     the ends of a polynomial: 0.11 counts for 100 pixels of 4 counts and 350 frames. A motion in
     front of the patch, or reflected in it, is taken for drift.
 
-    Of stage `corrected` of `schema`, after `mark_shutter` if there were shutter events; a reference
-    (y, x), bool, true on the patch, a blackbody, a wall, of which pixels with a `status` are left
-    out; the number of polynomials in a segment, the constant included; and `lazy` as in
-    `correct_capture`: the dataset with other `counts` [count]; `drift` (band, time) [count], which
-    was subtracted; and the attributes ``drift_order`` and ``drift_pixels``. TypeError or ValueError
-    if the drift was undone before, the reference is no boolean of its pixels or marks no good
-    pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are not.
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`, after `mark_shutter` if there were shutter events.
+    reference : DataArray
+        True on the patch, (y, x), bool: a blackbody, a wall. Pixels with a `status` are left out.
+    order : int
+        Number of polynomials in a segment, the constant included.
+    lazy : bool
+        As in `correct_capture`.
+
+    Returns
+    -------
+    Dataset
+        The dataset with other `counts` [count]; `drift` (band, time) [count], which was subtracted;
+        and the attributes ``drift_order`` and ``drift_pixels``.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the drift was undone before, the reference is no boolean of its pixels or marks no good
+        pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are
+        not.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:

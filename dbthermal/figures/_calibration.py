@@ -19,7 +19,15 @@ from dbthermal.figures.drawing import (
 def gain_offset_maps(correction: xr.Dataset) -> Figure:
     """Maps of gain and offset, one row per band, with the bad pixels marked.
 
-    Of `gain` [1], `offset` [count] and `bad`, all (band, y, x), from `correction.fit_correction`.
+    Parameters
+    ----------
+    correction : Dataset
+        From `correction.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
+
+    Returns
+    -------
+    Figure
+        Maps and marks.
     """
     bands = correction["band"].values
     figure, axes = canvas(len(bands), 2, (8.0, 2.8 * len(bands)))
@@ -40,11 +48,19 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
 def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
     """Response of each band with the residuals of both fits.
 
-    Of a response from `calibration.fit_response`, and the fitted counts (band, temperature) on a
-    fine grid of temperatures, from `response.counts`. From above: counts over temperature, the
-    line's residuals, and those of the Sakuma-Hattori curve on a scale of their own, with the noise
-    of one pixel and frame where the response has it; residuals and noise over the slope of the
-    line.
+    Parameters
+    ----------
+    response : Dataset
+        From `calibration.fit_response`.
+    fine : DataArray
+        Fitted counts (band, temperature) on a fine grid of temperatures, from `response.counts`.
+
+    Returns
+    -------
+    Figure
+        From above: counts over temperature, the line's residuals, and those of the
+        Sakuma-Hattori curve on a scale of their own, with the noise of one pixel and frame where
+        the response has it; residuals and noise over the slope of the line.
     """
     bands = response["band"].values
     figure, axes = canvas(3, len(bands), (4.6 * len(bands), 7.2))
@@ -74,7 +90,18 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
 
 
 def emissivity_bars(table: xr.Dataset) -> Figure:
-    """Band emissivities (material, band) [1] as bars, one group per material."""
+    """Band emissivities (material, band) [1] as bars, one group per material.
+
+    Parameters
+    ----------
+    table : Dataset
+        From `emissivity.band_table`: `emissivity` (material, band) [1].
+
+    Returns
+    -------
+    Figure
+        Bars.
+    """
     materials, bands = table["material"].values, table["band"].values
     figure, ((axis,),) = canvas(1, 1, (max(7.0, 0.62 * len(materials)), 4.6))
     width = 0.8 / len(bands)
@@ -91,9 +118,19 @@ def emissivity_bars(table: xr.Dataset) -> Figure:
 
 
 def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
-    """Condition number of the emissivity matrix for every pair of bands, with its numbers.
+    """Condition number of the emissivity matrix for every pair of bands.
 
-    (first, second) [1], averaged over a number of materials; NaN or infinite on the diagonal.
+    Parameters
+    ----------
+    summary : DataArray
+        (first, second) [1], averaged over materials; NaN or infinite on the diagonal.
+    materials : int
+        Number of materials that the average is over.
+
+    Returns
+    -------
+    Figure
+        Matrix with its numbers.
     """
     figure, ((axis,),) = canvas(1, 1, (5.4, 4.6))
     values = np.where(np.isfinite(summary.values), summary.values, np.nan)
@@ -119,8 +156,17 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
 def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = None) -> Figure:
     """Emissivities from thermocouple and blackbody with their standard deviations.
 
-    One point per band and material, of `emissivity` and `emissivity_std` (material, band) [1], with
-    tabulated values (material, band) [1] as crosses: of a simulation the truth.
+    Parameters
+    ----------
+    measured : Dataset
+        `emissivity`, `emissivity_std` (material, band) [1].
+    table : DataArray, optional
+        Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
+
+    Returns
+    -------
+    Figure
+        One point per band and material.
     """
     figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
     if table is not None:

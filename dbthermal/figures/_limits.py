@@ -28,10 +28,22 @@ _MICRO: Final = "\N{MICRO SIGN}m"
 def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) -> Figure:
     """Expected accuracy of the object temperature by filter, and by length of the film.
 
-    Left, `object_temperature_std` (material, filter) [K] of `limits.plan` as a map with its
-    numbers, the `best` filter of each material framed. Right, that of `limits.plan_durations`
-    (seconds, material, filter) [K] over the length of the film, of some materials, each with its
-    best filter; a material with none is left out.
+    Parameters
+    ----------
+    expected : Dataset
+        From `limits.plan`: `object_temperature_std` (material, filter) [K], `best` (material),
+        the attribute `beside`.
+    durations : Dataset
+        From `limits.plan_durations`: `object_temperature_std` (seconds, material, filter) [K].
+    materials : sequence of str
+        Whose lines to draw on the right, each with its best filter; a material with none is left
+        out.
+
+    Returns
+    -------
+    Figure
+        Left, a map with its numbers, the best filter of each material framed.
+        Right, lines over the length of the film.
     """
     std = expected["object_temperature_std"]
     height = 0.24 * std.sizes["material"] + 1.9

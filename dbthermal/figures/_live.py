@@ -32,10 +32,20 @@ _ALARM: Final = "#b3001b"
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """Picture and texts of one band; the text stands below the picture, the warning across it."""
+    """Picture and texts of one band.
 
-    image: npt.NDArray[Any] | None  # raw signal (y, x) [count]; None before the first frame
-    limits: tuple[float, float]  # counts that are black and white [count]
+    Attributes
+    ----------
+    image : array or None
+        Raw signal (y, x) [count]; None before the first frame.
+    limits : tuple of float
+        Counts that are black and white [count].
+    text, warning : str
+        Texts below and across the picture.
+    """
+
+    image: npt.NDArray[Any] | None
+    limits: tuple[float, float]
     text: str
     warning: str = ""
 
@@ -52,8 +62,17 @@ class _Artists:
 class LiveFigure:
     """Figure whose pictures and texts are replaced while it stays the same.
 
-    Of bands by their names, in the order of the pictures, and of the rows and columns of every
-    picture [pixel]; `figure` is that of matplotlib.
+    Parameters
+    ----------
+    bands : sequence of str
+        Their names, in the order of the pictures.
+    shape : tuple of int
+        Rows and columns of every picture [pixel].
+
+    Attributes
+    ----------
+    figure : Figure
+        Of matplotlib.
 
     Examples
     --------

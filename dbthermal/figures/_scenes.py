@@ -28,10 +28,21 @@ _DPI: Final = 100
 
 
 def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, int]) -> Figure:
-    """Truth against estimate over time at one pixel, object above background, two deviations wide.
+    """Truth against estimate over time at one pixel, with two standard deviations.
 
-    Of a scene with `object_temperature`, `background_temperature` (time, y, x) [K], and a result of
-    `separation.solve`; the pixel is a row and a column.
+    Parameters
+    ----------
+    truth : Dataset
+        Scene with `object_temperature`, `background_temperature` (time, y, x) [K].
+    result : Dataset
+        From `separation.solve`.
+    pixel : tuple of int
+        Row and column.
+
+    Returns
+    -------
+    Figure
+        Object above, background below.
     """
     figure, axes = canvas(2, 1, (7.4, 5.6))
     truth = laid_on(truth, result, "the truth", "the result", dims=("y", "x"))
@@ -62,9 +73,21 @@ def separated_frames(
 ) -> Figure:
     """Inputs, emission and mean-subtracted reflection of a scene, one row per time.
 
-    Inputs are (band, time, y, x), emission and reflection (time, y, x), in any unit; pixels without
-    a value are gray. The title is the name of the scene, the labels are those of inputs, emission
-    and reflection, with units.
+    Parameters
+    ----------
+    inputs : DataArray
+        (band, time, y, x), any unit.
+    emission, reflection : DataArray
+        (time, y, x); pixels without a value are gray.
+    title : str
+        Name of the scene.
+    labels : tuple of str
+        Labels with units of inputs, emission and reflection.
+
+    Returns
+    -------
+    Figure
+        As many rows as there are times.
     """
     emission = laid_on(emission, inputs, "the emission", "the inputs")
     reflection = laid_on(reflection, inputs, "the reflection", "the inputs")
@@ -100,9 +123,24 @@ def separated_temperatures(
 ) -> Figure:
     """`separated_frames` of temperatures, in degrees Celsius.
 
-    Of the apparent temperature of the inputs (band, time, y, x) [K], the object temperature (time,
-    y, x) [K], and the background temperature less its mean over time, or
-    `separation.reflected_change` (time, y, x) [K], with a label for the latter.
+    Parameters
+    ----------
+    apparent : DataArray
+        Apparent temperature of the inputs (band, time, y, x) [K].
+    emission : DataArray
+        Object temperature (time, y, x) [K].
+    change : DataArray
+        Background temperature less its mean over time, or `separation.reflected_change`
+        (time, y, x) [K].
+    title : str
+        Name of the scene.
+    label : str
+        Label of the change, with its unit.
+
+    Returns
+    -------
+    Figure
+        As many rows as there are times.
 
     Examples
     --------
@@ -121,8 +159,16 @@ def separated_temperatures(
 def reflection_shift(field: xr.Dataset) -> Figure:
     """Shift of the reflections between two cameras: its components and their standard deviations.
 
-    Of a field (axis, y, x) [pixel] from `alignment.reflection_shift`: rows down above, columns to
-    the right below. Extrapolated pixels are hatched, such without a value gray.
+    Parameters
+    ----------
+    field : Dataset
+        From `alignment.reflection_shift`, (axis, y, x) [pixel].
+
+    Returns
+    -------
+    Figure
+        Rows down above, columns to the right below. Extrapolated pixels are hatched, such without
+        a value gray.
     """
     figure, axes = canvas(2, 2, (7.4, 5.6))
     extrapolated = field["shift"].isel(axis=0).notnull() & ~field["known"]
@@ -147,10 +193,21 @@ def separated_film(
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """Frames of a film: the inputs, the emission and the mean-subtracted reflection side by side.
 
-    Of the apparent temperature of the inputs (band, time, y, x) [K], the object temperature (time,
-    y, x) [K], and the change by the reflection, `separation.reflected_change` (time, y, x) [K];
-    pixels without a value are gray. Yields colours, uint8 (rows, columns, 3), both sizes even, as
-    video codecs want them.
+    Parameters
+    ----------
+    apparent : DataArray
+        Apparent temperature of the inputs (band, time, y, x) [K].
+    emission : DataArray
+        Object temperature (time, y, x) [K]; pixels without a value are gray.
+    change : DataArray
+        Change by the reflection, `separation.reflected_change` (time, y, x) [K].
+    title : str
+        Name of the scene.
+
+    Yields
+    ------
+    ndarray of uint8, shape (rows, columns, 3)
+        Colours; both sizes even, as video codecs want them.
     """
     emission = laid_on(emission, apparent, "the emission", "the inputs")
     change = laid_on(change, apparent, "the reflection", "the inputs")

@@ -47,9 +47,21 @@ _RIGHT: Final = "#a8d5b0"
 def status(result: xr.Dataset) -> Figure:
     """Map of the pixels without a flag, and of the most decisive flag of the others, in words.
 
-    Of a result of `separation.solve` or `complete` with `status` (y, x), bits of `schema.Status`
-    (ValueError for other bits): a map with a colour for each flag that is the first of a pixel's,
-    in the order of `REASONS`, and its share.
+    Parameters
+    ----------
+    result : Dataset
+        From `separation.solve` or `complete`: `status` (y, x), bits of `schema.Status`.
+
+    Returns
+    -------
+    Figure
+        A map with a colour for each flag that is the first of a pixel's, in the order of `REASONS`,
+        and its share.
+
+    Raises
+    ------
+    ValueError
+        If a bit is not one of `schema.Status`.
 
     Examples
     --------
@@ -88,7 +100,13 @@ def _patch(name: str, share: float) -> Patch:
 
 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
-    """Name of the most decisive flag of each pixel; empty without a flag."""
+    """Name of the most decisive flag of each pixel; empty without a flag.
+
+    Parameters
+    ----------
+    flags : DataArray
+        Status (y, x), see `schema.Status`.
+    """
     bits = flags.values.astype(np.uint32)  # of older results they are of 16 bit
     unknown = int(np.bitwise_or.reduce(bits, axis=None)) & ~sum(schema.Status)
     if unknown:

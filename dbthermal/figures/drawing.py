@@ -34,22 +34,50 @@ MARKERS: Final = "osD^vPX*"
 def canvas(
     rows: int, columns: int, size: tuple[float, float]
 ) -> tuple[Figure, npt.NDArray[np.object_]]:
-    """Figure and axes (rows, columns), which are not registered with pyplot."""
+    """Figure and axes (rows, columns), which are not registered with pyplot.
+
+    Parameters
+    ----------
+    rows, columns : int
+        Numbers of axes.
+    size : tuple of float
+        Width and height [inch].
+    """
     figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     plt.close(figure)
     return figure, axes
 
 
 def band_label(name: object) -> str:
-    """Label of a band by its name, with its unit: "9.5 um", with a micro sign."""
+    """Label of a band, with its unit.
+
+    Parameters
+    ----------
+    name : object
+        Name of the band.
+
+    Returns
+    -------
+    str
+        E.g. "9.5 um", with a micro sign.
+    """
     return f"{name} \N{MICRO SIGN}m"
 
 
 def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
-    """Origin of the data in brackets, for a title: " (simulated)", " (not radiometric)", or empty.
+    """Origin of the data in brackets, for a title.
 
-    By their attributes `origin` ("simulated", "measured", ...), `twin` (name of the scene that a
-    simulation is a twin of) and `radiometric` (0 if the values are a picture's and not counts).
+    Parameters
+    ----------
+    data : Dataset or DataArray
+        With the attributes `origin` ("simulated", "measured", ...), `twin` (name of the scene
+        that a simulation is a twin of) and `radiometric` (0 if the values are a picture's and
+        not counts).
+
+    Returns
+    -------
+    str
+        E.g. " (simulated)" or " (not radiometric)"; empty for measured radiometric data.
     """
     notes = []
     origin = str(data.attrs.get("origin", ""))
@@ -72,8 +100,18 @@ def draw_image(
 ) -> None:
     """Draw an image (y, x) with its colour bar; pixels without a value are gray.
 
-    The label is that of the colour bar, with its unit; `limits` are the values at the ends of the
-    colour map, the image's own if not given.
+    Parameters
+    ----------
+    figure, axis : Figure, Axes
+        Where to draw.
+    image : DataArray
+        (y, x).
+    title, label : str
+        Title, and label of the colour bar with its unit.
+    cmap : str
+        Colour map.
+    limits : tuple of float, optional
+        Values at the ends of the colour map; the image's own if not given.
     """
     lowest, highest = limits if limits is not None else (None, None)
     drawn = axis.imshow(image.values, cmap=cmap, vmin=lowest, vmax=highest, interpolation="nearest")
@@ -85,7 +123,15 @@ def draw_image(
 
 
 def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, float]:
-    """Range that holds all but one in a hundred of the values at either end."""
+    """Range that holds all but one in a hundred of the values at either end.
+
+    Parameters
+    ----------
+    image : DataArray
+        Values, of any shape and unit.
+    symmetric : bool
+        Make the range symmetric about zero.
+    """
     values = image.values[np.isfinite(image.values)]
     if values.size == 0:
         return 0.0, 1.0
@@ -97,19 +143,39 @@ def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, f
 
 
 def plain_ticks(axis: Axes, places: xr.DataArray) -> None:
-    """Ticks at some places of a logarithmic axis, as plain numbers, and a grid."""
+    """Ticks at some places of a logarithmic axis, as plain numbers, and a grid.
+
+    Parameters
+    ----------
+    axis : Axes
+        Axes whose horizontal axis is logarithmic.
+    places : DataArray
+        Places of the ticks, in the unit of the axis.
+    """
     axis.set_xticks(places.values, [f"{place:g}" for place in places.values], fontsize=8)
     axis.set_xticks([], minor=True)
     axis.grid(visible=True, which="major", color="0.9")
 
 
 def plain_decades(axis: Axes) -> None:
-    """Ticks at 1, 2 and 5 of each decade of a logarithmic vertical axis, as plain numbers."""
+    """Ticks at 1, 2 and 5 of each decade of a logarithmic vertical axis, as plain numbers.
+
+    Parameters
+    ----------
+    axis : Axes
+        Axes whose vertical axis is logarithmic.
+    """
     axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.yaxis.set_minor_locator(NullLocator())
 
 
 def percent(share: float) -> str:
-    """Share in percent as text; less than 0.1 % is not rounded to zero."""
+    """Share in percent as text; less than 0.1 % is not rounded to zero.
+
+    Parameters
+    ----------
+    share : float
+        Share [1], of one.
+    """
     return "< 0.1 %" if 0 < share < 0.0005 else f"{100 * share:.1f} %"

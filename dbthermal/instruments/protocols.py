@@ -33,11 +33,23 @@ STABILITY_PERIOD: Final = 1.0  # time from reading to reading while a temperatur
 
 @dataclass(frozen=True)
 class Step:
-    """One recording of a sweep, through the filter of `band` (None without a wheel)."""
+    """One recording of a sweep.
 
-    number: int  # of the temperature, from 0
-    temperature: float  # set point of the blackbody [K]
-    blackbody: float  # mean of its readings during the recording [K]
+    Attributes
+    ----------
+    number : int
+        Number of the temperature, from 0.
+    temperature, blackbody : float
+        Set point of the blackbody, and mean of its readings during the recording [K].
+    band : str or None
+        Band of the filter; None without a wheel.
+    summary : Summary
+        Result of the recording.
+    """
+
+    number: int
+    temperature: float
+    blackbody: float
     band: str | None
     summary: Summary
 
@@ -50,11 +62,28 @@ def wait_stable(
     clock: Callable[[], float] = system_time.monotonic,
     sleep: Callable[[float], None] = system_time.sleep,
 ) -> float:
-    """Wait until a temperature is stable near its set point [K], and return its mean [K].
+    """Wait until a temperature is stable near its set point, and return its mean [K].
 
     Within the session's `window` the readings must lie within its `stability` of one another, and
-    their mean within its `tolerance` of the set point. TimeoutError after its `timeout`, ValueError
-    if the session has no blackbody.
+    their mean within its `tolerance` of the set point.
+
+    Parameters
+    ----------
+    session : Session
+        Session with a blackbody.
+    temperature : float
+        Set point [K].
+    read : callable
+        Reads the temperature [K].
+    clock, sleep : callable
+        Time [s], and a pause of some time [s].
+
+    Raises
+    ------
+    TimeoutError
+        After the session's `timeout`.
+    ValueError
+        If the session has no blackbody.
     """
     if session.blackbody is None:
         raise ValueError(f"Invalid session '{session.name}'. Must have a blackbody.")
@@ -91,20 +120,34 @@ def record_sweep(
     and complete are kept, so that a sweep that was interrupted goes on where it was. If the folder
     is renamed or moved meanwhile the sweep goes on in it. Call `Devices.prepare` before.
 
-    Of the devices of a session with a blackbody, which the thermocouple of that name reads, and a
-    folder for the recordings ``<name>_<step>_<band>.zarr``; `set_temperature` sets the blackbody
-    [K], or asks the user to, and limits and preview are those of
-    `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of the filter
-    in the beam. The steps are in the order of the session, with those that were recorded before.
+    Parameters
+    ----------
+    devices : Devices
+        Of a session with a blackbody, which the thermocouple of that name reads.
+    folder : str or Path
+        Where the recordings go: ``<name>_<step>_<band>.zarr``.
+    set_temperature : callable
+        Sets the blackbody [K], or asks the user to set it.
+    limits, preview : optional
+        As for `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of
+        the filter in the beam.
+
+    Returns
+    -------
+    list of Step
+        In the order of the session, with those that were recorded before.
 
     Raises
     ------
     ValueError
         If the session has no blackbody, or no reading of it; or a recording exists that is
         incomplete, of another temperature, or during which the wheel turned.
-    TimeoutError, SourceLostError, FileNotFoundError
-        As `wait_stable`, where the recordings before are kept; if a camera is lost on the way; if
-        the folder was deleted meanwhile.
+    TimeoutError
+        As `wait_stable`; the recordings before are kept.
+    SourceLostError
+        If a camera is lost on the way.
+    FileNotFoundError
+        If the folder was deleted meanwhile.
     """
     session = devices.session
     readings = devices.readings()
@@ -139,9 +182,19 @@ def record_scene(
 ) -> Summary:
     """Record a scene with all devices; an emulated scene begins with the recording.
 
-    Of any session, after `Devices.prepare`, into a folder ``*.zarr`` to make; limits, preview, stop
-    and errors are those of `dbthermal.instruments.recording.record`. The summary says how it ended,
-    and the numbers of frames.
+    Parameters
+    ----------
+    devices : Devices
+        Of any session; call `Devices.prepare` before.
+    path : str or Path
+        Folder ``*.zarr`` to make.
+    limits, preview, stop : optional
+        As for `dbthermal.instruments.recording.record`, whose errors it raises.
+
+    Returns
+    -------
+    Summary
+        How it ended, and numbers of frames.
 
     Examples
     --------

@@ -103,7 +103,13 @@ DeviceName = Literal["filter_wheel", "thermocouples"]
 
 @dataclass(frozen=True, config=_CHECKED)
 class Device:
-    """Addresses of one device, such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``."""
+    """Addresses of one device.
+
+    Attributes
+    ----------
+    simulated, hardware : str
+        Such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``.
+    """
 
     simulated: Annotated[str, _by(partial(addresses.parse, schemes=("sim", "pty")))]
     hardware: Annotated[str, _by(partial(addresses.parse, schemes=("v4l2", "serial", "tc08")))]
@@ -122,11 +128,21 @@ def _check_schemes(name: str, device: Device) -> None:
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
-    """One camera: addresses of its frames and of its command port, if any, and its kind."""
+    """One camera: addresses of its frames and of its command port, if any, and its kind.
+
+    Attributes
+    ----------
+    video : Device
+        Addresses of its frames.
+    control : Device or None
+        Addresses of its command port.
+    kind : str
+        One of `dbthermal.instruments.camera.KINDS`, that of its simulated address.
+    """
 
     video: Annotated[Device, _by(partial(_check_schemes, "video"))]
     control: Annotated[Device, _by(partial(_check_schemes, "control"))] | None = None
-    kind: str = "boson"  # of `dbthermal.instruments.camera.KINDS`, that of its simulated address
+    kind: str = "boson"
 
     def __post_init__(self) -> None:
         kind, simulated = camera_kind(self.kind), self.video.simulated
@@ -146,16 +162,26 @@ class Camera:
 
 @dataclass(frozen=True, config=_CHECKED)
 class Blackbody:
-    """Temperatures of a calibration, and the rule by which each counts as reached."""
+    """Temperatures of a calibration, and the rule by which each counts as reached.
 
-    temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]  # [K]
-    # Largest range of the readings in the window [K], and how long they must stay within it [s].
+    Attributes
+    ----------
+    temperatures : tuple of float
+        Set points [K].
+    stability, window : float
+        Largest range of the readings [K] in a window, and how long it is [s].
+    tolerance : float
+        Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
+        by half a kelvin or so each, and the recordings keep the reading.
+    timeout : float
+        Longest wait for it [s].
+    """
+
+    temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
     stability: Annotated[Positive, Field(le=10.0)] = 0.05
     window: Annotated[Positive, Field(le=3600.0)] = 30.0
-    # Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
-    # by half a kelvin or so each, and the recordings keep the reading.
     tolerance: Annotated[Positive, Field(le=50.0)] = 1.5
-    timeout: Annotated[Positive, Field(le=1e5)] = 1800.0  # longest wait for it [s]
+    timeout: Annotated[Positive, Field(le=1e5)] = 1800.0
 
     def __post_init__(self) -> None:
         if self.window >= self.timeout:
@@ -164,7 +190,15 @@ class Blackbody:
 
 @dataclass(frozen=True, config=_CHECKED)
 class Wheel(filterwheel.Settings):
-    """Settings of the wheel but its filters, see `dbthermal.instruments.filterwheel.Settings`."""
+    """Settings of the wheel but its filters, see `dbthermal.instruments.filterwheel.Settings`.
+
+    Attributes
+    ----------
+    filters : mapping
+        Empty: those of the session are taken.
+    addresses : tuple of tuple of int
+        As in `Settings`.
+    """
 
     filters: Mapping[int, str] = field(default_factory=dict, init=False)
     addresses: tuple[tuple[Byte, Byte], ...] = filterwheel.Settings.addresses
@@ -184,6 +218,37 @@ class Session:
     All protocols but ``scene`` go through the blackbody's temperatures. Invalid values raise
     pydantic's ValidationError, a ValueError.
 
+    Attributes
+    ----------
+    name : str
+        Name, of the recordings too.
+    simulated : bool
+        One switch for all devices.
+    protocol : str
+        ``"gain_offset"``, ``"response"``, ``"emissivity_bench"`` or ``"scene"``.
+    duration : float
+        Duration of the recording, or of each of its steps [s].
+    cameras : dict of str to Camera
+        Cameras by band, in the order of the recording.
+    frame_rate : float
+        Frame rate [Hz].
+    shape : tuple of int
+        Rows and columns.
+    telemetry_rows : int
+        Rows of telemetry in a frame, 0 or 2.
+    devices : dict of str to Device
+        Other devices by name.
+    filters : dict of int to str
+        Slot of the wheel to band.
+    wheel : Wheel
+        Settings of the wheel.
+    sweep : tuple of str
+        Filters at each temperature; see `swept`.
+    thermocouples : dict of int to str
+        Channel to measured object.
+    blackbody : Blackbody or None
+        Temperatures; None for ``"scene"`` alone.
+
     Examples
     --------
     >>> video = Device("sim://boson/wide", "v4l2:///dev/video0")
@@ -191,19 +256,19 @@ class Session:
     ('8-14',)
     """
 
-    name: Name  # of the recordings, too
-    simulated: StrictBool  # one switch for all devices
+    name: Name
+    simulated: StrictBool
     protocol: Literal["gain_offset", "response", "emissivity_bench", "scene"]
-    duration: Annotated[Positive, Field(le=1e6)]  # of the recording, or of each of its steps [s]
-    cameras: Annotated[dict[Name, Camera], Field(min_length=1)]  # by band, in recording order
-    frame_rate: Annotated[Positive, Field(le=1e4)] = 60.0  # [Hz]
-    shape: tuple[Pixels, Pixels] = (512, 640)  # rows, columns
+    duration: Annotated[Positive, Field(le=1e6)]
+    cameras: Annotated[dict[Name, Camera], Field(min_length=1)]
+    frame_rate: Annotated[Positive, Field(le=1e4)] = 60.0
+    shape: tuple[Pixels, Pixels] = (512, 640)
     telemetry_rows: Literal[0, 2] = 0
     devices: dict[DeviceName, Device] = field(default_factory=dict)
-    filters: dict[Slot, Name] = field(default_factory=dict)  # slot of the wheel to band
+    filters: dict[Slot, Name] = field(default_factory=dict)
     wheel: Wheel = field(default_factory=Wheel)
-    sweep: tuple[Name, ...] = ()  # filters at each temperature; see `swept`
-    thermocouples: dict[Channel, Label] = field(default_factory=dict)  # channel to measured object
+    sweep: tuple[Name, ...] = ()
+    thermocouples: dict[Channel, Label] = field(default_factory=dict)
     blackbody: Blackbody | None = None
 
     def __post_init__(self) -> None:
@@ -288,13 +353,23 @@ class Session:
 
     @classmethod
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:
-        """Read a session from YAML, see the module, and from the file that it names as its ``rig``.
+        """Read a session from a file, and from the file that it names as its ``rig``.
 
-        Keys that several sessions share, such as the addresses, may stand in another file, whose
-        name relative to this one is the key ``rig``. `changes` are values in place of those in the
-        files, by key; of ``blackbody``, key by key. FileNotFoundError if a file does not exist;
-        ValueError if it is not YAML, or a key is missing, unknown, repeated or in both files, or a
-        value is invalid: one line for each error, with file, place in it, value and rule.
+        Parameters
+        ----------
+        path : str or Path
+            YAML; see the module. Keys that several sessions share, such as the addresses, may stand
+            in another file, whose name relative to this one is the key ``rig``.
+        changes : mapping, optional
+            Values in place of those in the files, by key; of ``blackbody``, key by key.
+
+        Raises
+        ------
+        FileNotFoundError
+            If a file does not exist.
+        ValueError
+            If it is not YAML, or a key is missing, unknown, repeated or in both files, or a value
+            is invalid: one line for each error, with file, place in it, value and rule.
         """
         content = texts.read_yaml(path)
         files = {}

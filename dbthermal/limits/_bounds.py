@@ -22,7 +22,15 @@ _UNIFORM: Final = 1.0 / np.sqrt(12.0)
 def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
     r"""Ratio :math:`k_2 = (1 - e_2) / (1 - e_1)` [1] of the reflections in two bands.
 
-    Of emissivities (2, ...) [1].
+    Parameters
+    ----------
+    emissivity : array_like, shape (2, ...)
+        Emissivities [1].
+
+    Returns
+    -------
+    ndarray
+        Ratio [1].
 
     Examples
     --------
@@ -41,10 +49,23 @@ def ratio_variance_bound(
     .. math:: \mathrm{var}(k_2) \ge \frac{s_2^2 + k_2^2 s_1^2}
               {\sum_t [(1 - e_1) P y(t)]^2}
 
-    with P the projection orthogonal to the smooth subspace, in which the object may do anything:
-    that of the orthonormal functions (time, order). Of the emissivities [1] and the noise [K] of
-    the two bands, and the background temperature (time, ...) [K], the smallest variance [1] of an
-    unbiased estimate.
+    with P the projection orthogonal to the smooth subspace, in which the object may do anything.
+
+    Parameters
+    ----------
+    emissivity : tuple of float
+        Emissivities of the two bands [1].
+    noise : tuple of float
+        Standard deviations of the noise [K].
+    background : ndarray, shape (time, ...)
+        Background temperature [K].
+    functions : ndarray, shape (time, order)
+        Orthonormal functions that span the smooth subspace.
+
+    Returns
+    -------
+    ndarray
+        Smallest variance [1] of an unbiased estimate.
 
     Examples
     --------

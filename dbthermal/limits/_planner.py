@@ -26,11 +26,26 @@ class CaptureDesign:
     The object's time constant is a third of the capture. The background is warmer for the end of
     each period, as if someone stood there, and rests before.
 
-    `seconds` is the length [s], `rate` that of the frames [1/s]; `start` and `span` are the first
-    temperature of the object and its rise until the last frame [K]; `level` is the temperature of
-    the background at rest and `amplitude` the height of a pulse [K], which lasts for its `duration`
-    of a `period` [s]. ValueError if a number is not finite, or not positive (all but `span` and
-    `amplitude`), a pulse is longer than the period, or there are fewer than two frames.
+    Attributes
+    ----------
+    seconds : float
+        Length [s].
+    rate : float
+        Frame rate [1/s].
+    start, span : float
+        First temperature of the object, and its rise until the last frame [K].
+    level : float
+        Temperature of the background at rest [K].
+    amplitude : float
+        Height of a pulse [K].
+    period, duration : float
+        From pulse to pulse, and of one pulse [s].
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, or not positive (all but `span` and `amplitude`), a pulse is
+        longer than the period, or there are fewer than two frames.
     """
 
     seconds: float = 35.0
@@ -157,10 +172,24 @@ def plan_durations(
 ) -> xr.Dataset:
     """Expected accuracy of captures of several lengths, of one filter at a time.
 
-    Of a table and noise as in `plan`, lengths [s], strictly increasing, and a design of all
-    conditions but the length: the object's rise and the pulses are the same in all. The result is
-    that of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all. ValueError
-    as `plan`, or if the lengths do not increase.
+    Parameters
+    ----------
+    table, noise
+        See `plan`.
+    seconds : sequence of float
+        Lengths [s], strictly increasing. The object's rise and the pulses are the same in all.
+    design : CaptureDesign, optional
+        All conditions but the length.
+
+    Returns
+    -------
+    Dataset
+        That of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all.
+
+    Raises
+    ------
+    ValueError
+        As `plan`, or if the lengths do not increase.
 
     Examples
     --------

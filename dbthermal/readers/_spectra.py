@@ -48,16 +48,29 @@ _HEADER_RULES: Final = {
 def ecostress(path: str | Path) -> xr.Dataset:
     r"""Spectrum of an ECOSTRESS (or ASTER) library file, ``*.spectrum.txt``.
 
-    The file, in Latin-1, with either line end and either order of wavelengths, gives the
-    hemispherical reflectance R [%] of an opaque sample, so that by Kirchhoff's law its emissivity
-    is 1 - R / 100. Header and values are compared: units, kind of measurement, number of values,
-    first and last wavelength. The result is `emissivity` (wavelength) [1] over wavelength [m];
-    attributes: what the library says of the sample (``name``, ``class``, ...), ``source`` and
-    ``unphysical_values``.
+    The file gives the hemispherical reflectance R [%] of an opaque sample, so that by Kirchhoff's
+    law its emissivity is 1 - R / 100. Header and values are compared: units, kind of measurement,
+    number of values, first and last wavelength.
 
-    FileNotFoundError if the file does not exist; ValueError if it is truncated or longer than
-    declared, is no hemispherical reflectance in percent over micrometres, an emissivity is outside
-    `schema.EMISSIVITY_LIMITS`, or a wavelength is outside 0.001 to 1000 um or out of order.
+    Parameters
+    ----------
+    path : str or Path
+        File in Latin-1, with either line end and either order of wavelengths.
+
+    Returns
+    -------
+    Dataset
+        `emissivity` (wavelength) [1] over wavelength [m]; attributes: what the library says of the
+        sample (``name``, ``class``, ...), ``source`` and ``unphysical_values``.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    ValueError
+        If it is truncated or longer than declared, is no hemispherical reflectance in percent over
+        micrometres, an emissivity is outside `schema.EMISSIVITY_LIMITS`, or a wavelength is outside
+        0.001 to 1000 um or out of order.
 
     References
     ----------
@@ -92,12 +105,27 @@ def ecostress(path: str | Path) -> xr.Dataset:
 def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> dict[str, xr.Dataset]:
     r"""Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
 
-    Its columns are ``wavelength`` [micrometre], in steps that change little from one to the next,
-    and one of emissivity [1] per sample: sample code, such as ``"A001"``, to a spectrum as from
-    `ecostress`. The table must `reach` some wavelengths [micrometre], by default those of the
-    library, so that a file that was cut is refused. FileNotFoundError if the file does not exist;
-    ValueError if the columns are not these, a row is short, missing or added, the last line has no
-    end, the table does not reach so far, or a value is refused as by `ecostress`.
+    Parameters
+    ----------
+    path : str or Path
+        File with a column ``wavelength`` [micrometre], in steps that change little from one to the
+        next, and one of emissivity [1] per sample.
+    reach : tuple of float
+        Wavelengths that the table must reach [micrometre], so that a file that was cut is refused;
+        by default those of the library.
+
+    Returns
+    -------
+    dict of str to Dataset
+        Sample code, such as ``"A001"``, to a spectrum as `ecostress`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    ValueError
+        If the columns are not these, a row is short, missing or added, the last line has no end,
+        the table does not reach so far, or a value is refused as by `ecostress`.
 
     References
     ----------
@@ -133,11 +161,26 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
 def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
     r"""Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
 
-    They are ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>`` emissivity
-    [1], in steps and as far as `reach` [micrometre] as for `slum`; the result is as from
-    `ecostress`. FileNotFoundError if the file does not exist; ValueError if the columns are not
-    these, wavelength and wavenumber disagree by more than 0.1 %, or the table or a value is refused
-    as by `slum`.
+    Parameters
+    ----------
+    path : str or Path
+        File with columns ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>``
+        emissivity [1], in steps as for `slum`.
+    reach : tuple of float
+        Wavelengths that the table must reach [micrometre], as for `slum`.
+
+    Returns
+    -------
+    Dataset
+        A spectrum as `ecostress`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    ValueError
+        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or the
+        table or a value is refused as by `slum`.
 
     Examples
     --------

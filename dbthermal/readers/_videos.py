@@ -124,12 +124,28 @@ def masked_palette_video(
     `palette_video`. Compression pulls single pixels between strong colours over that line, so the
     object's outline is best taken from the share of frames in which a pixel is valid.
 
-    Of a file, a palette, memory and checksum as for `palette_video`, and a number of columns to
-    keep [pixel], left of a printed colour bar: `value` (time, y, x), float32 in [0, 1], a position
-    also where it is not valid, and `valid` (time, y, x), bool. Attributes of `value` as in
-    `palette_video`, but ``palette_residual`` is the median over the coloured pixels.
-    FileNotFoundError or ValueError as `palette_video`; also if the video is narrower, or has no
-    coloured pixel.
+    Parameters
+    ----------
+    path : str or Path
+        File as for `palette_video`.
+    palette : str
+        Name of a continuous colour map of matplotlib.
+    width : int, optional
+        Columns to keep [pixel], left of a printed colour bar.
+    memory, sha256 : optional
+        As for `palette_video`.
+
+    Returns
+    -------
+    Dataset
+        `value` (time, y, x), float32 in [0, 1], a position also where it is not valid; `valid`
+        (time, y, x), bool. Attributes of `value` as in `palette_video`, but ``palette_residual`` is
+        the median over the coloured pixels.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        As `palette_video`; also if the video is narrower than `width`, or has no coloured pixel.
 
     Examples
     --------

@@ -28,10 +28,23 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     its emissivity is undefined, but all that changes is reflected: the apparent temperature less
     its mean.
 
-    Of the apparent temperature of the inputs (band, time, y, x) [K], from
-    `response.apparent_temperature`, and a result of `solve` of the same capture: (time, y, x) [K],
-    float32; NaN where the reflection is unknown. ValueError if the first bands, sizes or
-    coordinates differ.
+    Parameters
+    ----------
+    apparent : DataArray
+        Apparent temperature of the inputs (band, time, y, x) [K], from
+        `response.apparent_temperature`.
+    result : Dataset
+        From `solve`, of the same capture.
+
+    Returns
+    -------
+    DataArray
+        (time, y, x) [K], float32; NaN where the reflection is unknown.
+
+    Raises
+    ------
+    ValueError
+        If the first bands, sizes or coordinates differ.
 
     Examples
     --------
@@ -186,12 +199,24 @@ def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     of the weighted variance over time; else its scale is nearly constant, or the surroundings
     change themselves, and it stays as it is.
 
-    Of a signal (band, time, y, x), two bands in units of their own, and the pixels (y, x), bool,
-    off the object, of which a third may change after all: the signal, in units of its mean over
-    time; the coordinate `gain` (band, time) [1], by which the noise was divided, 1 in a band that
-    is not undone. Attributes `scale_undone`, the bands that are, and `scale_explained`, each band's
-    explained share. ValueError if dims or bands are wrong, a value is not finite, or fewer than 200
-    pixels are still.
+    Parameters
+    ----------
+    signal : DataArray
+        (band, time, y, x), two bands in units of their own.
+    still : DataArray of bool
+        Pixels (y, x) off the object; a third of them may change after all.
+
+    Returns
+    -------
+    DataArray
+        The signal, in units of its mean over time; the coordinate `gain` (band, time) [1], by which
+        the noise was divided, 1 in a band that is not undone. Attributes `scale_undone`, the bands
+        that are, and `scale_explained`, each band's explained share.
+
+    Raises
+    ------
+    ValueError
+        If dims or bands are wrong, a value is not finite, or fewer than 200 pixels are still.
 
     References
     ----------

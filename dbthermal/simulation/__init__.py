@@ -2,8 +2,8 @@
 
 Begin with `walkers` and `observe`: a scene, and the counts that a `Rig` records of it. Nuisances
 of real cameras are added one by one (`fire_shutter`, `spoil_pixels`, `lag`, ...). For a scene of
-one's own there are transient temperatures (`heat`), and reflections of moving bodies (`rays`,
-`surroundings`). Everything made here carries `origin = "simulated"`.
+one's own there are transient temperatures (`heat`). Everything made here carries
+`origin = "simulated"`.
 """
 
 import importlib
@@ -53,19 +53,17 @@ __all__ = [
     "lose_frames",
     "observe",
     "pattern",
-    "rays",
     "repeat_frames",
     "scene",
     "side_by_side",
     "spoil_pixels",
-    "surroundings",
     "walkers",
 ]
 __dir__ = __all__.copy
 
 
 def __getattr__(name: str) -> ModuleType:
-    """Import `heat`, `rays` or `surroundings`, which need optional packages, on first use."""
-    if name in {"heat", "rays", "surroundings"}:
+    """Import `heat`, which needs an optional package, on first use."""
+    if name == "heat":
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")

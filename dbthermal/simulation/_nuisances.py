@@ -29,16 +29,36 @@ def expose(
 ) -> xr.Dataset:
     r"""Capture of bands that expose at times of their own: the stage `corrected`, with time stamps.
 
-    The scene is on a fine clock, whose times are finer than the frames'. Frame n of band m is
-    exposed at its step
+    The scene is on a fine clock. Frame n of band m is exposed at its step
 
     .. math:: o_m + n \, q_m
 
-    with q, `every`, of each band, or of all, and o, the `offsets`, steps of each band's first
-    frame. Of a scene and a response as in `observe`: `counts` (band, time, y, x) [count], and
-    `exposure_time` (band, time) [s], the true times on the scene's clock: drop the variable for
-    cameras without stamps. `time` is that of the first band. ValueError if there are not as many
-    offsets and rates as bands, or a frame lies outside the scene.
+    Parameters
+    ----------
+    scene : Dataset
+        See `observe`; its times are finer than the frames'.
+    response : Dataset
+        With `noise`, e.g. from `Rig.response`.
+    rng : Generator
+        Source of the noise.
+    every : int or sequence of int
+        q, steps of the fine clock from frame to frame; of each band, or of all.
+    offsets : sequence of int
+        o, step of each band's first frame.
+    frames : int
+        Number of frames.
+
+    Returns
+    -------
+    Dataset
+        `counts` (band, time, y, x) [count], and `exposure_time` (band, time) [s], the true times
+        on the scene's clock: drop the variable for cameras without stamps. `time` is that of the
+        first band.
+
+    Raises
+    ------
+    ValueError
+        If there are not as many offsets and rates as bands, or a frame lies outside the scene.
     """
     bands, last = response.sizes["band"], scene.sizes["time"] - 1
     rates = [every] * bands if isinstance(every, int) else list(every)
@@ -68,8 +88,17 @@ def expose(
 def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
     """Replace lost frames by copies of the frame before, as a driver does that stamps none.
 
-    `lost` is a mask (band, time); ValueError if a band's first frame is lost. The result has no
-    `exposure_time`.
+    Parameters
+    ----------
+    corrected : Dataset
+        Capture of stage `corrected`; the result has no `exposure_time`.
+    lost : Mask
+        Lost frames (band, time).
+
+    Raises
+    ------
+    ValueError
+        If a band's first frame is lost.
     """
     _check_lost(corrected, lost)
     if lost[:, 0].any():
@@ -83,9 +112,21 @@ def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
-    """Lose a share of the frames, in [0, 1), at random in each band, as `repeat_frames` does.
+    """Lose frames at random in each band: each is replaced by the one before (`repeat_frames`).
 
-    Of a capture of stage `corrected`; the result has `repeated` (band, time), bool, beside it.
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`.
+    share : float
+        Share of frames that are lost, in [0, 1).
+    rng : Generator
+        Source of the losses.
+
+    Returns
+    -------
+    Dataset
+        The capture with frames repeated, and `repeated` (band, time), bool.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not 0 <= share < 1:
@@ -107,11 +148,26 @@ def fire_shutter(
 ) -> xr.Dataset:
     """Shutter events: a frozen image while it is closed, new offsets of the pixels afterwards.
 
-    Of a capture of stage `corrected`, times (event,) at which the shutter closes [s], where the
-    last frame taken by then is repeated, the duration for which it stays closed [s], the standard
-    deviation of a pixel's step [count], and the bands whose cameras close; by default all.
-    TypeError or ValueError if the capture is not as `schema` has it, a time does not lie in it, the
-    duration is not positive, or a band is missing.
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`.
+    times : array_like, shape (event,)
+        Times at which the shutter closes [s]; the last frame taken by then is repeated.
+    rng : Generator
+        Source of the offsets.
+    duration : float
+        Time for which it stays closed [s].
+    offset_std : float
+        Standard deviation of a pixel's step [count].
+    bands : tuple of str, optional
+        Bands whose cameras close; by default all.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the capture is not as `schema` has it, a time does not lie in it, the duration is not
+        positive, or a band is missing.
 
     Examples
     --------
@@ -154,10 +210,25 @@ def spoil_pixels(
 ) -> xr.Dataset:
     """Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
 
-    Of a capture of stage `corrected`, a share of the pixels in each band, in [0, 1), a third of
-    each kind on average. A noisy pixel has a noise [count] added; a blinking one steps by an
-    amplitude [count], at a mean dwell [s], at least once. The result has `spoiled` (band, y, x),
-    int8, beside it: position in `SPOILED`.
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`.
+    share : float
+        Share of pixels that are bad in a band, a third of each kind on average, in [0, 1).
+    rng : Generator
+        Source of the pixels and of their signals.
+    noise_std : float
+        Noise added to a noisy pixel [count].
+    amplitude : float
+        Step of a blinking pixel [count].
+    dwell : float
+        Mean time between its steps [s]; there is at least one step.
+
+    Returns
+    -------
+    Dataset
+        The capture with bad pixels, and `spoiled` (band, y, x), int8: position in `SPOILED`.
     """
     counts = _floating(corrected).copy(deep=True)
     if not 0 <= share < 1:
@@ -187,9 +258,15 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
     .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
 
     the exact solution of :math:`\tau \dot I = z - I` for a signal z held from each frame to the
-    next, at rest before the first; `correction.undo_lag` is the inverse. Of a capture of stage
-    `corrected` without noise, for that of the read-out does not pass through the pixel, and a time
-    constant [s] of all bands or (band), by name.
+    next, at rest before the first; `correction.undo_lag` is the inverse.
+
+    Parameters
+    ----------
+    corrected : Dataset
+        Stage `corrected` of `schema`, without noise: that of the read-out does not pass through
+        the pixel.
+    time_constant : float or DataArray
+        Time constant [s], of all bands or (band), by name.
 
     Examples
     --------

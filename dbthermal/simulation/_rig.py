@@ -23,11 +23,22 @@ class Rig:
     about 115 counts/K near 300 K and NETD 20-40 mK without a filter; behind a filter the counts
     shrink with the band's share of dB/dT while the noise in counts stays.
 
-    Bands are names in `bands.FILTERS`, each with a noise, as NETD near 25 degrees Celsius [K].
-    `counts_per_kelvin` is the slope of the 8-14 um band at 300 K [count/K], `offset` the counts of
-    a body at 0 K, and `lowest` to `highest` the range of the simulated response [K]. The fixed
-    pattern from pixel to pixel has a relative `gain_std` [1], an `offset_std` [count], and a
-    `bad_fraction` of dead pixels [1].
+    Attributes
+    ----------
+    bands : tuple of str
+        Names in `bands.FILTERS`.
+    noise : tuple of float
+        Noise of each band, as NETD near 25 degrees Celsius [K].
+    counts_per_kelvin : float
+        Slope of the 8-14 um band at 300 K [count/K].
+    offset : float
+        Counts of a body at 0 K [count].
+    lowest, highest : float
+        Range of the simulated response [K].
+    gain_std, offset_std : float
+        Fixed pattern from pixel to pixel: relative gain [1] and offset [count].
+    bad_fraction : float
+        Fraction of dead pixels [1].
 
     Examples
     --------
@@ -102,12 +113,28 @@ def observe(
 
     .. math:: I_m = e_m U_m(x) + (1 - e_m) U_m(y) + \mathrm{noise}
 
-    Of a scene, as from `scene`: object and background temperature (time, y, x) [K], emissivity
-    (band, y, x) [1], where the background may be one for each band, (band, time, y, x), as two
-    cameras see it that stand side by side; and of a response with `noise`, e.g. from
-    `Rig.response`: `counts` (band, time, y, x) [count] of a floating dtype, `origin = "simulated"`,
-    and of a twin its `twin`. ValueError if a temperature lies outside the response, or a band is
-    missing.
+    Parameters
+    ----------
+    scene : Dataset
+        As from `scene`: object and background temperature (time, y, x) [K], emissivity
+        (band, y, x) [1]. The background may be one for each band, (band, time, y, x), as two
+        cameras see it that stand side by side.
+    response : Dataset
+        With `noise`, e.g. from `Rig.response`.
+    rng : Generator
+        Source of the noise.
+    dtype : str
+        Floating dtype of the counts.
+
+    Returns
+    -------
+    Dataset
+        `counts` (band, time, y, x) [count], `origin = "simulated"`, and of a twin its `twin`.
+
+    Raises
+    ------
+    ValueError
+        If a temperature lies outside the response, or a band is missing.
 
     Examples
     --------
@@ -141,10 +168,23 @@ def observe(
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
-    """Random fixed pattern of the rig's detectors, of a shape (rows, columns).
+    """Random fixed pattern of a rig's detectors.
 
-    `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies, relative to
-    the mean of the live pixels, a smooth vignette (narcissus) included; `dead` (band, y, x).
+    Parameters
+    ----------
+    rig : Rig
+        Its bands and deviations.
+    shape : tuple of int
+        Rows and columns.
+    rng : Generator
+        Source of all randomness.
+
+    Returns
+    -------
+    Dataset
+        `gain` (band, y, x) [1] and `offset` (band, y, x) [count] that the detector applies,
+        relative to the mean of the live pixels, a smooth vignette (narcissus) included; `dead`
+        (band, y, x).
     """
     size = (len(rig.bands), *shape)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
@@ -170,9 +210,22 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
 def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     """Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
 
-    Of counts from `observe` and a detector from `pattern`, with the same bands and shape: the stage
-    `capture`, `counts` uint16 (band, time, y, x) [count]. ValueError if the detector lacks a band,
-    or a count does not fit into 16 bits (no silent saturation).
+    Parameters
+    ----------
+    corrected : Dataset
+        From `observe`.
+    detector : Dataset
+        From `pattern`, with the same bands and shape.
+
+    Returns
+    -------
+    Dataset
+        Stage `capture`: `counts` uint16 (band, time, y, x).
+
+    Raises
+    ------
+    ValueError
+        If the detector lacks a band, or a count does not fit into 16 bits (no silent saturation).
 
     Examples
     --------
@@ -197,8 +250,23 @@ def blackbody_movies(
 ) -> xr.Dataset:
     """Raw movies of a blackbody that fills the view, at several temperatures.
 
-    Of a rig, blackbody temperatures [K], increasing, within the rig's range, a number of frames at
-    each, and a detector from `pattern`: `counts` uint16 (band, temperature, frame, y, x) [count].
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+    temperatures : ndarray
+        Blackbody temperatures [K], increasing, within the rig's range.
+    frames : int
+        Frames at each.
+    detector : Dataset
+        From `pattern`.
+    rng : Generator
+        Source of the noise.
+
+    Returns
+    -------
+    Dataset
+        `counts` uint16 (band, temperature, frame, y, x) [count].
 
     Examples
     --------
@@ -239,11 +307,29 @@ def contact_measurements(
 ) -> xr.Dataset:
     """Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
 
-    Of a response with `noise`, a true emissivity (band) [1], the true temperatures (measurement)
-    [K] of object and background, and the standard deviations [K] of a reading of thermocouple and
-    blackbody: `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
-    (measurement) [K], as read. ValueError if a temperature lies outside the response, or the
-    emissivity lacks a band.
+    Parameters
+    ----------
+    response : Dataset
+        With `noise`.
+    emissivity : DataArray
+        True emissivity (band) [1].
+    object_temperature, background_temperature : ndarray, shape (measurement,)
+        True temperatures [K].
+    stds : tuple of float
+        Standard deviation of a reading of thermocouple and blackbody [K].
+    rng : Generator
+        Source of the errors.
+
+    Returns
+    -------
+    Dataset
+        `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
+        (measurement) [K], as read.
+
+    Raises
+    ------
+    ValueError
+        If a temperature lies outside the response, or the emissivity lacks a band.
     """
     names = [str(name) for name in response["band"].values]
     places = schema.band_positions(emissivity, names, "the emissivity")
@@ -268,8 +354,17 @@ def contact_measurements(
 def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
     """Raw counts of one band, uint16 (..., y, x): fixed pattern, rounding, dead pixels at 0.
 
-    Takes corrected counts (..., y, x) [count] and the `pattern` (y, x) of this band. Raises a
-    ValueError if a count does not fit into 16 bits.
+    Parameters
+    ----------
+    counts : array
+        Corrected counts (..., y, x) [count].
+    detector : Dataset
+        The `pattern` (y, x) of this band.
+
+    Raises
+    ------
+    ValueError
+        If a count does not fit into 16 bits.
     """
     raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
     if not (raw.min() >= 0 and raw.max() <= correction.DETECTOR_MAXIMUM):  # a NaN fails it, too

@@ -18,12 +18,23 @@ _BACKGROUNDS: Final = ("pulses", "random walk", "still")
 class Background:
     """Temporal variation of the background.
 
-    Its kind is "pulses", people who walk by now and then; "random walk", a background that never
-    rests (a first-order autoregressive process); or "still". `level` is the resting temperature
-    [K], and `drift` its change over the capture, linear in time [K]; `amplitude` the height of a
-    pulse, or the standard deviation of the walk [K]; `count` the fewest and most pulses in the
-    capture, `duration` the shortest and longest one [s], and `correlation_time` that of the walk
-    [s].
+    Attributes
+    ----------
+    kind : {"pulses", "random walk", "still"}
+        People who walk by now and then; a background that never rests (a first-order
+        autoregressive process); or a constant one.
+    level : float
+        Resting temperature [K].
+    amplitude : float
+        Height of a pulse, or standard deviation of the walk [K].
+    count : tuple of int
+        Fewest and most pulses in the capture.
+    duration : tuple of float
+        Shortest and longest pulse [s].
+    correlation_time : float
+        Correlation time of the walk [s].
+    drift : float
+        Change of the resting temperature over the capture, linear in time [K].
     """
 
     kind: str = "pulses"
@@ -85,8 +96,21 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     .. math:: T(t) = T_0 + (T_1 - T_0) \frac{1 - e^{-t / \tau}}{1 - e^{-t_1 / \tau}}
 
     the solution of Newton's law of heating, the object prior of the paper
-    (doi:10.48550/arXiv.2509.11334). Of times (time,) [s], two or more, increasing, the first and
-    the last temperature [K], and positive time constants (...) [s]: temperatures (time, ...) [K].
+    (doi:10.48550/arXiv.2509.11334).
+
+    Parameters
+    ----------
+    time : ndarray, shape (time,)
+        Times [s], two or more, increasing.
+    start, stop : float
+        First and last temperature [K].
+    time_constant : array_like, shape (...)
+        Time constants, positive [s].
+
+    Returns
+    -------
+    ndarray, shape (time, ...)
+        Temperature [K].
 
     Examples
     --------
@@ -103,10 +127,26 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
 def scene(
     time: Array, object_temperature: Array, background_temperature: Array, emissivity: xr.DataArray
 ) -> xr.Dataset:
-    """Scene of given temperatures (time, y, x) [K] and emissivity (band) or (band, y, x) [1].
+    """Scene of given temperatures: the truth of a simulated capture.
 
-    The truth of a simulated capture: names, dims and units of the stage `separated` without its
-    deviations. Raises a ValueError unless the times (time,) [s] are two or more and increase.
+    Parameters
+    ----------
+    time : Array
+        Times (time,) [s].
+    object_temperature, background_temperature : Array
+        Temperatures (time, y, x) [K].
+    emissivity : DataArray
+        Emissivity (band) or (band, y, x) [1].
+
+    Returns
+    -------
+    Dataset
+        Names, dims and units of the stage `separated` without its deviations.
+
+    Raises
+    ------
+    ValueError
+        Unless the times are two or more and increase.
     """
     increasing(time, "a scene")
     stage = schema.STAGES["separated"]
@@ -130,9 +170,14 @@ def scene(
 
 
 def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArray:
-    """Emissivity (band, y, x) [1] of panels of equal width, one a material, from (material, band).
+    """Emissivity (band, y, x) [1] of panels of equal width, one a material.
 
-    The shape is that of the image: rows and columns.
+    Parameters
+    ----------
+    emissivity : DataArray
+        Emissivity (material, band) [1].
+    shape : tuple of int
+        Rows and columns of the image.
     """
     panel = np.arange(shape[1]) * emissivity.sizes["material"] // shape[1]
     columns = emissivity.values[panel].T[:, np.newaxis, :]
@@ -157,8 +202,27 @@ def independent_pixels(
 ) -> xr.Dataset:
     """Scene of many pixels of one material, each with its own heating curve and background.
 
-    At times (time,) [s], of an emissivity (band) [1], warming from `start` to `stop` [K] with a
-    time constant within a range [s]: a scene one row high, see `scene`.
+    Parameters
+    ----------
+    time : ndarray, shape (time,)
+        Times [s].
+    emissivity : DataArray
+        (band) [1].
+    background : Background
+        Variation of the background.
+    pixels : int
+        Number of pixels.
+    rng : Generator
+        Source of randomness.
+    start, stop : float
+        First and last object temperature [K].
+    time_constant : tuple of float
+        Range of the heating's time constant [s].
+
+    Returns
+    -------
+    Dataset
+        A scene one row high, see `scene`.
     """
     constants = rng.uniform(*time_constant, pixels)
     warm = heating(time, start, stop, constants)
@@ -178,12 +242,30 @@ def walkers(
 ) -> xr.Dataset:
     """Simulated twin of a plate heated in its middle that reflects people who walk by.
 
-    Each person is an upright ellipse with a head, warmer than the room, that crosses the view once
-    at a steady pace. Along an edge of the silhouette the reflection is abrupt.
+    Each person is an upright ellipse with a head, warmer than the room, that crosses the view
+    once at a steady pace. Along an edge of the silhouette the reflection is abrupt.
 
-    At times (time,) [s], of rows and columns, an emissivity (band) or (band, y, x) [1], and
-    temperatures of the room, of people, and of the plate's middle at the end [K], with a number of
-    crossings, and the time constant of the heating [s]: the scene, see `scene`.
+    Parameters
+    ----------
+    time : ndarray, shape (time,)
+        Times [s].
+    shape : tuple of int
+        Rows and columns.
+    emissivity : DataArray
+        (band) or (band, y, x) [1].
+    rng : Generator
+        Source of the paths.
+    temperatures : sequence of float
+        Temperatures of the room, of people, and of the plate's middle at the end [K].
+    crossings : int
+        Number of people.
+    time_constant : float
+        Time constant of the heating [s].
+
+    Returns
+    -------
+    Dataset
+        The scene, see `scene`.
 
     Examples
     --------

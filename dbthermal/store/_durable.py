@@ -25,9 +25,19 @@ _THREADS: Final = 8
 class HeldFolder:
     """A folder held by its descriptor, wherever it is renamed or moved on its disk.
 
-    It exists (OSError otherwise), and `path` is where it will be moved next, if that is another
-    place. `root` leads into it, wherever it is; without a /proc, as on macOS, it is its path.
-    `close` lets it go.
+    Parameters
+    ----------
+    folder : Path
+        That exists (OSError otherwise).
+    path : Path, optional
+        Where it will be moved next, if that is another place.
+
+    Attributes
+    ----------
+    root : Path
+        Leads into it, wherever it is; without a /proc, as on macOS, its path.
+    close : callable
+        Lets it go.
     """
 
     def __init__(self, folder: Path, path: Path | None = None) -> None:
@@ -113,8 +123,17 @@ def made_beside(path: Path) -> Iterator[Path]:
 def to_disk(paths: Iterable[Path]) -> None:
     """Wait until files and folders are on the disk, and not only in its cache.
 
-    All are synced at the same time, for a file system then writes its journal once. What is in a
-    folder is not synced with it. OSError, FileNotFoundError among them, if one cannot be.
+    All are synced at the same time, for a file system then writes its journal once.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+        Files and folders; what is in a folder is not synced with it.
+
+    Raises
+    ------
+    OSError
+        If one cannot be synced; FileNotFoundError if it does not exist.
     """
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(_to_disk, paths))

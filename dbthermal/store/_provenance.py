@@ -24,12 +24,21 @@ def provenance(
 ) -> dict[str, Any]:
     """Provenance of a result, for the functions that save it.
 
-    Of parameters by name, as in the notebook's parameters cell: finite numbers, strings, booleans,
-    None, and lists and mappings of these (TypeError or ValueError for any other), and the path of
-    each file, or folder such as a zarr store, that was read, of which the checksum alone is kept.
-    The record has ``parameters``; ``versions`` of Python, dbthermal and its core dependencies;
-    ``commit``, 40 hexadecimal digits, with ``-dirty`` if tracked files differ from it, or
-    ``"unknown"`` outside a git work tree; and ``inputs``, name to sha256.
+    Parameters
+    ----------
+    parameters : mapping
+        Name to value, as in the notebook's parameters cell: finite numbers, strings, booleans,
+        None, and lists and mappings of these; TypeError or ValueError for any other.
+    inputs : mapping, optional
+        Name to path of each file, or folder such as a zarr store, that was read. Only its checksum
+        is kept.
+
+    Returns
+    -------
+    dict
+        ``parameters``; ``versions`` of Python, dbthermal and its core dependencies; ``commit``, 40
+        hexadecimal digits, with ``-dirty`` if tracked files differ from it, or ``"unknown"``
+        outside a git work tree; and ``inputs``, name to sha256.
 
     Examples
     --------
@@ -52,7 +61,15 @@ def provenance(
 def checksum(path: str | Path) -> str:
     """SHA-256 of a file, as of ``sha256sum``, or of a folder's file names and contents.
 
-    FileNotFoundError if `path` does not exist.
+    Parameters
+    ----------
+    path : str or Path
+        File or folder.
+
+    Raises
+    ------
+    FileNotFoundError
+        If it does not exist.
     """
     path = Path(path)
     if not path.is_dir():

@@ -44,13 +44,26 @@ _COMPRESSORS: Final = (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), 
 class Recording:
     """A recording that is being written, in a new folder ``*.zarr``; FileExistsError if it exists.
 
-    `variables` are of dims (band, time, ...), frame by frame, or (log,), row by row, and `sizes`
-    has their other dims. `chunk` is the number of frames that a kill costs at most, `attrs` are
-    JSON, and `fills` are values behind a band's last frame, instead of NaN or 0.
-
     `frames` is the number of frames of each band and `rows` that of the log, as far as they are
     written; `commit` declares them valid. `root` leads into the folder wherever it is moved. After
     the folder was deleted, or one of an array moved, FileNotFoundError: nothing more is written.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr`` to make.
+    variables : mapping of str to Variable
+        Of dims (band, time, ...), frame by frame, or (log,), row by row.
+    sizes : mapping of str to int
+        Sizes of their other dims.
+    bands : sequence of str
+        Names of the bands.
+    chunk : int
+        Number of frames that a kill costs at most.
+    attrs : mapping
+        Attributes, as JSON.
+    fills : mapping of str to float, optional
+        Values behind a band's last frame, instead of NaN or 0.
     """
 
     def __init__(

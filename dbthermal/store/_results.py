@@ -72,8 +72,14 @@ def _chunks(variable: xr.Variable | xr.DataArray, *, even: bool = False) -> tupl
 def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:
     """Save a dataset as zarr (format 3, not consolidated), in place of an earlier one.
 
-    The path is a folder ``*.zarr`` (ValueError if it has another suffix), whose parents are made.
-    The provenance, from `dbthermal.store.provenance`, becomes ``attrs["provenance"]``.
+    Parameters
+    ----------
+    dataset : Dataset
+        Of any stage; it is not changed.
+    path : str or Path
+        Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
+    provenance : mapping
+        From `dbthermal.store.provenance`; becomes ``attrs["provenance"]``.
 
     Examples
     --------
@@ -92,8 +98,15 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
 def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
     """Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
 
-    The parts are the rows from the first to the last, made when they are asked for: no more than
-    one is held. What has no y, and the attributes, are those of the first.
+    Parameters
+    ----------
+    parts : iterable of Dataset
+        Rows from the first to the last, made when they are asked for: no more than one is held.
+        What has no y, and the attributes, are those of the first.
+    path : str or Path
+        Folder ``*.zarr``; see `save`.
+    provenance : mapping
+        See `save`.
 
     Examples
     --------
@@ -139,12 +152,21 @@ def _save_rows(
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:
-    """Open a saved dataset or a recording, a folder ``*.zarr``; values are read when they are used.
+    """Open a saved dataset or a recording; values are read when they are used.
 
-    It is identical to the one saved, with ``attrs["provenance"]`` added; text is of NumPy's
-    fixed-length kind. A recording that was cut short, or is being written, opens as far as all
-    bands are valid; its attributes have ``complete`` = False and, in ``frames_written``, the end of
-    each band.
+    A recording that was cut short, or is being written, opens as far as all bands are valid; its
+    attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``.
+
+    Returns
+    -------
+    Dataset
+        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
+        fixed-length kind.
 
     Raises
     ------
@@ -204,10 +226,17 @@ def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
 def save_numbers(
     numbers: Mapping[str, Number | np.generic], path: str | Path, provenance: Mapping[str, Any]
 ) -> None:
-    """Save headline numbers as strict JSON (``*.json``), with sorted names, and their provenance.
+    """Save headline numbers as strict JSON, with sorted names.
 
-    A name, unit included (``"object_rmse_K"``), has a finite number, a string or a boolean;
-    TypeError or ValueError for any other value.
+    Parameters
+    ----------
+    numbers : mapping
+        Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean;
+        TypeError or ValueError for any other value.
+    path : str or Path
+        File ``*.json``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.store.provenance`.
 
     Examples
     --------
@@ -231,9 +260,18 @@ def save_numbers(
 def read_numbers(path: str | Path) -> dict[str, Number]:
     """Read a file of `save_numbers`: name to value.
 
-    ValueError, with file and line, if it is not such a file, a name is listed twice, a number is
-    not finite, or it differs from what was written. A file without a checksum, of dbthermal 0.1.0,
-    is read with a warning.
+    A file without a checksum, of dbthermal 0.1.0, is read with a warning.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ``*.json``.
+
+    Raises
+    ------
+    ValueError
+        With file and line, if it is not such a file, a name is listed twice, a number is not
+        finite, or it differs from what was written.
     """
     content = texts.parse_json(texts.read_text(path), str(path))
     if not isinstance(content, dict) or not isinstance(content.get("numbers"), dict):
@@ -256,7 +294,17 @@ def _digest(content: Mapping[str, Any]) -> str:
 
 
 def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """Save a text in Markdown (``*.md``), with its provenance in a comment at its end."""
+    """Save a text in Markdown, with its provenance in a comment at its end.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+    path : str or Path
+        File ``*.md``.
+    provenance : mapping
+        As from `provenance`.
+    """
     comment = f"\n<!-- {_json(provenance)} -->\n"
     with _whole(path, ".md") as part:
         part.write_text(text + comment, encoding="utf-8")
@@ -265,10 +313,18 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
 def save_figure(
     figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
 ) -> None:
-    """Save a figure of matplotlib as PNG (``*.png``), the same bytes for the same figure.
+    """Save a figure as PNG, the same bytes for the same figure.
 
-    It stays open; its resolution is `dpi` [pixel/inch]. The provenance becomes the text chunk
-    ``Comment``, as JSON.
+    Parameters
+    ----------
+    figure : Figure
+        Of matplotlib; it stays open.
+    path : str or Path
+        File ``*.png``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.store.provenance`; becomes the text chunk ``Comment``, as JSON.
+    dpi : int
+        Resolution [pixel/inch].
 
     Examples
     --------
@@ -294,13 +350,22 @@ def save_video(
     rate: float,
     codec: Literal["vp9", "h264"] = "vp9",
 ) -> None:
-    """Save a film in MP4 (``*.mp4``), as browsers play it, at a frame rate [Hz].
+    """Save a film in MP4, as browsers play it.
 
-    Frames are uint8 (rows, columns, 3), colours; ValueError unless there is one at least, and all
-    are of one size, both sizes even. The provenance becomes the file's comment, as JSON. Of the
-    codecs VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of H.264,
-    x264, is under the GPL, and patents may ask for a licence where films are passed on (see
-    docs/licences.md). ValueError for any other.
+    Parameters
+    ----------
+    frames : iterable of ndarray of uint8, shape (rows, columns, 3)
+        Colours; at least one frame, all of one size, both sizes even, else ValueError.
+    path : str or Path
+        File ``*.mp4``. Its parents are made.
+    provenance : mapping
+        From `dbthermal.store.provenance`; becomes the file's comment, as JSON.
+    rate : float
+        Frame rate [Hz].
+    codec : {"vp9", "h264"}
+        Compression. VP9's encoder, libvpx, has a permissive licence and a grant of patents. That of
+        H.264, x264, is under the GPL, and patents may ask for a licence where films are passed on
+        (see docs/licences.md). ValueError for any other.
     """
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 

@@ -62,6 +62,16 @@ def test_a_band_between_its_frames() -> None:
     assert np.median(np.abs(error[1])) < 0.1
 
 
+def test_an_object_that_fills_a_third_of_the_image() -> None:
+    """Pixels without data, beside a registered object, say nothing of the noise."""
+    capture, true = drawn(22, (2.4, 1.2))
+    capture["counts"][..., : 2 * true.shape[2] // 3] = np.nan
+    error, _ = errors(alignment.reflection_shift(capture, RESPONSE), true)
+    print(f"median error {np.median(np.abs(error[1])):.3f} pixel of {error.shape[1]} pixels")
+    assert error.shape[1] > 0.2 * true[0].size
+    assert np.median(np.abs(error[1])) < 0.05
+
+
 def test_opened_capture_with_steps_between_segments(tmp_path: Path) -> None:
     """Steps at shutter events are no reflection; a capture on disk is read block by block.
 
@@ -137,6 +147,10 @@ def test_refuses_what_tells_no_shift() -> None:
     still = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)}, places)
     with pytest.raises(ValueError, match="Missing texture"):
         alignment.reflection_shift(still, RESPONSE)
+    unusable = np.full((30, 32), schema.Status.DEAD_PIXEL, dtype=np.uint32)
+    dead = still.assign(status=(("y", "x"), unusable, schema.status_attrs()))
+    with pytest.raises(ValueError, match="Missing texture"):
+        alignment.reflection_shift(dead, RESPONSE)
     with pytest.raises(ValueError, match="Must be two or more"):
         alignment.reflection_shift(still.isel(band=[0]), RESPONSE)
     with pytest.raises(ValueError, match="20 rows"):

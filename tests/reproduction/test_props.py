@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from dbthermal.simulation.surroundings import Actor, Pose, gliding
 from reproduction.twins import surfaces
 from reproduction.twins.panes import pointing
 from reproduction.twins.people import FINGERS, Route, imprint, pacing
 from reproduction.twins.props import Writing, board, cup
 from reproduction.twins.stage import AMBIENT, clock
+from reproduction.twins.surroundings import Actor, Pose, gliding
 
 PLATE = surfaces.plate(0.1, 0.1, 0.1)
 

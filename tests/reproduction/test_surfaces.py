@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from dbthermal.simulation.rays import vertex_normals
 from reproduction.twins import solids, surfaces
+from reproduction.twins.rays import vertex_normals
 
 SHAPES: dict[str, Callable[[], trimesh.Trimesh]] = {
     "plate": lambda: surfaces.plate(0.3, 0.2, 0.01),

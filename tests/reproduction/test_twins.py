@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from dbthermal import metrics, response, schema, separation, simulation
 from dbthermal.simulation import Rig
-from dbthermal.simulation.rays import Camera, Caster
-from dbthermal.simulation.surroundings import Actor, Pose
 from reproduction import twins
 from reproduction.twins import TWINS, Capture, Stage, solids, surfaces, vessels
 from reproduction.twins.panes import WITHDRAWAL
 from reproduction.twins.props import Writing
+from reproduction.twins.rays import Camera, Caster
 from reproduction.twins.stage import AMBIENT, clock
+from reproduction.twins.surroundings import Actor, Pose
 from reproduction.twins.vessels import Vessel
 
 GLASS = xr.DataArray(

@@ -89,30 +89,57 @@ FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
 class Settings:
     """Properties of one wheel.
 
-    ValueError if a slot is not 1 to 6, two filters have one name, or a number is out of its range.
+    Attributes
+    ----------
+    filters : mapping
+        Band in each slot, by its number 1 to 6. Slots left out hold no filter.
+    serial_number : int, optional
+        Serial number of the controller; another one is then refused.
+    addresses : tuple of tuple
+        Where the controller is looked for, in this order: address of its identity, and of its
+        motor. A BSC20x is a rack and silently ignores messages to a unit.
+    home_offset : float
+        From the position after homing to slot 1 [deg]. Differs from wheel to wheel: look.
+    home_direction, home_limit_switch : int, optional
+        1 forward, 2 reverse; 1 the reverse switch, 4 the forward one. Which a wheel needs is
+        uncertain: None keeps what the controller has.
+    velocity, home_velocity : float
+        [turn/s].
+    acceleration : float
+        [turn/s^2].
+    tolerance : float
+        Largest distance of the wheel from a slot [deg], below half the way to the next, 30.
+    reply_timeout, home_timeout, move_timeout : float
+        Longest wait for a reply, for the home switch, for a move [s].
+    start_timeout : float
+        Longest wait until a move is seen to start [s].
+    stall_timeout : float
+        Longest time for which the position may not change in a move [s].
+    poll_interval : float
+        Time between two status requests [s].
+
+    Raises
+    ------
+    ValueError
+        If a slot is not 1 to 6, two filters have one name, or a number is out of its range.
     """
 
-    filters: Mapping[int, str] = field(default_factory=dict)  # band by slot, 1 to 6; others empty
-    serial_number: int | None = None  # of the controller; another one is then refused
-    # Where the controller is looked for, in this order: address of its identity, and of its motor.
-    # A BSC20x is a rack and silently ignores messages to a unit.
+    filters: Mapping[int, str] = field(default_factory=dict)
+    serial_number: int | None = None
     addresses: tuple[tuple[int, int], ...] = ((apt.UNIT, apt.UNIT), (apt.RACK, apt.BAY_1))
-    # From the position after homing to slot 1 [deg]. Differs from wheel to wheel: look.
     home_offset: float = 0.0
-    # 1 forward, 2 reverse; 1 the reverse switch, 4 the forward one. Which a wheel needs is
-    # uncertain: None keeps what the controller has.
     home_direction: int | None = None
     home_limit_switch: int | None = None
-    velocity: float = 1.0  # [turn/s]
-    home_velocity: float = 0.2  # [turn/s]
-    acceleration: float = 1.0  # [turn/s^2]
-    tolerance: float = 0.1  # largest distance from a slot [deg], below half the way to the next, 30
-    reply_timeout: float = 1.0  # longest wait for a reply [s]
-    home_timeout: float = 60.0  # for the home switch [s]
-    move_timeout: float = 20.0  # for a move [s]
-    start_timeout: float = 1.0  # until a move is seen to start [s]
-    stall_timeout: float = 2.0  # longest time for which the position may not change in a move [s]
-    poll_interval: float = 0.05  # between two status requests [s]
+    velocity: float = 1.0
+    home_velocity: float = 0.2
+    acceleration: float = 1.0
+    tolerance: float = 0.1
+    reply_timeout: float = 1.0
+    home_timeout: float = 60.0
+    move_timeout: float = 20.0
+    start_timeout: float = 1.0
+    stall_timeout: float = 2.0
+    poll_interval: float = 0.05
 
     def __post_init__(self) -> None:
         for position in self.filters:

@@ -14,18 +14,31 @@ from dbthermal.instruments.camera import UNTIMED, FrameFlag
 def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     r"""Open a recording as stage `capture`, also one that was cut short or is being written.
 
-    Of a folder ``*.zarr`` from `record`: `counts` (band, time, y, x) [count], read when used;
-    `exposure_time` (band, time) [s], NaN for a frame that is damaged, missing or not new;
-    `frame_flags` (band, time), with bit ``shutter_closed``; `device_time`, `host_time`, `sequence`,
-    and the camera's telemetry, if any. `time` is when the first band was exposed [s]. If `fitted`,
-    for a camera whose stamps are on a clock of its own, its exposure times come from a line through
-    both clocks, h = a + b d with the device's time d and the host's h, by least squares: they are
-    late by the mean time that a frame takes to the host, and attribute ``clock_rates`` has b of
-    each band.
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``, from `record`.
+    fitted : bool
+        True for a camera whose stamps are on a clock of its own: its exposure times then come from
+        a line through both clocks, :math:`h = a + b d` with the device's time d and the host's h,
+        by least squares. They are late by the mean time that a frame takes to the host.
 
-    FileNotFoundError if the folder does not exist; ValueError if a band has fewer than two frames
-    with a time, or a file of the recording is not as it was written; see
-    `dbthermal.store.open_dataset`.
+    Returns
+    -------
+    Dataset
+        `counts` (band, time, y, x) [count], read when used; `exposure_time` (band, time) [s], NaN
+        for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
+        ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
+        any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates``
+        has b of each band.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        If a band has fewer than two frames with a time, or a file of the recording is not as it
+        was written; see `dbthermal.store.open_dataset`.
 
     Examples
     --------
@@ -54,7 +67,17 @@ def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
     """Log of a recording: time [s], kind, source and value of each note, in the order of writing.
 
     Kinds are ``"reading"``, ``"frames_lost"``, ``"shutter_closed"`` and others; the attributes of
-    the store explain their values. FileNotFoundError if the folder does not exist.
+    the store explain their values.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr`` of the recording.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
     """
     recording = store.open_dataset(path)
     kinds = {number: name for name, number in recording.attrs["log_kinds"].items()}
@@ -80,10 +103,18 @@ def mean_reading(path: str | Path, source: str) -> float:
 def overview(folder: str | Path) -> xr.Dataset:
     """Table of the recordings in a folder: frames, losses, rate and completeness of each band.
 
-    A row for each recording and band, by coordinates `recording` and `band`: `frames`, of which
-    `damaged`; `lost` by camera or driver, and `refused` by a full queue; `frame_rate` by the good
-    frames' stamps [Hz], NaN without two; `complete`, whether the recording went to its planned end.
-    Other files are passed over; ValueError without any recording.
+    Parameters
+    ----------
+    folder : str or Path
+        With recordings (ValueError without any); other files in it are passed over.
+
+    Returns
+    -------
+    Dataset
+        One row for each recording and band: `frames`, of which `damaged`; `lost` by camera or
+        driver, and `refused` by a full queue; `frame_rate` by the good frames' stamps [Hz], NaN
+        without two; `complete`, whether the recording went to its planned end. Coordinates
+        `recording` and `band`.
     """
     rows = [
         {"recording": path.stem, "band": band, **totals, **_rate_and_end(opened, band)}

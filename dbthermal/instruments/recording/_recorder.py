@@ -45,10 +45,15 @@ _BYTES: Final = 2  # of a pixel
 
 @dataclass(frozen=True)
 class Reading:
-    """Another instrument that is read beside the frames; `read` may take its time.
+    """Another instrument that is read beside the frames.
 
-    OSError, RuntimeError and ValueError of it are noted as a failed reading; any other error ends
-    the recording.
+    Attributes
+    ----------
+    read : callable
+        Reads a value, and may take its time. Its OSError, RuntimeError and ValueError are noted as
+        a failed reading; any other error ends the recording.
+    units : str
+        Unit of the value.
     """
 
     read: Callable[[], float]
@@ -57,37 +62,73 @@ class Reading:
 
 @dataclass(frozen=True)
 class Limits:
-    """Sizes and waiting times of a recording."""
+    """Sizes and waiting times of a recording.
 
-    chunk: int = CHUNK  # frames of a chunk: the most that a kill may cost
-    queue: int = 120  # frames of each band held until they are written
-    reserve: int = 10**9  # space that must stay free [byte]
-    silence: float = 1.0  # wait for a frame before it is noted that none came [s]
-    reading_period: float = 1.0  # time from reading to reading [s]
-    patience: float = 10.0  # wait, at the end, for a device that hangs [s]
-    preview_period: float = 0.2  # least time from preview to preview [s]
+    Attributes
+    ----------
+    chunk : int
+        Frames of a chunk: the most that a kill may cost.
+    queue : int
+        Frames of each band held until they are written.
+    reserve : int
+        Space that must stay free [byte].
+    silence : float
+        Wait for a frame before it is noted that none came [s].
+    reading_period : float
+        Time from reading to reading [s].
+    patience : float
+        Wait, at the end, for a device that hangs [s].
+    preview_period : float
+        Least time from preview to preview [s].
+    """
+
+    chunk: int = CHUNK
+    queue: int = 120
+    reserve: int = 10**9
+    silence: float = 1.0
+    reading_period: float = 1.0
+    patience: float = 10.0
+    preview_period: float = 0.2
 
 
 @dataclass(frozen=True)
 class Preview:
     """State of a recording while it goes on.
 
-    `totals` has numbers of frames for each band: ``frames``, ``lost``, ``refused``, ``damaged``.
+    Attributes
+    ----------
+    time : float
+        Time since the start [s].
+    frames : mapping of str to Frame
+        Last frame of each band that had one.
+    totals : mapping
+        Numbers of frames of each band: ``frames``, ``lost``, ``refused``, ``damaged``.
+    readings : mapping of str to float
+        Last value of each reading, NaN if it failed.
+    units : mapping of str to str
+        Units of the readings, else kelvin.
     """
 
-    time: float  # since the start [s]
-    frames: Mapping[str, Frame]  # last frame of each band that had one
+    time: float
+    frames: Mapping[str, Frame]
     totals: Mapping[str, Mapping[str, int]]
-    readings: Mapping[str, float]  # last value of each reading, NaN if it failed
-    units: Mapping[str, str] = field(default_factory=dict)  # of the readings, else kelvin
+    readings: Mapping[str, float]
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Result of a recording, with `totals` as in `Preview`.
+    """Result of a recording.
 
-    `ended` is ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is
-    lost), or ``"no frames"`` if a band had none. `path` is where the recording lies now.
+    Attributes
+    ----------
+    path : Path
+        Folder of the recording, wherever it lies now.
+    ended : str
+        ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is lost),
+        or ``"no frames"`` if a band had none.
+    totals : mapping
+        As in `Preview`.
     """
 
     path: Path
@@ -122,9 +163,10 @@ def record(
         Band to an open source, in the session's order; they stay open.
     path : str or Path
         Folder ``*.zarr`` to make; see `open_capture`.
-    readings, identities : mapping, optional
-        Name to another instrument: thermocouples, the cameras' temperatures, the blackbody; and
-        band, or name of another device, to model and numbers, beside those of the sources.
+    readings : mapping, optional
+        Name to another instrument: thermocouples, the cameras' temperatures, the blackbody.
+    identities : mapping, optional
+        Band, or name of another device, to model and numbers, beside those of the sources.
     limits : Limits, optional
         Sizes and waiting times.
     preview : callable, optional
@@ -132,19 +174,26 @@ def record(
     stop : Event, optional
         Ends the recording when it is set.
 
+    Returns
+    -------
+    Summary
+        How it ended, and numbers of frames; also in the store.
+
     Raises
     ------
-    FileExistsError, ValueError
-        If `path` exists; if the sources are not those of the session, or are emulated and the
-        session is not.
+    FileExistsError
+        If `path` exists.
     OSError
         If there is too little space, before or on the way; or the folder, or one of an array in
         it, was deleted, replaced or taken to another disk, or that of an array moved.
-    SignalExit, Exception
-        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell (a signal that
-        the program handles or ignores is left alone); error of a source, a reading or the preview,
-        or an interrupt by the keyboard. In all cases what was recorded is kept. A second interrupt
-        ends the wait, not the writing.
+    ValueError
+        If the sources are not those of the session, or are emulated and the session is not.
+    Exception
+        Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
+        what was recorded is kept. A second interrupt ends the wait, not the writing.
+    SignalExit
+        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell; also kept. A
+        signal that the program handles or ignores is left alone.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)

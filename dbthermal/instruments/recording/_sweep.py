@@ -77,14 +77,30 @@ class _Sweep:
 def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
     """Join the recordings of a blackbody sweep into one dataset.
 
-    Of the session of this name in a folder of `dbthermal.instruments.protocols.record_sweep`, and
-    of each recording the first `frames` of each band that are whole and show the blackbody: the
-    stage `blackbody_movies` of `schema`, `counts` (band, temperature, frame, y, x) [count]. The
-    bands are those of all filters, and that of the other camera, which is taken from the recordings
-    through the first filter. `temperature` is the mean of the blackbody's readings during the
-    recordings of a step [K]. FileNotFoundError if there is no recording of such a session;
-    ValueError if one is missing or incomplete, has fewer good frames in a band, or no reading of
-    the blackbody, or those of a step differ by more than the session's stability.
+    Parameters
+    ----------
+    folder : str or Path
+        Of `dbthermal.instruments.protocols.record_sweep`.
+    name : str
+        Of the session.
+    frames : int
+        Frames to take of each: the first ones of each band that are whole and show the blackbody.
+
+    Returns
+    -------
+    Dataset
+        Stage `blackbody_movies` of `schema`: `counts` (band, temperature, frame, y, x) [count]. The
+        bands are those of all filters, and that of the other camera, which is taken from the
+        recordings through the first filter. `temperature` is the mean of the blackbody's readings
+        during the recordings of a step [K].
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no recording of such a session.
+    ValueError
+        If a recording is missing or incomplete, has fewer good frames in a band, or no reading of
+        the blackbody, or those of a step differ by more than the session's stability.
     """
     sweep = _find(folder, name)
     temperatures, movies = [], []
@@ -113,14 +129,29 @@ def bench_series(
 ) -> dict[str, xr.Dataset]:
     """Mean counts and temperatures of an emissivity bench, a measurement for each step.
 
-    Of the session of this name in a folder of `dbthermal.instruments.protocols.record_sweep`:
-    material to its series, stage `contact` of `schema`, with `counts` (band, measurement), mean
-    over the region, its rows and columns, and the good frames [count]; `object_temperature`, by the
-    thermocouple named like it, and `background_temperature` (measurement), means of the readings
-    during the recordings [K]. With a correction of all bands, from
-    `dbthermal.correction.fit_correction`, the counts are corrected, and pixels that are bad or
-    saturated are left out. FileNotFoundError or ValueError as `open_sweep`, or if a region has no
-    pixel or a band no good frame.
+    Parameters
+    ----------
+    folder : str or Path
+        Of `dbthermal.instruments.protocols.record_sweep`.
+    name : str
+        Of the session.
+    region : mapping
+        Material to its rows and columns. The thermocouple named like it is the object's.
+    correction : Dataset, optional
+        From `dbthermal.correction.fit_correction`, of all bands. With it, the counts are corrected,
+        and pixels that are bad or saturated are left out.
+
+    Returns
+    -------
+    dict
+        Material to its series, stage `contact` of `schema`: `counts` (band, measurement), mean over
+        the region and the good frames [count]; `object_temperature` and `background_temperature`
+        (measurement), means of the readings during the recordings [K].
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        As `open_sweep`; or if a region has no pixel or a band no good frame.
     """
     sweep = _find(folder, name)
     series: dict[str, list[xr.Dataset]] = {material: [] for material in region}

@@ -53,9 +53,14 @@ class Exchange(ABC):
 class Convection(Exchange):
     """Exchange with a fluid, or through a contact: h (T_fluid - T).
 
-    The coefficient of heat transfer h [W m^-2 K^-1], not negative, and the temperature of the fluid
-    [K] are numbers, one for each vertex (vertex,), or functions of time. With a very large
-    coefficient, such as 1e9 W m^-2 K^-1, a prescribed temperature.
+    With a very large coefficient, such as 1e9 W m^-2 K^-1, a prescribed temperature.
+
+    Attributes
+    ----------
+    coefficient : float, ndarray (vertex,) or function of time
+        Coefficient of heat transfer h, not negative [W m^-2 K^-1].
+    temperature : float, ndarray (vertex,) or function of time
+        Temperature of the fluid [K].
     """
 
     coefficient: Varying
@@ -72,8 +77,12 @@ class Convection(Exchange):
 class Radiation(Exchange):
     """Exchange of one side with large surroundings: emissivity sigma (T_s^4 - T^4).
 
-    The total hemispherical emissivity, in [0, 1], and the radiant temperature T_s of the
-    surroundings [K] are numbers, one for each vertex (vertex,), or functions of time.
+    Attributes
+    ----------
+    emissivity : float, ndarray (vertex,) or function of time
+        Total hemispherical emissivity, in [0, 1].
+    temperature : float, ndarray (vertex,) or function of time
+        Radiant temperature T_s of the surroundings [K].
     """
 
     emissivity: Varying
@@ -97,7 +106,10 @@ class Radiation(Exchange):
 class Heating(Exchange):
     """Prescribed flux into the shell, such as absorbed light; negative if it cools.
 
-    Heat per area and time [W m^-2]: a number, one for each vertex (vertex,), or a function of time.
+    Attributes
+    ----------
+    flux : float, ndarray (vertex,) or function of time
+        Heat per area and time q [W m^-2].
     """
 
     flux: Varying

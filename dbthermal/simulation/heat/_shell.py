@@ -20,8 +20,14 @@ _FLATTEST: Final = 1e-9
 class Solid:
     """Thermal properties of a solid, constant over the temperatures of a scene.
 
-    Conductivity k [W m^-1 K^-1], density [kg m^-3], and specific heat at constant pressure [J kg^-1
-    K^-1].
+    Attributes
+    ----------
+    conductivity : float
+        Thermal conductivity k [W m^-1 K^-1].
+    density : float
+        Density [kg m^-3].
+    specific_heat : float
+        Specific heat at constant pressure c [J kg^-1 K^-1].
     """
 
     conductivity: float
@@ -51,15 +57,28 @@ CERAMIC: Final = Solid(conductivity=1.5, density=2400.0, specific_heat=1050.0)
 class Shell:
     r"""A shell so thin that its temperature is uniform through it.
 
-    That holds while the Biot number :math:`h d / k` is far below 1: 0.02 for 3 mm of glass in still
-    air, but 1 where hot water wets it. There the half wall up to the middle belongs in series with
-    the fluid, :math:`1 / (1/h + d / 2k)`, and the outer face still lags by some :math:`d^2 / 2
-    \alpha` (6 s). The arrays are kept as read-only copies.
+    That holds while the Biot number :math:`h d / k` is far below 1: 0.02 for 3 mm of glass in
+    still air, but 1 where hot water wets it. There the half wall up to the middle belongs in
+    series with the fluid, :math:`1 / (1/h + d / 2k)`, and the outer face still lags by some
+    :math:`d^2 / 2 \alpha` (6 s). The arrays are kept as read-only copies.
 
-    Vertices (vertex, 3) are positions [m], faces (face, 3) three vertex numbers each, whose sense
-    does not matter; edges may be open (insulated) or shared by more than two faces. The thickness d
-    is in metres. ValueError if a shape or a number is wrong, a vertex belongs to no face, or a face
-    is repeated or has no area.
+    Attributes
+    ----------
+    vertices : ndarray, shape (vertex, 3)
+        Positions [m].
+    faces : ndarray, shape (face, 3)
+        Three vertex numbers a face. Their sense does not matter; edges may be open (insulated)
+        or shared by more than two faces.
+    thickness : float
+        Thickness d [m].
+    solid : Solid
+        Material.
+
+    Raises
+    ------
+    ValueError
+        If a shape or a number is wrong, a vertex belongs to no face, or a face is repeated or
+        has no area.
     """
 
     vertices: Array

@@ -44,18 +44,39 @@ def simulate(
     .. math:: \rho c d \, \dot T = \nabla \cdot (k d \, \nabla T) + \sum_i h_i (T_i - T)
               + \sum_j \varepsilon_j \sigma (T_j^4 - T^4) + q
 
-    In space, the intrinsic Laplacian with a lumped mass (`Shell`): second order in the edge length.
-    In time, Alexander's stiffly accurate two-stage scheme (SDIRK2) [1]_, L-stable and of second
-    order in the step; where a function of time jumps within a step, of first. Both stages share one
-    sparse factorisation, which is reused for all steps of one length. An edge of the mesh is
-    insulated.
+    In space, the intrinsic Laplacian with a lumped mass (`Shell`): second order in the edge
+    length. In time, Alexander's stiffly accurate two-stage scheme (SDIRK2) [1]_, L-stable and of
+    second order in the step; where a function of time jumps within a step, of first. Both stages
+    share one sparse factorisation, which is reused for all steps of one length. An edge of the
+    mesh is insulated.
 
-    At increasing times (time,) [s], from an initial temperature, of all or (vertex,) [K], with an
-    exchange for each side and cause, none for an insulated body. `step` is the longest internal
-    step [s]: every interval of times is cut evenly into as few as this allows, by default one.
-    `tolerance` is the largest error of the iteration in a stage [K]. ValueError if a parameter has
-    the wrong shape or is not physical, or an exchange at some time is not; ArithmeticError if a
-    temperature falls to 0 K or below, or a stage does not converge.
+    Parameters
+    ----------
+    shell : Shell
+        The body.
+    time : array_like, shape (time,)
+        Increasing times [s]; the first is that of the initial temperature.
+    initial : float or array_like, shape (vertex,)
+        Initial temperature [K].
+    exchanges : sequence of Exchange
+        Heat exchanges; one record for each side and cause, none for an insulated body.
+    step : float, optional
+        Longest internal step [s]: every interval of `time` is cut evenly into as few steps as
+        this allows. One step an interval if left out.
+    tolerance : float
+        Largest error of the iteration in a stage [K].
+
+    Returns
+    -------
+    ndarray, shape (time, vertex)
+        Temperature [K].
+
+    Raises
+    ------
+    ValueError
+        If a parameter has the wrong shape or is not physical, or an exchange at some time is not.
+    ArithmeticError
+        If a temperature falls to 0 K or below, or a stage does not converge.
 
     References
     ----------

@@ -21,7 +21,7 @@ from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.world import World
 from dbthermal.response import Curve
 from dbthermal.simulation import Rig, digitise
-from dbthermal.simulation.rays import Camera
+from reproduction.twins.rays import Camera
 
 Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.uint16]

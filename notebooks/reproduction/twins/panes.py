@@ -8,12 +8,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dbthermal.simulation import heat
-from dbthermal.simulation.rays import Array, Camera
-from dbthermal.simulation.surroundings import Actor, Motion, Pose, gliding
 from reproduction.twins import surfaces
 from reproduction.twins.people import FINGERS, hand, imprint, pacing, person
 from reproduction.twins.props import Writing, board
+from reproduction.twins.rays import Array, Camera
 from reproduction.twins.stage import AMBIENT, TABLE, Capture, Stage, since
+from reproduction.twins.surroundings import Actor, Motion, Pose, gliding
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from dbthermal.simulation.rays import Array
-from dbthermal.simulation.surroundings import Actor, Motion, Pose, hinged, painted
+from reproduction.twins.rays import Array
 from reproduction.twins.surfaces import capsule, ellipsoid
+from reproduction.twins.surroundings import Actor, Motion, Pose, hinged, painted
 
 _SPACING: Final = 0.03
 """Distance of the vertices of a body [m]."""

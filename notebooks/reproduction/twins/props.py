@@ -6,9 +6,9 @@ from typing import Final
 import numpy as np
 import trimesh
 
-from dbthermal.simulation.rays import Array
-from dbthermal.simulation.surroundings import Actor, Motion, painted
+from reproduction.twins.rays import Array
 from reproduction.twins.surfaces import ellipsoid, revolved
+from reproduction.twins.surroundings import Actor, Motion, painted
 
 _SPACING: Final = 0.006
 """Distance of the vertices of a toy or a cup [m]."""

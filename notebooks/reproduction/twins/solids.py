@@ -7,13 +7,13 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from dbthermal.simulation import heat
-from dbthermal.simulation.rays import Array, Camera, vertex_normals
-from dbthermal.simulation.surroundings import Actor, Motion, Pose, gliding
 from reproduction.twins import surfaces
 from reproduction.twins.panes import Touch
 from reproduction.twins.people import Route, hand, imprint, pacing, person
 from reproduction.twins.props import cup, toy
+from reproduction.twins.rays import Array, Camera, vertex_normals
 from reproduction.twins.stage import AMBIENT, TABLE, Capture, Stage, passers_by, since, table
+from reproduction.twins.surroundings import Actor, Motion, Pose, gliding
 
 EMISSIVITY: Final = 0.9
 """Total hemispherical emissivity of glass and of the bunny [1], for their radiation alone."""

@@ -12,9 +12,9 @@ from scipy.special import ndtr
 
 from dbthermal import schema, simulation
 from dbthermal.simulation import heat
-from dbthermal.simulation.rays import Array, Camera, Caster, unit
-from dbthermal.simulation.surroundings import Actor, incident, painted
 from reproduction.twins.people import pacing, person
+from reproduction.twins.rays import Array, Camera, Caster, unit
+from reproduction.twins.surroundings import Actor, incident, painted
 
 AMBIENT: Final = 295.15
 """Temperature of the room, of its air, and of all that is not heated [K]."""

@@ -15,7 +15,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from dbthermal.planck import require_positive
-from dbthermal.simulation.rays import Array, unit
+from reproduction.twins.rays import Array, unit
 
 Profile = tuple[tuple[float, float], ...]
 

@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 
 from dbthermal.simulation import heat
-from dbthermal.simulation.rays import Array, Camera
 from reproduction.twins import surfaces
+from reproduction.twins.rays import Array, Camera
 from reproduction.twins.stage import AMBIENT, Capture, Stage, passers_by, since, table
 
 

@@ -14,9 +14,7 @@ import numpy.typing as npt
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dbthermal._arrays import Array
-from dbthermal.simulation._scenes import increasing
-from dbthermal.simulation.rays import Caster, Hits
+from reproduction.twins.rays import Array, Caster, Hits
 
 __all__ = ["Actor", "Pose", "gliding", "hinged", "incident", "painted"]
 __dir__ = __all__.copy
@@ -59,7 +57,12 @@ def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
     Before and after, the pose is that of the nearest stop. Raises a ValueError if the times do not
     increase, or the places are not finite, one for each time.
     """
-    times, places = increasing(times, "a motion"), np.asarray(places, dtype=np.float64)
+    times, places = np.asarray(times, dtype=np.float64), np.asarray(places, dtype=np.float64)
+    if times.ndim != 1 or times.size < 2:
+        raise ValueError(f"Invalid times of shape {times.shape} of a motion. Must be two or more.")
+    wrong = times[~np.isfinite(times) | ~(np.diff(times, prepend=-np.inf) > 0)]
+    if wrong.size:
+        raise ValueError(f"Invalid time {wrong[0]} s of a motion. Must be finite, and increase.")
     if places.shape != (times.size, 3) or not np.all(np.isfinite(places)):
         raise ValueError(
             f"Invalid places of shape {places.shape} of a motion. Must be finite, "
@@ -153,17 +156,6 @@ def incident(
 
     Of rays (ray, 3), the same in all frames, by their origins [m] and unit vectors, at times
     (time,) [s], before the walls of a room [K] and actors, of which the nearest hides the others.
-
-    Examples
-    --------
-    A ray along x meets a person of 306 K who walks through it, else a wall of 295 K:
-
-    >>> path = gliding([0.0, 2.0], [(2.0, -2.0, 0.0), (2.0, 2.0, 0.0)])  # s, m
-    >>> person = painted([(trimesh.creation.box((0.3, 0.5, 1.8)), 306.0)], path)
-    >>> origin, forward = np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]])
-    >>> met = incident(origin, forward, np.array([0.0, 1.0, 2.0]), 295.0, [person])
-    >>> met.ravel().round(1).tolist()  # K
-    [295.0, 306.0, 295.0]
     """
     targets = [_Target(actor, origins, directions) for actor in actors]
     result = np.full((time.size, len(directions)), room)

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dbthermal.simulation.rays import Camera, Caster, mirror, unit
-from dbthermal.simulation.surroundings import Actor, Motion, Pose, incident
+from reproduction.twins.rays import Camera, Caster, mirror, unit
 from reproduction.twins.surfaces import ellipsoid
+from reproduction.twins.surroundings import Actor, Motion, Pose, incident
 
 CAMERA = Camera(position=(0.1, -0.6, 0.3), target=(0.0, 0.0, 0.05), shape=(45, 60))
 FRONT = Camera(position=(0.0, -1.0, 0.0), target=(0.0, 0.0, 0.0), shape=(90, 120))

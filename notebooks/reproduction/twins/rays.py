@@ -210,12 +210,6 @@ def vertex_normals(mesh: trimesh.Trimesh) -> Array:
 
 
 def mirror(directions: Array, normals: Array) -> Array:
-    r"""Mirror law :math:`r = d - 2 (d \cdot n) n` for directions and unit normals (..., 3).
-
-    Examples
-    --------
-    >>> mirror(np.array([0.6, 0.0, -0.8]), np.array([0.0, 0.0, 1.0])).tolist()
-    [0.6, 0.0, 0.8]
-    """
+    r"""Mirror law :math:`r = d - 2 (d \cdot n) n` for directions and unit normals (..., 3)."""
     along = np.sum(directions * normals, axis=-1, keepdims=True)
     return np.asarray(directions - 2.0 * along * normals)
