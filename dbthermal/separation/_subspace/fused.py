@@ -136,7 +136,7 @@ RECORD: Final = np.dtype(
 
 
 class Solved(NamedTuple):
-    """What becomes of all pixels."""
+    """Films, numbers and sums of all pixels."""
 
     films: npt.NDArray[np.float32]  # object, deviation, background, deviation (4, time, pixel) [K]
     record: Any  # `RECORD` (pixel)

@@ -1,4 +1,4 @@
-"""What the compiled steps of a tile of two bands share: functions of time, limits, work space."""
+"""Functions of time, limits and work space of the compiled steps of a tile of two bands."""
 
 from typing import Any, NamedTuple
 
