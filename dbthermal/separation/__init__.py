@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling.materials import materials
 from dbthermal.separation._reflection import reflected_change, uncalibrated_reflection, unscaled
+from dbthermal.separation._run import run
 from dbthermal.separation._separate import separate
 from dbthermal.separation._solve import METHODS, get_method, solve
 
@@ -33,6 +34,7 @@ __all__ = [
     "get_method",
     "materials",
     "reflected_change",
+    "run",
     "separate",
     "solve",
     "uncalibrated_reflection",

@@ -1,6 +1,7 @@
 """Files on disk: results with their provenance, and recordings while they grow.
 
-`save` and `open_dataset` keep datasets as zarr, `save_rows` one that is made row by row;
+`save` and `open_dataset` keep datasets as zarr, `save_rows` one that is made row by row,
+`save_part` and `join_parts` one whose rows several processes make;
 `save_numbers`, `save_figure`, `save_text` and `save_video` keep the rest of a result, each with the
 record from `provenance`. `Recording` grows in chunks and survives a kill or a power loss; a
 `HeldFolder` is found wherever it is moved. No other package opens or writes zarr.
@@ -11,11 +12,13 @@ from dbthermal.store._provenance import checksum, provenance
 from dbthermal.store._recording import Recording
 from dbthermal.store._results import (
     Number,
+    join_parts,
     open_dataset,
     read_numbers,
     save,
     save_figure,
     save_numbers,
+    save_part,
     save_rows,
     save_text,
     save_video,
@@ -26,12 +29,14 @@ __all__ = [
     "Number",
     "Recording",
     "checksum",
+    "join_parts",
     "open_dataset",
     "provenance",
     "read_numbers",
     "save",
     "save_figure",
     "save_numbers",
+    "save_part",
     "save_rows",
     "save_text",
     "save_video",

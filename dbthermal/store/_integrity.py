@@ -185,10 +185,14 @@ def add_sums(root: Path, contents: Mapping[str, Content]) -> Path:
     return root / SUMS
 
 
-def last_sums(root: Path) -> bytes:
-    """Content of the file of checksums with the last state of every file alone, by name."""
-    sums = _read_sums(root)
-    return "".join(f"{key} {sums[key].split()[-1]}\n" for key in sorted(sums)).encode()
+def last_sums(root: Path) -> dict[str, str]:
+    """Checksum of the last state of every file, by name."""
+    return {key: states.split()[-1] for key, states in sorted(_read_sums(root).items())}
+
+
+def sums_file(sums: Mapping[str, str]) -> bytes:
+    """Content of a file of checksums, of one state of every file."""
+    return "".join(f"{key} {sums[key]}\n" for key in sorted(sums)).encode()
 
 
 def missing_files(root: Path) -> list[str]:

@@ -32,6 +32,7 @@ from dbthermal.store._integrity import (
     SummedStore,
     last_sums,
     missing_files,
+    sums_file,
 )
 
 Values = npt.NDArray[Any]
@@ -208,7 +209,7 @@ class Recording:
                     f"{len(lost)} that were deleted. Must stay while it is written to."
                 )
             self.commit(complete=complete, closed=True, **MARK, **attrs)
-            replace(self.root / SUMS, last_sums(self.root), self._part(SUMS))
+            replace(self.root / SUMS, sums_file(last_sums(self.root)), self._part(SUMS))
             self.path, self._closed = self.place(), True
             self._folder.close()
 

@@ -9,9 +9,11 @@ input. No other package opens or writes zarr.
 import hashlib
 import json
 import math
+import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -29,6 +31,7 @@ from dbthermal.store._integrity import (
     CheckedStore,
     SummedStore,
     last_sums,
+    sums_file,
     valid_part,
     warn_unchecked,
 )
@@ -49,23 +52,23 @@ _ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str
 """FFmpeg's encoder of each codec of a film, with its options."""
 
 
-def _chunks(variable: xr.Variable | xr.DataArray, *, even: bool = False) -> tuple[int, ...]:
+def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> tuple[int, ...]:
     """Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
 
     Every stage works pixel by pixel on all frames and bands, so a chunk holds the full story of a
-    nearly square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression; `even`
-    tiles divide the rows, so that rows that follow begin with a tile.
+    nearly square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression. Tiles
+    divide a `height` of rows, if there is one, so that rows that follow begin with a tile.
     """
     sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
     if not {"y", "x"} <= sizes.keys():
-        return tuple(sizes.values())
+        return tuple((sizes | ({"y": height} if height and "y" in sizes else {})).values())
     pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
     pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
-    height = min(sizes["y"], math.ceil(math.sqrt(pixels)))
-    if even:
-        height = next(rows for rows in range(height, 0, -1) if sizes["y"] % rows == 0)
-    width = min(sizes["x"], math.ceil(pixels / height))
-    sizes |= {"y": height if even else min(sizes["y"], math.ceil(pixels / width)), "x": width}
+    rows = min(height or sizes["y"], math.ceil(math.sqrt(pixels)))
+    if height:
+        rows = next(count for count in range(rows, 0, -1) if height % count == 0)
+    width = min(sizes["x"], math.ceil(pixels / rows))
+    sizes |= {"y": rows if height else min(sizes["y"], math.ceil(pixels / width)), "x": width}
     return tuple(sizes.values())
 
 
@@ -92,7 +95,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
     [20310, 20750]
     """
-    _save_rows([dataset], path, provenance, even=False)
+    _save_rows([dataset], path, provenance)
 
 
 def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
@@ -119,13 +122,99 @@ def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping
     ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
     [[0, 0], [1, 0], [2, 0]]
     """
-    _save_rows(parts, path, provenance, even=True)
+    rest = iter(parts)
+    first = next(rest)
+    _save_rows(chain([first], rest), path, provenance, first.sizes.get("y"))
+
+
+def save_part(
+    part: xr.Dataset, path: str | Path, provenance: Mapping[str, Any], height: int
+) -> None:
+    """Save some rows of a dataset as `save` does, for `join_parts`.
+
+    Parameters
+    ----------
+    part : Dataset
+        Rows that follow one another.
+    path : str or Path
+        Folder ``*.zarr`` of its own.
+    provenance : mapping
+        See `save`.
+    height : int
+        Rows of each part but the last, which has no more.
+    """
+    _save_rows([part], path, provenance, height)
+
+
+def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
+    """Join datasets of rows that follow one another; their chunks are moved, and not read.
+
+    Parameters
+    ----------
+    parts : iterable of str or Path
+        Folders from `save_part`, of one height but the last. They are used up.
+    path : str or Path
+        Folder ``*.zarr`` of the whole, with the attributes of the first.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> rows = [xr.Dataset({"status": (("y", "x"), [[row, 0]])}) for row in range(3)]
+    >>> with TemporaryDirectory() as folder:
+    ...     parts = [f"{folder}/{number}.zarr" for number in range(3)]
+    ...     for row, part in zip(rows, parts):
+    ...         store.save_part(row, part, store.provenance({}), 1)
+    ...     store.join_parts(parts, f"{folder}/wall.zarr")
+    ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
+    [[0, 0], [1, 0], [2, 0]]
+    """
+    first, *rest = [Path(part) for part in parts]
+    with _whole(path, ".zarr") as folder:
+        first.rename(folder)
+        metadata = {one: json.loads(one.read_text()) for one in folder.glob("*/zarr.json")}
+        along = {one: array for one, array in metadata.items() if "y" in array["dimension_names"]}
+        sums = last_sums(folder)
+        for part in rest:
+            for one, array in along.items():
+                sums |= _moved(part / one.parent.name, one.parent, array)
+        for one, array in along.items():
+            one.write_text(json.dumps(array, indent=2))
+            sums[one.relative_to(folder).as_posix()] = f"{zlib.crc32(one.read_bytes()):08x}"
+        (folder / SUMS).write_bytes(sums_file(sums))
+
+
+def _moved(part: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
+    """Move the chunks of a part of an array behind those of the whole; their checksums by name."""
+    place = array["dimension_names"].index("y")
+    end, rows = array["shape"][place], array["chunk_grid"]["configuration"]["chunk_shape"][place]
+    own, sums = last_sums(part.parent), {}
+    if end % rows:
+        raise ValueError(
+            f"Invalid part '{part.parent}' after {end} rows in chunks of {rows}. Must follow whole "
+            "chunks."
+        )
+    for chunk in [one for one in (part / "c").rglob("*") if one.is_file()]:
+        numbers = list(chunk.relative_to(part / "c").parts)
+        numbers[place] = str(int(numbers[place]) + end // rows)
+        moved = whole.joinpath("c", *numbers)
+        sums[moved.relative_to(whole.parent).as_posix()] = own[
+            chunk.relative_to(part.parent).as_posix()
+        ]
+        moved.parent.mkdir(parents=True, exist_ok=True)
+        chunk.rename(moved)
+    array["shape"][place] += json.loads((part / "zarr.json").read_text())["shape"][place]
+    return sums
 
 
 def _save_rows(
-    parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any], *, even: bool
+    parts: Iterable[xr.Dataset],
+    path: str | Path,
+    provenance: Mapping[str, Any],
+    height: int | None = None,
 ) -> None:
-    """Save parts that follow one another along y; their chunks divide the rows if `even`."""
+    """Save parts that follow one another along y, each of a height that chunks then divide."""
     options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
     with _whole(path, ".zarr") as folder:
         folder.mkdir()
@@ -133,7 +222,7 @@ def _save_rows(
             # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
             plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
             encoding = {
-                name: {"chunks": _chunks(variable, even=even), "compressors": _COMPRESSORS}
+                name: {"chunks": _chunks(variable, height), "compressors": _COMPRESSORS}
                 for name, variable in plain.variables.items()
             }
             if number == 0:
@@ -148,7 +237,7 @@ def _save_rows(
                 write_empty_chunks=True,
                 **(options if number else {"mode": "w-", "encoding": encoding}),
             )
-        (folder / SUMS).write_bytes(last_sums(folder))
+        (folder / SUMS).write_bytes(sums_file(last_sums(folder)))
 
 
 def open_dataset(path: str | Path) -> xr.Dataset:

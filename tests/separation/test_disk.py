@@ -1,0 +1,142 @@
+"""Captures from disk to disk: the same as in memory, by any process, after any kill."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import separation, simulation, store
+
+RIG = simulation.Rig()
+TIME = np.arange(64) / 10.0  # s
+MEMORY = 500e6 + 9 * 96 * 64 * 24  # byte: nine rows in a block of a process
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of 41 rows on disk, with lost samples, bad pixels and a shutter event."""
+    rng = np.random.default_rng(1)
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    scene = simulation.walkers(TIME, (41, 24), glass, rng, crossings=3)
+    capture = simulation.observe(scene, RIG.response(), rng)
+    capture["counts"][:, 20] = np.nan
+    capture["status"] = (("y", "x"), np.zeros((41, 24), dtype=np.uint32))
+    capture["status"][3, 4] = 1 << 10
+    capture["segment"] = ("time", (TIME > 3.0).astype(np.int32))
+    path = tmp_path_factory.mktemp("run") / "capture.zarr"
+    store.save(capture, path, store.provenance({}))
+    return path
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Content of every file of a store."""
+    return {
+        str(one.relative_to(folder)): one.read_bytes()
+        for one in sorted(folder.rglob("*"))
+        if one.is_file()
+    }
+
+
+@pytest.mark.parametrize("noise", ["known", "estimated"])
+def test_run_is_solve(path: Path, tmp_path: Path, noise: str) -> None:
+    """Block by block the result is that of the whole capture in memory, and no part is left."""
+    response = RIG.response()
+    response = response if noise == "known" else response.drop_vars(["noise", "netd"])
+    target = tmp_path / "result.zarr"
+    result = separation.run(path, target, response, memory=MEMORY)
+    expected = separation.solve(store.open_dataset(path).load(), response)
+    xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
+    assert result.attrs["method"] == "subspace"
+    assert [one.name for one in tmp_path.iterdir()] == ["result.zarr"]
+
+
+def test_options_of_pixels_are_cut_into_rows(path: Path, tmp_path: Path) -> None:
+    """A mask, and emissivities, of each pixel are those of its block."""
+    rng, capture = np.random.default_rng(2), store.open_dataset(path)
+    known = xr.DataArray(
+        rng.uniform([[[0.85]], [[0.7]]], [[[0.87]], [[0.73]]], (2, 41, 24)),
+        dims=("band", "y", "x"),
+        coords={"band": list(RIG.bands)},
+    )
+    mask = xr.DataArray(rng.random((41, 24)) < 0.9, dims=("y", "x"))
+    response, target = RIG.response(), tmp_path / "r.zarr"
+    result = separation.run(
+        path, target, response, "calibrated", memory=MEMORY, emissivity=known, mask=mask
+    )
+    expected = separation.solve(capture.load(), response, "calibrated", emissivity=known, mask=mask)
+    xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
+
+
+def test_processes_give_the_same_bytes(path: Path, tmp_path: Path) -> None:
+    """Two processes of an executor write the files that one process writes."""
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as two:
+        separation.run(path, tmp_path / "two.zarr", RIG.response(), executor=two, memory=MEMORY)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
+        separation.run(path, tmp_path / "one.zarr", RIG.response(), executor=one, memory=MEMORY)
+    assert files(tmp_path / "two.zarr") == files(tmp_path / "one.zarr")
+
+
+KILLED = """
+import sys
+from dbthermal import separation, simulation
+if __name__ == "__main__":
+    separation.run(sys.argv[1], sys.argv[2], simulation.Rig().response(), memory=float(sys.argv[3]))
+"""
+
+
+@pytest.mark.slow
+def test_kill_and_restart(path: Path, tmp_path: Path) -> None:
+    """Killed at ten random moments and started again, it ends with the bytes of a run at rest."""
+    separation.run(path, tmp_path / "rest.zarr", RIG.response(), memory=MEMORY)
+    rng, target = np.random.default_rng(5), tmp_path / "killed.zarr"
+    command = [sys.executable, "-c", KILLED, str(path), str(target), str(MEMORY)]
+    kills = 0
+    for _ in range(10):
+        process = subprocess.Popen(command)
+        time.sleep(rng.uniform(2.0, 6.0))
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        process.wait()
+    subprocess.run(command, check=True)
+    print(f"{kills} kills")
+    assert kills >= 1
+    assert files(target) == files(tmp_path / "rest.zarr")
+
+
+def test_parts_of_another_run_are_refused(path: Path, tmp_path: Path) -> None:
+    """What a run of other options has left is not taken for this one's."""
+    target = tmp_path / "result.zarr"
+    mask = xr.DataArray(np.zeros(64, dtype=bool), dims="time")
+    with pytest.raises(ValueError, match="Must"):
+        separation.run(path, target, RIG.response(), "nonsense", memory=MEMORY)
+    parts = Path(f"{target}.parts")
+    parts.mkdir()
+    (parts / "plan.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"Invalid folder .*result\.zarr\.parts.*another"):
+        separation.run(path, target, RIG.response(), memory=MEMORY, mask=mask)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "bcp"}, "Invalid method 'bcp': of the whole image"),
+        ({"pool": xr.DataArray(np.zeros((41, 24), int), dims=("y", "x"))}, "option 'pool'"),
+        ({"memory": 1e6}, "Invalid memory .* byte. Must be at least"),
+    ],
+)
+def test_what_is_of_the_whole_image_is_refused(
+    path: Path, tmp_path: Path, options: dict[str, object], message: str
+) -> None:
+    """Before anything is written."""
+    with pytest.raises(ValueError, match=message):
+        separation.run(path, tmp_path / "r.zarr", RIG.response(), **options)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
