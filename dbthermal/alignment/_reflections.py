@@ -204,7 +204,8 @@ def _coarse(
         size = float(np.exp(0.25 * np.log(variance[:, level.valid]).sum(axis=0).mean()))
         # A field of slower changes must lie within the deviation of the more robust one.
         apart = (begin.on(places) - field.on(places)) ** 2 / kept
-        if size < best / _MORE and apart.mean() < _AGREE**2:
+        told = _told(data, factor).any()
+        if told and size < best / _MORE and apart.mean() < _AGREE**2:
             kept, best = variance, size
             energy = np.minimum((pictures[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
             # Those of the largest energy, no more than memory allows.
