@@ -27,10 +27,10 @@ Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
 
-PIXELS: Final = 320
+PIXELS: Final = 2560
 """Pixels in a tile, unless a method sets its own number."""
 
-SAMPLES: Final = 2**19
+SAMPLES: Final = 2**20
 """Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
 
 BLOCK_ROWS: Final = 32
@@ -41,13 +41,13 @@ _TOGETHER: Final = 12
 # Resampled samples whose noise differs by less are separated together [1].
 _NOISE_STEP: Final = 0.05
 # A temperature leaves the calibrated range if it is so many standard deviations outside.
-_RANGE_SIGMAS: Final = 5.0
+RANGE_SIGMAS: Final = 5.0
 # A temperature [K], emissivity [1] or deviation beyond is no result.
-_USELESS: Final = 1e6
+USELESS: Final = 1e6
 
 
 @dataclass(frozen=True)
-class _Pixels:
+class Pixels:
     """A record of arrays, optional ones among them, whose last axis is the pixel."""
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
@@ -76,7 +76,7 @@ class _Pixels:
 
 
 @dataclass(frozen=True)
-class Material(_Pixels):
+class Material(Pixels):
     """Reflection ratios and emissivity that the pixels of one material share; NaN for others."""
 
     ratio: Array  # reflection ratios (band, pixel) [1]
@@ -87,7 +87,7 @@ class Material(_Pixels):
 
 
 @dataclass(frozen=True)
-class Survey(_Pixels):
+class Survey(Pixels):
     """Contribution of each pixel to the estimate for its material."""
 
     scatter: Array  # noise-whitened scatter of rapid changes less noise (band, band, pixel) [1]
@@ -159,7 +159,7 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class Estimate(_Pixels):
+class Estimate(Pixels):
     """Estimate of one tile; NaN where a quantity is undefined, with a status bit that says so."""
 
     object_temperature: Array  # (time, pixel) [K]
@@ -220,19 +220,25 @@ class Estimate(_Pixels):
             if getattr(self, name) is None:
                 continue
             value, std = getattr(self, name), getattr(self, f"{name}_std")
-            precise = (std < _USELESS) | (f"{name}_std" in not_estimated)
-            lost = ~((np.abs(value) < _USELESS) & precise)
+            precise = (std < USELESS) | (f"{name}_std" in not_estimated)
+            lost = ~((np.abs(value) < USELESS) & precise)
             explained = np.all(np.isnan(value), axis=0) & (self.status != 0)
             beyond |= np.any(lost, axis=0) & ~explained
             values[name], values[f"{name}_std"] = (
                 np.where(lost, np.nan, part) for part in (value, std)
             )
             if name.endswith("temperature"):
-                margin = _RANGE_SIGMAS * np.where(np.isnan(std), 0.0, std)
-                cold, hot = value < curve.lowest - margin, value > curve.highest + margin
-                beyond |= np.any(cold | hot, axis=0)
+                beyond |= np.any(out_of_range(value, std, curve), axis=0)
         status = self.status | status_bits({Status.OUTSIDE_RESPONSE: beyond})
         return replace(self, **values, status=status)
+
+
+def out_of_range(temperature: Array, std: Array, curve: Curve) -> Mask:
+    """Temperatures [K] outside the calibrated range of a response by several deviations."""
+    margin = RANGE_SIGMAS * np.where(np.isnan(std), 0.0, std)
+    return np.asarray(
+        (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
+    )
 
 
 @dataclass(frozen=True)

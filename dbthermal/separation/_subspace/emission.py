@@ -29,15 +29,20 @@ from dbthermal.separation._subspace import residuals
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
 
-_ROUNDS: Final = 2
+ROUNDS: Final = 2
 # Energy of the object's change over that of its noise, below which its emissivity is undefined.
-_OBJECT_TO_NOISE: Final = 10.0
+OBJECT_TO_NOISE: Final = 10.0
 # The background counts as resting within so many standard deviations, in that share of frames.
-_WITHIN: Final = 3.0
-_RESTING: Final = 0.3
+WITHIN: Final = 3.0
+RESTING: Final = 0.3
 # Degrees of the polynomials over which a spectrum is averaged: from, and up to, not including;
 # and degrees of freedom lost: of the first three, one is along the object's curve.
-_OCTAVES: Final = ((1, 4, 1), (4, 8, 0))
+OCTAVES: Final = ((1, 4, 1), (4, 8, 0))
+# Energy of the bend between the two responses, in units of the second band's noise, from which it
+# is worth taking out: it moves no linear function of the signal by more standard deviations.
+BEND: Final = 0.2
+# Times that it is taken out at most: it changes with the background that it is computed of.
+BENDS: Final = 2
 # Bound of a 95 % interval of the normal distribution.
 NORMAL95: Final = float(ndtri(0.975))
 
@@ -106,7 +111,7 @@ def estimate(
         noise_variance=noise_variance,
         drift_variance=drifting,
         constant=fit.constant,
-        restless=np.mean(line.residual**2 < _WITHIN**2 * expected, axis=0) < _RESTING,
+        restless=np.mean(line.residual**2 < WITHIN**2 * expected, axis=0) < RESTING,
     )
 
 
@@ -135,11 +140,11 @@ def _alternate(tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio) 
     emissivity = np.where((guess > 0) & (guess < 1), guess, middle)
     temperature = _newton(tile, ratios, emissivity, target, temperature)[0]
     line: residuals.Line | None = None
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         emitted = tile.blackbody(0, temperature)
         line = residuals.regress(emitted, tile.signals[0], tile.noise[0], start=line)
         functions_used = ratios.order + functions.steps
-        constant = line.energy < _OBJECT_TO_NOISE * functions_used * ratios.null_variance
+        constant = line.energy < OBJECT_TO_NOISE * functions_used * ratios.null_variance
         emissivity = np.where(constant, middle, line.slope)
         if tile.material is not None:
             known = ratios.pooled & np.isfinite(tile.material.emissivity)
@@ -251,7 +256,7 @@ def walk_variance(
     # Energy of a walk at degree 1: j^2 times that at degree j, less the noise's.
     walk = degree**2 * (spectrum**2 - noise**2 / share - curve_std**2 * (degree < order))
     octaves, widened = [], []
-    for low, high, lost in _OCTAVES:
+    for low, high, lost in OCTAVES:
         if (freedom := len(walk[low - 1 : high - 1]) - lost) > 0:
             octaves.append(walk[low - 1 : high - 1].sum(axis=0) / freedom)
             widened.append(octaves[-1] * (stdtrit(freedom, 0.975) / NORMAL95) ** 2)

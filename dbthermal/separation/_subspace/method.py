@@ -61,11 +61,10 @@ from dbthermal import _smooth as smooth
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._subspace import clock, pieces, reflection_ratio, residuals
+from dbthermal.separation._subspace import clock, fused, pieces, reflection_ratio, residuals, steps
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace.emission import Emission
-from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
-from dbthermal.separation._tiles import Array, Estimate, Mask, Survey, Tile
+from dbthermal.separation._subspace.steps import FILMS, Solution
+from dbthermal.separation._tiles import Estimate, Mask, Survey, Tile
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -73,34 +72,21 @@ _CHI2_SIGMAS: Final = 8.0
 _CORRELATION_SIGMAS: Final = 3.5
 _DELAY_SIGMAS: Final = 4.0
 _BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
-# Set beside the flags, within this module, where pieces of time are asked for.
-_PIECES: Final = np.uint32(1 << 31)
 # Last orders of the smooth curve at which its polynomials may be too few.
 _LAST: Final = 6
 # Flags of pixels in which rapid changes of the object are looked for.
-_SUSPECT: Final = (
-    np.uint32(
-        Status.OBJECT_NOT_SMOOTH
-        | Status.GRAY
-        | Status.CONSTANT_OBJECT
-        | Status.NONPHYSICAL_EMISSIVITY
-        | Status.ROLES_MAY_BE_SWAPPED
-        | Status.BACKGROUND_NEVER_RESTS
-    )
-    | _PIECES
+_SUSPECT: Final = np.uint32(
+    Status.OBJECT_NOT_SMOOTH
+    | Status.GRAY
+    | Status.CONSTANT_OBJECT
+    | Status.NONPHYSICAL_EMISSIVITY
+    | Status.ROLES_MAY_BE_SWAPPED
+    | Status.BACKGROUND_NEVER_RESTS
 )
 # Cost of an explanation over that of the best, up to which it is preferred if it has no flag.
 _LIKELY: Final = 40.0
 # Pieces of a rapid object, at most, whose bands seem apart in one smooth curve.
 _MOST_PIECES: Final = 10
-# Energy of the bend between the two responses, in units of the second band's noise, from which it
-# is worth taking out: it moves no linear function of the signal by more standard deviations.
-_BEND: Final = 0.2
-# Times that it is taken out at most: it changes with the background that it is computed of.
-_BENDS: Final = 2
-# Background temperatures at which a gray body's ratios are computed, over the calibrated range.
-_TEMPERATURES: Final = 9
-
 Record = TypeVar("Record", Estimate, Survey)
 
 
@@ -127,20 +113,6 @@ class SubspaceSettings:
             )
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Steps 1 to 4 of a tile."""
-
-    ratios: ReflectionRatio
-    emission: Emission
-    background: Array  # (time, pixel) [K]
-    background_variance: Array  # (time, pixel) [K^2]
-    straight: Tile  # the tile with signals of proportional reflections
-    gray: Mask  # the signals as they are may be those of a gray body (pixel)
-    by_pattern: tuple[Array | float, Array | float]  # variances, see `pattern_variances`
-    bend: Array  # of the signals as they are, see `emission.bend` (band - 1, time, pixel) [K]
-
-
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of two bands or more."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -151,7 +123,8 @@ def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
     """Scatter and emissivity of the pixels of a tile, each alone; of those without a flag."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         # Together the pixels see a bend that is too small to be seen in each.
-        result = _exact(tile, _functions(tile), settings, _survey, least=0.0)
+        functions = _functions(tile)
+        result = _survey(tile, functions, _solve(tile, functions, settings, least=0.0))
         first = _followed(tile, settings)[1]
         divided = np.asarray(first.any(axis=0))
         if np.any(divided):
@@ -166,160 +139,95 @@ def _functions(tile: Tile) -> smooth.Subspace:
     return smooth.subspace(tile.time, order, segment=tile.segment)
 
 
-def _exact(
+def _solve(
     tile: Tile,
     functions: smooth.Subspace,
     settings: SubspaceSettings,
-    finish: Callable[[Tile, smooth.Subspace, _Solution], Record],
-    least: float = _BEND,
-) -> Record:
-    """Steps 1 to 4, where it matters again on signals with proportional reflections."""
-    solution = _steps(tile, tile, functions, settings)
-    result = finish(tile, functions, solution)
-    part, removed, places = tile, np.zeros(1), np.arange(solution.gray.size)
-    for _ in range(_BENDS):
-        bend = solution.bend
-        change = bend - removed
-        change -= change.mean(axis=1, keepdims=True)
-        energy = np.einsum("btp,btp->bp", change, change)
-        bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
-        if not np.any(bent):
-            break
-        part, removed, places = part.select_pixels(bent), bend[..., bent], places[bent]
-        least = _BEND
-        signals = part.signals.copy()
-        signals[1:] -= removed
-        straight = replace(part, signals=signals)
-        solution = _steps(part, straight, functions, settings, solution.gray[bent])
-        result = result.replace_pixels(places, finish(part, functions, solution))
-    return result
+    least: float = emissions.BEND,
+) -> Solution:
+    """Steps 1 to 4, compiled for two bands."""
+    solve = fused.solve if len(tile.noise) == 2 else steps.solve
+    return solve(tile, functions, settings.background_drift, least)
 
 
-def _steps(
-    tile: Tile,
-    straight: Tile,
-    functions: smooth.Subspace,
-    settings: SubspaceSettings,
-    gray: Mask | None = None,
-) -> _Solution:
-    """
-    Steps 1 to 4; the first three on signals whose reflections are proportional.
-
-    The bend of a gray body is not known: whether it is one is told from signals as they are.
-    """
-    noise = np.array(tile.noise)
-    ratios = reflection_ratio.estimate(straight.signals, functions, noise, tile.material)
-    if gray is None:
-        curve = tile.curves[0]
-        temperature = np.linspace(curve.lowest, curve.highest, _TEMPERATURES)
-        slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
-        gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
-    emission = emissions.estimate(straight, functions, ratios, settings.background_drift)
-    background, variance = emissions.estimate_background(tile, emission, ratios)
-    by_pattern = emissions.pattern_variances(tile, emission, ratios, background)
-    bend = emissions.bend(tile, emission, background)
-    return _Solution(ratios, emission, background, variance, straight, gray, by_pattern, bend)
-
-
-def _report(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Estimate:
+def _report(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Estimate:
     """Values, standard deviations and flags; NaN where a quantity is undefined."""
-    ratios, emission = solution.ratios, solution.emission
     flags = _flags(tile, functions, solution)
     still = flags[Status.NO_BACKGROUND_MOTION]
-    ambiguous = emission.constant & flags[Status.ROLES_MAY_BE_SWAPPED]
+    ambiguous = solution.constant & flags[Status.ROLES_MAY_BE_SWAPPED]
     undefined = still | flags[Status.GRAY] | ambiguous
-    unidentified = undefined | emission.constant
-    ratio_variance = ratios.variance + emission.level_std**2
-    of_object, of_background = solution.by_pattern
-    result = Estimate(
-        object_temperature=emission.temperature,
-        object_temperature_std=np.sqrt(emission.temperature_std**2 + of_object),
-        background_temperature=solution.background,
-        background_temperature_std=np.sqrt(solution.background_variance + of_background),
-        emissivity=emission.emissivity,
-        emissivity_std=np.sqrt(np.einsum("bbp->bp", emission.emissivity_covariance)),
-        emissivity_covariance=emission.emissivity_covariance,
-        reflection_ratio=np.where(still, np.nan, ratios.ratio),
-        reflection_ratio_std=np.where(still, np.nan, np.sqrt(ratio_variance)),
-        status=status_bits(flags),
-    )
+    unidentified = undefined | solution.constant
     no_background = unidentified | flags[Status.NONPHYSICAL_EMISSIVITY]
-    return result.undefine(undefined, unidentified, no_background).check_range(tile.curves[0])
+    status = status_bits(flags)
+    # A temperature without a number in all samples of a pixel with a flag needs no further flag.
+    lost = (solution.lost > 0) & ((solution.missing < tile.time.size) | (status == 0))
+    beyond = (lost | solution.beyond) & ~np.stack([undefined, no_background])
+    status |= status_bits({Status.OUTSIDE_RESPONSE: np.any(beyond, axis=0)})
+    films = {name: getattr(solution, name) for name in FILMS}
+    result = Estimate(
+        **films,
+        emissivity=solution.emissivity,
+        emissivity_std=np.sqrt(np.einsum("bbp->bp", solution.emissivity_covariance)),
+        emissivity_covariance=solution.emissivity_covariance,
+        reflection_ratio=np.where(still, np.nan, solution.ratio),
+        reflection_ratio_std=np.where(still, np.nan, np.sqrt(solution.ratio_variance)),
+        status=status,
+    )
+    result = result.undefine(undefined, unidentified, no_background)
+    return result.check_range(tile.curves[0], not_estimated=FILMS)
 
 
-def _report_asking(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Estimate:
-    """As `_report`, and whether pieces of time are asked for."""
-    result, ratios = _report(tile, functions, solution), solution.ratios
-    residual = residuals.null_residual(solution.straight.signals, functions, ratios)
-    smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
-    curve, used = functions.object_part @ smoothed, ratios.order + functions.steps
-    asked = pieces.asked(residual, curve, tile.time, ratios.null_variance, used)
-    asked |= ratios.order > functions.orders - _LAST
-    return replace(result, status=result.status | np.where(asked, _PIECES, np.uint32(0)))
-
-
-def _survey(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> Survey:
+def _survey(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Survey:
     """
     Survey of a solution, without the pixels whose model is broken.
 
     A selection by the estimate itself would bias the sum over a material.
     """
     status = _report(tile, functions, solution).status
-    ratios, emission = solution.ratios, solution.emission
     sound = (status & _BROKEN) == 0
-    noise = np.array(tile.noise)
-    rapid, freedom = reflection_ratio.rapid_scatter(solution.straight.signals, functions, noise)
+    freedom = tile.time.size - functions.steps - reflection_ratio.rapid_orders(functions)
     return Survey(
-        scatter=np.where(sound, ratios.scatter, 0.0),
-        frames=sound
-        * np.asarray(tile.time.size - ratios.order - functions.steps, dtype=np.float64),
-        rapid_scatter=np.where(sound, rapid, 0.0),
-        rapid_frames=sound * freedom,
-        ratio=ratios.ratio,
-        null_weights=ratios.null_weights,
-        emissivity=np.where(status == 0, emission.emissivity[0], np.nan),
-        noise_variance=emission.noise_variance,
-        drift_variance=emission.drift_variance,
+        scatter=np.where(sound, solution.scatter, 0.0),
+        frames=sound * (tile.time.size - functions.steps - solution.order).astype(np.float64),
+        rapid_scatter=np.where(sound, solution.rapid_scatter, 0.0),
+        rapid_frames=sound * freedom[:, np.newaxis].astype(np.float64),
+        ratio=solution.ratio,
+        null_weights=solution.null_weights,
+        emissivity=np.where(status == 0, solution.emissivity[0], np.nan),
+        noise_variance=solution.noise_variance,
+        drift_variance=solution.drift_variance,
     )
 
 
-def _flags(tile: Tile, functions: smooth.Subspace, solution: _Solution) -> dict[Status, Mask]:
+def _flags(tile: Tile, functions: smooth.Subspace, solution: Solution) -> dict[Status, Mask]:
     """Conditions (pixel) of the bits of the status."""
-    ratios, emission, signals = solution.ratios, solution.emission, solution.straight.signals
-    residual = residuals.null_residual(signals, functions, ratios)
-    correlation = residuals.autocorrelation(residual)
-    delay = residuals.interband_delay(residual, signals[0], functions, ratios, tile.noise[0])
-    frames, others = tile.time.size, len(tile.noise) - 1
-    still = ~ratios.pooled & (ratios.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames))
+    frames, others, emissivity = tile.time.size, len(tile.noise) - 1, solution.emissivity
+    still = solution.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames)
     # The quietest band holds no more than its noise either.
-    still |= ~ratios.pooled & (ratios.scatter[0, 0] <= 0)
-    still |= ~np.isfinite(ratios.inverse_energy)
+    still |= solution.scatter[0, 0] <= 0
+    still = (still & ~solution.pooled) | ~np.isfinite(solution.inverse_energy)
     # Ratios of 1, where eq. 5 is singular, are not excluded.
-    singular = emission.epsilon_variance > 1.0 / chi2.isf(reflection_ratio.CHANCE, others)
+    singular = solution.epsilon_variance > 1.0 / chi2.isf(reflection_ratio.CHANCE, others)
     gray = ~still & (singular | solution.gray)
-    defined = ~still & ~gray & ~emission.constant
-    nonphysical = defined & np.any((emission.emissivity <= 0) | (emission.emissivity >= 1), axis=0)
-    swapped = defined & ~nonphysical & (emission.emissivity.mean(axis=0) < 0.5)
-    constant = ~still & ~gray & emission.constant
+    defined = ~still & ~gray & ~solution.constant
+    nonphysical = defined & np.any((emissivity <= 0) | (emissivity >= 1), axis=0)
+    swapped = defined & ~nonphysical & (emissivity.mean(axis=0) < 0.5)
+    constant = ~still & ~gray & solution.constant
     # Before a constant object all that changes would be the background, which comes and goes.
-    swapped |= constant & ~residuals.returning(signals[0])
+    swapped[constant] = ~residuals.returning(tile.signals[0][:, constant])
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
-    free = frames - ratios.order - functions.steps
+    free = frames - solution.order - functions.steps
     excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * free)
-    rough = (correlation > _CORRELATION_SIGMAS) | (ratios.reduced_chi2 > 1.0 + excess)
-    rapid = signals[0] - functions.functions @ ratios.coefficients[0]
-    free_part = 1.0 - functions.leverage()[:, ratios.order - 1]
-    common = ratios.null_weights[0] * tile.noise[0] ** 2 * free_part
-    rough |= residuals.unexplained(residual, rapid, ratios.null_variance, common)
+    rough = (solution.correlation > _CORRELATION_SIGMAS) | solution.unexplained
     return {
         Status.NO_BACKGROUND_MOTION: still,
         Status.GRAY: gray,
         Status.CONSTANT_OBJECT: constant,
-        Status.BACKGROUND_NEVER_RESTS: defined & emission.restless,
+        Status.BACKGROUND_NEVER_RESTS: defined & solution.restless,
         Status.NONPHYSICAL_EMISSIVITY: nonphysical,
         Status.ROLES_MAY_BE_SWAPPED: swapped,
-        Status.BANDS_APART: ~still & (delay > _DELAY_SIGMAS),
-        Status.OBJECT_NOT_SMOOTH: rough,
+        Status.BANDS_APART: ~still & (solution.delay > _DELAY_SIGMAS),
+        Status.OBJECT_NOT_SMOOTH: rough | (solution.reduced_chi2 > 1.0 + excess),
     }
 
 
@@ -330,9 +238,14 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
     And the frames that pieces begin with (time, pixel), none where one curve is smooth.
     """
     functions, noise = _functions(tile), np.array(tile.noise)
-    result = _exact(tile, functions, settings, _report_asking)
-    suspect = np.flatnonzero(result.status & _SUSPECT)
-    result = replace(result, status=result.status & ~_PIECES)
+    solution = _solve(tile, functions, settings)
+    used = solution.order + functions.steps
+    asked = pieces.asked(
+        solution.sums[0], solution.sums[1], tile.time, solution.null_variance, used
+    )
+    asked |= solution.order > functions.orders - _LAST
+    result = _report(tile, functions, solution)
+    suspect = np.flatnonzero(asked | ((result.status & _SUSPECT) != 0))
     first = np.zeros(tile.signals.shape[1:], dtype=bool)
     if suspect.size == 0:
         return result, first
@@ -373,14 +286,15 @@ def _divided(
     tile: Tile,
     first: Mask,
     settings: SubspaceSettings,
-    finish: Callable[[Tile, smooth.Subspace, _Solution], Record],
-    least: float = _BEND,
+    finish: Callable[[Tile, smooth.Subspace, Solution], Record],
+    least: float = emissions.BEND,
 ) -> Record:
     """Result with pieces that begin with some frames (time, pixel), same pieces together."""
     order, groups, parts = _functions(tile).orders, pieces.alike(first), []
     for places in groups:
         functions = smooth.piecewise(tile.time, first[:, places[0]], order, segment=tile.segment)
-        parts.append(_exact(tile.select_pixels(places), functions, settings, finish, least))
+        part = tile.select_pixels(places)
+        parts.append(finish(part, functions, _solve(part, functions, settings, least)))
     return parts[0].join(parts[1:]).select_pixels(np.argsort(np.concatenate(groups)))
 
 

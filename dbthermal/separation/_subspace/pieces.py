@@ -173,12 +173,15 @@ def _best(scatters: list[Array], prices: list[Array], axis: Array) -> tuple[Arra
 
     For axes (..., pixel, band), with the prices of the pieces' functions (piece).
     """
-    costs = []
+    bands, costs = axis.shape[-1], []
+    # v^T S v as a product of matrices of each pixel: (piece, band pair) by (band pair, axis).
+    squares = np.moveaxis(axis[..., np.newaxis] * axis[..., np.newaxis, :], -3, 0)
+    pairs = squares.reshape(len(squares), -1, bands**2).mT
     for (scatter, _), price in zip(scatters, prices, strict=True):
-        turned = np.einsum("ipbc,...pc->i...pb", scatter, axis)
-        along = np.einsum("...b,...b->...", turned, axis)
-        whole = np.einsum("ipbb->ip", scatter) + price[:, np.newaxis]
-        costs.append(whole.reshape(len(whole), *[1] * (axis.ndim - 2), -1) - along)
+        along = np.moveaxis(scatter, 1, 0).reshape(len(squares), -1, bands**2) @ pairs
+        whole = np.einsum("ipbb->pi", scatter) + price
+        cost = np.moveaxis(whole[..., np.newaxis] - along, 0, -1)
+        costs.append(cost.reshape(len(scatter), *axis.shape[:-1]))
     return _halve(costs)
 
 
@@ -274,21 +277,28 @@ def _first(chosen: list[Mask], edges: Whole) -> Mask:
     return result
 
 
+@lru_cache(maxsize=16)
+def blocks(frames: int) -> Whole:
+    """Edges of the blocks of frames whose means tell whether pieces are asked for."""
+    levels = min(int(np.log2(frames / _FUNCTIONS)), _COARSE + 2)
+    return np.round(np.linspace(0, frames, 2**levels + 1)).astype(np.intp)
+
+
 def asked(residual: Array, curve: Array, time: Array, variance: Array, used: Whole) -> Mask:
     """
     Pixels whose smooth curve is described shorter in pieces.
 
-    Of a null residual and the curve taken from it (time, pixel) [K], of noise of a variance (pixel)
-    [K^2], with the number of functions used (pixel). Means over a few frames are enough to see it.
+    Of the sums (block, pixel) [K] over `blocks` of a null residual and of the curve taken from it,
+    with noise of a variance (pixel) [K^2] and the number of functions used (pixel).
     """
-    levels = min(int(np.log2(len(time) / _FUNCTIONS)), _COARSE + 2)
-    edges = np.round(np.linspace(0, len(time), 2**levels + 1)).astype(np.intp)
+    edges = blocks(len(time))
+    levels = int(np.log2(len(residual)))
     length = np.diff(edges)[:, np.newaxis]
     # Means in units of their noise, about as many frames in each; with the curve and without.
     deviation = np.sqrt(np.where(variance > 0, variance, np.inf) / length.mean())
     places = np.add.reduceat(time, edges[:-1]) / length[:, 0]
-    left = np.add.reduceat(residual, edges[:-1], axis=0) / (length * deviation)
-    mean = left + np.add.reduceat(curve, edges[:-1], axis=0) / (length * deviation)
+    left = residual / (length * deviation)
+    mean = left + curve / (length * deviation)
     costs = []
     for level in range(levels - 1):
         cost = np.empty((1 << level, mean.shape[1]))

@@ -22,13 +22,16 @@ HIGHEST_ORDER: Final = 14
 """Smallest and largest smooth subspace that the data may choose (number of functions)."""
 
 # Functions by which the two largest orders differ that the ratios of a material are compared at.
-_FEWER: Final = 4
+FEWER: Final = 4
+
+TEMPERATURES: Final = 9
+"""Background temperatures, over the calibrated range, at which a gray body is looked for."""
 
 CHANCE: Final = float(2.0 * norm.sf(4.0))
 """Chance of four standard deviations, at which a hypothesis on the ratios is rejected."""
 
 # Chance at which a gray body passes for another: a tenth of what is promised of a status of 0.
-_GRAY_CHANCE: Final = 1e-4
+GRAY_CHANCE: Final = 1e-4
 
 
 @dataclass(frozen=True)
@@ -121,20 +124,24 @@ def estimate(
     )
 
 
-def rapid_scatter(signals: Array, functions: smooth.Subspace, noise: Array) -> tuple[Array, Array]:
-    """
-    Noise-whitened scatter less noise, of what the largest orders leave, and its freedom.
+def rapid_orders(functions: smooth.Subspace) -> Whole:
+    """Two large orders (2,): that of all functions, and before it of a few less."""
+    return np.array([max(1, functions.orders - FEWER), functions.orders])
 
-    (2, band, band, pixel) and (2, pixel), of `_FEWER` functions less and of all. What the order of
-    one pixel leaves of its object, unseen in its noise, adds up over the pixels of a material.
+
+def rapid_scatter(signals: Array, functions: smooth.Subspace, noise: Array) -> Array:
+    """
+    Noise-whitened scatter less noise (2, band, band, pixel), of what the largest orders leave.
+
+    What the order of one pixel leaves of its object, unseen in its noise, adds up over the pixels
+    of a material.
     """
     whitened = signals / noise[:, np.newaxis, np.newaxis]
     coefficients = np.einsum("tc,btp->bcp", functions.functions, whitened, optimize=True)
-    orders = np.array([max(1, functions.orders - _FEWER), functions.orders])
+    orders = rapid_orders(functions)
     scatter = _scatter(whitened, coefficients, functions.steps)[orders - 1]
-    freedom = signals.shape[1] - functions.steps - orders[:, np.newaxis, np.newaxis, np.newaxis]
-    scatter = np.moveaxis(scatter, 1, -1) - freedom * np.eye(len(noise))[..., np.newaxis]
-    return scatter, np.broadcast_to(freedom[:, 0, 0], (2, signals.shape[2])).astype(np.float64)
+    freedom = (signals.shape[1] - functions.steps - orders).reshape(2, 1, 1, 1)
+    return np.asarray(np.moveaxis(scatter, 1, -1) - freedom * np.eye(len(noise))[..., np.newaxis])
 
 
 def principal_ratio(scatter: Array, noise: Array) -> Array:
@@ -202,8 +209,8 @@ def may_be_gray(ratios: ReflectionRatio, noise: Array, slopes: Array) -> Mask:
     nearest = np.einsum("tbp,tbp->tp", between, between) / ratios.inverse_energy
     freedom = len(noise) - 1
     # The mean is no larger than the largest chance: few pixels need it.
-    gray = nearest.min(axis=0) < chdtri(freedom, _GRAY_CHANCE)
-    gray[gray] = chdtrc(freedom, nearest[:, gray]).mean(axis=0) > _GRAY_CHANCE
+    gray = nearest.min(axis=0) < chdtri(freedom, GRAY_CHANCE)
+    gray[gray] = chdtrc(freedom, nearest[:, gray]).mean(axis=0) > GRAY_CHANCE
     return np.asarray(gray)
 
 

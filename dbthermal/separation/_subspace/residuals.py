@@ -6,6 +6,7 @@ of an object that breaks the cue of its smoothness.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.special import chdtri, ndtri
 
 from dbthermal import _smooth as smooth
 from dbthermal.separation._subspace.reflection_ratio import CHANCE, ReflectionRatio
-from dbthermal.separation._tiles import Array, Mask
+from dbthermal.separation._tiles import Array, Mask, Whole
 
 Precision = TypeVar("Precision", np.float32, np.float64)
 
@@ -30,14 +31,16 @@ AROUND: Final = 1.0
 
 # Share of the points that must lie on the line: the scale is taken from their deviation, as an
 # absolute deviation of that rank -> standard deviation of a normal distribution.
-_SHARE: Final = 0.3
-_TO_STD: Final = 1.0 / float(ndtri(0.5 * (1.0 + _SHARE)))
-_ANNEALING: Final = 0.7
-_STARTING_STEPS: Final = 5
-_STARTING_POINTS: Final = 100
-_STEPS: Final = 3
+SHARE: Final = 0.3
+TO_STD: Final = 1.0 / float(ndtri(0.5 * (1.0 + SHARE)))
+ANNEALING: Final = 0.7
+STARTING_STEPS: Final = 5
+STARTING_POINTS: Final = 100
+STEPS: Final = 3
+# Largest correlation of neighbouring residuals: that of one all slow would be 1.
+MOST_CORRELATED: Final = 0.98
 # Deviations of noise from which a difference between frames is a change.
-_CHANGE: Final = 5.0
+CHANGE: Final = 5.0
 # Share of the change within a second that a sudden step makes.
 _MOST: Final = 2.0 / 3.0
 # Parts of the capture, and the total variation of their means over its range, from which a signal
@@ -86,8 +89,8 @@ def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None =
         residual = _first_residual(abscissa, ordinate, noise)
     else:
         residual = _fit(abscissa, ordinate, start.weights)[2]
-    for _ in range(_STEPS):
-        scale = np.maximum(noise, _TO_STD * _ranked_magnitude(residual))
+    for _ in range(STEPS):
+        scale = np.maximum(noise, TO_STD * _ranked_magnitude(residual))
         weights = _tukey(residual, scale)
         slope, _, residual, energy = _fit(abscissa, ordinate, weights)
     # var(slope) = s^2 / sum w (x - mean)^2, over the fraction of independent points.
@@ -158,6 +161,14 @@ def interband_delay(
     return np.asarray(np.maximum(score, _excess(residual, change, ratios.null_variance, noise)))
 
 
+@lru_cache(maxsize=16)
+def blocks(frames: int) -> tuple[Whole, tuple[float, float]]:
+    """Edges of the blocks of `unexplained`, and the limits of its two statistics."""
+    number = 2 ** int(np.log2(frames / _BLOCK))
+    edges = np.round(np.linspace(0, frames, number + 1)).astype(np.intp)
+    return edges, (float(chdtri(number, CHANCE)), float(chdtri(1.0, CHANCE / (2 * number))))
+
+
 def unexplained(residual: Array, rapid: Array, null_variance: Array, common: Array) -> Mask:
     r"""
     Pixels of which the null residual r (time, pixel) [K] is not white noise in some part of time.
@@ -170,8 +181,7 @@ def unexplained(residual: Array, rapid: Array, null_variance: Array, common: Arr
 
     which is a chi-square variable; its last term is `common` (time, pixel) [K^2] in each frame.
     """
-    levels = int(np.log2(len(residual) / _BLOCK))
-    edges = np.round(np.linspace(0, len(residual), 2**levels + 1)).astype(np.intp)
+    edges, (most, limit) = blocks(len(residual))
     length = np.diff(edges)[:, np.newaxis]
     product, square = residual * rapid - common, rapid**2
     sums, products, squares = (
@@ -179,9 +189,8 @@ def unexplained(residual: Array, rapid: Array, null_variance: Array, common: Arr
     )
     variance = np.where(null_variance > 0, null_variance, np.inf)
     together = (products**2 / np.where(squares > 0, squares, np.inf)).sum(axis=0) / variance
-    result = together > chdtri(len(length), CHANCE)
-    limit = chdtri(1.0, CHANCE / (2 * len(length)))
-    for _ in range(levels):
+    result = together > most
+    while len(sums) > 1:
         result |= np.any(sums**2 > limit * variance * length, axis=0)
         sums, length = sums[::2] + sums[1::2], length[::2] + length[1::2]
     return np.asarray(result)
@@ -214,7 +223,7 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     size = (frames, 1)
     around = maximum_filter(curve, size)[1:] - minimum_filter(curve, size)[1:]
     noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
-    jumps = (step > _CHANGE * noise) & (step > _MOST * around)
+    jumps = (step > CHANGE * noise) & (step > _MOST * around)
     return np.asarray(np.any(jumps[interval < 2.0 * usual], axis=0))
 
 
@@ -227,7 +236,7 @@ def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
     is a fraction of the deviation; the one with the smallest deviation wins, pixel by pixel. A
     hundred points in single precision are enough to start from.
     """
-    every = slice(None, None, max(1, abscissa.shape[0] // _STARTING_POINTS))
+    every = slice(None, None, max(1, abscissa.shape[0] // STARTING_POINTS))
     # About its mean, or single precision would not resolve a small range.
     centred, up = abscissa - abscissa.mean(axis=0), ordinate - ordinate.mean(axis=0)
     few = centred[every].astype(np.float32), up[every].astype(np.float32)
@@ -235,10 +244,10 @@ def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
     slope, intercept, smallest = (np.full(plain.shape[1], np.inf) for _ in range(3))
     for start in (np.ones_like(plain), plain >= 0, plain <= 0):
         weights = start.astype(np.float32)
-        for _ in range(_STARTING_STEPS):
+        for _ in range(STARTING_STEPS):
             *line, residual, _ = _fit(*few, weights)
             deviation = _ranked_magnitude(residual)
-            weights = _tukey(residual, np.maximum(noise, _ANNEALING * _TO_STD * deviation))
+            weights = _tukey(residual, np.maximum(noise, ANNEALING * TO_STD * deviation))
         better = deviation < smallest
         slope, intercept = np.where(better, line, (slope, intercept))
         smallest = np.where(better, deviation, smallest)
@@ -264,9 +273,9 @@ def _fit(
 
 
 def _ranked_magnitude(residual: npt.NDArray[Precision]) -> Array:
-    """Absolute value of rank `_SHARE` over time; in single precision, which is much faster."""
+    """Absolute value of rank `SHARE` over time; in single precision, which is much faster."""
     magnitude = np.abs(residual.T, dtype=np.float32, casting="same_kind")
-    middle = int(_SHARE * residual.shape[0])
+    middle = int(SHARE * residual.shape[0])
     return np.asarray(np.partition(magnitude, middle, axis=1)[:, middle], dtype=np.float64)
 
 
@@ -286,7 +295,7 @@ def _independent(residual: Array, weights: Array) -> Array:
     energy = np.einsum("tp,tp->p", kept, kept)
     lagged = np.einsum("tp,tp->p", kept[1:], kept[:-1])
     correlation = np.clip(
-        np.divide(lagged, energy, out=np.zeros_like(energy), where=energy > 0), 0, 0.98
+        np.divide(lagged, energy, out=np.zeros_like(energy), where=energy > 0), 0, MOST_CORRELATED
     )
     return np.asarray((1.0 - correlation) / (1.0 + correlation))
 
@@ -298,7 +307,7 @@ def _excess(residual: Array, change: Array, null_variance: Array, noise: float) 
     A chi-square variable of few degrees of freedom has a long tail: its cube root is nearly normal
     (Wilson, Hilferty 1931, doi:10.1073/pnas.17.12.684).
     """
-    steps = np.abs(change) > _CHANGE * np.sqrt(2.0) * noise
+    steps = np.abs(change) > CHANGE * np.sqrt(2.0) * noise
     at = np.zeros(residual.shape, dtype=bool)
     at[1:] |= steps
     at[:-1] |= steps

@@ -1,0 +1,151 @@
+"""Steps 1 to 4 of `method` for the pixels of a tile, and what its flags are judged by.
+
+In arrays (time, pixel) of any number of bands. `fused` repeats them for two bands, compiled.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from dbthermal import _smooth as smooth
+from dbthermal.separation._subspace import emission as emissions
+from dbthermal.separation._subspace import pieces, reflection_ratio, residuals
+from dbthermal.separation._tiles import USELESS, Array, Mask, Pixels, Tile, Whole, out_of_range
+
+FILMS: Final = (
+    *("object_temperature", "object_temperature_std"),
+    *("background_temperature", "background_temperature_std"),
+)
+"""Names of the films of a solution."""
+
+
+@dataclass(frozen=True)
+class Solution(Pixels):
+    """Object, background, ratios and emissivities of each pixel, and statistics of the fit."""
+
+    object_temperature: Array  # (time, pixel) [K]; NaN where its deviation is of no use
+    object_temperature_std: Array
+    background_temperature: Array  # (time, pixel) [K]
+    background_temperature_std: Array
+    missing: Array  # samples without a number (2, pixel), of object and background
+    lost: Array  # samples without a number or a deviation of use (2, pixel)
+    beyond: Mask  # temperatures outside the calibrated range (2, pixel)
+    ratio: Array  # see `reflection_ratio.ReflectionRatio` for this and what follows
+    ratio_variance: Array  # (band, pixel) [1], with that through the background's level
+    inverse_energy: Array
+    null_weights: Array
+    null_variance: Array
+    order: Whole
+    contrast: Array
+    reduced_chi2: Array
+    pooled: Mask
+    scatter: Array
+    rapid_scatter: Array  # see `reflection_ratio.rapid_scatter`
+    emissivity: Array  # see `emission.Emission` for this and what follows
+    emissivity_covariance: Array
+    epsilon_variance: Array
+    noise_variance: Array
+    drift_variance: Array
+    constant: Mask
+    restless: Mask
+    gray: Mask  # the signals as they are may be those of a gray body (pixel)
+    correlation: Array  # of the null residual, see `residuals` (pixel)
+    delay: Array  # of the bands (pixel)
+    unexplained: Mask  # the residual is not noise (pixel)
+    sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
+
+
+def solve(
+    tile: Tile, functions: smooth.Subspace, drift: float, least: float = emissions.BEND
+) -> Solution:
+    """
+    Steps 1 to 4, where it matters again on signals with proportional reflections.
+
+    With the limit of the background's `drift` [K], and the `least` bend that matters.
+    """
+    result, bend = _steps(tile, tile, functions, drift)
+    part, removed, places = tile, np.zeros(1), np.arange(result.gray.size)
+    for _ in range(emissions.BENDS):
+        change = bend - removed
+        change -= change.mean(axis=1, keepdims=True)
+        energy = np.einsum("btp,btp->bp", change, change)
+        bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
+        if not np.any(bent):
+            break
+        part, removed, places = part.select_pixels(bent), bend[..., bent], places[bent]
+        least = emissions.BEND
+        signals = part.signals.copy()
+        signals[1:] -= removed
+        straight = replace(part, signals=signals)
+        again, bend = _steps(part, straight, functions, drift, result.gray[places])
+        result = result.replace_pixels(places, again)
+    return result
+
+
+def _steps(
+    tile: Tile,
+    straight: Tile,
+    functions: smooth.Subspace,
+    drift: float,
+    gray: Mask | None = None,
+) -> tuple[Solution, Array]:
+    """
+    Steps 1 to 4, the first three on signals whose reflections are proportional; and the bend.
+
+    The bend of a gray body is not known: whether it is one is told from signals as they are.
+    """
+    noise, signals, frames = np.array(tile.noise), straight.signals, tile.time.size
+    ratios = reflection_ratio.estimate(signals, functions, noise, tile.material)
+    if gray is None:
+        curve = tile.curves[0]
+        temperature = np.linspace(curve.lowest, curve.highest, reflection_ratio.TEMPERATURES)
+        slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
+        gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
+    emission = emissions.estimate(straight, functions, ratios, drift)
+    background, variance = emissions.estimate_background(tile, emission, ratios)
+    of_object, of_background = emissions.pattern_variances(tile, emission, ratios, background)
+    films = np.stack([emission.temperature, background])
+    stds = np.sqrt([emission.temperature_std**2 + of_object, variance + of_background])
+    lost = ~((np.abs(films) < USELESS) & (stds < USELESS))
+    beyond = out_of_range(films, stds, tile.curves[0])
+    values = np.where(lost, np.nan, [films, stds])
+    residual = residuals.null_residual(signals, functions, ratios)
+    smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
+    rapid = signals[0] - functions.functions @ ratios.coefficients[0]
+    free = 1.0 - functions.leverage()[:, ratios.order - 1]
+    common = ratios.null_weights[0] * noise[0] ** 2 * free
+    curves = np.stack([residual, functions.object_part @ smoothed])
+    solution = Solution(
+        object_temperature=values[0, 0],
+        object_temperature_std=values[1, 0],
+        background_temperature=values[0, 1],
+        background_temperature_std=values[1, 1],
+        missing=np.isnan(films).sum(axis=1),
+        lost=lost.sum(axis=1),
+        beyond=np.any(beyond, axis=1),
+        ratio=ratios.ratio,
+        ratio_variance=ratios.variance + emission.level_std**2,
+        inverse_energy=ratios.inverse_energy,
+        null_weights=ratios.null_weights,
+        null_variance=ratios.null_variance,
+        order=ratios.order,
+        contrast=ratios.contrast,
+        reduced_chi2=ratios.reduced_chi2,
+        pooled=ratios.pooled,
+        scatter=ratios.scatter,
+        rapid_scatter=reflection_ratio.rapid_scatter(signals, functions, noise),
+        emissivity=emission.emissivity,
+        emissivity_covariance=emission.emissivity_covariance,
+        epsilon_variance=emission.epsilon_variance,
+        noise_variance=emission.noise_variance,
+        drift_variance=emission.drift_variance,
+        constant=emission.constant,
+        restless=emission.restless,
+        gray=gray,
+        correlation=residuals.autocorrelation(residual),
+        delay=residuals.interband_delay(residual, signals[0], functions, ratios, noise[0]),
+        unexplained=residuals.unexplained(residual, rapid, ratios.null_variance, common),
+        sums=np.add.reduceat(curves, pieces.blocks(frames)[:-1], axis=1),
+    )
+    return solution, emissions.bend(tile, emission, background)

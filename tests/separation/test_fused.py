@@ -1,0 +1,145 @@
+"""The compiled steps of two bands repeat those stated for arrays, within rounding."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import _smooth as smooth
+from dbthermal import response, simulation
+from dbthermal.response import Curve
+from dbthermal.separation._subspace import fused, kernels, method, steps
+from dbthermal.separation._tiles import Material, Tile
+
+RIG = simulation.Rig()
+TIME = np.arange(240) / 10.0  # s
+GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+# Largest difference, relative to the deviation of a quantity or, if it has none, to its size.
+ROUNDING = 1e-3
+
+
+def tile_of(emissivity: tuple[float, float] = (0.86, 0.72), highest: float = 353.15) -> Tile:
+    """Pixels of a scene with walkers, of which some show a constant object or background."""
+    rng = np.random.default_rng(3)
+    known = GLASS.copy(data=list(emissivity))
+    scene = simulation.walkers(TIME, (6, 8), known, rng, crossings=4)
+    warm = scene["object_temperature"]
+    scene["object_temperature"] = 293.15 + (warm - 293.15) * np.linspace(0.0, 1.0, 8)
+    scene["background_temperature"][:, 0] = 295.0
+    table = RIG.response()
+    counts = simulation.observe(scene, table, rng)["counts"].values.reshape(2, TIME.size, -1)
+    curves = [replace(response.curve(table, name), highest=highest) for name in RIG.bands]
+    signals = [c.linearise(part) - c.reference for c, part in zip(curves, counts, strict=True)]
+    noise = [float(table["noise"][band]) / c.reference_slope for band, c in enumerate(curves)]
+    order = np.argsort(noise)
+    return Tile(
+        signals=np.stack([signals[band] for band in order]),
+        time=TIME,
+        curves=tuple(curves[band] for band in order),
+        noise=tuple(noise[band] for band in order),
+        shape=(6, 8),
+        rng=rng,
+    )
+
+
+def material() -> Material:
+    """Material of half the pixels, close to what they show; its emissivity for a quarter."""
+    half = np.arange(48) % 2 == 0
+    values = {"inverse_energy": 1e-4, "noise_variance": 1e-5, "drift_variance": 2e-5}
+    parts = {name: np.where(half, value, np.nan) for name, value in values.items()}
+    ratio = np.where(half, np.array([[1.0], [2.0]]), np.nan)
+    return Material(ratio=ratio, emissivity=np.where(np.arange(48) % 4 == 0, 0.86, np.nan), **parts)
+
+
+CASES = {
+    "glass": {},
+    "nearly black": {"emissivity": (0.95, 0.88)},
+    "metal": {"emissivity": (0.3, 0.15)},
+    "beyond the response": {"highest": 298.0},
+}
+
+
+def assert_alike(one: steps.Solution, other: steps.Solution) -> None:
+    """Fail if a quantity of the compiled solution differs by more than rounding.
+
+    Where the ratios are those of noise, and the object is not defined, only step 1 is compared.
+    """
+    sound = np.isfinite(other.inverse_energy) & (other.epsilon_variance < 0.05)
+    one, other = one.select_pixels(sound), other.select_pixels(sound)
+    assert sound.sum() >= 20
+    scales = {
+        # Of single precision: a few roundings of 300 K are 1e-4 K.
+        "object_temperature": 0.1 + other.object_temperature_std,
+        "background_temperature": 0.1 + other.background_temperature_std,
+        "emissivity": np.sqrt(np.einsum("bbp->bp", other.emissivity_covariance)),
+        "ratio": np.sqrt(other.ratio_variance),
+    }
+    for field in fields(steps.Solution):
+        a, b = (np.asarray(getattr(part, field.name), dtype=float) for part in (one, other))
+        known = np.isfinite(b)
+        np.testing.assert_array_equal(np.isfinite(a), known, field.name)
+        scale = scales.get(field.name, np.abs(b) + 1e-3 * np.abs(b[known]).mean()) + 1e-12
+        error = np.abs(a[known] - b[known]) / np.broadcast_to(scale, b.shape)[known]
+        print(f"{field.name}: {error.max():.1e}")
+        assert error.max() < ROUNDING, field.name
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("least", [0.0, 0.2])
+@pytest.mark.parametrize("way", ["plain", "steps", "pieces", "material", "pattern", "linear"])
+def test_compiled_steps_are_those_of_arrays(case: str, least: float, way: str) -> None:
+    """Every quantity of every kind of pixel is the same in both forms, within rounding."""
+    tile = tile_of(**CASES[case])  # type: ignore[arg-type]
+    segment = (TIME > 9.0).astype(np.intp)
+    functions = smooth.subspace(TIME, 14, segment=segment if way == "steps" else None)
+    if way == "pieces":
+        functions = smooth.piecewise(TIME, np.isin(np.arange(TIME.size), [0, 100, 130]), 14)
+    if way == "material":
+        tile = replace(tile, material=material())
+    if way == "pattern":
+        tile = replace(tile, pattern=(0.1, 0.2))
+    if way == "linear":
+        table = RIG.response()
+        lines = {name: response.curve(table, name, "linear") for name in RIG.bands}
+        tile = replace(tile, curves=tuple(lines[curve.band] for curve in tile.curves))
+    with np.errstate(all="ignore"):
+        one = fused.solve(tile, functions, 3.0, least)
+        other = steps.solve(tile, functions, 3.0, least)
+    assert_alike(one, other)
+
+
+@pytest.mark.parametrize("emissivity", [(0.86, 0.72), (0.9, 0.899), (0.3, 0.15)])
+def test_flags_and_films_are_the_same(
+    emissivity: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With either form the method sets the same bits, and films differ by less than 1 mK."""
+    tile = tile_of(emissivity)
+    one = method.separate(tile, method.SubspaceSettings())
+    monkeypatch.setattr(fused, "solve", steps.solve)
+    other = method.separate(tile, method.SubspaceSettings())
+    np.testing.assert_array_equal(one.status, other.status)
+    for name in steps.FILMS:
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", response.KINDS)
+def test_response_of_the_kernels(kind: str) -> None:
+    """Signal, slope and inverse are those of the curve within 1e-6 K, far outside its range too."""
+    for name in RIG.bands:
+        curve: Curve = response.curve(RIG.response(), name, kind)
+        temperature = np.linspace(150.0, 900.0, 2000)
+        signal, slope, place = (np.empty(temperature.size) for _ in range(3))
+        kernels.blackbody(kernels.table(curve), temperature, signal, slope, place)
+        expected = curve.signal(temperature) - curve.reference
+        np.testing.assert_allclose(signal, expected, rtol=1e-9, atol=1e-6)  # K
+        np.testing.assert_allclose(slope, curve.slope(temperature), rtol=1e-9, atol=1e-6)
+
+
+def test_rank_without_sorting() -> None:
+    """The value of any rank is that of the sorted values, ties and equal values included."""
+    rng = np.random.default_rng(1)
+    for values in (rng.exponential(size=117), np.ones(50), rng.integers(0, 4, 60)):
+        single = values.astype(np.float32)
+        for rank in (0, len(single) // 3, len(single) - 1):
+            assert kernels.ranked(single, rank) == pytest.approx(np.sort(single)[rank], rel=1e-6)
