@@ -143,3 +143,12 @@ def test_rank_without_sorting() -> None:
         single = values.astype(np.float32)
         for rank in (0, len(single) // 3, len(single) - 1):
             assert kernels.ranked(single, rank) == pytest.approx(np.sort(single)[rank], rel=1e-6)
+
+
+def test_compiled_once() -> None:
+    """Signals of any layout, steps, pieces and materials are of one compiled kind."""
+    tile = tile_of()
+    turned = replace(tile, signals=np.asfortranarray(tile.signals), material=material())
+    for one in (tile, turned, tile.select_pixels(np.arange(48) > 9)):
+        fused.solve(one, smooth.subspace(TIME, 14, segment=(TIME > 9.0).astype(int)), 3, 0)
+    assert len(getattr(fused._separate, "signatures")) == 1  # noqa: B009

@@ -282,8 +282,8 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         object_part=np.ascontiguousarray(functions.object_part.T),
         rising=np.ascontiguousarray(functions.rising.T),
         leverage=np.ascontiguousarray(functions.leverage().T),
-        steps=functions.steps,
-        noise=(tile.noise[0], tile.noise[1]),
+        steps=int(functions.steps),
+        noise=(float(tile.noise[0]), float(tile.noise[1])),
         pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
         drift=drift / np.sqrt(3.0),
         rate=float(rates[0]),
@@ -322,7 +322,8 @@ def solve(
         materials[:] = np.stack([*numbers, material.noise_variance, material.drift_variance], 1)
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((pixels, 2, shared.parts.size - 1))
-    _separate(shared, tile.signals, materials, least, work, Solved(films, record, sums))
+    signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
+    _separate(shared, signals, materials, float(least), work, Solved(films, record, sums))
     # The first, mixed and last element of a symmetric matrix (..., 3), as one (..., 2, 2, pixel).
     covariance, scatter, rapid = (
         np.moveaxis(record[name][..., [[0, 1], [1, 2]]], 0, -1)

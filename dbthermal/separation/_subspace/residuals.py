@@ -218,7 +218,8 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     """
     interval = np.diff(time)
     usual = float(np.median(interval))
-    frames = max(3, 2 * int(np.ceil(0.5 * AROUND / usual)))
+    # A clock of bursts has a median far below its mean.
+    frames = min(time.size, max(3, 2 * int(np.ceil(0.5 * AROUND / usual))))
     step = np.abs(np.diff(curve, axis=0))
     size = (frames, 1)
     around = maximum_filter(curve, size)[1:] - minimum_filter(curve, size)[1:]
