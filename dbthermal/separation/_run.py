@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import xarray as xr
@@ -19,25 +19,32 @@ from dbthermal.separation import _inputs
 from dbthermal.separation._solve import get_method, solve
 from dbthermal.separation._tiles import BLOCK_ROWS
 
+if TYPE_CHECKING:
+    from dbthermal.separation._solve import Settings
+
 # Memory of a process before it separates anything [byte]; and of a sample of both bands: counts,
 # temperatures and deviations, as they are, compressed and on the way to the disk [byte].
 _BASE: Final = 500_000_000
 _SAMPLE: Final = 96
-# Options that say something of the whole image at once.
-_WHOLE: Final = ("pool", "reflection_shift")
 
 
-def run(
+def run(  # noqa: PLR0913 - those of `solve` are among them
     source: str | Path | xr.Dataset,
     target: str | Path,
     response: xr.Dataset,
     method: str = "subspace",
     *,
+    settings: "Settings | None" = None,
+    emissivity: xr.DataArray | None = None,
+    emissivity_std: xr.DataArray | None = None,
+    emissivity_covariance: xr.DataArray | None = None,
+    mask: xr.DataArray | None = None,
+    response_kind: str = "exact",
+    seed: int = 0,
     executor: Executor | None = None,
     memory: float = 2e9,
     provenance: Mapping[str, Any] = MappingProxyType({}),
     progress: bool = False,
-    **options: Any,
 ) -> xr.Dataset:
     """Separate a capture of any size from disk to disk, by blocks of rows, by several processes.
 
@@ -54,7 +61,10 @@ def run(
     response : Dataset
         As for `solve`.
     method : str
-        One of `METHODS` that takes each pixel alone.
+        One of `METHODS` that takes each pixel alone: materials, and a shift of the reflections, are
+        of the whole image, see `scene.separate_capture`.
+    settings, emissivity, emissivity_std, emissivity_covariance, mask, response_kind, seed
+        As for `solve`.
     executor : Executor, optional
         Of `concurrent.futures`, or with its interface, as from ``distributed.Client.get_executor``;
         two threads if not given.
@@ -64,9 +74,6 @@ def run(
         See `store.save`.
     progress : bool
         Show a bar.
-    **options
-        Of `solve`, by name: `settings`, `emissivity`, `emissivity_std`, `emissivity_covariance`,
-        `mask`, `response_kind`, `seed`.
 
     Returns
     -------
@@ -76,9 +83,8 @@ def run(
     Raises
     ------
     TypeError, ValueError
-        As `solve` does; for a method, or an option, of the whole image (`scene.separate_capture`
-        pools, and undoes a shift of the reflections); if the memory is too small for a row; and if
-        the parts at hand are of another run.
+        As `solve` does; for a method of the whole image; if the memory is too small for a row; and
+        if the parts at hand are of another run.
 
     Examples
     --------
@@ -95,10 +101,17 @@ def run(
     ...     result.object_temperature.shape
     (200, 4, 6)
     """
-    known = get_method(method)
-    if known.whole_image or (whole := [name for name in _WHOLE if options.get(name) is not None]):
-        what = f"method '{method}'" if known.whole_image else f"option '{whole[0]}'"
-        raise ValueError(f"Invalid {what}: of the whole image. Must take each pixel alone.")
+    if get_method(method).whole_image:
+        raise ValueError(f"Invalid method '{method}' for a run. Must take each pixel alone.")
+    options: dict[str, Any] = {
+        "settings": settings,
+        "emissivity": emissivity,
+        "emissivity_std": emissivity_std,
+        "emissivity_covariance": emissivity_covariance,
+        "mask": mask,
+        "response_kind": response_kind,
+        "seed": seed,
+    }
     if not isinstance(source, xr.Dataset):
         source = Path(source).absolute()  # for a process with another folder of its own
     capture = source if isinstance(source, xr.Dataset) else store.open_dataset(source)
@@ -152,16 +165,7 @@ def _with_noise(
     capture: xr.Dataset, response: xr.Dataset, method: str, options: Mapping[str, Any]
 ) -> xr.Dataset:
     """Response with the noise of the whole capture, that of every block; all inputs are checked."""
-    names = ("settings", "emissivity", "emissivity_std", "emissivity_covariance", "mask", "pool")
-    inputs = _inputs.check(
-        capture,
-        response,
-        get_method(method),
-        method,
-        seed=options.get("seed", 0),
-        response_kind=options.get("response_kind", "exact"),
-        **{name: options.get(name) for name in names},
-    )
+    inputs = _inputs.check(capture, response, get_method(method), method, pool=None, **options)
     if "noise" in response:
         return response
     slopes = np.array([curve.reference_slope for curve in inputs.curves])

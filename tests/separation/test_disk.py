@@ -128,8 +128,7 @@ def test_parts_of_another_run_are_refused(path: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "bcp"}, "Invalid method 'bcp': of the whole image"),
-        ({"pool": xr.DataArray(np.zeros((41, 24), int), dims=("y", "x"))}, "option 'pool'"),
+        ({"method": "bcp"}, "Invalid method 'bcp' for a run. Must take each"),
         ({"memory": 1e6}, "Invalid memory .* byte. Must be at least"),
     ],
 )
