@@ -9,7 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy import sparse
 from scipy.linalg import solveh_banded
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from dbthermal import noise as noises
 from dbthermal import response as responses
@@ -32,13 +32,15 @@ _SAMPLES: Final = 2**26  # of a band that are matched, at most: of a large image
 _COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
 _MISSING: Final = 0.1  # share of the frames that a pixel may lack
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
-# rapidly enters. A longer one is taken that tells the shift at so many times more pixels, and whose
-# field differs by no more than so many deviations.
+# rapidly enters. A longer one is taken whose field has so many times smaller deviations, and
+# differs by no more than so many of those of the shorter one's.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _MORE: Final = 1.25
 _AGREE: Final = 1.5
 _CLIP: Final = 3.0  # noise, to which the changes of a frame are clipped when frames are chosen
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
+_WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
+_RIDGE: Final = 1e-6  # of the largest information, where there is none
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
 
@@ -94,13 +96,14 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         field, data = matching.refine(level, field)
         if factor == 1:
             # The delay is seen in slower changes, too, in which there is more than noise.
+            spread = _variances(field, data, level)
             period = max(period, _PERIODS[2])
             freedom = _freedom(capture.frames.size, period) * used.size / capture.frames.size
             pictures = capture.rapid(period, used)
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
             times = corrected["time"].values[capture.frames[used]]
             late = delay(level, field.on(level.centres()), times)
-            return _result(corrected, capture, field, data).assign_attrs(delay=late)
+            return _result(corrected, capture, field, data, spread).assign_attrs(delay=late)
 
 
 @dataclass(frozen=True)
@@ -185,7 +188,8 @@ def _coarse(
     """Capture with its valid pixels, the period that tells most, energetic frames, rough field."""
     signals, valid = capture.binned(factor)
     reach = (signals[0].shape[0] // 3, signals[0].shape[1] // 3)
-    frames, best, result = capture.frames.size, 0.0, None
+    frames, result = capture.frames.size, None
+    best, kept = np.inf, np.array(np.inf)
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
@@ -196,15 +200,18 @@ def _coarse(
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
-        told, places = float(_told(data, factor).mean()), level.centres()
+        places, variance = level.centres(), _variances(field, data, level)
+        size = float(np.exp(0.25 * np.log(variance[:, level.valid]).sum(axis=0).mean()))
         # A field of slower changes must lie within the deviation of the more robust one.
-        apart = (begin.on(places) - field.on(places)) ** 2 / begin.variances(places)
-        if told > _MORE * best and (result is None or apart.mean() < _AGREE**2):
+        apart = (begin.on(places) - field.on(places)) ** 2 / kept
+        told = _told(data, factor).any()
+        if told and size < best / _MORE and apart.mean() < _AGREE**2:
+            kept, best = variance, size
             energy = np.minimum((pictures[1] / level.noise[1]) ** 2, _CLIP**2).mean(axis=(0, 1))
             # Those of the largest energy, no more than memory allows.
             most = max(noises.MINIMUM_FRAMES, _SAMPLES // valid.size)
             used = np.sort(np.argsort(energy)[::-1][:most])
-            best, result = told, (replace(capture, valid=valid), period, used, field)
+            result = (replace(capture, valid=valid), period, used, field)
     if result is None:
         raise ValueError(
             "Missing texture in the reflections: no rapid change that the bands share. "
@@ -218,6 +225,25 @@ def _told(data: Information, factor: int = 1) -> Mask:
     down, both, right = data.tensor * (4.0 * np.pi * (matching.WINDOW * factor) ** 2)
     largest = 0.5 * (down + right) + np.hypot(0.5 * (down - right), both)
     return np.asarray(largest > 1.0 / _KNOWN**2)
+
+
+def _variances(field: Field, data: Information, level: Movies) -> Array:
+    """
+    Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
+
+    The field is smoother than the reflection where windows ask for steps beyond their own noise.
+    """
+    area, told = 4.0 * np.pi * (matching.WINDOW * level.factor) ** 2, _told(data, level.factor)
+    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
+    inverse = np.linalg.inv(tensor + _RIDGE * max(tensor.max(), 1.0) * np.eye(2))
+    steps = np.einsum("yxij,jyx->iyx", inverse, area * data.gradient)
+    squares = steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0)
+    sums = [
+        gaussian_filter(part * told, _WIDE / level.factor, axes=(-2, -1))
+        for part in (squares, np.ones(told.shape))
+    ]
+    chi = np.maximum(sums[0] / np.maximum(sums[1], 1e-9), 1.0)
+    return np.asarray(chi * field.variances(level.centres()))
 
 
 def _freedom(frames: int, period: float) -> float:
@@ -271,12 +297,12 @@ def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
 
 
 def _result(
-    corrected: xr.Dataset, capture: _Capture, field: Field, data: Information
+    corrected: xr.Dataset, capture: _Capture, field: Field, data: Information, variance: Array
 ) -> xr.Dataset:
     """Field as a dataset, NaN far from where it is known."""
     shape = capture.valid.shape
     centres = [np.arange(size, dtype=np.float64) for size in shape]
-    shift, variance = field.on(centres), field.variances(centres)
+    shift = field.on(centres)
     reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
     known = _told(data) & reached
     distance = np.asarray(distance_transform_edt(~known))

@@ -72,6 +72,18 @@ def test_an_object_that_fills_a_third_of_the_image() -> None:
     assert np.median(np.abs(error[1])) < 0.05
 
 
+def test_deviation_of_a_field_finer_than_its_grid() -> None:
+    """Where windows ask for other shifts than a smooth field can have, its deviation is larger."""
+    rng, picture = np.random.default_rng(62), Picture(shape=(48, 64))
+    true = smooth_shift(picture.shape, 2.4, 1.2)
+    true[1] += np.sin(2.0 * np.pi * np.arange(48) / 9.0)[:, np.newaxis]
+    scene = picture.draw(np.arange(200) / 10.0, GLASS, rng, true)
+    capture = simulation.observe(scene, RESPONSE, rng)
+    error, score = errors(alignment.reflection_shift(capture, RESPONSE), true)
+    print(f"rms error {np.std(error[1]):.2f} pixel, score {np.sqrt(np.mean(score[1] ** 2)):.1f}")
+    assert np.sqrt(np.mean(score[1] ** 2)) < 10.0
+
+
 def test_opened_capture_with_steps_between_segments(tmp_path: Path) -> None:
     """Steps at shutter events are no reflection; a capture on disk is read block by block.
 
