@@ -125,7 +125,12 @@ def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Ar
     """
     energy = np.einsum("bbp->p", scatter) + len(scatter) * frames
     inverse = np.where(frames > 0, 1.0 / energy, 0.0)
-    weight = inverse * (_sum(labels, frames > 0, count) / _sum(labels, inverse, count))[labels]
+    weight = (
+        inverse
+        * (_sum(labels, np.where(frames > 0, 1.0, 0.0), count) / _sum(labels, inverse, count))[
+            labels
+        ]
+    )
     return scatter * weight, frames * weight
 
 
