@@ -71,11 +71,13 @@ def piecewise(
     order: int,
     *,
     segment: npt.NDArray[np.integer] | None = None,
+    number: int = PIECE_ORDER,
 ) -> Subspace:
     """Polynomials in pieces of the time that begin with some frames (time,), of one order together.
 
-    The rising polynomials are those of `subspace` of an order. A shutter event must not be the
-    first frame of a piece: its step would be the object's as well.
+    So many in each piece, or as many as it has frames. The rising polynomials are those of
+    `subspace` of an order. A shutter event must not be the first frame of a piece: its step would
+    be the object's as well.
     """
     time, rising = np.asarray(time, dtype=np.float64), subspace(time, order, segment=segment).rising
     edges = [*np.flatnonzero(first), time.size]
@@ -83,7 +85,7 @@ def piecewise(
     for start, stop in pairwise(edges):
         inside = slice(start, stop)
         events = len(camera_steps(None if segment is None else segment[inside]))
-        block = np.zeros((time.size, min(PIECE_ORDER, stop - start - events)))
+        block = np.zeros((time.size, min(number, stop - start - events)))
         block[inside] = polynomial_basis(time[inside], block.shape[1])
         blocks.append(block)
     functions, object_part = _without_steps(

@@ -49,7 +49,7 @@ _MODULES: Final = {
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
 # Share of the pixels of the materials that have an emissivity alone, from which it is theirs [1].
-_MOST_TOLD: Final = 0.9
+_MOST_TOLD: Final = 0.98
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -319,14 +319,14 @@ def _materials(
     every |= told > _MOST_TOLD * sum((part.frames > 0).sum() for _, part in found)
     if material is None or every:
         return material
-    # Emissivities of the few pixels with a ratio of their own are those of a selection by it.
+    # Pixels with a ratio or pieces of their own are those of a selection by them.
     ratio = replace(material, emissivity=np.full_like(material.emissivity, np.nan))
     surveys = threads.map(
         lambda block: _survey(inputs, block, selected, bar, ratio), _blocks(inputs)
     )
     again = _pool(inputs, [part for survey in surveys for part in survey])
     assert again is not None
-    return replace(again, ratio=material.ratio, inverse_energy=material.inverse_energy)
+    return again
 
 
 def _separate_all(

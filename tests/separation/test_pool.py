@@ -8,7 +8,8 @@ import xarray as xr
 
 from dbthermal import schema, separation
 from dbthermal.separation._pooling import pool
-from dbthermal.separation._tiles import Material
+from dbthermal.separation._subspace import reflection_ratio
+from dbthermal.separation._tiles import Material, Survey
 from dbthermal.simulation import Rig
 from reproduction import experiments
 
@@ -157,6 +158,24 @@ def test_wrong_labels_do_not_pull() -> None:
     assert abs(float(ratio[0, :60].mean()) - 2.0) < 0.02
     error = (shared["object_temperature"] - scene["object_temperature"]).isel(x=slice(60, None))
     assert float(np.sqrt((error**2).mean())) < 1.0  # [K]; 3 K with the ratio of glass
+
+
+def test_few_pixels_of_much_energy_are_outliers() -> None:
+    """Sixty pixels keep their ratio of 2 beside six, of a thousand times the energy, of 0.8."""
+    noise, rng, frames = np.array([0.05, 0.05]), np.random.default_rng(0), np.full(66, 280.0)
+    axis = np.where(np.arange(66) < 60, 2.0, 0.8)
+    std = np.where(np.arange(66) < 60, 20.0, 600.0) / np.sqrt(280.0)
+    ratio = np.stack([np.ones(66), axis])
+    rapid = std * rng.standard_normal((280, 1, 66)) * ratio + rng.standard_normal((280, 2, 66))
+    scatter = np.einsum("tbp,tcp->bcp", rapid, rapid) - 280.0 * np.eye(2)[..., np.newaxis]
+    twice, zero, half = np.stack([scatter] * 2), np.zeros(66), np.full(66, 0.5)
+    own = reflection_ratio.principal_ratio(np.moveaxis(scatter, -1, 0), noise)
+    survey = Survey(
+        scatter, frames, twice, np.stack([frames] * 2), own, 0 * ratio, half, zero, zero
+    )
+    material = pool.estimate(np.zeros(66, dtype=np.intp), 1, survey, noise)
+    variance = reflection_ratio.ratio_variance(material.ratio, material.inverse_energy, noise)
+    assert abs(material.ratio[1, 0] - 2.0) < 4.0 * np.sqrt(variance[1, 0])
 
 
 def test_two_materials_stay_apart() -> None:

@@ -58,18 +58,20 @@ def estimate(labels: Labels, count: int, survey: Survey, noise: Array) -> Materi
         # A pixel that takes a rapid object for the background has an energy beyond all others'.
         told = np.isfinite(survey.emissivity) * 1.0
         sound = np.where(told > 0, labels, -1)
-        outliers = _outliers(labels, _ratios(sound, count, survey, noise), survey, noise)
+        found = _ratios(sound, count, survey, noise, even=True)
+        outliers = _outliers(labels, found, survey, noise)
         # Near black the few that have an emissivity alone are selected by their own ratio.
         surveyed = np.where(survey.frames > 0, 1.0, 0.0)
         most = _sum(labels, told, count) > _MAJORITY * _sum(labels, surveyed, count)
         outliers &= np.append(most, False)[labels]
         used = np.where(outliers, -1, labels)
         for _ in range(_ROUNDS):
-            found = _ratios(used, count, survey, noise)
+            found = _ratios(used, count, survey, noise, even=True)
             outliers = _outliers(used, found, survey, noise)
             if not np.any(outliers):
                 break
             used = np.where(outliers, -1, used)
+        found = _ratios(used, count, survey, noise)
         ratio = found.ratio
         return Material(ratio, found.variance, *_emissivities(used, count, survey, ratio))
 
@@ -98,17 +100,38 @@ class _Ratios:
     rapid: Mask  # at the largest order, not at those of the pixels (material)
 
 
-def _ratios(labels: Labels, count: int, survey: Survey, noise: Array) -> _Ratios:
+def _ratios(
+    labels: Labels, count: int, survey: Survey, noise: Array, *, even: bool = False
+) -> _Ratios:
     """Ratios of the summed scatters, at the order of each pixel unless the largest contradicts it.
 
-    Then at that; and what four functions less would change, beyond noise, is a variance.
+    Then at that; and what fewer functions would change, beyond noise, is a variance. With `even`
+    weights few pixels of much energy do not turn the axis: they are to be found as outliers.
     """
     used, frames = survey.scatter, survey.frames
     parts = [(used, frames), *zip(survey.rapid_scatter, survey.rapid_frames, strict=True)]
+    if even:
+        parts = [_even(labels, count, *part) for part in parts]
     own, fewer, most = (_at_order(labels, count, *part, noise) for part in parts)
     rapid = _apart(own, most, noise)[0] > _ORDER_SIGMAS
     ratio, variance = (np.where(rapid, *pair) for pair in zip(most, own, strict=True))
     return _Ratios(ratio, variance + np.where(rapid, _apart(fewer, most, noise)[1], 0.0), rapid)
+
+
+def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Array, Array]:
+    """Scatters and their frames, of about the same energy in all pixels of a material.
+
+    Their sum is the spatial sign covariance (Locantore et al. 1999, doi:10.1007/BF02595862).
+    """
+    energy = np.einsum("bbp->p", scatter) + len(scatter) * frames
+    inverse = np.where(frames > 0, 1.0 / energy, 0.0)
+    weight = (
+        inverse
+        * (_sum(labels, np.where(frames > 0, 1.0, 0.0), count) / _sum(labels, inverse, count))[
+            labels
+        ]
+    )
+    return scatter * weight, frames * weight
 
 
 def _at_order(
@@ -145,28 +168,30 @@ def _apart(
 
 
 def _outliers(labels: Labels, material: _Ratios, survey: Survey, noise: Array) -> Mask:
-    """Pixels whose ratio, at the order of their material, is not the material's.
+    """Pixels whose ratio, at the orders of their material, is not the material's.
 
     Both by its own deviation, and by that of the material's ratio in the pixel: near black, pixels
     that tell little have ratios of a wide and skew distribution. Those far off pull the ratio, and
     go first: at least half as far as the farthest of the material.
     """
-    rapid = material.rapid[labels]
-    scatter = np.where(rapid, survey.rapid_scatter[1], survey.scatter)
-    frames = np.where(rapid, survey.rapid_frames[1], survey.frames)
-    whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
-    own = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
-    inverse = _inverse_energy(scatter, own, noise, frames)
-    std = np.sqrt(reflection_ratio.ratio_variance(own, inverse, noise))
-    common = material.ratio[:, labels]
-    score = np.nan_to_num(np.max(np.abs(own - common)[1:] / std[1:], axis=0)) * (labels >= 0)
-    farthest = np.zeros(len(material.rapid))
-    np.maximum.at(farthest, labels, score)
-    apart = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
+    rapid, common = material.rapid[labels], material.ratio[:, labels]
     axis = common / noise[:, np.newaxis]
-    apart &= ~reflection_ratio.agrees(whole, axis / np.sqrt((axis**2).sum(axis=0)))
+    axis = axis / np.sqrt((axis**2).sum(axis=0))
+    result = np.zeros(labels.shape, dtype=bool)
+    for large, large_frames in zip(survey.rapid_scatter, survey.rapid_frames, strict=True):
+        scatter = np.where(rapid, large, survey.scatter)
+        frames = np.where(rapid, large_frames, survey.frames)
+        whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
+        own = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
+        inverse = _inverse_energy(scatter, own, noise, frames)
+        std = np.sqrt(reflection_ratio.ratio_variance(own, inverse, noise))
+        score = np.nan_to_num(np.max(np.abs(own - common)[1:] / std[1:], axis=0)) * (labels >= 0)
+        farthest = np.zeros(len(material.rapid))
+        np.maximum.at(farthest, labels, score)
+        apart = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
+        result |= apart & ~reflection_ratio.agrees(whole, axis)
     known = np.isfinite(material.variance[labels])
-    return np.asarray(apart & known & (survey.frames > 0) & (labels >= 0))
+    return np.asarray(result & known & (survey.frames > 0) & (labels >= 0))
 
 
 def _emissivities(

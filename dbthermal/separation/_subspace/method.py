@@ -87,6 +87,8 @@ _SUSPECT: Final = np.uint32(
 _LIKELY: Final = 40.0
 # Pieces of a rapid object, at most, whose bands seem apart in one smooth curve.
 _MOST_PIECES: Final = 10
+# Polynomials of a piece in a survey: those of a pixel alone, and two larger numbers.
+_NUMBERS: Final = (smooth.PIECE_ORDER, smooth.PIECE_ORDER + 3, 2 * smooth.PIECE_ORDER)
 Record = TypeVar("Record", Estimate, Survey)
 
 
@@ -129,7 +131,12 @@ def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
         divided = np.asarray(first.any(axis=0))
         if np.any(divided):
             part = tile.select_pixels(divided)
-            again = _divided(part, first[:, divided], settings, _survey, least=0.0)
+            again, *more = (
+                _divided(part, first[:, divided], settings, _survey, least=0.0, number=number)
+                for number in _NUMBERS
+            )
+            rapid = np.stack([one.scatter for one in more]), np.stack([one.frames for one in more])
+            again = replace(again, rapid_scatter=rapid[0], rapid_frames=rapid[1])
             result = result.replace_pixels(divided, again)
         return result
 
@@ -288,11 +295,13 @@ def _divided(
     settings: SubspaceSettings,
     finish: Callable[[Tile, smooth.Subspace, Solution], Record],
     least: float = emissions.BEND,
+    number: int = smooth.PIECE_ORDER,
 ) -> Record:
     """Result with pieces that begin with some frames (time, pixel), same pieces together."""
     order, groups, parts = _functions(tile).orders, pieces.alike(first), []
     for places in groups:
-        functions = smooth.piecewise(tile.time, first[:, places[0]], order, segment=tile.segment)
+        begins = first[:, places[0]]
+        functions = smooth.piecewise(tile.time, begins, order, segment=tile.segment, number=number)
         part = tile.select_pixels(places)
         parts.append(finish(part, functions, _solve(part, functions, settings, least)))
     return parts[0].join(parts[1:]).select_pixels(np.argsort(np.concatenate(groups)))
