@@ -8,17 +8,16 @@ record from `provenance`. `Recording` grows in chunks and survives a kill or a p
 """
 
 from dbthermal.store._durable import HeldFolder, to_disk
+from dbthermal.store._parts import join_parts, save_part
 from dbthermal.store._provenance import checksum, provenance
 from dbthermal.store._recording import Recording
 from dbthermal.store._results import (
     Number,
-    join_parts,
     open_dataset,
     read_numbers,
     save,
     save_figure,
     save_numbers,
-    save_part,
     save_rows,
     save_text,
     save_video,

@@ -9,7 +9,6 @@ input. No other package opens or writes zarr.
 import hashlib
 import json
 import math
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
@@ -95,7 +94,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
     [20310, 20750]
     """
-    _save_rows([dataset], path, provenance)
+    save_parts([dataset], path, provenance)
 
 
 def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping[str, Any]) -> None:
@@ -124,91 +123,10 @@ def save_rows(parts: Iterable[xr.Dataset], path: str | Path, provenance: Mapping
     """
     rest = iter(parts)
     first = next(rest)
-    _save_rows(chain([first], rest), path, provenance, first.sizes.get("y"))
+    save_parts(chain([first], rest), path, provenance, first.sizes.get("y"))
 
 
-def save_part(
-    part: xr.Dataset, path: str | Path, provenance: Mapping[str, Any], height: int
-) -> None:
-    """Save some rows of a dataset as `save` does, for `join_parts`.
-
-    Parameters
-    ----------
-    part : Dataset
-        Rows that follow one another.
-    path : str or Path
-        Folder ``*.zarr`` of its own.
-    provenance : mapping
-        See `save`.
-    height : int
-        Rows of each part but the last, which has no more.
-    """
-    _save_rows([part], path, provenance, height)
-
-
-def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
-    """Join datasets of rows that follow one another; their chunks are moved, and not read.
-
-    Parameters
-    ----------
-    parts : iterable of str or Path
-        Folders from `save_part`, of one height but the last. They are used up.
-    path : str or Path
-        Folder ``*.zarr`` of the whole, with the attributes of the first.
-
-    Examples
-    --------
-    >>> import xarray as xr
-    >>> from tempfile import TemporaryDirectory
-    >>> from dbthermal import store
-    >>> rows = [xr.Dataset({"status": (("y", "x"), [[row, 0]])}) for row in range(3)]
-    >>> with TemporaryDirectory() as folder:
-    ...     parts = [f"{folder}/{number}.zarr" for number in range(3)]
-    ...     for row, part in zip(rows, parts):
-    ...         store.save_part(row, part, store.provenance({}), 1)
-    ...     store.join_parts(parts, f"{folder}/wall.zarr")
-    ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
-    [[0, 0], [1, 0], [2, 0]]
-    """
-    first, *rest = [Path(part) for part in parts]
-    with _whole(path, ".zarr") as folder:
-        first.rename(folder)
-        metadata = {one: json.loads(one.read_text()) for one in folder.glob("*/zarr.json")}
-        along = {one: array for one, array in metadata.items() if "y" in array["dimension_names"]}
-        sums = last_sums(folder)
-        for part in rest:
-            for one, array in along.items():
-                sums |= _moved(part / one.parent.name, one.parent, array)
-        for one, array in along.items():
-            one.write_text(json.dumps(array, indent=2))
-            sums[one.relative_to(folder).as_posix()] = f"{zlib.crc32(one.read_bytes()):08x}"
-        (folder / SUMS).write_bytes(sums_file(sums))
-
-
-def _moved(part: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
-    """Move the chunks of a part of an array behind those of the whole; their checksums by name."""
-    place = array["dimension_names"].index("y")
-    end, rows = array["shape"][place], array["chunk_grid"]["configuration"]["chunk_shape"][place]
-    own, sums = last_sums(part.parent), {}
-    if end % rows:
-        raise ValueError(
-            f"Invalid part '{part.parent}' after {end} rows in chunks of {rows}. Must follow whole "
-            "chunks."
-        )
-    for chunk in [one for one in (part / "c").rglob("*") if one.is_file()]:
-        numbers = list(chunk.relative_to(part / "c").parts)
-        numbers[place] = str(int(numbers[place]) + end // rows)
-        moved = whole.joinpath("c", *numbers)
-        sums[moved.relative_to(whole.parent).as_posix()] = own[
-            chunk.relative_to(part.parent).as_posix()
-        ]
-        moved.parent.mkdir(parents=True, exist_ok=True)
-        chunk.rename(moved)
-    array["shape"][place] += json.loads((part / "zarr.json").read_text())["shape"][place]
-    return sums
-
-
-def _save_rows(
+def save_parts(
     parts: Iterable[xr.Dataset],
     path: str | Path,
     provenance: Mapping[str, Any],
@@ -216,7 +134,7 @@ def _save_rows(
 ) -> None:
     """Save parts that follow one another along y, each of a height that chunks then divide."""
     options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
-    with _whole(path, ".zarr") as folder:
+    with whole(path, ".zarr") as folder:
         folder.mkdir()
         for number, part in enumerate(parts):
             # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
@@ -342,7 +260,7 @@ def save_numbers(
         "provenance": dict(provenance),
     }
     content["sha256"] = _digest(content)
-    with _whole(path, ".json") as part:
+    with whole(path, ".json") as part:
         part.write_text(_json(content, indent=2) + "\n", encoding="utf-8")
 
 
@@ -395,7 +313,7 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
         As from `provenance`.
     """
     comment = f"\n<!-- {_json(provenance)} -->\n"
-    with _whole(path, ".md") as part:
+    with whole(path, ".md") as part:
         part.write_text(text + comment, encoding="utf-8")
 
 
@@ -427,7 +345,7 @@ def save_figure(
     '{"commit": "unknown"}'
     """
     metadata = {"Software": "dbthermal", "Comment": _json(provenance)}
-    with _whole(path, ".png") as part:
+    with whole(path, ".png") as part:
         figure.savefig(part, dpi=dpi, metadata=metadata)
 
 
@@ -461,7 +379,7 @@ def save_video(
     if codec not in _ENCODERS:
         raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
     encoder, options = _ENCODERS[codec]
-    with _whole(path, ".mp4") as part, av.open(part, "w") as film:
+    with whole(path, ".mp4") as part, av.open(part, "w") as film:
         film.metadata["comment"] = _json(provenance)
         fraction = Fraction(rate).limit_denominator(1000)
         stream = film.add_stream(encoder, rate=fraction, options=options)
@@ -482,7 +400,7 @@ def save_video(
 
 
 @contextmanager
-def _whole(path: str | Path, suffix: str) -> Iterator[Path]:
+def whole(path: str | Path, suffix: str) -> Iterator[Path]:
     """Yield a place beside `path` to write to; move it to `path` unless an error is raised."""
     path = Path(path)
     if path.suffix != suffix:
