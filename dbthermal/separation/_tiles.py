@@ -27,15 +27,18 @@ Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
 
-PIXELS: Final = 2560
+PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
-SAMPLES: Final = 2**20
+SAMPLES: Final = 2**19
 """Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
 
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
 
+# Times as many pixels in a tile whose steps are compiled: these keep to the cache by themselves,
+# and the pixels that need more are then enough together.
+_COMPILED: Final = 8
 # Tiles whose pixels are read together where they are then sorted by their noise.
 _TOGETHER: Final = 12
 # Resampled samples whose noise differs by less are separated together [1].
@@ -278,9 +281,10 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
     width = block.sizes["x"]
-    fitting = max(1, min(PIXELS, SAMPLES // block.sizes["time"]))
+    times = _COMPILED if method.compiled and len(inputs.bands) == 2 else 1
+    fitting = max(1, min(times * PIXELS, times * SAMPLES // block.sizes["time"]))
     most = int(getattr(inputs.settings, "batch", fitting))
-    size = most if displacement is None else max(width, _TOGETHER * most)
+    size = most if displacement is None else max(width, _TOGETHER * min(most, PIXELS))
     size = block.sizes["y"] * width if method.whole_image else size
     time = block["time"].values.astype(np.float64)
     segment = block["segment"].values.astype(np.intp) if "segment" in block else None

@@ -314,5 +314,6 @@ METHOD: Final = Method(
     check_clock=clock.check,
     survey=survey,
     any_bands=True,
+    compiled=True,
 )
 """The subspace separator, for `solve`."""
