@@ -148,7 +148,7 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
 
 @dataclass(frozen=True)
 class _Job:
-    """What all captures of a run have in common."""
+    """Options that all captures of a run share."""
 
     response: xr.Dataset
     method: str
