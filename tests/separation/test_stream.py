@@ -278,6 +278,8 @@ def test_rate_of_full_frames() -> None:
     steady = slice(1500 - 15 * 15, None)
     cost, wall = np.mean(used[steady]), np.mean(passed[steady])
     good = float((stream.result()["status"] == 0).mean())
-    print(f"{1e3 * cost:.1f} ms of processor, {1e3 * wall:.1f} ms, a pair of frames; {good:.2f} good")
+    print(
+        f"{1e3 * cost:.1f} ms of processor, {1e3 * wall:.1f} ms, a pair of frames; {good:.2f} good"
+    )
     print(f"{stream.nbytes / 1e6:.0f} MB, latency {stream.latency} s")
     assert cost < 2.0 / 60.0  # s, on two cores

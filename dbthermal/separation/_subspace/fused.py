@@ -17,6 +17,7 @@ from scipy.special import stdtrit
 
 from dbthermal import _smooth as smooth
 from dbthermal import planck
+from dbthermal._arrays import Array
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels, pieces, pixel, reflection_ratio, residuals
@@ -25,8 +26,6 @@ from dbthermal.separation._subspace.pixel import Ratio
 from dbthermal.separation._subspace.shared import Model, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Tile
-
-Array = npt.NDArray[np.float64]
 
 _BLOCK: Final = 16  # pixels whose samples are turned at once
 

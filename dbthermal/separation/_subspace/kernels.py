@@ -14,10 +14,9 @@ from numba import njit
 from numpy.polynomial import Chebyshev
 
 from dbthermal import planck
+from dbthermal._arrays import Array
 from dbthermal.response import Curve, LinearCurve
 from dbthermal.separation._subspace import residuals
-
-Array = npt.NDArray[np.float64]
 
 _ERROR: Final = 1e-7  # of a response's polynomials [K]
 _MARGIN: Final = 0.25  # of the calibrated range, beside it, in which they hold

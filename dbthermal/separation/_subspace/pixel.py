@@ -4,17 +4,15 @@ from math import erfc, log, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtri
 from scipy.stats import chi2
 
 from dbthermal import planck
+from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels, reflection_ratio, residuals
 from dbthermal.separation._subspace.kernels import Table, compiled
 from dbthermal.separation._subspace.shared import Model, Work
-
-Array = npt.NDArray[np.float64]
 
 CHANCE: Final = float(chi2.isf(reflection_ratio.CHANCE, 1))
 _GRAY_LIMIT: Final = float(chdtri(1, reflection_ratio.GRAY_CHANCE))
@@ -263,18 +261,8 @@ def _linear(
     kernel, again = work.kernel, work.spare
     kept, slope, size = weights, 0.0, 0.0
     for last in range(2):
-        total, mean, middle, square, product = 0.0, 0.0, 0.0, 0.0, 0.0
-        for t in range(frames):
-            w = kept[t]
-            wu = w * emitted[t]
-            total += w
-            mean += wu
-            middle += w * drift[t]
-            square += wu * emitted[t]
-            product += wu * drift[t]
-        mean, middle = mean / total, middle / total
-        slope = (product - total * mean * middle) / (square - total * mean**2)
-        level, length, size = middle - slope * mean, 0.0, 0.0
+        slope, level, _ = kernels.moments(emitted, drift, kept)
+        length, size = 0.0, 0.0
         for t in range(frames):
             kernel[t] = kept[t] * (drift[t] - level - slope * emitted[t])
             length += kernel[t] * drift[t]

@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal._arrays import Array
 from dbthermal.separation._subspace import kernels
-
-Array = npt.NDArray[np.float64]
 
 
 class Model(NamedTuple):

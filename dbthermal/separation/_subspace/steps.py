@@ -41,7 +41,7 @@ class Solution(Pixels):
     reduced_chi2: Array
     pooled: Mask
     scatter: Array
-    rapid_scatter: Array  # see `reflection_ratio.rapid_scatter`
+    rapid_scatter: Array
     emissivity: Array  # see `emission.Emission` for this and what follows
     emissivity_covariance: Array
     epsilon_variance: Array
@@ -116,6 +116,7 @@ def _steps(
     free = 1.0 - functions.leverage()[:, ratios.order - 1]
     common = ratios.null_weights[0] * noise[0] ** 2 * free
     curves = np.stack([residual, functions.object_part @ smoothed])
+    parts = vars(ratios) | vars(emission)
     solution = Solution(
         object_temperature=values[0, 0],
         object_temperature_std=values[1, 0],
@@ -124,28 +125,12 @@ def _steps(
         missing=np.isnan(films).sum(axis=1),
         lost=lost.sum(axis=1),
         beyond=np.any(beyond, axis=1),
-        ratio=ratios.ratio,
         ratio_variance=ratios.variance + emission.level_std**2,
-        inverse_energy=ratios.inverse_energy,
-        null_weights=ratios.null_weights,
-        null_variance=ratios.null_variance,
-        order=ratios.order,
-        contrast=ratios.contrast,
-        reduced_chi2=ratios.reduced_chi2,
-        pooled=ratios.pooled,
-        scatter=ratios.scatter,
-        rapid_scatter=reflection_ratio.rapid_scatter(signals, functions, noise),
-        emissivity=emission.emissivity,
-        emissivity_covariance=emission.emissivity_covariance,
-        epsilon_variance=emission.epsilon_variance,
-        noise_variance=emission.noise_variance,
-        drift_variance=emission.drift_variance,
-        constant=emission.constant,
-        restless=emission.restless,
         gray=gray,
         correlation=residuals.autocorrelation(residual),
         delay=residuals.interband_delay(residual, signals[0], functions, ratios, noise[0]),
         unexplained=residuals.unexplained(residual, rapid, ratios.null_variance, common),
         sums=np.add.reduceat(curves, pieces.blocks(frames)[:-1], axis=1),
+        **{name: parts[name] for name in parts if name in Solution.__dataclass_fields__},
     )
     return solution, emissions.bend(tile, emission, background)
