@@ -238,7 +238,7 @@ def test_a_bad_frame_is_named(
     stream = Stream(capture.isel(time=[0]), response, frame_rate=RATE)
     good: npt.NDArray[np.float32] = capture["counts"].values[:, 0]
     stream.update(0.0, good)
-    arguments = {"time": 1.0, "frames": capture["counts"].values[:, 1]} | change
+    arguments: dict[str, Any] = {"time": 1.0, "frames": capture["counts"].values[:, 1]} | change
     with pytest.raises(error, match=match):
         stream.update(**arguments)
     with pytest.raises(ValueError, match="no temperatures are known"):
@@ -250,7 +250,7 @@ def test_a_bad_stream_is_named(glass: Data) -> None:
     """Numbers that are not positive, and a response without noise, are refused."""
     _, capture, response = glass
     for name in ("frame_rate", "latency", "memory", "refresh"):
-        options: dict[str, float] = {"frame_rate": RATE} | {name: 0.0}
+        options: dict[str, Any] = {"frame_rate": RATE} | {name: 0.0}
         with pytest.raises(ValueError, match=name):
             Stream(capture, response, **options)
     with pytest.raises(ValueError, match="Missing noise of the response"):

@@ -356,7 +356,7 @@ class Stream:
         for both, (before, after, degree) in zip(weights, _WINDOWS, strict=True):
             inside = (reach >= -max(1, int(before * self._half))) & (piece == piece[centre])
             inside &= reach <= max(1, int(after * self._half))
-            order = min(degree + 1, np.count_nonzero(inside))
+            order = min(int(degree) + 1, int(np.count_nonzero(inside)))
             powers = (times[inside, np.newaxis] - times[centre]) ** np.arange(order)
             both[:order, inside] = np.linalg.pinv(powers)[:2]
         variance = (weights[:, 0] ** 2).sum(axis=1) / self._block
