@@ -271,7 +271,7 @@ def test_missing_library(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(_recording, "import_module", absent)
-    with pytest.raises(ImportError, match=r"Missing library 'av'.*dbthermal\[video\]"):
+    with pytest.raises(ImportError, match=r"Missing library 'av'.*dbthermal\[recordings\]"):
         readers.flir(path)
 
 
