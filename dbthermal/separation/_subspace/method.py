@@ -61,7 +61,15 @@ from dbthermal import _smooth as smooth
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._subspace import clock, fused, pieces, reflection_ratio, residuals, steps
+from dbthermal.separation._subspace import (
+    clock,
+    division,
+    fused,
+    pieces,
+    reflection_ratio,
+    residuals,
+    steps,
+)
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Estimate, Mask, Survey, Tile
@@ -261,23 +269,24 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
     used, others = ratios.order + functions.steps, len(noise) - 1
     cost = others * (ratios.reduced_chi2 * (tile.time.size - used) + pieces.COST * used)
     known = None if part.material is None else part.material.ratio
-    divisions = pieces.divide(part.signals, tile.time, noise, tile.segment, known)
+    divide = division.divide if others == 1 else pieces.divide  # compiled for two bands
+    divisions = divide(part.signals, tile.time, noise, tile.segment, known)
     lowest = np.min([cost, *(one.cost for one in divisions)], axis=0)
-    for division in divisions:
+    for one in divisions:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
         flagged = (best.status != 0) | (cost > lowest + _LIKELY)
-        tried = (division.cost < cost) | (flagged & (division.cost < lowest + _LIKELY))
+        tried = (one.cost < cost) | (flagged & (one.cost < lowest + _LIKELY))
         # One piece is a smooth curve.
-        places = np.flatnonzero(tried & (division.first.sum(axis=0) > 1))
+        places = np.flatnonzero(tried & (one.first.sum(axis=0) > 1))
         if places.size == 0:
             continue
-        again = _divided(part.select_pixels(places), division.first[:, places], settings, _report)
-        cheaper = division.cost[places] < cost[places] - _LIKELY
+        again = _divided(part.select_pixels(places), one.first[:, places], settings, _report)
+        cheaper = one.cost[places] < cost[places] - _LIKELY
         better = (again.status == 0) | (flagged[places] & cheaper)
         places, again = places[better], again.select_pixels(better)
         best = best.replace_pixels(places, again)
-        cost[places] = division.cost[places]
-        first[:, suspect[places]] = division.first[:, places]
+        cost[places] = one.cost[places]
+        first[:, suspect[places]] = one.first[:, places]
     jumping = first[:, suspect].any(axis=0) & residuals.sudden(
         best.object_temperature, best.object_temperature_std, tile.time
     )
