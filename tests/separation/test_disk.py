@@ -8,16 +8,18 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from dbthermal import separation, simulation, store
+from dbthermal.separation import _run
 
 RIG = simulation.Rig()
 TIME = np.arange(64) / 10.0  # s
-MEMORY = 500e6 + 9 * 96 * 64 * 24  # byte: nine rows in a block of a process
+MEMORY = _run._BASE + 9 * (_run._SAMPLE + _run._TILE) * 2 * 64 * 24  # byte: nine rows in a block
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,8 @@ def test_run_is_solve(path: Path, tmp_path: Path, noise: str) -> None:
     response = RIG.response()
     response = response if noise == "known" else response.drop_vars(["noise", "netd"])
     target = tmp_path / "result.zarr"
-    result = separation.run(path, target, response, memory=MEMORY)
+    separation.run(path, target, response, memory=MEMORY)
+    result = store.open_dataset(target)
     expected = separation.solve(store.open_dataset(path).load(), response)
     xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
     assert result.attrs["method"] == "subspace"
@@ -68,9 +71,8 @@ def test_options_of_pixels_are_cut_into_rows(path: Path, tmp_path: Path) -> None
     )
     mask = xr.DataArray(rng.random((41, 24)) < 0.9, dims=("y", "x"))
     response, target = RIG.response(), tmp_path / "r.zarr"
-    result = separation.run(
-        path, target, response, "calibrated", memory=MEMORY, emissivity=known, mask=mask
-    )
+    separation.run(path, target, response, "calibrated", memory=MEMORY, emissivity=known, mask=mask)
+    result = store.open_dataset(target)
     expected = separation.solve(capture.load(), response, "calibrated", emissivity=known, mask=mask)
     xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
 
@@ -81,6 +83,73 @@ def test_processes_give_the_same_bytes(path: Path, tmp_path: Path) -> None:
         separation.run(path, tmp_path / "two.zarr", RIG.response(), executor=two, memory=MEMORY)
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
         separation.run(path, tmp_path / "one.zarr", RIG.response(), executor=one, memory=MEMORY)
+    assert files(tmp_path / "two.zarr") == files(tmp_path / "one.zarr")
+
+
+def test_several_captures_are_one_call(path: Path, tmp_path: Path) -> None:
+    """Of three captures one is at fault: it is named, the others are finished, and made once."""
+    response, capture = RIG.response(), store.open_dataset(path).load()
+    store.save(capture.isel(band=[0]), tmp_path / "broken.zarr", {})
+    sources: list[Any] = [path, tmp_path / "broken.zarr", capture.isel(y=slice(9))]
+    targets = [tmp_path / f"{name}.zarr" for name in ("first", "second", "third")]
+    with pytest.raises(ExceptionGroup, match=r"1 of 3 captures failed, .*second") as caught:
+        separation.run(sources, targets, response, memory=MEMORY)
+    (error,) = caught.value.exceptions
+    assert isinstance(error, ValueError)
+    assert "second.zarr" in error.__notes__[0]
+    expected = separation.solve(capture.isel(y=slice(9)), response)
+    result = store.open_dataset(targets[2]).load()
+    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+    before = [(target / "zarr.json").stat().st_mtime_ns for target in (targets[0], targets[2])]
+    store.save(capture.isel(y=slice(9)), tmp_path / "broken.zarr", {})
+    separation.run(sources, targets, response, memory=MEMORY)
+    after = [(target / "zarr.json").stat().st_mtime_ns for target in (targets[0], targets[2])]
+    assert after == before
+    assert store.open_dataset(targets[1]).drop_attrs().equals(result.drop_attrs())
+    separation.run(sources[:1], targets[:1], response, memory=MEMORY, seed=1)
+    assert (targets[0] / "zarr.json").stat().st_mtime_ns > before[0]  # of another run
+    with pytest.raises(ValueError, match="Invalid number of targets 2 for 3 captures"):
+        separation.run(sources, targets[:2], response)
+    with pytest.raises(ValueError, match=r"Invalid target .*first.* Must .* be named once"):
+        separation.run(sources, [*targets[:2], targets[0]], response)
+
+
+def dask_backed(path: Path) -> xr.Dataset:
+    """The capture in dask's arrays, in chunks that are no blocks of a run."""
+    pytest.importorskip(
+        "dask.array", reason="dask is not installed: pip install dbthermal[cluster]"
+    )
+    return store.open_dataset(path).chunk({"y": 16, "x": 10})
+
+
+@pytest.mark.parametrize("kind", ["zarr", "dask"])
+def test_a_lazy_dataset_is_a_source(path: Path, tmp_path: Path, kind: str) -> None:
+    """Opened lazily, or dask's, and sent to a process by rows, it gives what the folder does."""
+    lazy = dask_backed(path) if kind == "dask" else store.open_dataset(path)
+    separation.run(path, tmp_path / "folder.zarr", RIG.response(), memory=MEMORY)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
+        separation.run(lazy, tmp_path / "lazy.zarr", RIG.response(), memory=MEMORY, executor=one)
+    results = [store.open_dataset(tmp_path / f"{name}.zarr").load() for name in ("folder", "lazy")]
+    xr.testing.assert_equal(*results)
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+def test_a_cluster_gives_the_same_bytes(path: Path, tmp_path: Path, lazy: bool) -> None:
+    """Two workers of dask's scheduler, processes both, write the files that one process does."""
+    reason = "dask.distributed is not installed: pip install dbthermal[cluster]"
+    distributed = pytest.importorskip("distributed", reason=reason)
+    options: dict[str, Any] = {"memory": MEMORY, "provenance": {"run of": "a test"}}
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
+        separation.run(path, tmp_path / "one.zarr", RIG.response(), executor=one, **options)
+    source = dask_backed(path) if lazy else path
+    with (
+        distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+        client.get_executor() as two,
+    ):
+        separation.run(source, tmp_path / "two.zarr", RIG.response(), executor=two, **options)
+        workers = len(client.scheduler_info()["workers"])
+    assert workers == 2
     assert files(tmp_path / "two.zarr") == files(tmp_path / "one.zarr")
 
 
