@@ -95,7 +95,9 @@ def test_compiled_steps_are_those_of_arrays(case: str, least: float, way: str) -
     segment = (TIME > 9.0).astype(np.intp)
     functions = smooth.subspace(TIME, 14, segment=segment if way == "steps" else None)
     if way == "pieces":
-        functions = smooth.piecewise(TIME, np.isin(np.arange(TIME.size), [0, 100, 130]), 14)
+        functions = smooth.piecewise(
+            TIME, np.isin(np.arange(TIME.size), [0, 100, 130]), functions.rising
+        )
     if way == "material":
         tile = replace(tile, material=material())
     if way == "pattern":
@@ -161,7 +163,9 @@ def test_compiled_divisions_are_those_of_arrays(way: str) -> None:
         at = rng.integers(5, frames - 5)
         rise = 1.0 - np.exp(-np.arange(frames - at) / rng.uniform(1.0, 40.0))
         signals[:, at:, pixel] += np.outer([0.86, 0.72], rng.normal() * 5.0 * rise)
-    segment = np.cumsum(np.isin(np.arange(frames), [90, 97, 200])) if way == "steps" else None
+    segment = None
+    if way == "steps":
+        segment = np.cumsum(np.isin(np.arange(frames), [90, 97, 200])).astype(np.intp)
     known = np.stack([np.ones(48), np.where(np.arange(48) % 2, 2.0, np.nan)])
     args = signals, time, np.array(tile.noise), segment, known if way == "known" else None
     finite = 0

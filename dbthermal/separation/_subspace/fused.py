@@ -5,6 +5,7 @@ The equations of `steps`, whose results are repeated within rounding.
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from math import sqrt
 from typing import Any, Final, NamedTuple
 
@@ -15,6 +16,7 @@ from scipy.special import stdtrit
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array
+from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace import emission as emissions
@@ -113,7 +115,7 @@ def _film(
     return lost, missing, beyond > 0.0
 
 
-_FIELDS: Final = {
+_FIELDS: Final[dict[Any, dict[str, tuple[int, ...]]]] = {
     np.float64: {
         **dict.fromkeys(["inverse_energy", "null_variance", "contrast", "reduced_chi2"], ()),
         **dict.fromkeys(["epsilon_variance", "noise_variance", "drift_variance"], ()),
@@ -288,25 +290,27 @@ _separate: Final = _compiled(kernels.DIGEST)
 def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     """All that the pixels of a tile of two bands share."""
     first, second = tile.curves
-    around = tile.reference + np.array([-0.5, 0.5])  # [K]
-    rates = np.diff(np.log(second.slope(around) / first.slope(around)))
-    temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
+    rate, gray = _ratios(first, second)
+    columns = np.ascontiguousarray(functions.functions.T)
+    of_object = columns  # the same array, if it holds the same, stays in the cache
+    if functions.object_part is not functions.functions:
+        of_object = np.ascontiguousarray(functions.object_part.T)
     degrees = functions.rising.shape[1]
     freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in emissions.OCTAVES]
     edges, limits = residuals.blocks(tile.time.size)
     return Model(
         first=kernels.table(first),
         second=kernels.table(second),
-        functions=np.ascontiguousarray(functions.functions.T),
-        object_part=np.ascontiguousarray(functions.object_part.T),
+        functions=columns,
+        object_part=of_object,
         rising=np.ascontiguousarray(functions.rising.T),
         leverage=np.ascontiguousarray(functions.leverage().T),
         steps=int(functions.steps),
         noise=(float(tile.noise[0]), float(tile.noise[1])),
         pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
         drift=drift / np.sqrt(3.0),
-        rate=float(rates[0]),
-        gray=second.slope(temperatures) / first.slope(temperatures),
+        rate=rate,
+        gray=gray,
         widened=(stdtrit(np.maximum(freedom, 1), 0.975) / emissions.NORMAL95) ** 2,
         edges=edges,
         limits=limits,
@@ -314,6 +318,15 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         lowest=first.lowest,
         highest=first.highest,
     )
+
+
+@lru_cache
+def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
+    """Relative rate of the ratio of the slopes at the reference [1/K], and some of the ratios."""
+    around = first.reference + np.array([-0.5, 0.5])  # [K]
+    rates = np.diff(np.log(second.slope(around) / first.slope(around)))
+    temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
+    return float(rates[0]), second.slope(temperatures) / first.slope(temperatures)
 
 
 def _work_space(functions: smooth.Subspace) -> Work:
@@ -346,6 +359,11 @@ def solve(
     record, sums = np.zeros(pixels, RECORD), np.zeros((pixels, 2, shared.parts.size - 1))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     _separate(shared, signals, materials, float(least), work, Solved(films, record, sums))
-    named: dict[str, Any] = {name: np.moveaxis(record[name], 0, -1) for name in RECORD.names}
-    named |= {"beyond": named["beyond"] > 0, **dict(zip(FILMS, films, strict=True))}
+    named: dict[str, Any] = {name: np.moveaxis(record[name], 0, -1) for name in RECORD.names or ()}
+    freedom = frames - functions.steps - record["order"]
+    named |= {
+        "freedom": freedom,
+        "beyond": named["beyond"] > 0,
+        **dict(zip(FILMS, films, strict=True)),
+    }
     return Solution(sums=sums.transpose(1, 2, 0), **named)

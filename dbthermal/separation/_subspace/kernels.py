@@ -164,11 +164,11 @@ def _inverse(table: Table, signal: float) -> float:
     """Temperature [K] of a blackbody with any signal less the reference [K]."""
     excess = signal - table.offset
     if table.linear:
-        return excess / table.amplitude
+        return float(excess / table.amplitude)
     if excess > 0.0:
         scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(table.amplitude / excess)
-        return (scale - table.shift) / table.wavelength
-    return np.nan
+        return float((scale - table.shift) / table.wavelength)
+    return float(np.nan)
 
 
 @compiled
@@ -253,7 +253,7 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
     return float(np.uint32(lowest + above).view(np.float32))
 
 
-def _line(real: type[np.float32] | type[np.float64]) -> Callable[..., Any]:
+def _line(real: type[np.float32] | type[np.float64]) -> Any:
     """Weighted line of arrays of a precision, compiled."""
     zero, one = real(0.0), real(1.0)
 

@@ -37,6 +37,7 @@ class Solution(Pixels):
     null_weights: Array
     null_variance: Array
     order: Whole
+    freedom: Whole  # frames less the functions used (pixel)
     contrast: Array
     reduced_chi2: Array
     pooled: Mask
@@ -80,7 +81,7 @@ def solve(
         straight = replace(part, signals=signals)
         line = line.select_pixels(bent)
         again, bend, line = _steps(part, straight, functions, drift, result.gray[places], line)
-        result = result.replace_pixels(places, again)
+        result.replace_pixels(places, again)
     return result
 
 
@@ -128,6 +129,7 @@ def _steps(
         lost=lost.sum(axis=1),
         beyond=np.any(beyond, axis=1),
         ratio_variance=ratios.variance + emission.level_std**2,
+        freedom=frames - functions.steps - ratios.order,
         gray=gray,
         correlation=residuals.autocorrelation(residual),
         delay=residuals.interband_delay(residual, signals[0], functions, ratios, noise[0]),
