@@ -37,7 +37,7 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
     """Variance of the slope by a background that walks, and its bound; `emission.walk_variance`."""
     degrees, kept = len(model.rising), work.spare
     spectrum, curve = work.columns[:degrees], work.spectrum[:degrees]
-    share = work.weights.mean()
+    share = kernels.mean(work.weights)
     for t in range(kept.size):
         kept[t] = work.residual[t] * work.weights[t] / share
     kernels.projected(model.rising, degrees, kept, spectrum)
@@ -85,8 +85,7 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
     variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
     curve = _curve_variance(model, kernel, count, ratios.null_variance, work)
     variance = (variance + line.emissivity[0] ** 2 * curve) / length**2
-    spread = drift.max() - drift.min()
-    before = max((limit / spread) ** 2, size**2 + variance)
+    before = max((limit / model.spread) ** 2, size**2 + variance)
     share = before / (before + variance)
     return float(slope**2 * share * (share * size**2 + variance))
 
@@ -191,7 +190,7 @@ def _background(
         variance[t] = value + contrast**2 * steady
     if pattern[0] > 0.0 or pattern[1] > 0.0:
         direct0, direct1 = one / (1.0 - first), two / (1.0 - last)
-        kernels.blackbody(model.first, work.background, work.kernel, work.spare)
+        kernels.slopes(model.first, work.background, work.spare)
         for t in range(variance.size):
             slope0, slope1 = work.object_slope[t], work.other_object_slope[t]
             steepness = w[0] * first * slope0 + w[1] * last * slope1

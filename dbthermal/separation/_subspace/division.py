@@ -161,7 +161,7 @@ def _best(tree: Tree, scratch: Scratch) -> None:
 
 @compiled
 def _halve(tree: Tree, scratch: Scratch, one: float, two: float) -> None:
-    """Whether each piece is halved in its best division, by one axis."""
+    """Find the pieces that are halved in the best division, by one axis."""
     least, scatter, inner = scratch.cheapest, scratch.scatter, len(tree.edges) // 2
     for i in range(len(tree.edges)):
         least[i] = two * two * scatter[i, 0] - 2.0 * one * two * scatter[i, 1]
@@ -320,7 +320,7 @@ def _pixel(tree: Tree, scratch: Scratch, ratio: float, begins: Mask) -> None:
 
 @compiled
 def _near(axis: Array, taken: Array, count: int, apart: float) -> bool:
-    """Whether an axis is within an angle [rad] of one of those that are taken."""
+    """Compare an axis with those that are taken: is it within an angle [rad] of one."""
     near = False
     for i in range(count):
         product = abs(axis[0] * taken[i, 0] + axis[1] * taken[i, 1])

@@ -304,6 +304,7 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         functions=columns,
         object_part=of_object,
         rising=np.ascontiguousarray(functions.rising.T),
+        spread=float(np.ptp(functions.rising[:, 0])),
         leverage=np.ascontiguousarray(functions.leverage().T),
         steps=int(functions.steps),
         noise=(float(tile.noise[0]), float(tile.noise[1])),

@@ -141,6 +141,20 @@ def blackbody(table: Table, temperature: Array, signal: Array, slope: Array) -> 
 
 
 @compiled
+def slopes(table: Table, temperature: Array, slope: Array) -> None:
+    """Slope [1] alone, as `blackbody`."""
+    outside, scale = 0.0, 1.0 / table.half
+    for t in range(temperature.size):
+        x = (temperature[t] - table.middle) * scale
+        outside += 0.0 if abs(x) <= 1.0 else 1.0
+        slope[t] = polynomial(table.slope, x)
+    if outside > 0.0:
+        for t in range(temperature.size):
+            if not abs(temperature[t] - table.middle) <= table.half:
+                slope[t] = _exact(table, temperature[t])[1]
+
+
+@compiled
 def temperature(table: Table, signal: Array, result: Array) -> None:
     """Temperature [K] of a blackbody with a signal (time) [K], in place; NaN where undefined."""
     outside, scale, narrow = 0.0, 1.0 / table.half_signal, 1.0 / table.half
@@ -177,6 +191,14 @@ def dot(one: Array, other: Array) -> float:
     for t in range(one.size):
         total += one[t] * other[t]
     return total
+
+
+@compiled
+def mean(values: Array) -> float:
+    total = 0.0
+    for t in range(values.size):
+        total += values[t]
+    return total / values.size
 
 
 @compiled
@@ -309,7 +331,7 @@ def moments(x: Any, y: Any, weights: Any) -> tuple[float, float, float]:
 @compiled
 def _started(x: Array, y: Array, noise: float, residual: Array, few: Any) -> None:
     """Residual from the best of three starts, in place; see `residuals.regress`."""
-    middle, centre = x.mean(), y.mean()
+    middle, centre = mean(x), mean(y)
     step = max(1, x.size // residuals.STARTING_POINTS)
     count = (x.size + step - 1) // step
     xs, ys, rest = few[0, :count], few[1, :count], few[2, :count]

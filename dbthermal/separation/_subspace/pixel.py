@@ -229,7 +229,7 @@ def background(model: Model, line: Line, work: Work) -> None:
         mean[t] = one * reflected + two * work.reflected[t]
     # From the temperature of the mean signal, one Gauss-Newton step on the exact responses.
     kernels.temperature(model.first, mean, result)
-    kernels.blackbody(model.first, result, bend, work.back_slope)
+    kernels.slopes(model.first, result, work.back_slope)
     kernels.blackbody(model.second, result, bend, work.other_back_slope)
     for t in range(z.size):
         a, b = work.back_slope[t], work.other_back_slope[t]

@@ -17,6 +17,7 @@ class Model(NamedTuple):
     functions: Array  # (column, time), of `smooth.Subspace`
     object_part: Array  # (column, time)
     rising: Array  # (degree, time)
+    spread: float  # of the first of these
     leverage: Array  # (order, time)
     steps: int
     noise: tuple[float, float]  # [K]
