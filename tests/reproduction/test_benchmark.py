@@ -57,7 +57,7 @@ def test_a_series_ends_before_it_is_long(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_small_capture_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On disk and in memory: every figure is positive, and the processes' memory holds."""
     monkeypatch.setattr(benchmark, "ON_DISK", 128)
-    monkeypatch.setattr(benchmark.os, "cpu_count", lambda: 1)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
     assert benchmark.seconds_of("apparent", {"pixels": 32, "frames": 40, "bands": 2}) > 0
     disk = benchmark.from_disk(tmp_path)
     assert list(disk.seconds) == [1]
