@@ -318,7 +318,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             whole = method.whole_image or np.all(pixels)
             parts.append((frames, pixels, part if whole else part.select_pixels(pixels)))
         if displacement is not None:
-            parts = [alike for one in parts for alike in _of_one_noise(*one, gain, most)]
+            parts = [alike for one in parts for alike in of_one_noise(*one, gain, most)]
         yield Cut(window, status, valid, parts)
 
 
@@ -351,7 +351,7 @@ def _tile(
     )
 
 
-def _of_one_noise(
+def of_one_noise(
     frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
 ) -> Iterator[tuple[Mask, Mask, Tile]]:
     """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise."""
