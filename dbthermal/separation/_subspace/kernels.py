@@ -24,6 +24,11 @@ from dbthermal.separation._subspace import residuals
 _ERROR: Final = 1e-7  # of a response's polynomials [K]
 _MARGIN: Final = 0.25  # of the calibrated range, beside it, in which they hold
 _TERMS: Final = 12  # of a polynomial
+# Degrees, and shares of the range: of a wide one, such as a maker's, the outer parts stay exact.
+_TRIED: Final = (
+    *((degree, 1.0) for degree in range(1, _TERMS)),
+    *((_TERMS - 1, 0.85**k) for k in range(1, 14)),
+)
 _NEWTON: Final = 4  # steps of the inverse, at most
 _GUESSES: Final = 60  # of the value of a rank, at most
 
@@ -61,13 +66,14 @@ class Table(NamedTuple):
 def table(curve: Curve) -> Table:
     """Polynomials of a response, of the least degree that keeps an error."""
     margin = _MARGIN * (curve.highest - curve.lowest)
-    low, high = max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin
-    dense = np.linspace(low, high, 1001)
+    widest = max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin
 
     def signal(temperature: Array) -> Array:
         return curve.signal(temperature) - curve.reference
 
-    for degree in range(1, _TERMS):
+    for degree, share in _TRIED:
+        low, high = (np.mean(widest) + share * np.diff(widest) * np.array([-0.5, 0.5])).tolist()
+        dense = np.linspace(low, high, 1001)
         u, slope = (Chebyshev.interpolate(f, degree, [low, high]) for f in (signal, curve.slope))
         errors = np.abs([u(dense) - signal(dense), slope(dense) - curve.slope(dense)])
         if errors.max() < _ERROR:
