@@ -63,8 +63,9 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     ----------
     source : str, Path, Dataset, or a sequence of these
         Stage `corrected` of `schema`, as for `solve`: a folder ``*.zarr`` of `store.save`, which
-        every process opens by itself, or a lazy Dataset (of zarr, dask, `correct_capture`), of
-        which every process is sent its rows.
+        every process opens by itself, or a lazy Dataset (of zarr, dask), of which every process is
+        sent its rows. What `correct_capture` or `align` leave to be computed, threads can take, and
+        the workers of a cluster, not those of a ProcessPoolExecutor.
     target : str or Path, or as many
         Folder ``*.zarr`` for each result. While it is made, its parts are in ``*.zarr.parts``.
     response : Dataset
@@ -78,8 +79,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         Of `concurrent.futures`, or with its interface, as from ``distributed.Client.get_executor``;
         two threads if not given, or one where the memory is too small for two.
     memory : float
-        Largest memory of a process [byte]; the rows of a block follow from it. A process of an
-        executor is taken to separate one block at a time, but for that of a ThreadPoolExecutor.
+        Largest memory of a process [byte]; if it is tight, a block has fewer rows than 32. Each
+        process of an executor separates one block at a time, but that of a ThreadPoolExecutor.
     provenance : mapping, optional
         See `store.save`.
     progress : bool
@@ -250,7 +251,7 @@ def _with_noise(
 def _share(
     capture: xr.Dataset, memory: float, executor: Executor | None, method: Method
 ) -> tuple[int, int]:
-    """Threads of a process, and rows of a block, of a multiple of those that are read at once."""
+    """Threads of a process, and rows of a block: those that `solve` reads at once, or fewer."""
     row = capture["counts"][..., 0, :].size
     long = min(PIXELS * capture.sizes["time"], SAMPLES) * capture.sizes["band"]
     each, tile = _TILE * (1 if method.compiled else _TIMES), _TILE * _TIMES * long
@@ -266,8 +267,7 @@ def _share(
             f"row of {capture.sizes['x']} pixels and {capture.sizes['time']} frames."
         )
     rows = int(max((free - tile) / _SAMPLE, free / (_SAMPLE + each)) / row)
-    rows = min(rows, capture.sizes["y"])
-    return threads, rows - rows % BLOCK_ROWS if rows > BLOCK_ROWS else rows
+    return threads, min(rows, BLOCK_ROWS, capture.sizes["y"])
 
 
 def _begin(parts: Path, plan: Mapping[str, Any]) -> None:

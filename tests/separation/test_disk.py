@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import separation, simulation, store
+from dbthermal import correction, separation, simulation, store
 from dbthermal.separation import _run
+from dbthermal.store import _parts
+from reproduction.experiments import whole
 
 RIG = simulation.Rig()
 TIME = np.arange(64) / 10.0  # s
@@ -133,6 +135,24 @@ def test_a_lazy_dataset_is_a_source(path: Path, tmp_path: Path, kind: str) -> No
     xr.testing.assert_equal(*results)
 
 
+def test_raw_counts_are_corrected_by_rows(tmp_path: Path) -> None:
+    """A raw capture on disk, corrected when it is read, is separated as if corrected before."""
+    rng, shape = np.random.default_rng(3), (41, 24)
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    scene = simulation.walkers(TIME, shape, glass, rng, crossings=3)
+    detector = simulation.pattern(RIG, shape, rng)
+    movies = simulation.blackbody_movies(RIG, np.linspace(275.0, 345.0, 6), 16, detector, rng)
+    fitted, response = whole.calibrate(movies)
+    seen = simulation.observe(scene, RIG.response(), rng)
+    store.save(simulation.capture(seen, detector), tmp_path / "raw.zarr", {})
+    raw = store.open_dataset(tmp_path / "raw.zarr")
+    corrected = correction.correct_capture(raw, fitted, lazy=True)
+    separation.run(corrected, tmp_path / "result.zarr", response, memory=MEMORY)
+    expected = separation.solve(corrected.load(), response)
+    result = store.open_dataset(tmp_path / "result.zarr").load()
+    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+
+
 @pytest.mark.parametrize("lazy", [False, True])
 def test_a_cluster_gives_the_same_bytes(path: Path, tmp_path: Path, lazy: bool) -> None:
     """Two workers of dask's scheduler, processes both, write the files that one process does."""
@@ -151,6 +171,31 @@ def test_a_cluster_gives_the_same_bytes(path: Path, tmp_path: Path, lazy: bool) 
         workers = len(client.scheduler_info()["workers"])
     assert workers == 2
     assert files(tmp_path / "two.zarr") == files(tmp_path / "one.zarr")
+
+
+def test_a_join_that_is_cut_short_loses_nothing(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The parts stay whole until they are joined: started again, no block is separated anew."""
+    options: dict[str, Any] = {"memory": MEMORY, "provenance": {"run of": "a test"}}
+    separation.run(path, tmp_path / "rest.zarr", RIG.response(), **options)
+    links = iter(range(20))
+    link = _parts._link
+
+    def cut_short(source: Any, target: Any) -> None:
+        """Link twenty files, then fail as on a full disk."""
+        if next(links, None) is None:
+            raise OSError(28, "No space left on device")
+        link(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_parts, "_link", cut_short)
+        with pytest.raises(OSError, match="No space"):
+            separation.run(path, tmp_path / "cut.zarr", RIG.response(), **options)
+    assert not (tmp_path / "cut.zarr").exists()
+    monkeypatch.setattr(_run, "_separate_part", None)
+    separation.run(path, tmp_path / "cut.zarr", RIG.response(), **options)
+    assert files(tmp_path / "cut.zarr") == files(tmp_path / "rest.zarr")
 
 
 KILLED = """

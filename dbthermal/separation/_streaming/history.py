@@ -108,7 +108,7 @@ class History:
                     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
                         functions = _functions(tile)
                         solution = _solve(tile, functions, inputs.settings)
-                        found: Any = _report(tile, functions, solution)
+                        found: Any = _report(tile, solution)
                     (a, b), (_, d) = found.emissivity_covariance
                     ratio = found.reflection_ratio[1], found.reflection_ratio_std[1] ** 2
                     maps[:, pixels] = [*ratio, *found.emissivity, a, b, d]

@@ -3,7 +3,6 @@
 Planes (y, x) are in single precision, and the loops along a row are taken many pixels at once.
 """
 
-import hashlib
 from collections.abc import Callable
 from contextlib import suppress
 from math import sqrt
@@ -15,7 +14,7 @@ from numba import njit
 
 from dbthermal.schema import LARGEST, Status
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import fused, kernels
+from dbthermal.separation._subspace import kernels
 from dbthermal.separation._subspace.kernels import Table, compiled
 from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS
 
@@ -173,7 +172,7 @@ def _object(
     one, two = w[0] * first, w[1] * last
     target = w[0] * found[0, 0] + w[1] * found[1, 0]
     table, other = camera.first, camera.second
-    t = kernels.polynomial(other.rough, (target - other.middle_signal) / other.half_signal)
+    t = kernels.polynomial(other.inverse, (target - other.middle_signal) / other.half_signal)
     u, v, du, dv, steepness = 0.0, 0.0, 0.0, 0.0, 1.0
     for _ in range(_NEWTON + 1):
         p, q = (t - table.middle) / table.half, (t - other.middle) / other.half
@@ -237,7 +236,7 @@ def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -
             line[4][x] * (z1 - line[7][x] - line[8][x] * dt),
         )
         guess = (r0 + r1 - table.middle_signal) / table.half_signal
-        t = kernels.polynomial(table.rough, guess)
+        t = kernels.polynomial(table.inverse, guess)
         # One Gauss-Newton step of eq. 9.
         p, q = (t - table.middle) / table.half, (t - other.middle) / other.half
         du, dv = kernels.polynomial(table.slope, p), kernels.polynomial(other.slope, q)
@@ -331,5 +330,4 @@ def _kept(digest: str) -> tuple[Callable[..., None], Callable[..., None]]:
     return absorb, emit
 
 
-_SOURCES: Final = b"".join(path.read_bytes() for path in sorted(fused._SOURCES))
-absorb, emit = _kept(hashlib.sha256(_SOURCES).hexdigest())
+absorb, emit = _kept(kernels.DIGEST)

@@ -108,7 +108,7 @@ def estimate(
     if material is not None:
         inverse = np.where(pooled, material.inverse_energy, inverse)
     weights, variance = null_combination(ratio, noise)
-    rapid, unit = rapid_orders(functions) - 1, np.eye(len(noise))[..., np.newaxis]
+    rapid, unit = rapid_orders(functions.orders) - 1, np.eye(len(noise))[..., np.newaxis]
     contrast = np.full(order.shape, np.inf)
     np.divide(largest[-1] * others, null_energy[-1], out=contrast, where=null_energy[-1] > 0)
     return ReflectionRatio(
@@ -127,14 +127,14 @@ def estimate(
     )
 
 
-def rapid_orders(functions: smooth.Subspace) -> Whole:
+def rapid_orders(orders: int) -> Whole:
     """
     Two large orders (2,): that of all functions, and before it of a few less.
 
     What the order of one pixel leaves of its object, unseen in its noise, adds up over the pixels
     of a material.
     """
-    return np.array([max(1, functions.orders - FEWER), functions.orders])
+    return np.array([max(1, orders - FEWER), orders])
 
 
 def principal_ratio(scatter: Array, noise: Array) -> Array:

@@ -37,6 +37,7 @@ class Solution(Pixels):
     null_weights: Array
     null_variance: Array
     order: Whole
+    freedom: Whole  # frames less the functions used (pixel)
     contrast: Array
     reduced_chi2: Array
     pooled: Mask
@@ -64,7 +65,7 @@ def solve(
 
     With the limit of the background's `drift` [K], and the `least` bend that matters.
     """
-    result, bend = _steps(tile, tile, functions, drift)
+    result, bend, line = _steps(tile, tile, functions, drift)
     part, removed, places = tile, np.zeros(1), np.arange(result.gray.size)
     for _ in range(emissions.BENDS):
         change = bend - removed
@@ -78,8 +79,9 @@ def solve(
         signals = part.signals.copy()
         signals[1:] -= removed
         straight = replace(part, signals=signals)
-        again, bend = _steps(part, straight, functions, drift, result.gray[places])
-        result = result.replace_pixels(places, again)
+        line = line.select_pixels(bent)
+        again, bend, line = _steps(part, straight, functions, drift, result.gray[places], line)
+        result.replace_pixels(places, again)
     return result
 
 
@@ -89,7 +91,8 @@ def _steps(
     functions: smooth.Subspace,
     drift: float,
     gray: Mask | None = None,
-) -> tuple[Solution, Array]:
+    start: residuals.Line | None = None,
+) -> tuple[Solution, Array, residuals.Line]:
     """
     Steps 1 to 4, the first three on signals whose reflections are proportional; and the bend.
 
@@ -102,7 +105,7 @@ def _steps(
         temperature = np.linspace(curve.lowest, curve.highest, reflection_ratio.TEMPERATURES)
         slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
         gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
-    emission = emissions.estimate(straight, functions, ratios, drift)
+    emission = emissions.estimate(straight, functions, ratios, drift, start)
     background, variance = emissions.estimate_background(tile, emission, ratios)
     of_object, of_background = emissions.pattern_variances(tile, emission, ratios, background)
     films = np.stack([emission.temperature, background])
@@ -126,6 +129,7 @@ def _steps(
         lost=lost.sum(axis=1),
         beyond=np.any(beyond, axis=1),
         ratio_variance=ratios.variance + emission.level_std**2,
+        freedom=frames - functions.steps - ratios.order,
         gray=gray,
         correlation=residuals.autocorrelation(residual),
         delay=residuals.interband_delay(residual, signals[0], functions, ratios, noise[0]),
@@ -133,4 +137,4 @@ def _steps(
         sums=np.add.reduceat(curves, pieces.blocks(frames)[:-1], axis=1),
         **{name: parts[name] for name in parts if name in Solution.__dataclass_fields__},
     )
-    return solution, emissions.bend(tile, emission, background)
+    return solution, emissions.bend(tile, emission, background), emission.line
