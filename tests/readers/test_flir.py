@@ -282,8 +282,11 @@ def fates(path: Path, codec: str, number: int) -> Counter[str]:
 
     Without a codec, damage of the pixels alone is told from other counts.
     """
-    counts, found = scene(), Counter[str]()
-    whole = sequence(counts, codec, sums=codec == "png")
+    counts, found = scene(1 if codec == "jpeg" else 3), Counter[str]()
+    if codec == "jpeg":
+        whole = jpeg(sequence(counts, "png", sums=True), 900)
+    else:
+        whole = sequence(counts, codec, sums=codec == "png")
     places = [whole.index(image.tobytes()) for image in counts] if not codec else []
     for seed in range(number):
         kind, changed = damaged(whole, seed)
@@ -313,7 +316,7 @@ def fate(read: xr.Dataset, counts: np.ndarray, pixels: list[bytes]) -> str:
 @pytest.mark.parametrize(
     "number", [pytest.param(300, id="300"), pytest.param(10_000, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("codec", ["", "png", "jpegls"])
+@pytest.mark.parametrize("codec", ["", "png", "jpegls", "jpeg"])
 def test_damage(path: Path, codec: str, number: int) -> None:
     """Damaged files are refused or harmless; unprotected pixels, damaged, are those of the file.
 
