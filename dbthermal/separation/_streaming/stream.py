@@ -76,6 +76,10 @@ class Stream:
 
     Attributes
     ----------
+    bands : tuple of str
+        Names of the bands, as in the template.
+    is_ready : bool
+        True once temperatures are known.
     lost_frames : int
         Frames that did not come, by the times of the others, or were of no use.
 
@@ -133,7 +137,8 @@ class Stream:
         known |= {"reflection_shift": reflection_shift}
         two = replace(METHOD, minimum_frames=1, any_bands=False)
         inputs = _inputs.check(template, response, two, "stream", **known)
-        responses.noise(response, [curve.band for curve in inputs.curves])
+        self.bands = tuple(curve.band for curve in inputs.curves)
+        responses.noise(response, list(self.bands))
         # From here on the quietest band is the first one.
         self._order, template = inputs.bands, template.isel(band=inputs.bands)
         inputs = _inputs.check(template, response, two, "stream", **known)
@@ -163,6 +168,11 @@ class Stream:
         self._threads = ThreadPoolExecutor(int(workers))
         self._result = self._dataset([], [], self._history.status)
         self._warm()
+
+    @property
+    def is_ready(self) -> bool:
+        """True once temperatures are known."""
+        return self._result.sizes["time"] > 0
 
     @property
     def latency(self) -> float:
@@ -237,7 +247,7 @@ class Stream:
         ValueError
             If none are known yet.
         """
-        if self._result.sizes["time"] == 0:
+        if not self.is_ready:
             least = METHOD.minimum_frames * self._block
             raise ValueError(
                 f"Missing frames: {self._blocks * self._block} came, and no temperatures are "
