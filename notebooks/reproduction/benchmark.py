@@ -256,8 +256,9 @@ def ratios(times: Times, disk: Disk) -> Iterator[tuple[str, str]]:
     """Yield each ratio with its name."""
     one, most = disk.seconds[1], max(disk.seconds)
     speed = disk.samples / disk.seconds[most] / FRAME / 60
-    dbvt, subspace = (a_pixel(times[method, "pixels"]) for method in ("dbvt", "subspace"))
-    yield "`dbvt` over `subspace`, a pixel", f"{dbvt / subspace:.0f}"
+    dbvt, subspace = (times[method, "pixels"] for method in ("dbvt", "subspace"))
+    sizes = f"{max(dbvt)} over {max(subspace)} pixels"
+    yield f"`dbvt` over `subspace`, a pixel, {sizes}", f"{a_pixel(dbvt) / a_pixel(subspace):.0f}"
     disk_to_disk = f"`subspace` from disk to disk, {most} processes, over reading and writing alone"
     yield disk_to_disk, f"{disk.seconds[most] / disk.read_write:.1f}"
     yield f"frames of 640x512 by {most} processes over a camera's 60 a second", f"{speed:.2f}"
@@ -311,7 +312,8 @@ def figure(times: Times) -> Figure:
             axis.loglog(list(found), list(found.values()), marker + "-", color=color, label=method)
         axis.set_xlabel(f"number of {name}")
         axis.set_ylabel("processor time [s]")
-    axes[0, 1].legend(frameon=False, fontsize=8)
+    handles, labels = axes[0, 1].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside right center", frameon=False, fontsize=8)
     drawn.suptitle(f"One thread: {USUAL['frames']} frames, left; {FEW} pixels, right (simulated)")
     return drawn
 

@@ -33,7 +33,7 @@ def test_the_table_says_what_was_measured() -> None:
     )
     text = benchmark.table(times(), disk, 0.5)
     for line in (
-        "| `dbvt` over `subspace`, a pixel | 4 |",
+        "| `dbvt` over `subspace`, a pixel, 2048 over 2048 pixels | 4 |",
         "2 processes, over reading and writing alone | 2.0 |",
         "over a camera's 60 a second | 1.00 |",
         "| peak memory over `memory=1e+09` | 0.80 |",
