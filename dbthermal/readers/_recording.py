@@ -81,6 +81,23 @@ def _roughness(frame: Counts) -> float:
     return sum(float(np.abs(np.diff(values, axis=axis)).sum()) for axis in (0, 1))
 
 
+def check_unit(unit: str, name: str) -> None:
+    """Raise ValueError if the numbers of a file are no counts."""
+    if unit != "count":
+        raise ValueError(
+            f"Invalid unit '{unit}' of '{name}'. Must be 'count': object and reflection add up in "
+            "counts, and no longer in temperatures (temperature-linear data). Record or export raw "
+            "counts."
+        )
+
+
+def check_order(counts: Counts, name: str) -> None:
+    """Raise ValueError if images are smoother with their bytes swapped."""
+    if next((sign for frame in counts if (sign := smoother(frame))), 0) < 0:
+        rule = "Must be the other byte order, or another shape or header"
+        raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
+
+
 def byte_order(name: str, value: str) -> str:
     """Byte order as numpy writes it, of 'little' or 'big'."""
     if value not in {"little", "big"}:
