@@ -218,7 +218,7 @@ def _jpegls_size(body: bytes, place: str) -> tuple[int, int, int]:
     for marker, start, _ in container.segments(body, place):
         if marker == 0xF7:
             bits, height, width, _ = struct.unpack_from(">BHHB", body, start)
-            return height, width, 16 if bits > 8 else bits  # in 16, which FFmpeg does not scale
+            return height, width, bits
     raise ValueError(f"Invalid JPEG in {place}, of 8 bits. Must be JPEG-LS: record 16-bit counts.")
 
 

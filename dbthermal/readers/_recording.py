@@ -126,7 +126,8 @@ def recording(
     flags: npt.NDArray[np.uint16] | None = None,
 ) -> xr.Dataset:
     """Dataset of one band: `counts` (time, y, x), its clock and flags; see `readers.flir`."""
-    if not np.any(counts & 0xFF) or not np.any(counts >> 8):
+    empty = (not any(np.any(frame & byte) for frame in counts) for byte in (0x00FF, 0xFF00))
+    if any(empty):
         raise ValueError(
             f"Invalid counts of '{name}': one of their two bytes is always 0, as in pictures of 8 "
             "bits or with automatic gain. Must be 16-bit counts of the detector: record those."

@@ -171,7 +171,7 @@ def raw(
         raise ValueError(f"Invalid size {found}. {rule}.")
     recordings.check_memory((frames, *shape), memory, name)
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
-    counts = np.fromfile(one, form, offset=header)["counts"].astype(np.uint16)
+    counts = np.memmap(one, form, "r", offset=header)["counts"].astype(np.uint16)
     recordings.check_order(counts, name)
     seconds = recordings.stamps(clock, frames, name)
     attrs = {"source": name, "format": "raw", "byte_order": byte_order, "byte_order_by": "caller"}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 from flir_files import damaged, scene
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -48,6 +49,17 @@ def test_arrays_of_other_libraries() -> None:
         read(frames.astype("uint16").assign_attrs(units="K"))
     with pytest.raises(ValueError, match=r"Invalid shape \(24, 32\) of 'array'"):
         read(scene()[0])
+
+
+def test_arrays_on_disk(tmp_path: Path) -> None:
+    """Arrays that zarr and xarray open and leave on disk are read when they are taken."""
+    path = tmp_path / "a.zarr"
+    zarr.create_array(store=path, name="frames", data=scene())
+    assert_array_equal(read(zarr.open_group(path, mode="r")["frames"]).counts, scene())
+    frames = xr.DataArray(scene(), dims=("t", "y", "x"), name="frames")
+    frames.astype("i4").to_netcdf(tmp_path / "a.nc", engine="scipy")
+    with xr.open_dataset(tmp_path / "a.nc") as opened:
+        assert_array_equal(read(opened["frames"].astype("uint16")).counts, scene())
 
 
 def test_objects_are_not_loaded(tmp_path: Path) -> None:
