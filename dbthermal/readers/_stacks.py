@@ -1,6 +1,7 @@
 """Counts that other programs wrote: TIFF stacks and bare numbers, which tell little else."""
 
 import json
+import logging
 import math
 import re
 import struct
@@ -188,10 +189,24 @@ class _Page(NamedTuple):
     spans: list[tuple[int, int]]
 
 
+class _Complaints(logging.Handler):
+    """Errors that a library logs instead of raising them."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self.messages = list[str]()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep the message."""
+        self.messages.append(record.getMessage())
+
+
 def _pages(path: Path) -> list[_Page]:
     """Pages of a file, which must be as many as its description states."""
     tifffile = recordings.optional("tifffile", "recordings")
     size, pages, total = path.stat().st_size, list[_Page](), 0
+    complaints, log = _Complaints(logging.ERROR), logging.getLogger("tifffile")
+    log.addHandler(complaints)
     try:
         with tifffile.TiffFile(path) as file:
             for number, page in enumerate(file.pages):
@@ -200,9 +215,14 @@ def _pages(path: Path) -> list[_Page]:
                 if total > size:  # as of a chain of pages that returns to itself
                     raise ValueError(f"{total} bytes of pixels. Must fit into its {size}.")
             stated = _stated(str(file.pages[0].description))
+            for message in complaints.messages:  # which tifffile logs, and goes on
+                raise ValueError(message)
+            _check_apart(file, pages)
     except _DAMAGE as error:
         rule = "" if "Must " in str(error) else ". Must be a whole TIFF or BigTIFF."
         raise ValueError(f"Invalid or damaged TIFF '{path.name}': {error}{rule}") from error
+    finally:
+        log.removeHandler(complaints)
     if len(pages) == 1 and stated > 1:  # one page for a stack without gaps: ImageJ beyond 4 GB
         (start, length), *others = pages[0].spans
         if others or start + stated * length > size:
@@ -213,6 +233,21 @@ def _pages(path: Path) -> list[_Page]:
         found = f"Truncated TIFF '{path.name}': {len(pages)} pages"
         raise ValueError(f"{found}. Must be the {stated} that its description states.")
     return pages
+
+
+def _check_apart(file: Any, pages: list[_Page]) -> None:
+    """Raise ValueError where pixels lie over others, or over what describes them."""
+    spans = [(start, start + length, True) for page in pages for start, length in page.spans]
+    form = file.tiff
+    for page in file.pages:
+        entries = form.tagnosize + form.tagsize * len(page.tags) + form.offsetsize
+        spans.append((page.offset, page.offset + entries, False))
+        spans += [(t.valueoffset, t.valueoffset + t.valuebytecount, False) for t in page.tags]
+    used, pixels = 8, 8  # bytes before which something lies, and pixels lie
+    for start, stop, of_pixels in sorted(spans):
+        if start < (used if of_pixels else pixels):
+            raise ValueError(f"Overlapping parts at byte {start}. Must lie apart.")
+        used, pixels = max(used, stop), max(pixels, stop) if of_pixels else pixels
 
 
 def _page(page: Any, path: Path, order: str, number: int) -> _Page:

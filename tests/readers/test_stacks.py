@@ -157,11 +157,14 @@ def tiff_fates(path: Path, options: dict[str, Any], number: int) -> Counter[str]
 )
 @pytest.mark.parametrize("form", ["plain", "big-endian", "bigtiff"])
 def test_damage(tmp_path: Path, form: str, number: int) -> None:
-    """Damaged stacks are refused, or read as they are."""
+    """Damaged stacks are refused, or read as they are.
+
+    One in a thousand lost its last pages where zeros end their chain and spoil the description.
+    """
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found = tiff_fates(tmp_path / "a.tif", FORMS[form], number)
     taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     print(form, dict(found), f"{taken} KiB")
     assert taken < 2**20  # KiB
     assert not [key for key in found if key.startswith(("unclear", "other"))]
-    assert sum(value for key, value in found.items() if "fewer" in key) <= 0.02 * number
+    assert sum(value for key, value in found.items() if "fewer" in key) <= 0.002 * number
