@@ -20,7 +20,7 @@ _GAP: Final = 1.5
 # Largest relative deviation of a time step from the median of an even clock [1].
 _EVEN: Final = 0.05
 _MINIMUM_FRAMES: Final = 2
-# Share of the largest step by which a cubic may leave the line beside a sudden step: the noise.
+# Share of the largest step by which it may leave the line beside a sudden step: the noise.
 _SWING: Final = 0.125
 # Fewest frames in a row, of a recording that pauses.
 _ROW: Final = 64
@@ -30,14 +30,15 @@ PAUSE: Final = 20
 
 @dataclass(frozen=True)
 class Interpolation:
-    r"""Interpolation in time by the line between two frames and the cubic through four.
+    r"""Interpolation in time by the value to be expected between four frames.
 
     .. math:: I(t) = (1 - w) I_{before} + w I_{after} + \sum_{i=-1}^{2} b_i I_{before + i}
 
-    The bend b makes the line the cubic (Lagrange); it is 0 without four frames in a row. Half-way
-    between frames the line keeps 71 % of a change that takes four frames from crest to crest, the
-    cubic 88 %; of one of eight frames 92 and 99 %. What a band loses would be taken for a smaller
-    reflection than that of the other.
+    For a random walk that is the line between two frames, for what is smooth from frame to frame
+    nearly the cubic through four: the bend b, which is 0 without four frames in a row. The wrong
+    one takes, or adds, a part of the rapid changes, and the reflection of this band would be taken
+    for smaller, or larger: half-way between frames the line keeps 71 % of a change that takes four
+    frames from crest to crest, the cubic 88 %.
 
     `before`, `after` (wanted): frames; `weight` (wanted): w [1]; `bend` (wanted, 4): b [1];
     `valid` (wanted): false across a gap or past an end; `stamps` (time): exposure times [s].
@@ -56,7 +57,7 @@ class Interpolation:
         """Write the interpolated frames (wanted, ...) into `out`, NaN where not valid.
 
         Between two samples that differ by more than `largest_step` no value is known: NaN. Nor is
-        it beside them, where the cubic swings.
+        it beside them, where a curve swings.
         """
 
         @lru_cache(maxsize=3)  # of the frames' intervals in turn
@@ -242,8 +243,12 @@ def pauses(times: Array) -> Array:
     return np.stack([times[after - 1], times[after]], axis=1)
 
 
-def interpolation(stamps: Array, present: Mask, wanted: Array, segment: Indices) -> Interpolation:
+def interpolation(
+    stamps: Array, present: Mask, wanted: Array, segment: Indices, growth: float
+) -> Interpolation:
     """Interpolation of the frames present, exposed at `stamps` (time) [s], at times `wanted` [s].
+
+    Of a signal with that `growth`, see the function.
 
     Valid where a frame was exposed within 1 % of a period of the wanted time, or one each before
     and after it of one `segment` (time), no more than one and a half frame periods apart.
@@ -265,17 +270,43 @@ def interpolation(stamps: Array, present: Mask, wanted: Array, segment: Indices)
     between = (weight > 0) & (weight < 1) & joined[right - 1]
     valid = (weight == 0) | (weight == 1) | between
     in_a_row = np.pad(joined & (np.diff(usable) == 1), (1, 1))
-    four = between & in_a_row[right - 1] & in_a_row[right] & in_a_row[right + 1]
+    four = (growth > 1.0) & between & in_a_row[right - 1] & in_a_row[right] & in_a_row[right + 1]
     nodes = times[np.clip(right[:, np.newaxis] + np.arange(-2, 2), 0, usable.size - 1)]
     bend = np.zeros(nodes.shape)
-    bend[four] = _cubic(nodes[four], wanted[four])
+    bend[four] = _expected(nodes[four], wanted[four], growth)
     bend[four, 1] -= 1.0 - weight[four]
     bend[four, 2] -= weight[four]
     return Interpolation(usable[right - 1], usable[right], weight, bend, valid, stamps)
 
 
-def _cubic(nodes: Array, wanted: Array) -> Array:
-    """Weights (wanted, 4) of the cubics through four nodes (wanted, 4), at the times wanted."""
-    away = np.where(np.eye(4, dtype=bool), 1.0, (wanted[:, np.newaxis] - nodes)[:, np.newaxis])
-    apart = nodes[:, :, np.newaxis] - nodes[:, np.newaxis] + np.eye(4)
-    return np.asarray(np.prod(away / apart, axis=2))
+def _expected(nodes: Array, wanted: Array, growth: float) -> Array:
+    """Weights (wanted, 4) of the samples at four nodes (wanted, 4), at the times wanted.
+
+    Universal kriging with a linear trend (Matheron 1973, doi:10.2307/1425829), of the generalised
+    covariance |h|^growth less h^2, of which the trend knows nothing, for a limit at a growth of 2.
+    """
+    times = np.column_stack([nodes, wanted]) - wanted[:, np.newaxis]
+    times /= np.diff(nodes).mean(axis=1)[:, np.newaxis]
+    lag = np.abs(times[:, :, np.newaxis] - times[:, np.newaxis])
+    growth += 1e-7 * (growth == 2.0)
+    covariance = (lag**growth - lag**2) / (growth - 2.0)
+    trend = np.stack([np.ones_like(times), times], axis=2)
+    system = np.zeros((len(wanted), 6, 6))
+    system[:, :4, :4] = covariance[:, :4, :4]
+    system[:, :4, 4:], system[:, 4:, :4] = trend[:, :4], np.swapaxes(trend[:, :4], 1, 2)
+    right = np.concatenate([covariance[:, :4, 4], trend[:, 4]], axis=1)
+    return np.asarray(np.linalg.solve(system, right[..., np.newaxis])[:, :4, 0])
+
+
+def growth(signal: npt.NDArray[Any]) -> float:
+    """Exponent a in mean [x(t + h) - 2 x(t) + x(t - h)]^2 ~ h^a of signals (time, ...), 1 to 3.9.
+
+    Of lags of 1, 2 and 4 frames, whose differences hold no noise: 1 of a random walk, 4 of what is
+    smooth from frame to frame. It is 1 where nothing changes.
+    """
+    spread = []
+    for lag in (1, 2, 4):
+        bend = signal[2 * lag :] - 2.0 * signal[lag:-lag] + signal[: -2 * lag]
+        spread.append(np.nanmean(bend**2) if np.isfinite(bend).any() else 0.0)
+    fine, coarse = np.diff(spread)
+    return float(np.clip(np.log2(coarse / fine), 1.0, 3.9)) if min(fine, coarse) > 0.0 else 1.0

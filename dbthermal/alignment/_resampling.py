@@ -53,14 +53,14 @@ def align(
 
     The samples of one band are not touched in time, and its noise stays white: the noisiest, by its
     noise relative to its signal, unless `clock` names another. The other bands are interpolated at
-    its exposure times by cubics through four frames, beside a gap by the line between two. An
-    offset of whole frames is a pure shift.
+    its exposure times by what is to be expected between four frames: the line between two for a
+    random walk, nearly a cubic for what is smooth. An offset of whole frames is a pure shift.
 
     Frames are NaN in a band where that would reach over a gap, over a change of `segment`, or
     past an end, and where its camera gave none: NaN, or a copy of the frame before. Nothing is
     extrapolated: a recording that pauses is aligned in its parts. Where a signal steps between two
     frames, by five standard deviations of noise, the sample is NaN, too, for when it changed is not
-    known, and those beside it, where a cubic overshoots. Interpolation makes the noise of a band
+    known, and those beside it, where a curve overshoots. Interpolation makes the noise of a band
     smaller, by up to 0.8 (`noise_factor`), and correlates neighbouring frames; in the quieter of
     two bands that hardly counts.
 
@@ -144,7 +144,7 @@ def align(
     times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
     plans, factors, missing = [], np.ones(len(names)), _missing(views)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
-        plan = clocks.interpolation(row, ~absent, times, segment)
+        plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))
         plans.append(replace(plan, valid=plan.valid & (plan.labels(segment) == segment)))
         power = plans[band].power()[plans[band].valid]  # of independent noises
         factors[band] = np.sqrt(np.mean(power)) if power.size else 1.0

@@ -32,6 +32,7 @@ from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal.response import Curve
 from dbthermal.schema import Status
+from dbthermal.separation import _quality as quality
 from dbthermal.separation._displaced import without
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import residuals
@@ -369,12 +370,15 @@ def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Si
 
     Beside it the steps of the camera in it, which are no change. The change from r to p (loose,
     time) [K] and its variance (loose): smoothed over time, it is that of e_1 u_1(x) and holds
-    little of that of the reflection.
+    little of that of the reflection. Bad pixels have no part in it.
     """
     displacement, capture = inputs.displacement, inputs.capture
     assert displacement is not None
     (height, width), curve = displacement.shape, inputs.curves[displacement.reference]
-    change = np.zeros((loose.size, capture.sizes["time"]))
+    change, unknown = (
+        np.zeros((loose.size, capture.sizes["time"])),
+        np.zeros(loose.size, dtype=bool),
+    )
     segment = capture["segment"].values if "segment" in capture else None
     order = min(_ORDER, change.shape[1] // 4)
     functions = smooth.subspace(capture["time"].values, order, segment=segment)
@@ -393,13 +397,20 @@ def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Si
         both = np.nan_to_num(_bridge(signal, np.ones(signal.shape[1], dtype=bool))).T
         steps[:, here] = (basis - own)[frames] @ (both[inside] @ basis).T
         at = displacement.weights(rows, source)[loose[chosen] - top * width]
+        *_, flags = quality.read(capture.isel(band=[displacement.reference], y=source))
+        bad = quality.unusable(flags)
+        at = without(at, bad, width)
+        unknown[chosen] = abs(at) @ bad > 0.0
         change[chosen] = at @ both - both[loose[chosen] - source.start * width]
+    change[unknown] = 0.0
     smoothed = (change @ basis) @ own.T
     # The mean of correlated errors: K / N, times (1 + rho) / (1 - rho).
     error = change - (change @ basis) @ basis.T
     energy = (error**2).sum(axis=1)
     lagged = np.clip((error[:, 1:] * error[:, :-1]).sum(axis=1) / energy, 0.0, 0.98)
     variance = energy * basis.shape[1] / change.shape[1] ** 2 * (1.0 + lagged) / (1.0 - lagged)
+    # One that is not known, beside bad pixels, may be as large as the others.
+    variance[unknown] = np.mean((first if unknown.all() else smoothed[~unknown]) ** 2)
     # A sample that is no measurement is an outlier of the regression.
     return np.nan_to_num(first), steps, smoothed, np.nan_to_num(variance)
 
