@@ -409,8 +409,8 @@ def _first_band(inputs: Inputs, loose: Whole, frames: Whole) -> tuple[Signal, Si
     energy = (error**2).sum(axis=1)
     lagged = np.clip((error[:, 1:] * error[:, :-1]).sum(axis=1) / energy, 0.0, 0.98)
     variance = energy * basis.shape[1] / change.shape[1] ** 2 * (1.0 + lagged) / (1.0 - lagged)
-    # One that is not known, beside bad pixels, may be as large as the others.
-    variance[unknown] = np.mean((first if unknown.all() else smoothed[~unknown]) ** 2)
+    # One that is not known, beside bad pixels, may be as large as any other.
+    variance[unknown] = np.max((first.T if unknown.all() else smoothed[~unknown]) ** 2, initial=0)
     # A sample that is no measurement is an outlier of the regression.
     return np.nan_to_num(first), steps, smoothed, np.nan_to_num(variance)
 

@@ -130,6 +130,25 @@ def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:
     assert float(apart.max()) < 0.5  # K
 
 
+def test_stuck_pixels_do_not_reach_their_surroundings() -> None:
+    """A pixel that is far too warm in the first band passes for no change of the object."""
+    shift = smooth_shift(SMALL.shape, 2.5, 0.0)
+    scene, capture = film(SMALL, shift, 1)
+    stuck = np.zeros(SMALL.shape, dtype=np.uint32)
+    stuck[4::6, 7::9] = int(Status.DEAD_PIXEL)
+    counts = capture["counts"].where(stuck == 0, 2.0 * float(capture["counts"][0].max()))
+    noisy = counts + np.random.default_rng(1).normal(0.0, 3.0, counts.shape)
+    bad = capture.assign(counts=noisy.astype(np.float32), status=(("y", "x"), stuck))
+    result = separation.solve(bad, RIG.response(), reflection_shift=field(shift))
+    error = abs(result["object_temperature"] - scene["object_temperature"]).mean("time")
+    score = (error / result["object_temperature_std"].mean("time")).where(result["status"] == 0)
+    print(
+        f"without a flag {float(score.notnull().mean()):.2f}, largest error {score.max():.1f} std"
+    )
+    assert float(score.notnull().mean()) > 0.6
+    assert float(score.max()) < 5.0
+
+
 def test_known_emissivities_and_rapid_heating() -> None:
     """Frame by frame, the two places make the object more certain than one place does."""
     picture = Picture(shape=(20, 48), walkers=6, rise=(2.0, 6.0))
