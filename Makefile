@@ -112,8 +112,8 @@ record: .venv/installed ## keep the numbers of results/full as the reference, an
 data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
 	$(python) -m reproduction.manifest
 
-bench: .venv/installed ## measure time and memory
-	$(python) -m pytest -m bench --capture=no
+bench: .venv/installed ## measure every method's time, and a run from disk to disk, into results/bench
+	$(python) -m reproduction.benchmark
 
 attack: .venv/installed ## attack the package with 6,000 hostile inputs, and write their counts into docs/trust.md
 	PYTHONPATH=tests:notebooks $(python) -m attack --inputs 6000 --seed 1 --write docs/trust.md

@@ -144,7 +144,7 @@ def end_of(
         end = counts.max(axis=0, where=valid, initial=counts.min(initial=0))
     else:
         end = counts.min(axis=0, where=valid, initial=counts.max(initial=0))
-    there = (counts == end) & used
+    there = counts == end if used is True else (counts == end) & valid
     # A product of matrices adds up several times faster than a sum over the first axis.
     number = np.ones(len(there), dtype=np.float32) @ there.astype(np.float32)
     return end, number.astype(np.intp)
@@ -169,7 +169,8 @@ def is_heap(number: npt.ArrayLike, near: npt.ArrayLike, band: Grain) -> Mask:
 
 def repeated(counts: npt.NDArray[Any], valid: Mask) -> Mask:
     """Samples (time - 1, pixel) of counts (time, pixel) that repeat the one before."""
-    return np.asarray((counts[1:] == counts[:-1]) & valid[1:] & valid[:-1])
+    same = counts[1:] == counts[:-1]
+    return np.asarray(same if valid.all() else same & valid[1:] & valid[:-1])
 
 
 def frozen(same: Mask, chance: float) -> Mask:

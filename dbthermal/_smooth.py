@@ -6,6 +6,7 @@ then has polynomials in pieces of the time.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Final
 
@@ -68,30 +69,39 @@ def subspace(
 def piecewise(
     time: npt.ArrayLike,
     first: npt.NDArray[np.bool_],
-    order: int,
+    rising: Array,
     *,
     segment: npt.NDArray[np.integer] | None = None,
     number: int = PIECE_ORDER,
 ) -> Subspace:
     """Polynomials in pieces of the time that begin with some frames (time,), of one order together.
 
-    So many in each piece, or as many as it has frames. The rising polynomials are those of
-    `subspace` of an order. A shutter event must not be the first frame of a piece: its step would
+    So many in each piece, or as many as it has frames. The rising polynomials (time, degree) are
+    those of `subspace`. A shutter event must not be the first frame of a piece: its step would
     be the object's as well.
     """
-    time, rising = np.asarray(time, dtype=np.float64), subspace(time, order, segment=segment).rising
+    time = np.asarray(time, dtype=np.float64)
     edges = [*np.flatnonzero(first), time.size]
     blocks = []
     for start, stop in pairwise(edges):
         inside = slice(start, stop)
         events = len(camera_steps(None if segment is None else segment[inside]))
         block = np.zeros((time.size, min(number, stop - start - events)))
-        block[inside] = polynomial_basis(time[inside], block.shape[1])
+        block[inside] = _known_basis(time[inside].tobytes(), block.shape[1])
         blocks.append(block)
+    if not camera_steps(segment):  # of two pieces, orthonormal as they are
+        together = np.hstack(blocks)
+        return Subspace(together, together, together.shape[1] - 1, rising)
     functions, object_part = _without_steps(
         np.hstack(blocks), camera_steps(segment), np.empty((time.size, 0))
     )
     return Subspace(functions, object_part, functions.shape[1] - 1, rising)
+
+
+@lru_cache(maxsize=4096)
+def _known_basis(time: bytes, order: int) -> Array:
+    """Basis over some times: many pixels have pieces of the same."""
+    return polynomial_basis(np.frombuffer(time), order)
 
 
 def camera_steps(segment: npt.NDArray[np.integer] | None) -> list[Array]:

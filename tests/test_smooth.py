@@ -79,7 +79,8 @@ def test_steps_and_pieces_are_in_the_subspace() -> None:
     """Steps of the camera and a polynomial in each piece are their own projection."""
     time = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, 60))
     first = np.isin(np.arange(60), [0, 20, 23, 41])
-    functions = smooth.piecewise(time, first, 6, segment=segmented(60, 30))
+    rising = smooth.subspace(time, 6, segment=segmented(60, 30)).rising
+    functions = smooth.piecewise(time, first, rising, segment=segmented(60, 30))
     assert (functions.orders, functions.steps) == (1, 3 * smooth.PIECE_ORDER + 3)
     piece = np.cumsum(first)
     curve = piece * (3.0 + 0.1 * (time - time[35]) ** 3) + np.sin(7.0 * time) * (piece == 2)

@@ -3,14 +3,12 @@
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
+from dbthermal._arrays import Array
 from dbthermal.alignment import _matching as matching
 from dbthermal.alignment._matching import Movies
 from dbthermal.alignment._resampling import interpolation
-
-Array = npt.NDArray[np.float64]
 
 _ROWS: Final = 32  # that are resampled at a time
 _TAPS: Final = 6  # neighbours a side, of which movies are interpolated

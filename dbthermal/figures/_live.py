@@ -27,6 +27,7 @@ _TEXT_HEIGHT: Final = 1.15  # of title, lines and foot [inch]
 _BAR: Final = 0.76  # of a band's width that its picture takes, beside the colour bar
 _LETTERS: Final = 75  # of a line of the foot, per band
 _TICKS: Final = 4  # intervals of the colour bar at most: every number costs a millisecond
+_CELSIUS: Final = "temperature [\N{DEGREE SIGN}C]"
 _ALARM: Final = "#b3001b"
 
 
@@ -37,9 +38,9 @@ class Panel:
     Attributes
     ----------
     image : array or None
-        Raw signal (y, x) [count]; None before the first frame.
+        Raw signal (y, x) [count], or a temperature [degree Celsius]; None before the first one.
     limits : tuple of float
-        Counts that are black and white [count].
+        Values at both ends of the colours.
     text, warning : str
         Texts below and across the picture.
     """
@@ -68,6 +69,8 @@ class LiveFigure:
         Their names, in the order of the pictures.
     shape : tuple of int
         Rows and columns of every picture [pixel].
+    temperatures : sequence of str
+        Names of pictures of temperatures beside them.
 
     Attributes
     ----------
@@ -82,23 +85,29 @@ class LiveFigure:
     4
     """
 
-    def __init__(self, bands: Sequence[str], shape: tuple[int, int]) -> None:
+    def __init__(
+        self, bands: Sequence[str], shape: tuple[int, int], temperatures: Sequence[str] = ()
+    ) -> None:
         self.bands, self.shape = tuple(bands), shape
+        number = len(bands) + len(temperatures)
         height = _BAR * _WIDTH * shape[0] / shape[1] + _TEXT_HEIGHT
-        self.figure, axes = canvas(1, len(bands), (_WIDTH * len(bands), height))
+        self.figure, axes = canvas(1, number, (_WIDTH * number, height))
         self.figure.set_layout_engine("none")
         self._engine = ConstrainedLayoutEngine()
         self._empty = np.full(shape, np.nan)
         self._room: list[int] = []
         self._title = self.figure.suptitle("")
         self._foot = self.figure.supxlabel("", fontsize=9)
+        signal, temperature = ("raw signal [count]", "gray"), (_CELSIUS, "inferno")
+        pictures = [(band, band_label(band), *signal) for band in bands]
+        pictures += [(name, name, *temperature) for name in temperatures]
         self._artists = {
-            band: _artists(self.figure, axis, band, shape)
-            for band, axis in zip(bands, axes[0], strict=True)
+            name: _artists(self.figure, axis, shape, *labels)
+            for (name, *labels), axis in zip(pictures, axes[0], strict=True)
         }
 
     def update(self, panels: Mapping[str, Panel], *, title: str, foot: str = "") -> None:
-        """Show each band's `Panel`, a title, and a foot that belongs to no band."""
+        """Show the `Panel` of each picture, a title, and a foot that belongs to none."""
         for band, artists in self._artists.items():
             panel = panels[band]
             image = self._empty if panel.image is None else panel.image
@@ -124,10 +133,12 @@ class LiveFigure:
             self._room = room
 
 
-def _artists(figure: Figure, axis: Axes, band: str, shape: tuple[int, int]) -> _Artists:
-    """Artists of a band before its first picture."""
+def _artists(
+    figure: Figure, axis: Axes, shape: tuple[int, int], title: str, label: str, cmap: str
+) -> _Artists:
+    """Artists before the first picture."""
     empty = xr.DataArray(np.full(shape, np.nan), dims=("y", "x"))
-    draw_image(figure, axis, empty, band_label(band), "raw signal [count]", cmap="gray")
+    draw_image(figure, axis, empty, title, label, cmap=cmap)
     image = axis.images[0]
     assert image.colorbar is not None  # draw_image gave it one
     image.colorbar.locator = MaxNLocator(_TICKS, integer=True)

@@ -8,6 +8,8 @@ of each band, in place, in a notebook or nowhere::
     view = live.View(DisplayHandle(), title=session.name, is_simulated=session.simulated)
     record(session, devices.sources, path, readings=devices.readings(), preview=view)
 
+With a `Separation` it shows the temperatures of object and background beside them, live.
+
 A `Watch` computes the numbers that are shown, and draws nothing: matplotlib is loaded with the
 first picture. The queue of the recording has to bridge the time that an update takes.
 """
@@ -19,6 +21,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
+import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal.instruments.camera import (
@@ -34,9 +37,10 @@ from dbthermal.instruments.recording import Preview
 if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does without it
     from matplotlib.figure import Figure
 
-    from dbthermal.figures import LiveFigure
+    from dbthermal.figures import LiveFigure, Panel
+    from dbthermal.separation import Stream
 
-__all__ = ["Display", "Picture", "Status", "View", "Watch"]
+__all__ = ["Display", "Picture", "Separation", "Status", "View", "Watch"]
 __dir__ = __all__.copy
 
 _WINDOW: Final = 3.0  # time over which a frame rate is measured [s]
@@ -45,6 +49,7 @@ _PERCENTILES: Final = (1.0, 99.0)  # of the counts that are black and white in t
 _LEAST_SHARE: Final = 0.01  # of pixels at either end of the range, from which a warning comes [1]
 _COMPRESSION: Final = 1  # of zlib's 1 to 9
 _RANGE: Final = np.iinfo(np.uint16)
+_FILMS: Final = ("object", "background")
 _STEP: Final = 4  # every fourth pixel of every fourth row is enough for percentiles
 _FFC_STATES: Final = {float(state): state.name.lower().replace("_", " ") for state in FfcStatus}
 _IN_PROGRESS: Final = _FFC_STATES[FfcStatus.IN_PROGRESS]
@@ -236,6 +241,32 @@ class Picture:
         return self.png
 
 
+class Separation:
+    """Live separation of the pairs of frames that a view is shown, for its `separation`.
+
+    `stream` is a `separation.Stream` at the rate of the previews, ``Limits.preview_period``, and
+    `correction` from `correction.fit_correction` has its bands. Frames of a closed shutter are left
+    out, and pairs of which a frame was shown before.
+    """
+
+    def __init__(self, stream: "Stream", correction: xr.Dataset) -> None:
+        maps = correction[["gain", "offset"]].sel(band=list(stream.bands)).astype(np.float32)
+        self._stream, self._bands = stream, stream.bands
+        self._gain, self._offset = maps["gain"].values, maps["offset"].values
+        self._shown = dict.fromkeys(self._bands, -math.inf)
+
+    def __call__(self, preview: Preview) -> xr.Dataset | None:
+        """Take the last frames; return the temperatures known by now, None before the first."""
+        frames = [preview.frames[band] for band in self._bands if band in preview.frames]
+        times = {band: frame.host_time for band, frame in preview.frames.items()}
+        fresh = all(times.get(band, -math.inf) > shown for band, shown in self._shown.items())
+        if fresh and not any(FrameFlag.SHUTTER_CLOSED in frame.flags for frame in frames):
+            self._shown = {band: times[band] for band in self._bands}
+            counts = self._gain * np.stack([frame.counts for frame in frames]) + self._offset
+            self._stream.update(float(np.mean([frame.host_time for frame in frames])), counts)
+        return self._stream.result() if self._stream.is_ready else None
+
+
 class View:
     """Live view: an instance is the `preview` of a recording, or of several.
 
@@ -243,7 +274,7 @@ class View:
     threads go on meanwhile. It is shown on a `display`; without one the figure is only kept.
     `title` is the name of the recording, beside which the figure says if it `is_simulated`;
     `period` is the least time from update to update [s], not negative, and `window` that over which
-    frame rates are measured [s], positive.
+    frame rates are measured [s], positive. With a `separation` it shows temperatures as well.
 
     Examples
     --------
@@ -260,12 +291,15 @@ class View:
         title: str = "recording",
         period: float = _PERIOD,
         window: float = _WINDOW,
+        separation: Separation | None = None,
     ) -> None:
         if not 0 <= period < math.inf:
             raise ValueError(f"Invalid period {period} s. Must be 0 or more.")
         self._display, self._period = display, period
         self._title = f"{title} (emulated)" if is_simulated else title
         self._watch = Watch(window)
+        self._separation = separation
+        self._separated: xr.Dataset | None = None
         self._drawn: LiveFigure | None = None
         self._is_shown, self._time = False, -math.inf
 
@@ -283,6 +317,8 @@ class View:
         """Take a preview; show it if the one shown last is old enough, or of another recording."""
         if self._watch.note(preview):
             self._time = -math.inf
+        if self._separation is not None:
+            self._separated = self._separation(preview)
         # Nothing is drawn before the first frame: only a frame knows the size of a picture.
         if preview.frames and preview.time - self._time >= self._period:
             self._time = preview.time
@@ -294,11 +330,13 @@ class View:
         status, frames = self._watch.status(), preview.frames
         bands, shape = tuple(preview.totals), next(iter(frames.values())).counts.shape
         if self._drawn is None or (self._drawn.bands, self._drawn.shape) != (bands, shape):
-            self._drawn = LiveFigure(bands, shape)
+            self._drawn = LiveFigure(bands, shape, _FILMS if self._separation else ())
         panels = {}
         for band, one in status.items():
             image = frames[band].counts if band in frames else None
             panels[band] = Panel(image, _apart(one.limits), one.text, one.warning)
+        if self._separation:
+            panels |= {name: _temperature(name, self._separated) for name in _FILMS}
         title, foot = f"{self._title}, {preview.time:.1f} s", _foot(preview)
         self._drawn.update(panels, title=title, foot=foot)
         if self._display is not None:
@@ -306,6 +344,19 @@ class View:
             picture = Picture(_png(self._drawn), "\n".join((title, *lines, foot)))
             (self._display.update if self._is_shown else self._display.display)(picture)
             self._is_shown = True
+
+
+def _temperature(name: str, separated: xr.Dataset | None) -> "Panel":
+    """Panel of the last temperatures of a separation."""
+    from dbthermal.figures import Panel  # noqa: PLC0415 - loads matplotlib
+
+    if separated is None:
+        return Panel(None, (0.0, 1.0), "not known yet")
+    image = separated[f"{name}_temperature"].values[-1] - zero_Celsius
+    good = 100 * float((separated["status"] == 0).mean())
+    known = image[np.isfinite(image)]
+    low, high = np.percentile(known, _PERCENTILES) if known.size else (0.0, 1.0)
+    return Panel(image, (low, max(high, low + 0.1)), f"{good:.0f} % of the pixels without a flag")
 
 
 def _apart(limits: tuple[float, float]) -> tuple[float, float]:

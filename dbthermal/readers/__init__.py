@@ -1,12 +1,21 @@
-"""Readers of outside formats: thermal spectra, videos drawn in a palette, settings in YAML.
+"""Readers of outside formats: recordings, thermal spectra, videos drawn in a palette, YAML.
 
 A reader takes a path and returns labelled data in SI units, or raises; it mends nothing. What it
 opens was written by others: it must be a regular file of a limited size.
 """
 
 from dbthermal._text import read_yaml
+from dbthermal.readers._flir import flir
 from dbthermal.readers._spectra import ecostress, slum, ucsb
 from dbthermal.readers._videos import masked_palette_video, palette_video
 
-__all__ = ["ecostress", "masked_palette_video", "palette_video", "read_yaml", "slum", "ucsb"]
+__all__ = [
+    "ecostress",
+    "flir",
+    "masked_palette_video",
+    "palette_video",
+    "read_yaml",
+    "slum",
+    "ucsb",
+]
 __dir__ = __all__.copy

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from dbthermal.separation._baselines.naive import NaiveSettings
     from dbthermal.separation._baselines.pyrometry import RatioSettings
     from dbthermal.separation._dbvt import DbvtSettings
+    from dbthermal.separation._streaming.stream import Stream
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "DbvtSettings",
     "NaiveSettings",
     "RatioSettings",
+    "Stream",
     "SubspaceSettings",
     "complete",
     "get_method",
@@ -42,18 +44,19 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-# The settings are imported with their method when they are first used: one needs torch.
-_SETTINGS: Final = {
+# These are imported when they are first used: one needs torch, others compile.
+_LATER: Final = {
     "BcpSettings": "_baselines.bcp",
     "CalibratedSettings": "_baselines.calibrated",
     "DbvtSettings": "_dbvt",
     "NaiveSettings": "_baselines.naive",
     "RatioSettings": "_baselines.pyrometry",
+    "Stream": "_streaming.stream",
     "SubspaceSettings": "_subspace.method",
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name in _SETTINGS:
-        return getattr(importlib.import_module(f"{__name__}.{_SETTINGS[name]}"), name)
+    if name in _LATER:
+        return getattr(importlib.import_module(f"{__name__}.{_LATER[name]}"), name)
     raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")

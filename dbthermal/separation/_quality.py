@@ -1,7 +1,7 @@
 """Data quality: which samples of a capture are valid, and which pixels cannot be used."""
 
 from collections.abc import Iterator, Mapping
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -60,22 +60,25 @@ def read(
     what repeats by chance.
     """
     raw = part["counts"].values
-    counts = raw.reshape(*raw.shape[:2], -1).astype(np.float64)
+    counts = raw.reshape(*raw.shape[:2], -1)  # judged in its own precision, which is cheaper
     valid = np.all(schema.measured(counts), axis=0)
     if "mask" in part:
         valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
-    counts[:, ~valid] = 0.0
+    counts = _kept(counts, valid)
     known = grains(part) if known is None else known
     saturated = [samples.heaped(band, valid, it) for band, it in zip(counts, known, strict=True)]
-    frozen, copied = _frozen(counts, valid, [it.chance for it in known])
+    same = [samples.repeated(band, valid) for band in counts]
+    frozen, copied = _frozen(same, valid, [it.chance for it in known])
     valid &= ~copied[:, np.newaxis]
-    counts[:, ~valid] = 0.0
+    counts = _kept(counts, valid).astype(np.float64)
     frames = valid.sum(axis=0)
     invalid = too_few(valid, fewest, most_missing)
-    used = True if valid.all() else valid  # numpy's reductions are slower with a mask
-    highest = counts.max(axis=1, where=used, initial=-np.inf)
-    lowest = counts.min(axis=1, where=used, initial=np.inf)
-    constant = np.any(highest == lowest, axis=0) & ~invalid
+    if valid.all():
+        constant = np.any([band.all(axis=0) for band in same], axis=0) & ~invalid
+    else:
+        highest = counts.max(axis=1, where=valid, initial=-np.inf)
+        lowest = counts.min(axis=1, where=valid, initial=np.inf)
+        constant = np.any(highest == lowest, axis=0) & ~invalid
     status = status_bits(
         {
             Status.INVALID_SAMPLES: invalid,
@@ -86,8 +89,14 @@ def read(
     )
     if "status" in part:
         status |= part["status"].values.reshape(-1).astype(np.uint32)
-    counts[:, :, unusable(status)] = 0.0
+    if (without := unusable(status)).any():
+        counts[:, :, without] = 0.0
     return counts, valid, status
+
+
+def _kept(counts: npt.NDArray[Any], valid: Mask) -> npt.NDArray[Any]:
+    """Counts (band, time, pixel) with zero for samples that are not valid (time, pixel)."""
+    return counts if valid.all() else np.where(valid, counts, counts.dtype.type(0))
 
 
 def too_few(valid: Mask, fewest: int, most_missing: float = MOST_MISSING) -> Mask:
@@ -177,9 +186,12 @@ def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
     return counts[:, frames][:, :, good], frames
 
 
-def _frozen(counts: Array, valid: Mask, chances: list[float]) -> tuple[Mask, Mask]:
-    """Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy."""
-    same = [samples.repeated(band, valid) for band in counts]
+def _frozen(same: list[Mask], valid: Mask, chances: list[float]) -> tuple[Mask, Mask]:
+    """
+    Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy.
+
+    Of the samples that repeat the one before, by band.
+    """
     copied = [samples.copies(*pair, valid) for pair in zip(same, chances, strict=True)]
     pixels = samples.frozen(np.all(same, axis=0), float(np.prod(chances)))
     for band, copy, chance in zip(same, copied, chances, strict=True):

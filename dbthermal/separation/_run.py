@@ -4,8 +4,9 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
-from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -16,21 +17,27 @@ from tqdm import tqdm
 
 from dbthermal import store
 from dbthermal.separation import _inputs
+from dbthermal.separation._inputs import Method
 from dbthermal.separation._solve import get_method, solve
-from dbthermal.separation._tiles import BLOCK_ROWS
+from dbthermal.separation._tiles import BLOCK_ROWS, PIXELS, SAMPLES
 
 if TYPE_CHECKING:
     from dbthermal.separation._solve import Settings
 
-# Memory of a process before it separates anything [byte]; and of a sample of both bands: counts,
-# temperatures and deviations, as they are, compressed and on the way to the disk [byte].
-_BASE: Final = 500_000_000
-_SAMPLE: Final = 96
+# Memory [byte], from the peaks of processes with one thread and with two, of 350 to 3000 frames:
+# of a process that has imported and compiled all, and with torch;
+_BASE: Final = 450_000_000
+# of a sample of a band in a block: counts (4), results (8), and those on the way to the disk;
+_SAMPLE: Final = 16
+# of a sample of a band in the tile of a compiled method (110 to 140), whose tiles have so many
+# times the pixels; of another in about the same proportion more (500 to 900).
+_TILE: Final = 140
+_TIMES: Final = 8
 
 
 def run(  # noqa: PLR0913 - those of `solve` are among them
-    source: str | Path | xr.Dataset,
-    target: str | Path,
+    source: str | Path | xr.Dataset | Sequence[str | Path | xr.Dataset],
+    target: str | Path | Sequence[str | Path],
     response: xr.Dataset,
     method: str = "subspace",
     *,
@@ -45,46 +52,48 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     memory: float = 2e9,
     provenance: Mapping[str, Any] = MappingProxyType({}),
     progress: bool = False,
-) -> xr.Dataset:
-    """Separate a capture of any size from disk to disk, by blocks of rows, by several processes.
+) -> None:
+    """Separate captures of any size from disk to disk, by blocks of rows, by several processes.
 
     Each block of rows is separated as by `solve` and written by the one process that has it; what
     is written stays when the run is killed, and the next one goes on from there to the same bytes.
+    A target that the same run has made before is left as it is.
 
     Parameters
     ----------
-    source : str, Path or Dataset
+    source : str, Path, Dataset, or a sequence of these
         Stage `corrected` of `schema`, as for `solve`: a folder ``*.zarr`` of `store.save`, which
-        every process opens by itself, or a lazy Dataset that can be sent to the processes.
-    target : str or Path
-        Folder ``*.zarr`` for the result. While it is made, its parts are in ``*.zarr.parts``.
+        every process opens by itself, or a lazy Dataset (of zarr, dask), of which every process is
+        sent its rows. What `correct_capture` or `align` leave to be computed, threads can take, and
+        the workers of a cluster, not those of a ProcessPoolExecutor.
+    target : str or Path, or as many
+        Folder ``*.zarr`` for each result. While it is made, its parts are in ``*.zarr.parts``.
     response : Dataset
         As for `solve`.
     method : str
         One of `METHODS` that takes each pixel alone: materials, and a shift of the reflections, are
         of the whole image, see `scene.separate_capture`.
     settings, emissivity, emissivity_std, emissivity_covariance, mask, response_kind, seed
-        As for `solve`.
+        As for `solve`, the same for all captures.
     executor : Executor, optional
         Of `concurrent.futures`, or with its interface, as from ``distributed.Client.get_executor``;
-        two threads if not given.
+        two threads if not given, or one where the memory is too small for two.
     memory : float
-        Largest memory of a process [byte]; the rows of a block follow from it.
+        Largest memory of a process [byte]; if it is tight, a block has fewer rows than 32. Each
+        process of an executor separates one block at a time, but that of a ThreadPoolExecutor.
     provenance : mapping, optional
         See `store.save`.
     progress : bool
         Show a bar.
-
-    Returns
-    -------
-    Dataset
-        As from `solve`, lazy.
 
     Raises
     ------
     TypeError, ValueError
         As `solve` does; for a method of the whole image; if the memory is too small for a row; and
         if the parts at hand are of another run.
+    ExceptionGroup
+        Of several captures: what was raised, each with the name of its capture; all others are
+        finished.
 
     Examples
     --------
@@ -97,8 +106,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     >>> capture = simulation.observe(scene, rig.response(), rng)
     >>> with TemporaryDirectory() as folder:
     ...     store.save(capture, f"{folder}/capture.zarr", store.provenance({}))
-    ...     result = run(f"{folder}/capture.zarr", f"{folder}/result.zarr", rig.response())
-    ...     result.object_temperature.shape
+    ...     run(f"{folder}/capture.zarr", f"{folder}/result.zarr", rig.response())
+    ...     store.open_dataset(f"{folder}/result.zarr").object_temperature.shape
     (200, 4, 6)
     """
     if get_method(method).whole_image:
@@ -112,49 +121,114 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         "response_kind": response_kind,
         "seed": seed,
     }
-    if not isinstance(source, xr.Dataset):
-        source = Path(source).absolute()  # for a process with another folder of its own
-    capture = source if isinstance(source, xr.Dataset) else store.open_dataset(source)
-    response = _with_noise(capture, response, method, options)
-    height = _rows(capture, memory, 1 if executor else 2)
-    parts = Path(f"{target}.parts").absolute()
-    plan = {"capture": _digest(capture), "height": height, "method": method}
-    plan |= {"options": _digest({"response": response, **options})}
-    _begin(parts, plan)
-    rows = [slice(top, top + height) for top in range(0, capture.sizes["y"], height)]
-    paths = [parts / f"{one.start:06d}.zarr" for one in rows]
-    missing = [(one, path) for one, path in zip(rows, paths, strict=True) if not path.exists()]
-    task = (source, response, method, options, height, dict(provenance) or store.provenance({}))
-    with ThreadPoolExecutor(2) as threads:
-        several = executor or threads
-        jobs = [several.submit(_separate_part, one, path, *task) for one, path in missing]
+    pairs = _pairs(source, target)
+    # Two captures at a time: while one is joined, the processes have the other's rows.
+    with (
+        ThreadPoolExecutor(2 if executor else 1) as captures,
+        tqdm(desc="run", unit="block", total=0, disable=not progress) as bar,
+    ):
+        job = _Job(response, method, options, executor, memory, dict(provenance), bar)
+        runs = [captures.submit(job.separate, *pair) for pair in pairs]
         try:
-            for job in tqdm(as_completed(jobs), "run", len(jobs), disable=not progress):
-                job.result()
+            errors = [one.exception() for one in runs]
         finally:
-            for job in jobs:
-                job.cancel()
-    store.join_parts(paths, target)
-    shutil.rmtree(parts)
-    return store.open_dataset(target)
+            for one in (*runs, *job.blocks):
+                one.cancel()
+    failed = [(error, pair) for error, pair in zip(errors, pairs, strict=True) if error]
+    if failed and isinstance(target, str | Path):
+        raise failed[0][0]
+    for error, (_, place) in failed:
+        error.add_note(f"Of the capture for '{place}'.")
+    if failed:
+        names = ", ".join(f"'{place}'" for _, (_, place) in failed)
+        raise BaseExceptionGroup(
+            f"{len(failed)} of {len(pairs)} captures failed, for {names}",
+            [error for error, _ in failed],
+        )
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Options that all captures of a run share."""
+
+    response: xr.Dataset
+    method: str
+    options: dict[str, Any]
+    executor: Executor | None
+    memory: float
+    provenance: dict[str, Any]
+    bar: "tqdm[Any]"
+    blocks: list[Future[None]] = field(default_factory=list)  # of all captures
+
+    def separate(self, source: Path | xr.Dataset, target: Path) -> None:
+        """Separate a capture, or what is left of it, into its target."""
+        capture = store.open_dataset(source) if isinstance(source, Path) else source
+        response = _with_noise(capture, self.response, self.method, self.options)
+        provenance = self.provenance or store.provenance({})
+        digest = _digest([*_thinned(capture), response, self.method, self.options])
+        provenance = json.loads(json.dumps({**provenance, "run": digest}))
+        parts = Path(f"{target}.parts")
+        if target.exists() and store.open_dataset(target).attrs.get("provenance") == provenance:
+            shutil.rmtree(parts, ignore_errors=True)  # of a run that was killed at its very end
+            return
+        threads, height = _share(capture, self.memory, self.executor, get_method(self.method))
+        _begin(parts, {"height": height, **provenance})
+        rows = [slice(top, top + height) for top in range(0, capture.sizes["y"], height)]
+        paths = [parts / f"{one.start:06d}.zarr" for one in rows]
+        jobs = []
+        with ThreadPoolExecutor(threads) as own:
+            for one, path in zip(rows, paths, strict=True):
+                if not path.exists():
+                    here = {name: _of_rows(value, one) for name, value in self.options.items()}
+                    part = source if isinstance(source, Path) else capture.isel(y=one)
+                    task = (part, one, path, response, self.method, here, height, provenance)
+                    jobs.append((self.executor or own).submit(_separate_part, *task))
+            self.blocks.extend(jobs)
+            self.bar.total = (self.bar.total or 0) + len(jobs)
+            try:
+                for block in as_completed(jobs):
+                    block.result()
+                    self.bar.update()
+            finally:
+                for block in jobs:
+                    block.cancel()
+        store.join_parts(paths, target)
+        shutil.rmtree(parts)
 
 
 def _separate_part(
+    source: Path | xr.Dataset,
     rows: slice,
     path: Path,
-    source: str | Path | xr.Dataset,
     response: xr.Dataset,
     method: str,
     options: Mapping[str, Any],
     height: int,
     provenance: Mapping[str, Any],
 ) -> None:
-    """Separate a block of rows and write it, whole or not at all."""
-    capture = source if isinstance(source, xr.Dataset) else store.open_dataset(source)
-    part = capture.isel(y=rows).load()
-    here = {name: _of_rows(value, rows) for name, value in options.items()}
-    result = solve(part, response, method, workers=1, **here)
+    """Separate a block of rows, of a capture on disk or in hand, and write it whole or not."""
+    part = store.open_dataset(source).isel(y=rows) if isinstance(source, Path) else source
+    # What is dask's is computed here: its own threads, or the cluster's, would hold more blocks.
+    part = part.load(scheduler="synchronous")
+    result = solve(part, response, method, workers=1, **options)
     store.save_part(result, path, provenance, height)
+
+
+def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
+    """Sources and targets, whose paths do not depend on a process's own folder."""
+    one = isinstance(target, str | Path)
+    sources, targets = ([source], [target]) if one else (list(source), list(target))
+    if len(sources) != len(targets):
+        raise ValueError(
+            f"Invalid number of targets {len(targets)} for {len(sources)} captures. Must be one "
+            "for each."
+        )
+    places = [Path(place).absolute() for place in targets]
+    for place in places:
+        if place.suffix != ".zarr" or places.count(place) > 1:
+            raise ValueError(f"Invalid target '{place}'. Must end in '.zarr', and be named once.")
+    captures = [it if isinstance(it, xr.Dataset) else Path(it).absolute() for it in sources]
+    return list(zip(captures, places, strict=True))
 
 
 def _of_rows(value: Any, rows: slice) -> Any:
@@ -174,17 +248,26 @@ def _with_noise(
     return response.sel(band=order).assign(noise=noise.assign_attrs(units="count"))
 
 
-def _rows(capture: xr.Dataset, memory: float, threads: int) -> int:
-    """Rows of a block, of a multiple of those that are read at once where memory allows."""
-    row = threads * _SAMPLE * capture["counts"][..., 0, :].size // 2
-    rows = int((memory - _BASE) // row)
-    if rows < 1:
+def _share(
+    capture: xr.Dataset, memory: float, executor: Executor | None, method: Method
+) -> tuple[int, int]:
+    """Threads of a process, and rows of a block: those that `solve` reads at once, or fewer."""
+    row = capture["counts"][..., 0, :].size
+    long = min(PIXELS * capture.sizes["time"], SAMPLES) * capture.sizes["band"]
+    each, tile = _TILE * (1 if method.compiled else _TIMES), _TILE * _TIMES * long
+    # What a block takes is that of its samples and of a tile, or, if less, of all as one tile.
+    least = _SAMPLE * row + min(each * row, tile)
+    threads = 1 if executor or memory < _BASE + 2 * least else 2
+    if isinstance(executor, ThreadPoolExecutor):
+        threads = executor._max_workers
+    free = (memory - _BASE) / threads
+    if free < least:
         raise ValueError(
-            f"Invalid memory {memory:g} byte. Must be at least {_BASE + row:g} for one row of "
-            f"{capture.sizes['x']} pixels and {capture.sizes['time']} frames."
+            f"Invalid memory {memory:g} byte. Must be at least {_BASE + threads * least:g} for one "
+            f"row of {capture.sizes['x']} pixels and {capture.sizes['time']} frames."
         )
-    rows = min(rows, capture.sizes["y"])
-    return rows - rows % BLOCK_ROWS if rows > BLOCK_ROWS else rows
+    rows = int(max((free - tile) / _SAMPLE, free / (_SAMPLE + each)) / row)
+    return threads, min(rows, BLOCK_ROWS, capture.sizes["y"])
 
 
 def _begin(parts: Path, plan: Mapping[str, Any]) -> None:
@@ -197,15 +280,31 @@ def _begin(parts: Path, plan: Mapping[str, Any]) -> None:
         part.replace(file)
     elif file.read_text() != content:
         raise ValueError(
-            f"Invalid folder '{parts}': of a run of another capture, response or options. Must be "
-            "deleted, or the run be started as it was."
+            f"Invalid folder '{parts}': of a run of another capture, response, version, memory or "
+            "options. Must be deleted, or the run be started as it was."
         )
 
 
+def _thinned(capture: xr.Dataset) -> list[xr.Dataset]:
+    """Capture by which it is known again; of its films, which are too large, a few pixels."""
+    step = slice(None, None, max(1, int(np.sqrt(capture.sizes["y"] * capture.sizes["x"]) / 4)))
+    films = [name for name in capture.data_vars if capture[name].ndim > 2]
+    few = capture[films].isel(y=step, x=step, missing_dims="ignore")
+    return [capture.drop_vars(films), few]
+
+
 def _digest(value: Any) -> str:
-    """Digest of options by name, or of a capture by its coordinates, attributes and sizes."""
+    """Digest of numbers, text, arrays, datasets, and of sequences and mappings of these."""
     if isinstance(value, xr.Dataset):
-        short = value.drop_vars([name for name in value.data_vars if value[name].ndim > 1])
-        value = {"short": short, "sizes": dict(value.sizes)}
-    plain = {n: v.to_dict() if hasattr(v, "to_dict") else v for n, v in value.items()}
-    return hashlib.sha256(json.dumps(plain, sort_keys=True, default=repr).encode()).hexdigest()
+        value = [dict(value.sizes), value.attrs, dict(value.variables)]
+    elif isinstance(value, xr.DataArray):
+        value = [value.variable, dict(value.coords.variables)]
+    elif isinstance(value, xr.Variable):
+        plain = value.values.tolist() if value.dtype.hasobject else value.values.tobytes()
+        value = [value.dims, value.shape, str(value.dtype), value.attrs, plain]
+    elif isinstance(value, Mapping):
+        # A store lists its arrays in any order.
+        value = sorted(value.items(), key=lambda item: str(item[0]))
+    if isinstance(value, list | tuple):
+        value = [_digest(one) for one in value]
+    return hashlib.sha256(repr(value).encode()).hexdigest()

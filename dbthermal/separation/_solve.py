@@ -366,10 +366,9 @@ def _separate(
         estimates = []
         for frames, pixels, tile in cut.parts:
             estimate: Estimate = inputs.apply(inputs.method.separate, tile)
-            whole = estimate.status.size == pixels.size
-            estimates.append(
-                (frames, pixels, estimate.select_pixels(pixels) if whole else estimate)
-            )
+            if estimate.status.size == pixels.size and not pixels.all():
+                estimate = estimate.select_pixels(pixels)
+            estimates.append((frames, pixels, estimate))
         _write(result, inputs.bands, cut, estimates)
         bar.update(cut.status.size)
 
@@ -441,6 +440,7 @@ def _write(
     `bands` are the places of the tile's bands in the capture. A pixel of no estimate becomes NaN
     and keeps its status; so do temperatures at frames of no estimate, and at invalid samples.
     """
+    every = bool(np.all(cut.valid))
     complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
     for name in map(str, result.data_vars):
         target = result[name].values[..., cut.window[0], cut.window[1]]
@@ -462,7 +462,7 @@ def _write(
                     target[tuple(bands[index] for index in place)][where] = values[place]
             else:
                 _write_film(target, frames, where, values)
-        if "time" in dims and not np.all(cut.valid):
+        if "time" in dims and not every:
             target[~cut.valid.reshape(-1, *shape)] = np.nan
 
 

@@ -59,15 +59,12 @@ class Pixels:
         parts: dict[str, Any] = {name: v if v is None else v[..., selected] for name, v in values}
         return replace(self, **parts)
 
-    def replace_pixels(self, selected: Mask | Whole, part: Self) -> Self:
-        """Return the record with the selected pixels replaced by those of a part, in order."""
-        parts: dict[str, Any] = {}
+    def replace_pixels(self, selected: Mask | Whole, part: Self) -> None:
+        """Replace the selected pixels by those of a part, in order, in place."""
         for field in fields(self):
             value = getattr(self, field.name)
             if value is not None:
-                parts[field.name] = value.copy()
-                parts[field.name][..., selected] = getattr(part, field.name)
-        return replace(self, **parts)
+                value[..., selected] = getattr(part, field.name)
 
     def join(self, others: Sequence[Self]) -> Self:
         """Return the record with the pixels of others after its own."""
@@ -318,7 +315,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
             whole = method.whole_image or np.all(pixels)
             parts.append((frames, pixels, part if whole else part.select_pixels(pixels)))
         if displacement is not None:
-            parts = [alike for one in parts for alike in _of_one_noise(*one, gain, most)]
+            parts = [alike for one in parts for alike in of_one_noise(*one, gain, most)]
         yield Cut(window, status, valid, parts)
 
 
@@ -335,8 +332,10 @@ def _tile(
     if emissivity is not None and covariance is not None:
         emissivity, covariance = emissivity[bands], covariance[np.ix_(bands, bands)]
     # The linearised signals (see `response`), less the reference temperature.
-    pairs = zip(bands, curves, strict=True)
-    signals = np.stack([curve.linearise(counts[band]) - curve.reference for band, curve in pairs])
+    signals = counts if bands == sorted(bands) else counts[bands]
+    for signal, curve in zip(signals, curves, strict=True):
+        np.subtract(signal, curve.reference_counts, out=signal)
+        np.divide(signal, curve.reference_slope, out=signal)
     return Tile(
         signals=signals,
         time=time,
@@ -351,7 +350,7 @@ def _tile(
     )
 
 
-def _of_one_noise(
+def of_one_noise(
     frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
 ) -> Iterator[tuple[Mask, Mask, Tile]]:
     """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise."""

@@ -1,6 +1,8 @@
 """Rows of a dataset that several processes make, each whole in a folder of its own, and joined."""
 
 import json
+import os
+import shutil
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -32,12 +34,13 @@ def save_part(
 
 
 def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
-    """Join datasets of rows that follow one another; their chunks are moved, and not read.
+    """Join datasets of rows that follow one another; their chunks are linked, and not read.
 
     Parameters
     ----------
     parts : iterable of str or Path
-        Folders from `save_part`, of one height but the last. They are used up.
+        Folders from `save_part`, of one height but the last. They stay as they are; on a disk
+        without hard links their chunks are copied.
     path : str or Path
         Folder ``*.zarr`` of the whole, with the attributes of the first.
 
@@ -57,21 +60,31 @@ def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
     """
     first, *rest = [Path(part) for part in parts]
     with whole(path, ".zarr") as folder:
-        first.rename(folder)
+        shutil.copytree(first, folder, copy_function=_link)
         metadata = {one: json.loads(one.read_text()) for one in folder.glob("*/zarr.json")}
         along = {one: array for one, array in metadata.items() if "y" in array["dimension_names"]}
         sums = last_sums(folder)
         for part in rest:
             for one, array in along.items():
-                sums |= _moved(part / one.parent.name, one.parent, array)
+                sums |= _added(part / one.parent.name, one.parent, array)
         for one, array in along.items():
+            one.unlink()
             one.write_text(json.dumps(array, indent=2))
             sums[one.relative_to(folder).as_posix()] = f"{zlib.crc32(one.read_bytes()):08x}"
+        (folder / SUMS).unlink()
         (folder / SUMS).write_bytes(sums_file(sums))
 
 
-def _moved(part: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
-    """Move the chunks of a part of an array behind those of the whole; their checksums by name."""
+def _link(source: str | Path, target: str | Path) -> None:
+    """Link a file at a second place; a kill then leaves the parts whole."""
+    try:
+        os.link(source, target)
+    except OSError:  # a disk that knows no links
+        shutil.copyfile(source, target)
+
+
+def _added(part: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
+    """Add the chunks of a part of an array behind those of the whole; their checksums by name."""
     place = array["dimension_names"].index("y")
     end, rows = array["shape"][place], array["chunk_grid"]["configuration"]["chunk_shape"][place]
     own, sums = last_sums(part.parent), {}
@@ -83,11 +96,11 @@ def _moved(part: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
     for chunk in [one for one in (part / "c").rglob("*") if one.is_file()]:
         numbers = list(chunk.relative_to(part / "c").parts)
         numbers[place] = str(int(numbers[place]) + end // rows)
-        moved = whole.joinpath("c", *numbers)
-        sums[moved.relative_to(whole.parent).as_posix()] = own[
+        added = whole.joinpath("c", *numbers)
+        sums[added.relative_to(whole.parent).as_posix()] = own[
             chunk.relative_to(part.parent).as_posix()
         ]
-        moved.parent.mkdir(parents=True, exist_ok=True)
-        chunk.rename(moved)
+        added.parent.mkdir(parents=True, exist_ok=True)
+        _link(chunk, added)
     array["shape"][place] += json.loads((part / "zarr.json").read_text())["shape"][place]
     return sums

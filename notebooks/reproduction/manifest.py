@@ -41,6 +41,11 @@ def _matching(label: str, pattern: str, rule: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+_ORIGIN: Final = _matching(
+    "origin", r"https?://[^?#@\\\x00-\x1f]+/", "begin with https:// and end in '/'"
+)
+
+
 class File(BaseModel):
     """Outside file: name at its origin and in its folder, checksum, and size [byte]."""
 
@@ -59,6 +64,7 @@ class File(BaseModel):
     bytes: Annotated[int, _matching("size", "[1-9][0-9]*", "be > 0 bytes")]
     covers_8_14um: bool = True  # False for a spectrum that ends short of 14 um
     thermal_duplicate_of: str | None = None  # file with the same values in the thermal infrared
+    origin: Annotated[str, _ORIGIN] | None = None  # where it is not the collection's
 
 
 def _by_name(entries: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -74,10 +80,7 @@ class Collection(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     title: str
-    origin: Annotated[
-        str,
-        _matching("origin", r"https?://[^?#@\\\x00-\x1f]+/", "begin with https:// and end in '/'"),
-    ]
+    origin: Annotated[str, _ORIGIN]
     citation: tuple[str, ...]
     terms: str
     used_by: tuple[str, ...]
@@ -87,7 +90,7 @@ class Collection(BaseModel):
 
     def url(self, name: str) -> str:
         """Address of a file, with spaces and the like quoted."""
-        return quote(self.origin + self[name].name, safe=":/")
+        return quote((self[name].origin or self.origin) + name, safe=":/")
 
     def __getitem__(self, name: str) -> File:
         """File by name; ValueError if it is not listed."""
@@ -208,7 +211,7 @@ def _fetch(listed: Collection, file: File, folder: Path) -> Path:
     if locked.mirror() is None and not path.is_file():
         source = pooch.create(
             folder,
-            base_url=listed.origin,
+            base_url=file.origin or listed.origin,
             registry={file.name: f"sha256:{file.sha256}"},
             urls={file.name: listed.url(file.name)},
             retry_if_failed=_RETRIES,

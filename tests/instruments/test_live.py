@@ -11,16 +11,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from faulty_camera import Faults, FaultyCamera, Movie
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
+from dbthermal import schema, simulation
 from dbthermal.figures import LiveFigure, Panel
 from dbthermal.instruments import live, telemetry
 from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag, Metadata
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Preview, Reading, Summary, record
 from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.separation import Stream
+from dbthermal.simulation import Rig
 
 BANDS = ("8-14", "9.5")
 DEGREE = "\N{DEGREE SIGN}C"
@@ -305,6 +309,53 @@ def test_labels_and_room() -> None:
         assert min(outer.x0, outer.y0) >= 0
         assert outer.x1 <= figure.get_figwidth()
     assert [axis.get_ylabel() for axis in axes[2:]] == ["raw signal [count]"] * 2
+
+
+def test_a_separation_is_shown_beside_the_frames() -> None:
+    """Previews of both bands go through the correction into a stream; what is known is drawn."""
+    rig, rng, rate = Rig(), np.random.default_rng(1), 10.0
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    scene = simulation.walkers(np.arange(150) / rate, (12, 16), glass, rng)
+    capture, response = simulation.observe(scene, rig.response(), rng), rig.response()
+    detector = simulation.pattern(rig, (12, 16), rng)
+    raw = simulation.capture(capture, detector)["counts"]
+    gain, offset = 1.0 / detector["gain"], -detector["offset"] / detector["gain"]
+    dead = detector["dead"].any("band") * np.uint32(schema.Status.DEAD_PIXEL)
+    template = capture.isel(time=[0]).assign(status=dead.astype(np.uint32))
+    stream = Stream(template, response, frame_rate=rate, refresh=2.0)
+    correction = xr.Dataset({"gain": gain, "offset": offset})
+    separation = live.Separation(stream, correction)
+    view = live.View(is_simulated=True, separation=separation)
+    for number, at in enumerate(capture["time"].values):
+        frames = {
+            str(band): replace(frame(raw.sel(band=band).values[number]), host_time=100.0 + at)
+            for band in rig.bands
+        }
+        totals = {
+            band: {"frames": number, "lost": 0, "refused": 0, "damaged": 0} for band in frames
+        }
+        shown = Preview(float(at), frames, totals, {})
+        view(shown)
+        separation(shown)  # the same frames once more are left out
+        assert stream.is_ready or "not known yet" in texts(view)
+        closed = {
+            band: replace(one, host_time=100.01 + at, flags=FrameFlag.SHUTTER_CLOSED)
+            for band, one in frames.items()
+        }
+        separation(replace(shown, frames=closed))
+    assert stream.lost_frames == 0
+    result = stream.result()
+    truth = scene.assign_coords(time=scene["time"] + 100.0).sel(
+        time=result["time"], method="nearest"
+    )
+    error = result["object_temperature"].values - truth["object_temperature"].values
+    off = float(np.median(abs(error[:, result["status"].values == 0])))
+    print(f"emulated camera: median error {off:.3f} K")
+    assert off < 0.3  # K
+    assert any("of the pixels without a flag" in text for text in texts(view))
+    assert view.figure is not None
+    titles = [axis.get_title() for axis in view.figure.axes]
+    assert titles[2:4] == ["object", "background"]
 
 
 def test_recording_without_a_notebook(tmp_path: Path) -> None:

@@ -111,17 +111,18 @@ def edit(root: Path, old: str, new: str) -> None:
 
 
 def test_the_list_is_complete() -> None:
-    """Every collection has an origin, a citation, terms; all but the mesh are used; 949 files."""
+    """Every collection has an origin, a citation, terms; all but the mesh are used; 957 files."""
     collections = manifest.load().collections
-    names = {"ecostress", "slum", "ucsb", "scenes", "other_scenes", "meshes"}
+    names = {"ecostress", "slum", "ucsb", "scenes", "other_scenes", "meshes", "recordings"}
     assert set(collections) == names
-    assert [name for name in names if collections[name].optional] == ["other_scenes"]
+    optional = {name for name in names if collections[name].optional}
+    assert optional == {"other_scenes", "recordings"}
     for collection in collections.values():
         assert collection.origin.startswith("https://")
         assert collection.origin.endswith("/")
         assert all((collection.citation, collection.terms))
         assert collection.used_by
-    assert sum(len(collection.files) for collection in collections.values()) == 949
+    assert sum(len(collection.files) for collection in collections.values()) == 957
 
 
 def test_the_list_notes_short_and_repeated_spectra() -> None:
@@ -300,6 +301,7 @@ def test_unknown_names(copies: Path) -> None:
         ("  notes:", "  '':", "Invalid collection ''"),
         ("origin: http:", "origin: file:", "Invalid origin 'file:"),
         ("origin: http:", "origin: ftp:", "Invalid origin 'ftp:"),
+        ("bytes: 5", "bytes: 5, origin: 'ftp://a/'", "Invalid origin 'ftp:"),
         ("name: one.txt", "name: two.txt", r"notes\.files\n.*Repeated file name"),
         ("bytes: 5", "bytes: 5, colour: red", "colour"),
         ("    terms: free\n", "", "terms"),

@@ -8,16 +8,20 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import separation, simulation, store
+from dbthermal import correction, separation, simulation, store
+from dbthermal.separation import _run
+from dbthermal.store import _parts
+from reproduction.experiments import whole
 
 RIG = simulation.Rig()
 TIME = np.arange(64) / 10.0  # s
-MEMORY = 500e6 + 9 * 96 * 64 * 24  # byte: nine rows in a block of a process
+MEMORY = _run._BASE + 9 * (_run._SAMPLE + _run._TILE) * 2 * 64 * 24  # byte: nine rows in a block
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +55,8 @@ def test_run_is_solve(path: Path, tmp_path: Path, noise: str) -> None:
     response = RIG.response()
     response = response if noise == "known" else response.drop_vars(["noise", "netd"])
     target = tmp_path / "result.zarr"
-    result = separation.run(path, target, response, memory=MEMORY)
+    separation.run(path, target, response, memory=MEMORY)
+    result = store.open_dataset(target)
     expected = separation.solve(store.open_dataset(path).load(), response)
     xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
     assert result.attrs["method"] == "subspace"
@@ -68,9 +73,8 @@ def test_options_of_pixels_are_cut_into_rows(path: Path, tmp_path: Path) -> None
     )
     mask = xr.DataArray(rng.random((41, 24)) < 0.9, dims=("y", "x"))
     response, target = RIG.response(), tmp_path / "r.zarr"
-    result = separation.run(
-        path, target, response, "calibrated", memory=MEMORY, emissivity=known, mask=mask
-    )
+    separation.run(path, target, response, "calibrated", memory=MEMORY, emissivity=known, mask=mask)
+    result = store.open_dataset(target)
     expected = separation.solve(capture.load(), response, "calibrated", emissivity=known, mask=mask)
     xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
 
@@ -82,6 +86,116 @@ def test_processes_give_the_same_bytes(path: Path, tmp_path: Path) -> None:
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
         separation.run(path, tmp_path / "one.zarr", RIG.response(), executor=one, memory=MEMORY)
     assert files(tmp_path / "two.zarr") == files(tmp_path / "one.zarr")
+
+
+def test_several_captures_are_one_call(path: Path, tmp_path: Path) -> None:
+    """Of three captures one is at fault: it is named, the others are finished, and made once."""
+    response, capture = RIG.response(), store.open_dataset(path).load()
+    store.save(capture.isel(band=[0]), tmp_path / "broken.zarr", {})
+    sources: list[Any] = [path, tmp_path / "broken.zarr", capture.isel(y=slice(9))]
+    targets = [tmp_path / f"{name}.zarr" for name in ("first", "second", "third")]
+    with pytest.raises(ExceptionGroup, match=r"1 of 3 captures failed, .*second") as caught:
+        separation.run(sources, targets, response, memory=MEMORY)
+    (error,) = caught.value.exceptions
+    assert isinstance(error, ValueError)
+    assert "second.zarr" in error.__notes__[0]
+    expected = separation.solve(capture.isel(y=slice(9)), response)
+    result = store.open_dataset(targets[2]).load()
+    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+    before = [(target / "zarr.json").stat().st_mtime_ns for target in (targets[0], targets[2])]
+    store.save(capture.isel(y=slice(9)), tmp_path / "broken.zarr", {})
+    separation.run(sources, targets, response, memory=MEMORY)
+    after = [(target / "zarr.json").stat().st_mtime_ns for target in (targets[0], targets[2])]
+    assert after == before
+    assert store.open_dataset(targets[1]).drop_attrs().equals(result.drop_attrs())
+    separation.run(sources[:1], targets[:1], response, memory=MEMORY, seed=1)
+    assert (targets[0] / "zarr.json").stat().st_mtime_ns > before[0]  # of another run
+    with pytest.raises(ValueError, match="Invalid number of targets 2 for 3 captures"):
+        separation.run(sources, targets[:2], response)
+    with pytest.raises(ValueError, match=r"Invalid target .*first.* Must .* be named once"):
+        separation.run(sources, [*targets[:2], targets[0]], response)
+
+
+def dask_backed(path: Path) -> xr.Dataset:
+    """The capture in dask's arrays, in chunks that are no blocks of a run."""
+    pytest.importorskip(
+        "dask.array", reason="dask is not installed: pip install dbthermal[cluster]"
+    )
+    return store.open_dataset(path).chunk({"y": 16, "x": 10})
+
+
+@pytest.mark.parametrize("kind", ["zarr", "dask"])
+def test_a_lazy_dataset_is_a_source(path: Path, tmp_path: Path, kind: str) -> None:
+    """Opened lazily, or dask's, and sent to a process by rows, it gives what the folder does."""
+    lazy = dask_backed(path) if kind == "dask" else store.open_dataset(path)
+    separation.run(path, tmp_path / "folder.zarr", RIG.response(), memory=MEMORY)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
+        separation.run(lazy, tmp_path / "lazy.zarr", RIG.response(), memory=MEMORY, executor=one)
+    results = [store.open_dataset(tmp_path / f"{name}.zarr").load() for name in ("folder", "lazy")]
+    xr.testing.assert_equal(*results)
+
+
+def test_raw_counts_are_corrected_by_rows(tmp_path: Path) -> None:
+    """A raw capture on disk, corrected when it is read, is separated as if corrected before."""
+    rng, shape = np.random.default_rng(3), (41, 24)
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    scene = simulation.walkers(TIME, shape, glass, rng, crossings=3)
+    detector = simulation.pattern(RIG, shape, rng)
+    movies = simulation.blackbody_movies(RIG, np.linspace(275.0, 345.0, 6), 16, detector, rng)
+    fitted, response = whole.calibrate(movies)
+    seen = simulation.observe(scene, RIG.response(), rng)
+    store.save(simulation.capture(seen, detector), tmp_path / "raw.zarr", {})
+    raw = store.open_dataset(tmp_path / "raw.zarr")
+    corrected = correction.correct_capture(raw, fitted, lazy=True)
+    separation.run(corrected, tmp_path / "result.zarr", response, memory=MEMORY)
+    expected = separation.solve(corrected.load(), response)
+    result = store.open_dataset(tmp_path / "result.zarr").load()
+    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+
+
+@pytest.mark.parametrize("lazy", [False, True])
+def test_a_cluster_gives_the_same_bytes(path: Path, tmp_path: Path, lazy: bool) -> None:
+    """Two workers of dask's scheduler, processes both, write the files that one process does."""
+    reason = "dask.distributed is not installed: pip install dbthermal[cluster]"
+    distributed = pytest.importorskip("distributed", reason=reason)
+    options: dict[str, Any] = {"memory": MEMORY, "provenance": {"run of": "a test"}}
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
+        separation.run(path, tmp_path / "one.zarr", RIG.response(), executor=one, **options)
+    source = dask_backed(path) if lazy else path
+    with (
+        distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+        client.get_executor() as two,
+    ):
+        separation.run(source, tmp_path / "two.zarr", RIG.response(), executor=two, **options)
+        workers = len(client.scheduler_info()["workers"])
+    assert workers == 2
+    assert files(tmp_path / "two.zarr") == files(tmp_path / "one.zarr")
+
+
+def test_a_join_that_is_cut_short_loses_nothing(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The parts stay whole until they are joined: started again, no block is separated anew."""
+    options: dict[str, Any] = {"memory": MEMORY, "provenance": {"run of": "a test"}}
+    separation.run(path, tmp_path / "rest.zarr", RIG.response(), **options)
+    links = iter(range(20))
+    link = _parts._link
+
+    def cut_short(source: Any, target: Any) -> None:
+        """Link twenty files, then fail as on a full disk."""
+        if next(links, None) is None:
+            raise OSError(28, "No space left on device")
+        link(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_parts, "_link", cut_short)
+        with pytest.raises(OSError, match="No space"):
+            separation.run(path, tmp_path / "cut.zarr", RIG.response(), **options)
+    assert not (tmp_path / "cut.zarr").exists()
+    monkeypatch.setattr(_run, "_separate_part", None)
+    separation.run(path, tmp_path / "cut.zarr", RIG.response(), **options)
+    assert files(tmp_path / "cut.zarr") == files(tmp_path / "rest.zarr")
 
 
 KILLED = """

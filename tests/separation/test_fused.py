@@ -1,6 +1,7 @@
 """The compiled steps of two bands repeat those stated for arrays, within rounding."""
 
 from dataclasses import fields, replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import xarray as xr
 from dbthermal import _smooth as smooth
 from dbthermal import response, simulation
 from dbthermal.response import Curve
-from dbthermal.separation._subspace import fused, kernels, method, steps
+from dbthermal.separation._subspace import division, fused, kernels, method, pieces, steps
 from dbthermal.separation._tiles import Material, Tile
 
 RIG = simulation.Rig()
@@ -94,7 +95,9 @@ def test_compiled_steps_are_those_of_arrays(case: str, least: float, way: str) -
     segment = (TIME > 9.0).astype(np.intp)
     functions = smooth.subspace(TIME, 14, segment=segment if way == "steps" else None)
     if way == "pieces":
-        functions = smooth.piecewise(TIME, np.isin(np.arange(TIME.size), [0, 100, 130]), 14)
+        functions = smooth.piecewise(
+            TIME, np.isin(np.arange(TIME.size), [0, 100, 130]), functions.rising
+        )
     if way == "material":
         tile = replace(tile, material=material())
     if way == "pattern":
@@ -117,6 +120,7 @@ def test_flags_and_films_are_the_same(
     tile = tile_of(emissivity)
     one = method.separate(tile, method.SubspaceSettings())
     monkeypatch.setattr(fused, "solve", steps.solve)
+    monkeypatch.setattr(division, "divide", pieces.divide)
     other = method.separate(tile, method.SubspaceSettings())
     np.testing.assert_array_equal(one.status, other.status)
     for name in steps.FILMS:
@@ -129,20 +133,51 @@ def test_response_of_the_kernels(kind: str) -> None:
     for name in RIG.bands:
         curve: Curve = response.curve(RIG.response(), name, kind)
         temperature = np.linspace(150.0, 900.0, 2000)
-        signal, slope, place = (np.empty(temperature.size) for _ in range(3))
-        kernels.blackbody(kernels.table(curve), temperature, signal, slope, place)
+        signal, slope, back = (np.empty(temperature.size) for _ in range(3))
+        kernels.blackbody(kernels.table(curve), temperature, signal, slope)
         expected = curve.signal(temperature) - curve.reference
         np.testing.assert_allclose(signal, expected, rtol=1e-9, atol=1e-6)  # K
         np.testing.assert_allclose(slope, curve.slope(temperature), rtol=1e-9, atol=1e-6)
+        kernels.temperature(kernels.table(curve), expected, back)
+        np.testing.assert_allclose(back, temperature, rtol=1e-9, atol=1e-6)  # K
 
 
 def test_rank_without_sorting() -> None:
-    """The value of any rank is that of the sorted values, ties and equal values included."""
+    """The value of any rank is that of the sorted values, whatever the guess; with ties."""
     rng = np.random.default_rng(1)
-    for values in (rng.exponential(size=117), np.ones(50), rng.integers(0, 4, 60)):
+    for values in (rng.exponential(size=117), np.ones(50), rng.integers(0, 4, 60), np.zeros(9)):
         single = values.astype(np.float32)
-        for rank in (0, len(single) // 3, len(single) - 1):
-            assert kernels.ranked(single, rank) == pytest.approx(np.sort(single)[rank], rel=1e-6)
+        for rank, guess in product((0, len(single) // 3, len(single) - 1), (1e-3, 0.5, 100.0)):
+            value = kernels.ranked(single, rank, guess)
+            assert value == pytest.approx(np.sort(single)[rank], rel=1e-6)
+
+
+@pytest.mark.parametrize("way", ["plain", "uneven", "steps", "known", "short"])
+def test_compiled_divisions_are_those_of_arrays(way: str) -> None:
+    """Objects that change rapidly, beside walkers: the same pieces, and costs but for rounding."""
+    tile, rng = tile_of(), np.random.default_rng(4)
+    frames = 60 if way == "short" else TIME.size
+    time = TIME[:frames] if way != "uneven" else np.sort(rng.choice(4 * frames, frames, False)) / 40
+    signals = tile.signals[:, :frames].copy()
+    for pixel in range(48):
+        at = rng.integers(5, frames - 5)
+        rise = 1.0 - np.exp(-np.arange(frames - at) / rng.uniform(1.0, 40.0))
+        signals[:, at:, pixel] += np.outer([0.86, 0.72], rng.normal() * 5.0 * rise)
+    segment = None
+    if way == "steps":
+        segment = np.cumsum(np.isin(np.arange(frames), [90, 97, 200])).astype(np.intp)
+    known = np.stack([np.ones(48), np.where(np.arange(48) % 2, 2.0, np.nan)])
+    args = signals, time, np.array(tile.noise), segment, known if way == "known" else None
+    finite = 0
+    with np.errstate(all="ignore"):
+        pairs = zip(division.divide(*args), pieces.divide(*args), strict=True)
+    for one, other in pairs:
+        some = np.isfinite(other.cost)
+        np.testing.assert_array_equal(np.isfinite(one.cost), some)
+        np.testing.assert_allclose(one.cost[some], other.cost[some], rtol=1e-8)
+        np.testing.assert_array_equal(one.first[:, some], other.first[:, some])
+        finite += int((other.first[:, some].sum(axis=0) > 1).sum())
+    assert finite > 20
 
 
 def test_compiled_once() -> None:

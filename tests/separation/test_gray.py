@@ -162,6 +162,7 @@ def test_a_gray_body_is_flat_in_the_responses_alone() -> None:
         reduced_chi2=one,
         coefficients=np.zeros((2, 4, 5)),
         scatter=np.zeros((2, 2, 5)),
+        rapid_scatter=np.zeros((2, 2, 2, 5)),
         pooled=np.zeros(5, dtype=bool),
     )
     found = reflection_ratio.may_be_gray(ratios, noise, slopes)

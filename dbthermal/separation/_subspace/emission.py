@@ -63,13 +63,22 @@ class Emission:
     drift_variance: Array  # of e_1, from the background's slow part (pixel) [1]
     constant: Mask  # the object changes too little for its emissivity (pixel)
     restless: Mask  # the background hardly rests (pixel)
+    line: residuals.Line  # the last regression
 
 
 def estimate(
-    tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio, background_drift: float
+    tile: Tile,
+    functions: smooth.Subspace,
+    ratios: ReflectionRatio,
+    background_drift: float,
+    start: residuals.Line | None = None,
 ) -> Emission:
-    """Object temperature and emissivities, steps 2 and 3 of `method`, with their uncertainty."""
-    fit = _alternate(tile, functions, ratios)
+    """
+    Object temperature and emissivities, steps 2 and 3 of `method`, with their uncertainty.
+
+    The regression starts from the line of nearly the same signals, if there is one.
+    """
+    fit = _alternate(tile, functions, ratios, start)
     line, first, noise = fit.line, fit.emissivity, np.array(tile.noise)
     # Eq. 6 by implicit differentiation: dx/deps = (dh/deps - dq/deps) / h', var x = var q / h'^2.
     sensitivity = (fit.partial - functions.object_part @ ratios.coefficients[0]) / fit.steepness
@@ -112,6 +121,7 @@ def estimate(
         drift_variance=drifting,
         constant=fit.constant,
         restless=np.mean(line.residual**2 < WITHIN**2 * expected, axis=0) < RESTING,
+        line=line,
     )
 
 
@@ -128,7 +138,12 @@ class _Fit:
     partial: Array  # see `_newton` (time, pixel) [K]
 
 
-def _alternate(tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio) -> _Fit:
+def _alternate(
+    tile: Tile,
+    functions: smooth.Subspace,
+    ratios: ReflectionRatio,
+    line: residuals.Line | None,
+) -> _Fit:
     """Alternate the object temperature (eq. 6) and the first emissivity (eq. 7)."""
     # Eq. 5: q = w.z, smoothed, less the steps of the camera.
     smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
@@ -139,7 +154,6 @@ def _alternate(tile: Tile, functions: smooth.Subspace, ratios: ReflectionRatio) 
     guess = _plain_slope(tile.blackbody(0, temperature), tile.signals[0])
     emissivity = np.where((guess > 0) & (guess < 1), guess, middle)
     temperature = _newton(tile, ratios, emissivity, target, temperature)[0]
-    line: residuals.Line | None = None
     for _ in range(ROUNDS):
         emitted = tile.blackbody(0, temperature)
         line = residuals.regress(emitted, tile.signals[0], tile.noise[0], start=line)

@@ -3,11 +3,10 @@ r"""Steps 1 to 4 of `method` for two bands, one pixel after another, compiled.
 The equations of `steps`, whose results are repeated within rounding.
 """
 
-import hashlib
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from math import sqrt
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -16,24 +15,23 @@ from numba import njit
 from scipy.special import stdtrit
 
 from dbthermal import _smooth as smooth
-from dbthermal import planck
+from dbthermal._arrays import Array
+from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._subspace.pixel import Ratio
 from dbthermal.separation._subspace.shared import Model, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Tile
 
-Array = npt.NDArray[np.float64]
-
 _BLOCK: Final = 16  # pixels whose samples are turned at once
 
 
 @compiled
 def _unsteady(
-    model: Model, ratios: Ratio, residual: Array, rapid: Array
+    model: Model, ratios: Ratio, residual: Array, rapid: Array, steep: Array
 ) -> tuple[float, float, bool]:
     """Autocorrelation, delay of the bands, and whether the residual is noise; see `residuals`."""
     frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
@@ -42,26 +40,26 @@ def _unsteady(
     for lag in range(1, residuals.LAGS + 1):
         lagged += kernels.dot(residual[lag:], residual[: frames - lag])
     correlation = lagged / (residuals.LAGS * energy) if energy > 0 else 0.0
-    free = frames - ratios.order - model.steps
     common = ratios.weights[0] * noise**2
-    late, early, changes = free * common, -free * common, 0.0
-    edge, limit = False, residuals.CHANGE * sqrt(2.0) * noise
-    count, at_changes = 0, 0.0
-    for t in range(frames):
-        steep = False
-        if t + 1 < frames:
-            change = rapid[t + 1] - rapid[t]
-            late += residual[t] * change
-            early += residual[t + 1] * change
-            changes += change**2
-            steep = abs(change) > limit
-        if steep or edge:
-            count += 1
-            at_changes += residual[t] ** 2 / null
-        edge = steep
+    free = (frames - ratios.order - model.steps) * common
+    # A matched filter with the differences between frames, of a band that is late or early.
+    late, early, changes = free, -free, 0.0
+    limit, steep[frames - 1] = residuals.CHANGE * sqrt(2.0) * noise, 0.0
+    for t in range(frames - 1):
+        change = rapid[t + 1] - rapid[t]
+        late += residual[t] * change
+        early += residual[t + 1] * change
+        changes += change**2
+        steep[t] = 1.0 if abs(change) > limit else 0.0
     score = max(abs(late), abs(early)) / sqrt(null * changes) if null * changes > 0 else 0.0
-    variance = 2.0 / (9.0 * max(count, 1))
-    mean = at_changes / count if count > 0 else 1.0
+    # Energy in the frames at a change.
+    count, at_changes = steep[0], steep[0] * residual[0] ** 2
+    for t in range(1, frames):
+        at = max(steep[t], steep[t - 1])
+        count += at
+        at_changes += at * residual[t] ** 2
+    variance = 2.0 / (9.0 * max(count, 1.0))
+    mean = at_changes / (null * count) if count > 0 else 1.0
     score = max(score, (mean ** (1.0 / 3.0) - (1.0 - variance)) / sqrt(variance))
     return (
         correlation * sqrt(residuals.LAGS * frames),
@@ -101,38 +99,41 @@ def _unexplained(model: Model, ratios: Ratio, residual: Array, rapid: Array, com
 @compiled
 def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
-) -> tuple[int, int, bool]:
-    """A temperature and its deviation, NaN where useless; samples lost, NaN, and out of range."""
-    lost, missing, beyond = 0, 0, False
+) -> tuple[float, float, bool]:
+    """A temperature and its deviation, NaN where useless; and what is wrong with them."""
+    lost, missing, beyond = 0.0, 0.0, 0.0
     for t in range(temperature.size):
         one, deviation = temperature[t], sqrt(variance[t])
-        missing += np.isnan(one)
+        missing += 1.0 if np.isnan(one) else 0.0
         margin = tiles.RANGE_SIGMAS * (0.0 if np.isnan(deviation) else deviation)
-        beyond |= one < model.lowest - margin or one > model.highest + margin
-        if abs(one) < tiles.USELESS and deviation < tiles.USELESS:
-            value[t], std[t] = one, deviation
-        else:
-            lost += 1
-            value[t], std[t] = np.nan, np.nan
-    return lost, missing, beyond
+        outside = (one < model.lowest - margin) | (one > model.highest + margin)
+        beyond += 1.0 if outside else 0.0
+        useful = (abs(one) < tiles.USELESS) & (deviation < tiles.USELESS)
+        lost += 0.0 if useful else 1.0
+        value[t] = one if useful else np.nan
+        std[t] = deviation if useful else np.nan
+    return lost, missing, beyond > 0.0
 
 
-_NUMBERS: Final = (
-    *("ratio", "inverse_energy", "first_weight", "second_weight", "null_variance", "order"),
-    *("contrast", "reduced_chi2", "first_emissivity", "second_emissivity", "epsilon"),
-    *("ratio_variance", "noise_variance", "drift_variance", "correlation", "delay"),
-    *("object_lost", "object_missing", "background_lost", "background_missing"),
-)
-_CONDITIONS: Final = (
-    *("pooled", "gray", "constant", "restless", "rough", "object_beyond", "background_beyond"),
-)
-_SYMMETRIC: Final = [("covariance", np.float64, 3), ("scatter", np.float64, 3)]
+_FIELDS: Final[dict[Any, dict[str, tuple[int, ...]]]] = {
+    np.float64: {
+        **dict.fromkeys(["inverse_energy", "null_variance", "contrast", "reduced_chi2"], ()),
+        **dict.fromkeys(["epsilon_variance", "noise_variance", "drift_variance"], ()),
+        **dict.fromkeys(["correlation", "delay"], ()),
+        **dict.fromkeys(["ratio", "ratio_variance", "null_weights", "emissivity"], (2,)),
+        **dict.fromkeys(["missing", "lost"], (2,)),
+        **dict.fromkeys(["scatter", "emissivity_covariance"], (2, 2)),
+        "rapid_scatter": (2, 2, 2),
+    },
+    np.bool_: {
+        **dict.fromkeys(["pooled", "gray", "constant", "restless", "unexplained"], ()),
+    },
+    np.intp: {"order": (), "beyond": (2,)},  # no arrays of truth values in a record
+}
 RECORD: Final = np.dtype(
-    [(name, np.float64) for name in _NUMBERS]
-    + [(name, np.bool_) for name in _CONDITIONS]
-    + [*_SYMMETRIC, ("rapid_scatter", np.float64, (2, 3))]
+    [(name, kind, shape) for kind, shapes in _FIELDS.items() for name, shape in shapes.items()]
 )
-"""Numbers of a pixel; a symmetric matrix of two bands as its first, mixed and last element."""
+"""Numbers of a pixel, the fields of a `Solution` without films and sums."""
 
 
 class Solved(NamedTuple):
@@ -157,63 +158,86 @@ def _energy(bend: Array, removed: Array) -> float:
 @compiled
 def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums: Array) -> None:
     """Steps 1 to 4, on the exact model where it matters, and all that the flags need."""
-    straight, bend, change = work.straight, work.bend, work.change
-    orders, steps = model.leverage.shape[0], model.steps
-    z, other, coefficients = work.first, work.second, work.coefficients
-    scatter = work.scatter
-    straight[:] = other
-    change[:] = 0.0
-    ratios, emission = pixel.solve(model, work)
-    gray = pixel.may_be_gray(model, ratios)
-    for _ in range(emissions.BENDS):
-        energy = _energy(bend, change)
-        if not energy > (least * model.noise[1]) ** 2:
+    work.straight[:] = work.second
+    work.removed[:] = 0.0
+    gray, again = False, 0
+    while True:
+        ratios = pixel.ratios(model, work, again)
+        line = pixel.emission(model, ratios, work, again)
+        pixel.background(model, line, work)
+        # The bend of a gray body is not known: it is told from the signals as they are.
+        gray = gray if again > 0 else pixel.may_be_gray(model, ratios)
+        energy = _energy(work.bend, work.removed)
+        if again == emissions.BENDS or not energy > (least * model.noise[1]) ** 2:
             break
-        least = emissions.BEND
-        for t in range(z.size):
-            change[t] = bend[t]
-            straight[t] = other[t] - bend[t]
-        ratios, emission = pixel.solve(model, work)
-    count, w = ratios.order + steps, ratios.weights
-    residual, rapid, curve = work.null_residual, work.rapid, work.target
+        least, again = emissions.BEND, again + 1
+        for t in range(work.bend.size):
+            work.removed[t] = work.bend[t]
+            work.straight[t] = work.second[t] - work.bend[t]
+    deviations = bars.bars(model, ratios, line, work)
+    _judge(model, ratios, work, record, sums)
+    object_ = _film(work.temperature, work.variance, model, films[0], films[1])
+    background = _film(work.background, work.background_variance, model, films[2], films[3])
+    for i, judged in enumerate((object_, background)):
+        record.lost[i], record.missing[i], record.beyond[i] = judged
+    _write_ratio(model, ratios, deviations.level, record)
+    _write_scatter(model, ratios, work.scatter, record)
+    record.gray, record.constant, record.restless = gray, line.constant, deviations.restless
+    record.epsilon_variance = deviations.epsilon
+    record.noise_variance = deviations.noise_variance
+    record.drift_variance = deviations.drift_variance
+    record.emissivity[0], record.emissivity[1] = line.emissivity
+    _write_symmetric(deviations.covariance, record.emissivity_covariance)
+
+
+@compiled
+def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> None:
+    """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
+    residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
+    count, w = ratios.order + model.steps, ratios.weights
     combined = w[0] * coefficients[0] + w[1] * coefficients[1]
     kernels.combined(model.functions, coefficients[0], count, rapid)
     kernels.combined(model.functions, combined, count, residual)
-    for t in range(z.size):
-        rapid[t] = z[t] - rapid[t]
-        residual[t] = w[0] * z[t] + w[1] * straight[t] - residual[t]
-    correlation, delay, rough = _unsteady(model, ratios, residual, rapid)
+    for t in range(rapid.size):
+        rapid[t] = work.first[t] - rapid[t]
+        residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
+    record.correlation, record.delay, record.unexplained = _unsteady(
+        model, ratios, residual, rapid, work.spare
+    )
     for block in range(model.parts.size - 1):
         for t in range(model.parts[block], model.parts[block + 1]):
             sums[0, block] += residual[t]
-            sums[1, block] += curve[t]
-    lost, missing, beyond = _film(work.temperature, work.variance, model, films[0], films[1])
-    record.object_lost, record.object_missing, record.object_beyond = lost, missing, beyond
-    lost, missing, beyond = _film(
-        work.background, work.background_variance, model, films[2], films[3]
-    )
-    record.background_lost, record.background_missing = lost, missing
-    record.background_beyond = beyond
-    record.ratio, record.inverse_energy = ratios.ratio, ratios.inverse_energy
-    record.first_weight, record.second_weight = w
-    record.null_variance, record.order = ratios.null_variance, ratios.order
-    record.contrast, record.reduced_chi2 = ratios.contrast, ratios.reduced_chi2
-    record.pooled, record.gray = ratios.pooled, gray
-    record.first_emissivity, record.second_emissivity = emission.emissivity
-    record.epsilon = emission.epsilon
+            sums[1, block] += work.target[t]
+
+
+@compiled
+def _write_ratio(model: Model, ratios: Ratio, level: float, record: Any) -> None:
+    record.ratio[0], record.ratio[1] = 1.0, ratios.ratio
     error = model.noise[1] ** 2 + (ratios.ratio * model.noise[0]) ** 2  # eq. 4
-    record.ratio_variance = ratios.inverse_energy * error + emission.level**2
-    record.noise_variance = emission.noise_variance
-    record.drift_variance = emission.drift_variance
-    record.constant, record.restless = emission.constant, emission.restless
-    record.correlation, record.delay, record.rough = correlation, delay, rough
-    for i in range(3):
-        record.covariance[i], record.scatter[i] = emission.covariance[i], ratios.scatter[i]
+    record.ratio_variance[1] = ratios.inverse_energy * error + level**2
+    record.inverse_energy, record.null_variance = ratios.inverse_energy, ratios.null_variance
+    record.null_weights[0], record.null_weights[1] = ratios.weights
+    record.order, record.pooled = ratios.order, ratios.pooled
+    record.contrast, record.reduced_chi2 = ratios.contrast, ratios.reduced_chi2
+
+
+@compiled
+def _write_scatter(model: Model, ratios: Ratio, scatter: Array, record: Any) -> None:
+    """Scatter less noise, at the order of the pixel and at `reflection_ratio.rapid_orders`."""
+    _write_symmetric(ratios.scatter, record.scatter)
+    orders, rows = len(scatter), model.functions.shape[1] - model.steps
     for place in range(2):
         order = max(1, orders - reflection_ratio.FEWER * (1 - place))
-        for i in range(3):
-            free = 0.0 if i == 1 else z.size - steps - order
-            record.rapid_scatter[place, i] = scatter[order - 1, i] - free
+        a, b, d = scatter[order - 1]
+        free = rows - order
+        _write_symmetric((a - free, b, d - free), record.rapid_scatter[place])
+
+
+@compiled
+def _write_symmetric(elements: tuple[float, float, float], matrix: Any) -> None:
+    """First, mixed and last element of a symmetric matrix, in place."""
+    matrix[0, 0], matrix[0, 1], matrix[1, 0] = elements[0], elements[1], elements[1]
+    matrix[1, 1] = elements[2]
 
 
 @compiled
@@ -260,34 +284,34 @@ def _compiled(digest: str) -> Callable[..., None]:
     return separate
 
 
-_SOURCES: Final = [*Path(__file__).parent.glob("*.py"), Path(planck.__file__), Path(tiles.__file__)]
-_separate: Final = _compiled(
-    hashlib.sha256(b"".join(one.read_bytes() for one in sorted(_SOURCES))).hexdigest()
-)
+_separate: Final = _compiled(kernels.DIGEST)
 
 
 def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     """All that the pixels of a tile of two bands share."""
     first, second = tile.curves
-    around = tile.reference + np.array([-0.5, 0.5])  # [K]
-    rates = np.diff(np.log(second.slope(around) / first.slope(around)))
-    temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
+    rate, gray = _ratios(first, second)
+    columns = np.ascontiguousarray(functions.functions.T)
+    of_object = columns  # the same array, if it holds the same, stays in the cache
+    if functions.object_part is not functions.functions:
+        of_object = np.ascontiguousarray(functions.object_part.T)
     degrees = functions.rising.shape[1]
     freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in emissions.OCTAVES]
     edges, limits = residuals.blocks(tile.time.size)
     return Model(
         first=kernels.table(first),
         second=kernels.table(second),
-        functions=np.ascontiguousarray(functions.functions.T),
-        object_part=np.ascontiguousarray(functions.object_part.T),
+        functions=columns,
+        object_part=of_object,
         rising=np.ascontiguousarray(functions.rising.T),
+        spread=float(np.ptp(functions.rising[:, 0])),
         leverage=np.ascontiguousarray(functions.leverage().T),
         steps=int(functions.steps),
         noise=(float(tile.noise[0]), float(tile.noise[1])),
         pattern=(0.0, 0.0) if tile.pattern is None else (tile.pattern[0], tile.pattern[1]),
         drift=drift / np.sqrt(3.0),
-        rate=float(rates[0]),
-        gray=second.slope(temperatures) / first.slope(temperatures),
+        rate=rate,
+        gray=gray,
         widened=(stdtrit(np.maximum(freedom, 1), 0.975) / emissions.NORMAL95) ** 2,
         edges=edges,
         limits=limits,
@@ -297,16 +321,28 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     )
 
 
+@lru_cache
+def _ratios(first: Curve, second: Curve) -> tuple[float, Array]:
+    """Relative rate of the ratio of the slopes at the reference [1/K], and some of the ratios."""
+    around = first.reference + np.array([-0.5, 0.5])  # [K]
+    rates = np.diff(np.log(second.slope(around) / first.slope(around)))
+    temperatures = np.linspace(first.lowest, first.highest, reflection_ratio.TEMPERATURES)
+    return float(rates[0]), second.slope(temperatures) / first.slope(temperatures)
+
+
 def _work_space(functions: smooth.Subspace) -> Work:
     """Arrays for the signals and curves of one pixel."""
     frames, columns = functions.functions.shape
     rest: dict[str, Any] = {
         "few": np.empty((6, frames), np.float32),
         "coefficients": np.empty((2, columns)),
+        "columns": np.empty(columns + functions.rising.shape[1]),
+        "spectrum": np.empty(functions.rising.shape[1]),
         "scatter": np.empty((functions.orders, 3)),
         "material": np.empty(5),
     }
-    return Work(**{name: np.empty(frames) for name in Work._fields} | rest)
+    curves = {name: np.empty(frames) for name in Work._fields}
+    return Work(**curves | rest | {"ones": np.ones(frames)})
 
 
 def solve(
@@ -324,30 +360,11 @@ def solve(
     record, sums = np.zeros(pixels, RECORD), np.zeros((pixels, 2, shared.parts.size - 1))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     _separate(shared, signals, materials, float(least), work, Solved(films, record, sums))
-    # The first, mixed and last element of a symmetric matrix (..., 3), as one (..., 2, 2, pixel).
-    covariance, scatter, rapid = (
-        np.moveaxis(record[name][..., [[0, 1], [1, 2]]], 0, -1)
-        for name in ("covariance", "scatter", "rapid_scatter")
-    )
-    single = (
-        *("inverse_energy", "null_variance", "contrast", "reduced_chi2", "pooled", "gray"),
-        *("noise_variance", "drift_variance", "constant", "restless", "correlation", "delay"),
-    )
-    named: dict[str, Any] = {name: record[name] for name in single}
-    for name in ("missing", "lost", "beyond"):
-        named[name] = np.stack([record[f"object_{name}"], record[f"background_{name}"]])
-    named |= zip(FILMS, films, strict=True)
-    return Solution(
-        ratio=np.stack([np.ones(pixels), record["ratio"]]),
-        ratio_variance=np.stack([np.zeros(pixels), record["ratio_variance"]]),
-        null_weights=np.stack([record["first_weight"], record["second_weight"]]),
-        order=record["order"].astype(np.intp),
-        scatter=scatter,
-        rapid_scatter=rapid,
-        emissivity=np.stack([record["first_emissivity"], record["second_emissivity"]]),
-        emissivity_covariance=covariance,
-        epsilon_variance=record["epsilon"],
-        unexplained=record["rough"],
-        sums=sums.transpose(1, 2, 0),
-        **named,
-    )
+    named: dict[str, Any] = {name: np.moveaxis(record[name], 0, -1) for name in RECORD.names or ()}
+    freedom = frames - functions.steps - record["order"]
+    named |= {
+        "freedom": freedom,
+        "beyond": named["beyond"] > 0,
+        **dict(zip(FILMS, films, strict=True)),
+    }
+    return Solution(sums=sums.transpose(1, 2, 0), **named)

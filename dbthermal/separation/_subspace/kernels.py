@@ -4,8 +4,10 @@ A pixel's curves stay in the processor's cache, and a step costs what its sums c
 for arrays in `response` and `residuals` is repeated within rounding.
 """
 
+import hashlib
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -14,16 +16,22 @@ from numba import njit
 from numpy.polynomial import Chebyshev
 
 from dbthermal import planck
+from dbthermal._arrays import Array
 from dbthermal.response import Curve, LinearCurve
+from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import residuals
-
-Array = npt.NDArray[np.float64]
 
 _ERROR: Final = 1e-7  # of a response's polynomials [K]
 _MARGIN: Final = 0.25  # of the calibrated range, beside it, in which they hold
 _TERMS: Final = 12  # of a polynomial
-_ROUGH: Final = 7  # degree of the inverse that two Newton steps begin with
-_BISECTIONS: Final = 22  # of the range of values, in which a rank is sought
+_NEWTON: Final = 4  # steps of the inverse, at most
+_GUESSES: Final = 60  # of the value of a rank, at most
+
+_LARGE: Final = 1e18  # a residual of no weight
+
+_SOURCES: Final = [*Path(__file__).parent.glob("*.py"), Path(planck.__file__), Path(tiles.__file__)]
+DIGEST: Final = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(_SOURCES))).hexdigest()
+"""Of the sources, with which compiled code is kept."""
 
 # Sums may be taken in any order; NaN stays NaN.
 _FLAGS: Final = {"reassoc", "contract", "nsz", "arcp"}
@@ -36,7 +44,8 @@ class Table(NamedTuple):
 
     signal: tuple[float, ...]  # coefficients of u(T) - T_r [K], rising
     slope: tuple[float, ...]  # of u'(T) [1]
-    rough: tuple[float, ...]  # of T of (signal - middle_signal) / half_signal [K]
+    inverse: tuple[float, ...]  # of T of (signal - middle_signal) / half_signal [K]
+    newton: int  # steps after which the inverse is exact
     middle: float  # [K]
     half: float  # [K]
     middle_signal: float  # less the reference [K]
@@ -69,11 +78,17 @@ def table(curve: Curve) -> Table:
             f"degree {degree}. Must be smooth over its range, {curve.lowest} to {curve.highest} K."
         )
     ends, a = signal(np.array([low, high])), curve.reference_slope
-    inverse = Chebyshev.interpolate(lambda s: curve.temperature(s + curve.reference), _ROUGH, ends)
+    inverse = Chebyshev.interpolate(
+        lambda s: curve.temperature(s + curve.reference), _TERMS - 1, ends
+    )
+    values, newton = inverse(signal(dense)), 0
+    while newton < _NEWTON and np.abs(values - dense).max() > _ERROR:
+        values, newton = values - (u(values) - signal(dense)) / slope(values), newton + 1
     return Table(
         signal=_coefficients(u),
         slope=_coefficients(slope),
-        rough=_coefficients(inverse),
+        inverse=_coefficients(inverse),
+        newton=newton,
         middle=0.5 * (low + high),
         half=0.5 * (high - low),
         middle_signal=float(ends.mean()),
@@ -112,18 +127,62 @@ def polynomial(c: tuple[float, ...], x: float) -> float:
 
 
 @compiled
-def blackbody(table: Table, temperature: Array, signal: Array, slope: Array, x: Array) -> None:
+def blackbody(table: Table, temperature: Array, signal: Array, slope: Array) -> None:
     """Signal less the reference [K] and slope [1] of a blackbody (time) [K], in place."""
-    largest = 0.0
+    outside, scale = 0.0, 1.0 / table.half  # a sum: a largest value would not be taken many at once
     for t in range(temperature.size):
-        x[t] = (temperature[t] - table.middle) / table.half
-        largest = max(largest, abs(x[t]))
-    for t in range(temperature.size):
-        signal[t], slope[t] = polynomial(table.signal, x[t]), polynomial(table.slope, x[t])
-    if not largest <= 1.0:
+        x = (temperature[t] - table.middle) * scale
+        outside += 0.0 if abs(x) <= 1.0 else 1.0
+        signal[t], slope[t] = polynomial(table.signal, x), polynomial(table.slope, x)
+    if outside > 0.0:
         for t in range(temperature.size):
-            if not abs(x[t]) <= 1.0:
+            if not abs(temperature[t] - table.middle) <= table.half:
                 signal[t], slope[t] = _exact(table, temperature[t])
+
+
+@compiled
+def slopes(table: Table, temperature: Array, slope: Array) -> None:
+    """Slope [1] alone, as `blackbody`."""
+    outside, scale = 0.0, 1.0 / table.half
+    for t in range(temperature.size):
+        x = (temperature[t] - table.middle) * scale
+        outside += 0.0 if abs(x) <= 1.0 else 1.0
+        slope[t] = polynomial(table.slope, x)
+    if outside > 0.0:
+        for t in range(temperature.size):
+            if not abs(temperature[t] - table.middle) <= table.half:
+                slope[t] = _exact(table, temperature[t])[1]
+
+
+@compiled
+def temperature(table: Table, signal: Array, result: Array) -> None:
+    """Temperature [K] of a blackbody with a signal (time) [K], in place; NaN where undefined."""
+    outside, scale, narrow = 0.0, 1.0 / table.half_signal, 1.0 / table.half
+    for t in range(signal.size):
+        x = (signal[t] - table.middle_signal) * scale
+        outside += 0.0 if abs(x) <= 1.0 else 1.0
+        result[t] = polynomial(table.inverse, x)
+    for _ in range(table.newton):
+        for t in range(signal.size):
+            x = (result[t] - table.middle) * narrow
+            excess = polynomial(table.signal, x) - signal[t]
+            result[t] -= excess / polynomial(table.slope, x)
+    if outside > 0.0:
+        for t in range(signal.size):
+            if not abs(signal[t] - table.middle_signal) <= table.half_signal:
+                result[t] = _inverse(table, signal[t])
+
+
+@compiled
+def _inverse(table: Table, signal: float) -> float:
+    """Temperature [K] of a blackbody with any signal less the reference [K]."""
+    excess = signal - table.offset
+    if table.linear:
+        return float(excess / table.amplitude)
+    if excess > 0.0:
+        scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(table.amplitude / excess)
+        return float((scale - table.shift) / table.wavelength)
+    return float(np.nan)
 
 
 @compiled
@@ -135,35 +194,120 @@ def dot(one: Array, other: Array) -> float:
 
 
 @compiled
-def combined(columns: Array, coefficients: Array, count: int, result: Array) -> None:
-    """Sum of the first columns (column, time) times coefficients, in place."""
-    result[:] = 0.0
-    for j in range(count):
-        for t in range(result.size):
-            result[t] += coefficients[j] * columns[j, t]
-
-
-@njit(nogil=True, fastmath=_FLAGS | {"nnan"}, error_model="numpy")
-def ranked(values: npt.NDArray[np.float32], rank: int) -> float:
-    """Value of a rank, from 0, of values that are not negative, by bisection: no sorting."""
-    low, high = np.float32(0.0), np.float32(0.0)
+def mean(values: Array) -> float:
+    total = 0.0
     for t in range(values.size):
-        high = max(high, values[t])
-    for _ in range(_BISECTIONS):
-        middle = np.float32(0.5) * (low + high)
+        total += values[t]
+    return total / values.size
+
+
+@compiled
+def combined(columns: Array, coefficients: Array, count: int, result: Array) -> None:
+    """Sum of the first columns (column, time) times coefficients, in place; four at once."""
+    result[:] = 0.0
+    four = count - count % 4
+    for j in range(0, four, 4):
+        a, b, c, d = coefficients[j], coefficients[j + 1], coefficients[j + 2], coefficients[j + 3]
+        for t in range(result.size):
+            result[t] += (
+                a * columns[j, t]
+                + b * columns[j + 1, t]
+                + c * columns[j + 2, t]
+                + d * columns[j + 3, t]
+            )
+    for j in range(four, count):
+        a = coefficients[j]
+        for t in range(result.size):
+            result[t] += a * columns[j, t]
+
+
+@compiled
+def projected(columns: Array, count: int, curve: Array, result: Array) -> None:
+    """Products of the first columns (column, time) with a curve, in place; four at once."""
+    four = count - count % 4
+    for j in range(0, four, 4):
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        for t in range(curve.size):
+            value = curve[t]
+            a += columns[j, t] * value
+            b += columns[j + 1, t] * value
+            c += columns[j + 2, t] * value
+            d += columns[j + 3, t] * value
+        result[j], result[j + 1], result[j + 2], result[j + 3] = a, b, c, d
+    for j in range(four, count):
+        result[j] = dot(columns[j], curve)
+
+
+@compiled
+def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
+    """
+    Value of a rank, from 0, of values that are not negative, from a guess: no sorting.
+
+    By interpolation between the numbers of values below two others. The bits of such numbers, as
+    whole numbers, are in the same order, and NaN above all.
+    """
+    bits = values.view(np.uint32)
+    least, most = np.float32(0.0), np.float32(values.size)
+    low, high = np.float32(0.0), np.float32(np.inf)
+    middle, goal = np.float32(guess), np.float32(rank)
+    for turn in range(_GUESSES):
         below = np.float32(0.0)  # sums of one kind are taken many at once
         for t in range(values.size):
             below += np.float32(1.0) if values[t] < middle else np.float32(0.0)
-        if below <= rank:
-            low = middle
+        if below <= goal:
+            low, least = middle, below
         else:
-            high = middle
-        if below == rank:
+            high, most = middle, below
+        if below == goal:
             break
-    result = np.float32(np.inf)
-    for t in range(values.size):
-        result = min(result, values[t] if values[t] >= low else np.float32(np.inf))
-    return float(result)
+        if high == np.float32(np.inf):
+            middle = np.float32(2.0) * low
+        elif turn % 3 == 2:
+            middle = np.float32(0.5) * (low + high)
+        else:
+            share = (goal + np.float32(0.5) - least) / (most - least)
+            middle = low + share * (high - low)
+        if not low < middle < high:
+            break
+    lowest, above = np.float32(low).view(np.uint32), np.uint32(0xFFFFFFFF)
+    for t in range(bits.size):  # what is below the bound wraps around
+        above = min(above, np.uint32(bits[t] - lowest))
+    return float(np.uint32(lowest + above).view(np.float32))
+
+
+def _line(real: type[np.float32] | type[np.float64]) -> Any:
+    """Weighted line of arrays of a precision, compiled."""
+    zero, one = real(0.0), real(1.0)
+
+    @compiled
+    def line(x: Any, y: Any, weights: Any, residual: Any, scale: float) -> tuple[Any, Any, Any]:
+        """
+        Slope and intercept of a weighted line, and the energy of the abscissa about its mean.
+
+        With weights as they are or, for a scale, Tukey's bisquare of residuals; these in place.
+        """
+        inverse = real(1.0 / (residuals.TUNING * scale))
+        total, first, second, square, product = zero, zero, zero, zero, zero
+        for t in range(x.size):
+            r = residual[t] * inverse
+            kept = max(one - r * r, zero)
+            w = kept * kept
+            weights[t] = w
+            wx = w * x[t]
+            total += w
+            first += wx
+            second += w * y[t]
+            square += wx * x[t]
+            product += wx * y[t]
+        middle, centre = first / total, second / total
+        energy = square - total * middle * middle
+        slope = (product - total * middle * centre) / energy
+        return slope, centre - slope * middle, energy
+
+    return line
+
+
+_single, _double = _line(np.float32), _line(np.float64)
 
 
 @compiled
@@ -185,42 +329,32 @@ def moments(x: Any, y: Any, weights: Any) -> tuple[float, float, float]:
 
 
 @compiled
-def _bisquare(residual: Any, scale: float, weights: Any) -> None:
-    """Tukey's bisquare weights of residuals, in place."""
-    inverse = 1.0 / (residuals.TUNING * scale)
-    for t in range(residual.size):
-        r = residual[t] * inverse
-        kept = max(1.0 - r * r, 0.0)
-        weights[t] = kept * kept
-
-
-@compiled
 def _started(x: Array, y: Array, noise: float, residual: Array, few: Any) -> None:
     """Residual from the best of three starts, in place; see `residuals.regress`."""
-    middle, centre = x.mean(), y.mean()
+    middle, centre = mean(x), mean(y)
     step = max(1, x.size // residuals.STARTING_POINTS)
     count = (x.size + step - 1) // step
     xs, ys, rest = few[0, :count], few[1, :count], few[2, :count]
-    weights, plain = few[3, :count], few[4, :count]
+    weights, plain, magnitude = few[3, :count], few[4, :count], few[5, :count]
     for i in range(count):
-        xs[i], ys[i] = x[i * step] - middle, y[i * step] - centre
-    weights[:] = 1.0
-    slope, intercept, _ = moments(xs, ys, weights)
+        xs[i], ys[i], rest[i] = x[i * step] - middle, y[i * step] - centre, 0.0
+    slope, intercept, _ = _single(xs, ys, weights, rest, 1.0)
     for i in range(count):
         plain[i] = ys[i] - intercept - slope * xs[i]
-    rank = int(residuals.SHARE * count)
+    rank, zero = int(residuals.SHARE * count), np.float32(0.0)
     best, best_slope, best_intercept = np.inf, np.inf, np.inf
     for start in range(3):
-        for i in range(count):
-            inside = start == 0 or (start == 1 and plain[i] >= 0) or (start == 2 and plain[i] <= 0)
-            weights[i] = 1.0 if inside else 0.0
+        sign = np.float32(2 * start - 3) if start > 0 else zero
+        scale, deviation = 1.0, noise
+        for i in range(count):  # a residual of 0 has the weight 1, a large one 0
+            rest[i] = np.float32(0.0) if sign * plain[i] >= zero else np.float32(_LARGE)
         for _ in range(residuals.STARTING_STEPS):
-            slope, intercept, _ = moments(xs, ys, weights)
+            slope, intercept, _ = _single(xs, ys, weights, rest, scale)
             for i in range(count):
-                rest[i] = abs(ys[i] - intercept - slope * xs[i])
-            deviation = ranked(rest, rank)
+                rest[i] = ys[i] - intercept - slope * xs[i]
+                magnitude[i] = abs(rest[i])
+            deviation = ranked(magnitude, rank, deviation)
             scale = max(noise, residuals.ANNEALING * residuals.TO_STD * deviation)
-            _bisquare(rest, scale, weights)
         if deviation < best:
             best, best_slope, best_intercept = deviation, slope, intercept
     for t in range(x.size):
@@ -243,14 +377,16 @@ def regress(
     else:
         _started(x, y, noise, residual, few)
     magnitude, rank = few[5], int(residuals.SHARE * x.size)
+    deviation = noise
+    for t in range(x.size):
+        magnitude[t] = abs(residual[t])
     for _ in range(residuals.STEPS):
-        for t in range(x.size):
-            magnitude[t] = abs(residual[t])
-        scale = max(noise, residuals.TO_STD * ranked(magnitude, rank))
-        _bisquare(residual, scale, weights)
-        slope, intercept, energy = moments(x, y, weights)
+        deviation = ranked(magnitude, rank, deviation)
+        scale = max(noise, residuals.TO_STD * deviation)
+        slope, intercept, energy = _double(x, y, weights, residual, scale)
         for t in range(x.size):
             residual[t] = y[t] - intercept - slope * x[t]
+            magnitude[t] = abs(residual[t])
     kept, lagged = (residual[0] * weights[0]) ** 2, 0.0
     for t in range(1, x.size):
         one = residual[t] * weights[t]

@@ -50,9 +50,8 @@ separation in the sense of Belouchrani et al. (1997), doi:10.1109/78.554307, for
 formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 from scipy.stats import chi2
@@ -61,7 +60,15 @@ from dbthermal import _smooth as smooth
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Method
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._subspace import clock, fused, pieces, reflection_ratio, residuals, steps
+from dbthermal.separation._subspace import (
+    clock,
+    division,
+    fused,
+    pieces,
+    reflection_ratio,
+    residuals,
+    steps,
+)
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Estimate, Mask, Survey, Tile
@@ -89,7 +96,6 @@ _LIKELY: Final = 40.0
 _MOST_PIECES: Final = 10
 # Polynomials of a piece in a survey: those of a pixel alone, and two larger numbers.
 _NUMBERS: Final = (smooth.PIECE_ORDER, smooth.PIECE_ORDER + 3, 2 * smooth.PIECE_ORDER)
-Record = TypeVar("Record", Estimate, Survey)
 
 
 @dataclass(frozen=True)
@@ -126,18 +132,23 @@ def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         # Together the pixels see a bend that is too small to be seen in each.
         functions = _functions(tile)
-        result = _survey(tile, functions, _solve(tile, functions, settings, least=0.0))
+        alone = _solve(tile, functions, settings, least=0.0)
+        result = _survey(tile, functions.orders, alone)
         first = _followed(tile, settings)[1]
         divided = np.asarray(first.any(axis=0))
         if np.any(divided):
             part = tile.select_pixels(divided)
             again, *more = (
-                _divided(part, first[:, divided], settings, _survey, least=0.0, number=number)
+                _survey(
+                    part,
+                    1,
+                    _divided(part, first[:, divided], functions, settings, 0.0, number),
+                )
                 for number in _NUMBERS
             )
             rapid = np.stack([one.scatter for one in more]), np.stack([one.frames for one in more])
             again = replace(again, rapid_scatter=rapid[0], rapid_frames=rapid[1])
-            result = result.replace_pixels(divided, again)
+            result.replace_pixels(divided, again)
         return result
 
 
@@ -157,9 +168,9 @@ def _solve(
     return solve(tile, functions, settings.background_drift, least)
 
 
-def _report(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Estimate:
-    """Values, standard deviations and flags; NaN where a quantity is undefined."""
-    flags = _flags(tile, functions, solution)
+def _report(tile: Tile, solution: Solution) -> Estimate:
+    """Values, standard deviations and flags; NaN, in the films in place, where undefined."""
+    flags = _flags(tile, solution)
     still = flags[Status.NO_BACKGROUND_MOTION]
     ambiguous = solution.constant & flags[Status.ROLES_MAY_BE_SWAPPED]
     undefined = still | flags[Status.GRAY] | ambiguous
@@ -171,33 +182,36 @@ def _report(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Estim
     beyond = (lost | solution.beyond) & ~np.stack([undefined, no_background])
     status |= status_bits({Status.OUTSIDE_RESPONSE: np.any(beyond, axis=0)})
     films = {name: getattr(solution, name) for name in FILMS}
+    for name, film in films.items():
+        without = undefined if name.startswith("object") else no_background
+        np.copyto(film, np.nan, where=without)
+    covariance = np.where(unidentified, np.nan, solution.emissivity_covariance)
     result = Estimate(
         **films,
-        emissivity=solution.emissivity,
-        emissivity_std=np.sqrt(np.einsum("bbp->bp", solution.emissivity_covariance)),
-        emissivity_covariance=solution.emissivity_covariance,
+        emissivity=np.where(unidentified, np.nan, solution.emissivity),
+        emissivity_std=np.sqrt(np.einsum("bbp->bp", covariance)),
+        emissivity_covariance=covariance,
         reflection_ratio=np.where(still, np.nan, solution.ratio),
         reflection_ratio_std=np.where(still, np.nan, np.sqrt(solution.ratio_variance)),
         status=status,
     )
-    result = result.undefine(undefined, unidentified, no_background)
     return result.check_range(tile.curves[0], not_estimated=FILMS)
 
 
-def _survey(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Survey:
+def _survey(tile: Tile, orders: int, solution: Solution) -> Survey:
     """
-    Survey of a solution, without the pixels whose model is broken.
+    Survey of a solution of some orders, without the pixels whose model is broken.
 
     A selection by the estimate itself would bias the sum over a material.
     """
-    status = _report(tile, functions, solution).status
+    status = _report(tile, solution).status
     sound = (status & _BROKEN) == 0
-    freedom = tile.time.size - functions.steps - reflection_ratio.rapid_orders(functions)
+    fewer = reflection_ratio.rapid_orders(orders)[:, np.newaxis] - solution.order
     return Survey(
         scatter=np.where(sound, solution.scatter, 0.0),
-        frames=sound * (tile.time.size - functions.steps - solution.order).astype(np.float64),
+        frames=sound * solution.freedom.astype(np.float64),
         rapid_scatter=np.where(sound, solution.rapid_scatter, 0.0),
-        rapid_frames=sound * freedom[:, np.newaxis].astype(np.float64),
+        rapid_frames=sound * (solution.freedom - fewer).astype(np.float64),
         ratio=solution.ratio,
         null_weights=solution.null_weights,
         emissivity=np.where(status == 0, solution.emissivity[0], np.nan),
@@ -206,7 +220,7 @@ def _survey(tile: Tile, functions: smooth.Subspace, solution: Solution) -> Surve
     )
 
 
-def _flags(tile: Tile, functions: smooth.Subspace, solution: Solution) -> dict[Status, Mask]:
+def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     """Conditions (pixel) of the bits of the status."""
     frames, others, emissivity = tile.time.size, len(tile.noise) - 1, solution.emissivity
     still = solution.contrast < 1.0 + _CONTRAST_SIGMAS / np.sqrt(frames)
@@ -223,8 +237,7 @@ def _flags(tile: Tile, functions: smooth.Subspace, solution: Solution) -> dict[S
     # Before a constant object all that changes would be the background, which comes and goes.
     swapped[constant] = ~residuals.returning(tile.signals[0][:, constant])
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
-    free = frames - solution.order - functions.steps
-    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * free)
+    excess = 2.0 * _CHI2_SIGMAS / np.sqrt(2.0 * others * solution.freedom)
     rough = (solution.correlation > _CORRELATION_SIGMAS) | solution.unexplained
     return {
         Status.NO_BACKGROUND_MOTION: still,
@@ -251,7 +264,7 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
         solution.sums[0], solution.sums[1], tile.time, solution.null_variance, used
     )
     asked |= solution.order > functions.orders - _LAST
-    result = _report(tile, functions, solution)
+    result = _report(tile, solution)
     suspect = np.flatnonzero(asked | ((result.status & _SUSPECT) != 0))
     first = np.zeros(tile.signals.shape[1:], dtype=bool)
     if suspect.size == 0:
@@ -261,23 +274,25 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
     used, others = ratios.order + functions.steps, len(noise) - 1
     cost = others * (ratios.reduced_chi2 * (tile.time.size - used) + pieces.COST * used)
     known = None if part.material is None else part.material.ratio
-    divisions = pieces.divide(part.signals, tile.time, noise, tile.segment, known)
+    divide = division.divide if others == 1 else pieces.divide  # compiled for two bands
+    divisions = divide(part.signals, tile.time, noise, tile.segment, known)
     lowest = np.min([cost, *(one.cost for one in divisions)], axis=0)
-    for division in divisions:
+    for one in divisions:
         # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
         flagged = (best.status != 0) | (cost > lowest + _LIKELY)
-        tried = (division.cost < cost) | (flagged & (division.cost < lowest + _LIKELY))
+        tried = (one.cost < cost) | (flagged & (one.cost < lowest + _LIKELY))
         # One piece is a smooth curve.
-        places = np.flatnonzero(tried & (division.first.sum(axis=0) > 1))
+        places = np.flatnonzero(tried & (one.first.sum(axis=0) > 1))
         if places.size == 0:
             continue
-        again = _divided(part.select_pixels(places), division.first[:, places], settings, _report)
-        cheaper = division.cost[places] < cost[places] - _LIKELY
+        some = part.select_pixels(places)
+        again = _report(some, _divided(some, one.first[:, places], functions, settings))
+        cheaper = one.cost[places] < cost[places] - _LIKELY
         better = (again.status == 0) | (flagged[places] & cheaper)
         places, again = places[better], again.select_pixels(better)
-        best = best.replace_pixels(places, again)
-        cost[places] = division.cost[places]
-        first[:, suspect[places]] = division.first[:, places]
+        best.replace_pixels(places, again)
+        cost[places] = one.cost[places]
+        first[:, suspect[places]] = one.first[:, places]
     jumping = first[:, suspect].any(axis=0) & residuals.sudden(
         best.object_temperature, best.object_temperature_std, tile.time
     )
@@ -286,24 +301,24 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
     apart = result.status[suspect] & np.uint32(Status.BANDS_APART)
     hidden = first[:, suspect].sum(axis=0) > _MOST_PIECES
     status |= np.where((best.status != 0) | hidden, apart, np.uint32(0))
-    return result.replace_pixels(suspect, replace(best, status=status)), first
+    result.replace_pixels(suspect, replace(best, status=status))
+    return result, first
 
 
 def _divided(
     tile: Tile,
     first: Mask,
+    functions: smooth.Subspace,
     settings: SubspaceSettings,
-    finish: Callable[[Tile, smooth.Subspace, Solution], Record],
     least: float = emissions.BEND,
     number: int = smooth.PIECE_ORDER,
-) -> Record:
-    """Result with pieces that begin with some frames (time, pixel), same pieces together."""
-    order, groups, parts = _functions(tile).orders, pieces.alike(first), []
+) -> Solution:
+    """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
+    groups, parts, time, segment = pieces.alike(first), [], tile.time, tile.segment
     for places in groups:
-        begins = first[:, places[0]]
-        functions = smooth.piecewise(tile.time, begins, order, segment=tile.segment, number=number)
-        part = tile.select_pixels(places)
-        parts.append(finish(part, functions, _solve(part, functions, settings, least)))
+        begins, rising = first[:, places[0]], functions.rising
+        divided = smooth.piecewise(time, begins, rising, segment=segment, number=number)
+        parts.append(_solve(tile.select_pixels(places), divided, settings, least))
     return parts[0].join(parts[1:]).select_pixels(np.argsort(np.concatenate(groups)))
 
 

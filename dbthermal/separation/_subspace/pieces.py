@@ -26,7 +26,7 @@ from dbthermal.separation._tiles import Array, Mask, Whole
 
 # Functions of a piece by which the division is chosen. Two more are fitted: what the choice leaves
 # of the curve is too small to be significant, but it would bias ratio and curve.
-_FUNCTIONS: Final = 4
+FUNCTIONS: Final = 4
 # Cost of a function in units of the energy of noise: 1 for none, log N for an information criterion
 # that would rather miss a change than find one too many.
 COST: Final = 2.5
@@ -35,14 +35,17 @@ _MARGIN: Final = 3.0
 # Levels of the pieces that are enough to see that pieces are better.
 _COARSE: Final = 4
 # Halvings after which the pieces give the axes to start from.
-_STARTS: Final = (0, 2, 3, 4, 5)
-_ROUNDS: Final = 4
+STARTS: Final = (0, 2, 3, 4, 5)
+ROUNDS: Final = 4
 # Axes that are refined, of which the two best are kept: joined, they may change places.
-_AXES: Final = 4
+AXES: Final = 4
 # Costs of pieces that are computed at once: all together would need much memory.
 _AT_ONCE: Final = 2**20
+# Costs that differ by less are the same but for rounding: of two divisions the finer one is taken,
+# whose pieces may be joined, and of two ways to join pieces that of the longest.
+TIE: Final = 1e-6
 # Standard deviations between two axes that are told apart.
-_APART: Final = 6.0
+APART: Final = 6.0
 
 Piece = tuple[slice, Array, int]
 """Frames of a piece, its functions, orthonormal, and how many of them are used to choose."""
@@ -65,11 +68,11 @@ def divide(
     The second one is that of the other line, if there is one, and costs more. Reflection ratios of
     a material may be `known` (band, pixel), NaN for others.
     """
-    edges, levels = _tree(time.tobytes(), None if segment is None else segment.tobytes())
+    edges, levels = tree(time.tobytes(), None if segment is None else segment.tobytes())
     white = signals / noise[:, np.newaxis, np.newaxis]
     scatters = [_scatters(white, level) for level in levels]
     prices = [COST * (len(noise) - 1) * np.array([p[2] for p in level]) for level in levels]
-    starts = [_axis(scatters[level][0]) for level in _STARTS if level < len(scatters)]
+    starts = [_axis(scatters[level][0]) for level in STARTS if level < len(scatters)]
     axes = np.concatenate(starts)
     if known is not None:
         along = (known / noise[:, np.newaxis]).T
@@ -82,15 +85,15 @@ def divide(
     divisions: list[Division] = []
     taken = np.full((0, *axes.shape[1:]), np.nan)
     deviation = np.zeros(signals.shape[2])
-    for _ in range(_AXES):
-        same = np.any(_angle(axes, taken) < _APART * deviation, axis=0)
+    for _ in range(AXES):
+        same = np.any(_angle(axes, taken) < APART * deviation, axis=0)
         left = np.where(same, np.inf, costs)
         axis = axes[np.argmin(left, axis=0), np.arange(left.shape[1])]
-        for _ in range(_ROUNDS):
+        for _ in range(ROUNDS):
             chosen = _best(scatters, prices, axis)[1]
             total = _total(scatters, chosen)
             axis = _axis(total)
-        again = np.any(_angle(axis, taken) < _APART * deviation, axis=0)
+        again = np.any(_angle(axis, taken) < APART * deviation, axis=0)
         none = again | ~np.isfinite(left.min(axis=0))
         first, cost = _joined(white, axis, _first(chosen, edges), time, segment)
         divisions.append(Division(first, np.where(none, np.inf, cost)))
@@ -106,7 +109,7 @@ def divide(
 
 
 @lru_cache(maxsize=4)
-def _tree(time: bytes, segment: bytes | None) -> tuple[Whole, list[list[Piece]]]:
+def tree(time: bytes, segment: bytes | None) -> tuple[Whole, list[list[Piece]]]:
     """
     First frames of the shortest pieces, and the end; the pieces of each level of halving.
 
@@ -120,11 +123,11 @@ def _tree(time: bytes, segment: bytes | None) -> tuple[Whole, list[list[Piece]]]
     edges = np.round(np.linspace(0, times.size, 2**levels + 1)).astype(np.intp)
     for event in [] if events is None else np.flatnonzero(np.diff(events)) + 1:
         edges[1:-1][edges[1:-1] == event] += 1
-    tree: list[list[Piece]] = []
+    halved: list[list[Piece]] = []
     for level in range(levels + 1):
         bounds = edges[:: 2 ** (levels - level)]
         inside = [slice(start, stop) for start, stop in pairwise(bounds)]
-        tree.append(
+        halved.append(
             [
                 (
                     one,
@@ -135,7 +138,7 @@ def _tree(time: bytes, segment: bytes | None) -> tuple[Whole, list[list[Piece]]]
                 for one in inside
             ]
         )
-    return edges, tree
+    return edges, halved
 
 
 def _scatters(white: Array, pieces: list[Piece]) -> Array:
@@ -147,6 +150,9 @@ def _scatters(white: Array, pieces: list[Piece]) -> Array:
     bands, _, pixels = white.shape
     scatter = np.empty((2, len(pieces), pixels, bands, bands))
     for number, (inside, basis, chosen) in enumerate(pieces):
+        if basis.shape[0] == basis.shape[1]:  # any curve
+            scatter[:, number] = 0.0
+            continue
         signal = white[:, inside]
         held = basis.T @ signal
         first, more = held[:, :chosen], held[:, chosen:]
@@ -191,7 +197,7 @@ def _halve(costs: list[Array]) -> tuple[Array, list[Mask]]:
     least = costs[-1]
     for cost in costs[-2::-1]:
         halves = least[::2] + least[1::2]
-        halved.append(halves < cost)
+        halved.append(halves < cost + TIE)
         least = np.minimum(halves, cost)
     chosen, inside = [], np.ones(least.shape, dtype=bool)
     for halve in halved[::-1]:
@@ -221,8 +227,8 @@ def _joined(
                 least[start] + _cost(part, edges[start], edges[stop], time, segment)
                 for start in range(stop)
             ]
-            before.append(np.argmin(sums, axis=0))
             least[stop] = np.min(sums, axis=0)
+            before.append(np.argmax(sums < least[stop] + TIE, axis=0))
         cost[places] = least[-1]
         at = np.full(places.size, len(edges) - 1)
         while np.any(at > 0):
@@ -259,7 +265,7 @@ def functions(time: bytes, segment: bytes | None) -> tuple[Array, int]:
     order = max(1, min(smooth.PIECE_ORDER, times.size - len(steps)))
     # Steps of the camera come first.
     columns = [*steps, smooth.polynomial_basis(times, order)]
-    chosen = _FUNCTIONS if times.size > smooth.PIECE_ORDER else order
+    chosen = FUNCTIONS if times.size > smooth.PIECE_ORDER else order
     return np.linalg.qr(np.column_stack(columns))[0], len(steps) + chosen
 
 
@@ -280,7 +286,7 @@ def _first(chosen: list[Mask], edges: Whole) -> Mask:
 @lru_cache(maxsize=16)
 def blocks(frames: int) -> Whole:
     """Edges of the blocks of frames whose means tell whether pieces are asked for."""
-    levels = min(int(np.log2(frames / _FUNCTIONS)), _COARSE + 2)
+    levels = min(int(np.log2(frames / FUNCTIONS)), _COARSE + 2)
     return np.round(np.linspace(0, frames, 2**levels + 1)).astype(np.intp)
 
 

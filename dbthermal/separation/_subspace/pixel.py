@@ -1,20 +1,17 @@
-"""Steps 1 to 4 of `method` for one pixel of two bands, compiled; the equations stand in `steps`."""
+"""Steps 1 to 4 of `method` for one pixel of two bands, compiled; their bars are in `bars`."""
 
 from math import erfc, log, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtri
 from scipy.stats import chi2
 
-from dbthermal import planck
+from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels, reflection_ratio, residuals
-from dbthermal.separation._subspace.kernels import Table, compiled
+from dbthermal.separation._subspace import kernels, reflection_ratio
+from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._subspace.shared import Model, Work
-
-Array = npt.NDArray[np.float64]
 
 CHANCE: Final = float(chi2.isf(reflection_ratio.CHANCE, 1))
 _GRAY_LIMIT: Final = float(chdtri(1, reflection_ratio.GRAY_CHANCE))
@@ -35,108 +32,54 @@ class Ratio(NamedTuple):
     pooled: bool
 
 
-class Emission(NamedTuple):
-    """Numbers of `emission.Emission`, of one pixel; its curves are rows of the work space."""
+class Line(NamedTuple):
+    """Robust line of step 3 (eq. 7), and the emissivities that follow from it."""
 
     emissivity: tuple[float, float]
-    covariance: tuple[float, float, float]
-    epsilon: float
-    level: float
-    noise_variance: float
-    drift_variance: float
+    variance: float  # of the slope
+    scale: float  # of the residual [K]
+    energy: float  # of the object's curve [K^2]
     constant: bool
-    restless: bool
+    known: bool  # the emissivity is the material's
 
 
 @compiled
-def _temperature(table: Table, signal: Array, result: Array, work: Work) -> None:
-    """Temperature [K] of a blackbody with a signal (time) [K], in place; NaN where undefined."""
-    x, value, slope, largest = work.spare, work.emitted, work.slope, 0.0
-    for t in range(signal.size):
-        x[t] = (signal[t] - table.middle_signal) / table.half_signal
-        largest = max(largest, abs(x[t]))
-    for t in range(signal.size):
-        result[t] = kernels.polynomial(table.rough, x[t])
-    for _ in range(2):  # Newton's steps
-        kernels.blackbody(table, result, value, slope, work.place)
-        for t in range(signal.size):
-            result[t] += (signal[t] - value[t]) / slope[t]
-    if not largest <= 1.0:
-        for t in range(signal.size):
-            if not abs(x[t]) <= 1.0:
-                excess = signal[t] - table.offset
-                if table.linear:
-                    result[t] = excess / table.amplitude
-                elif excess > 0.0:
-                    scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(table.amplitude / excess)
-                    result[t] = (scale - table.shift) / table.wavelength
-                else:
-                    result[t] = np.nan
-
-
-@compiled
-def _ratios(model: Model, work: Work) -> Ratio:
-    """Step 1 of the signals of both bands; their coefficients (2, column) in place."""
-    noise, orders, steps = model.noise, model.leverage.shape[0], model.steps
-    z, s, material = work.first, work.straight, work.material
-    coefficients, scatter = work.coefficients, work.scatter
-    columns, frames = model.functions.shape
-    held = np.zeros(3)
-    for j in range(columns):
-        one, other = kernels.dot(model.functions[j], z), kernels.dot(model.functions[j], s)
-        coefficients[0, j], coefficients[1, j] = one, other
-    total = kernels.dot(z, z), kernels.dot(z, s), kernels.dot(s, s)
-    unit = noise[0] ** 2, noise[0] * noise[1], noise[1] ** 2
-    for j in range(columns):
-        one, other = coefficients[0, j], coefficients[1, j]
-        held[0] += one * one
-        held[1] += one * other
-        held[2] += other * other
-        if j >= steps:
-            for i in range(3):
-                scatter[j - steps, i] = (total[i] - held[i]) / unit[i]
-    # Energy across the axis, by order: the smaller eigenvalue, or that of a known axis.
+def ratios(model: Model, work: Work, again: int) -> Ratio:
+    """Step 1; coefficients (2, column) in place, those of the first band unless done before."""
+    coefficients, columns = work.coefficients, len(model.functions)
+    if not again:
+        kernels.projected(model.functions, columns, work.first, coefficients[0])
+    kernels.projected(model.functions, columns, work.straight, coefficients[1])
+    _scatter(model, work)
+    noise, scatter, material = model.noise, work.scatter, work.material
+    orders, frames = len(scatter), work.first.size
     known = material[0] / noise[1] * noise[0]
     share = 1.0 / sqrt(1.0 + known**2), known / sqrt(1.0 + known**2)
-    lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1) - 1
     pooled = False
     if not np.isnan(known):
-        order = _order(scatter, share, True, lowest, frames)
-        a, b, d = scatter[order]
+        a, b, d = scatter[_order(scatter, share, True, frames)]
         turned = a * share[0] + b * share[1], b * share[0] + d * share[1]
         along = share[0] * turned[0] + share[1] * turned[1]
         statistic = (turned[0] ** 2 + turned[1] ** 2) / along - along
         pooled = statistic < CHANCE
-    order = _order(scatter, share, pooled, lowest, frames)
-    free = frames - steps - (order + 1.0)
+    order = _order(scatter, share, pooled, frames)
+    free = frames - model.steps - (order + 1.0)
     a, b, d = scatter[order]
     largest, null = _energies(a, b, d, share, pooled)
-    if pooled:
-        ratio = material[0]
-    else:
-        # The longer of two expressions for the axis.
-        across, up = (largest - d, b) if a >= d else (b, largest - a)
-        ratio = up / across * (noise[1] / noise[0])
+    # The axis by the longer of two expressions.
+    across, up = (largest - d, b) if a >= d else (b, largest - a)
+    ratio = material[0] if pooled else up / across * (noise[1] / noise[0])
+    # Eq. 4: sigma^2 of the energy along the axis less the noise's, over |v|^2.
     length = 1.0 / noise[0] ** 2 + (ratio / noise[1]) ** 2
     energy = (largest - free) / length
     inverse = (energy + free / length) / energy**2 if energy > 0 else np.inf
-    if pooled:
-        inverse = material[1]
-    along0, along1, emitted0, emitted1 = (
-        1.0 / noise[0],
-        ratio / noise[1],
-        1.0 / noise[0],
-        1.0 / noise[1],
-    )
-    part = (along0 * emitted0 + along1 * emitted1) / (along0**2 + along1**2)
-    off0, off1 = emitted0 - part * along0, emitted1 - part * along1
-    variance = 1.0 / (off0**2 + off1**2)
     last = scatter[orders - 1]
     most, least = _energies(last[0], last[1], last[2], share, pooled)
+    weights, variance = _null_combination(ratio, noise)
     return Ratio(
         ratio,
-        inverse,
-        (off0 * variance / noise[0], off1 * variance / noise[1]),
+        material[1] if pooled else inverse,
+        weights,
         variance,
         order + 1,
         most / least if least > 0 else np.inf,
@@ -144,6 +87,34 @@ def _ratios(model: Model, work: Work) -> Ratio:
         (a - free, b, d - free),
         pooled,
     )
+
+
+@compiled
+def _scatter(model: Model, work: Work) -> None:
+    """Scatter (order, 3) of the whitened signals outside the functions of each order (eq. 3)."""
+    z, s, coefficients, steps = work.first, work.straight, work.coefficients, model.steps
+    a, b, d = kernels.dot(z, z), kernels.dot(z, s), kernels.dot(s, s)
+    one, two = 1.0 / model.noise[0], 1.0 / model.noise[1]
+    # The basis is orthonormal: |P z|^2 = |z|^2 - sum of squared coefficients.
+    for j in range(coefficients.shape[1]):
+        a -= coefficients[0, j] ** 2
+        b -= coefficients[0, j] * coefficients[1, j]
+        d -= coefficients[1, j] ** 2
+        if j >= steps:
+            scatter = work.scatter[j - steps]
+            scatter[0], scatter[1], scatter[2] = a * one * one, b * one * two, d * two * two
+
+
+@compiled
+def _null_combination(
+    ratio: float, noise: tuple[float, float]
+) -> tuple[tuple[float, float], float]:
+    """Weights w of eq. 5 and the variance of that combination, as `null_combination`."""
+    along0, along1, one, two = 1.0 / noise[0], ratio / noise[1], 1.0 / noise[0], 1.0 / noise[1]
+    part = (along0 * one + along1 * two) / (along0**2 + along1**2)
+    off0, off1 = one - part * along0, two - part * along1
+    variance = 1.0 / (off0**2 + off1**2)
+    return (off0 * variance * one, off1 * variance * two), variance
 
 
 @compiled
@@ -159,10 +130,9 @@ def _energies(
 
 
 @compiled
-def _order(
-    scatter: Array, axis: tuple[float, float], known: float, lowest: int, frames: int
-) -> int:
+def _order(scatter: Array, axis: tuple[float, float], known: float, frames: int) -> int:
     """Order less one of the lowest information criterion, see `reflection_ratio.choose_order`."""
+    lowest = min(reflection_ratio.LOWEST_ORDER, len(scatter) - 1) - 1
     best, least = lowest, np.inf
     for order in range(lowest, scatter.shape[0] - 1):
         a, b, d = scatter[order]
@@ -192,287 +162,85 @@ def may_be_gray(model: Model, ratios: Ratio) -> bool:
 
 
 @compiled
-def _newton(model: Model, ratios: Ratio, emissivity: float, work: Work) -> None:
-    """One step of `emission._newton`, in place; h' and the partial derivative in the work space."""
-    emitted, other, slope, other_slope = (
-        work.emitted,
-        work.other_emitted,
-        work.slope,
-        work.second_slope,
-    )
-    steepness, partial = work.steepness, work.partial
+def _newton(ratios: Ratio, emissivity: float, work: Work) -> None:
+    """A step towards h(x) = q (eq. 6) with u(x) at hand; h' and the partial derivative too."""
+    emitted, other, slope, other_slope = work.emitted, work.other, work.slope, work.other_slope
     target, temperature = work.target, work.temperature
-    kernels.blackbody(model.first, temperature, emitted, slope, work.place)
-    kernels.blackbody(model.second, temperature, other, other_slope, work.place)
     one = ratios.weights[0] * emissivity
     two = ratios.weights[1] * (1.0 - ratios.ratio * (1.0 - emissivity))
     for t in range(target.size):
-        steepness[t] = one * slope[t] + two * other_slope[t]
-        partial[t] = other[t] + emissivity * (emitted[t] - other[t])
-        temperature[t] += (target[t] - one * emitted[t] - two * other[t]) / steepness[t]
+        steepness = one * slope[t] + two * other_slope[t]
+        work.steepness[t] = steepness
+        work.partial[t] = other[t] + emissivity * (emitted[t] - other[t])
+        temperature[t] += (target[t] - one * emitted[t] - two * other[t]) / steepness
 
 
 @compiled
-def _curve_variance(model: Model, kernel: Array, count: int, variance: float) -> float:
-    """Variance of a kernel's sum over the object's smoothed noise."""
-    total: float = 0.0
-    for j in range(count):
-        total += kernels.dot(model.object_part[j], kernel) ** 2
-    return variance * float(total)
+def _responses(model: Model, temperature: Array, work: Work) -> None:
+    """Signals u(T) and slopes u'(T) of both bands, in place."""
+    kernels.blackbody(model.first, temperature, work.emitted, work.slope)
+    kernels.blackbody(model.second, temperature, work.other, work.other_slope)
 
 
 @compiled
-def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[float, float]:
-    """Variance of the slope by a background that walks, and its bound; `emission.walk_variance`."""
-    degrees, frames = model.rising.shape
-    residual, weights, emitted = work.residual, work.weights, work.emitted
-    spectrum, curve = np.empty(degrees), np.empty(degrees)
-    share = weights.mean()
-    energy, product = 0.0, 0.0
-    for j in range(degrees):
-        total = 0.0
-        for t in range(frames):
-            total += model.rising[j, t] * residual[t] * weights[t]
-        spectrum[j], curve[j] = total / share, kernels.dot(model.rising[j], emitted)
-        energy += curve[j] ** 2
-        product += curve[j] * spectrum[j]
-    scale, expected, upper = 0.0, 0.0, 0.0
-    for j in range(degrees):
-        scale += curve[j] ** 2 / (j + 1.0) ** 2
-        spectrum[j] -= curve[j] * product / energy
-    for octave in range(len(emissions.OCTAVES)):
-        low, high, lost = emissions.OCTAVES[octave]
-        walk, last = 0.0, min(high - 1, degrees)
-        for j in range(low - 1, last):
-            noise = model.noise[0] ** 2 / share + (curve_variance if j + 1 < count else 0.0)
-            walk += (j + 1.0) ** 2 * (spectrum[j] ** 2 - noise)
-        freedom = last - (low - 1) - lost
-        if freedom > 0:
-            expected = max(expected, walk / freedom)
-            upper = max(upper, walk / freedom * model.widened[octave])
-    return scale / energy**2 * expected, scale / energy**2 * upper
-
-
-@compiled
-def _linear(
-    model: Model, ratios: Ratio, emissivity: float, scale: float, limit: float, work: Work
-) -> float:
-    """Variance of the slope by a linear drift, as `emission._linear_variance`."""
-    drift, frames, count = model.rising[0], work.first.size, ratios.order + model.steps
-    emitted, residual, weights = work.emitted, work.residual, work.weights
-    kernel, again = work.kernel, work.spare
-    kept, slope, size = weights, 0.0, 0.0
-    for last in range(2):
-        total, mean, middle, square, product = 0.0, 0.0, 0.0, 0.0, 0.0
-        for t in range(frames):
-            w = kept[t]
-            wu = w * emitted[t]
-            total += w
-            mean += wu
-            middle += w * drift[t]
-            square += wu * emitted[t]
-            product += wu * drift[t]
-        mean, middle = mean / total, middle / total
-        slope = (product - total * mean * middle) / (square - total * mean**2)
-        level, length, size = middle - slope * mean, 0.0, 0.0
-        for t in range(frames):
-            kernel[t] = kept[t] * (drift[t] - level - slope * emitted[t])
-            length += kernel[t] * drift[t]
-            size += kernel[t] * residual[t]
-        size /= length
-        for t in range(frames):
-            kernel[t] /= length
-        if last == 0:
-            inverse = 1.0 / (residuals.TUNING * scale)
-            for t in range(frames):
-                r = (residual[t] - size * (drift[t] - level - slope * emitted[t])) * inverse
-                inside = max(1.0 - r * r, 0.0)
-                again[t] = inside * inside
-            kept = again
-    variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
-    variance += emissivity**2 * _curve_variance(model, kernel, count, ratios.null_variance)
-    spread = drift.max() - drift.min()
-    before = max((limit / spread) ** 2, size**2 + variance)
-    share = before / (before + variance)
-    return float(slope**2 * share * (share * size**2 + variance))
-
-
-@compiled
-def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: Work) -> bool:
-    """Variance of the object, and whether the background hardly rests; see `emission.estimate`."""
-    count, null, noise = ratios.order + model.steps, ratios.null_variance, model.noise[0]
-    # Of eq. 6 by implicit differentiation, and what the residual of a frame of rest holds.
-    sensitivity, smooth_variance = work.sensitivity, work.smooth_variance
-    kernels.combined(model.object_part, work.coefficients[0], count, sensitivity)
-    resting, more = 0, 1.0 + log(work.first.size) / count
-    beside = (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
-    for t in range(work.first.size):
-        sensitivity[t] = (work.partial[t] - sensitivity[t]) / work.steepness[t]
-        smooth_variance[t] = model.leverage[ratios.order - 1, t] * null / work.steepness[t] ** 2
-        square = sensitivity[t] ** 2 * epsilon
-        expected = noise**2 + first**2 * (square + smooth_variance[t] * more)
-        resting += work.residual[t] ** 2 < emissions.WITHIN**2 * expected
-        work.variance[t] = square / beside + smooth_variance[t]
-    return resting < emissions.RESTING * work.first.size
-
-
-@compiled
-def _emission(model: Model, ratios: Ratio, work: Work) -> Emission:
-    """Steps 2 and 3, as `emission.estimate`; the rows that it leaves are named in `_pixel`."""
-    z, coefficients, material = work.first, work.coefficients, work.material
-    emitted, target = work.emitted, work.target
-    temperature, weights, residual = work.temperature, work.weights, work.residual
-    kernel, spare, place, few = work.kernel, work.spare, work.place, work.few
-    frames, noise, count = z.size, model.noise[0], ratios.order + model.steps
-    w, null = ratios.weights, ratios.null_variance
-    combined = w[0] * coefficients[0] + w[1] * coefficients[1]
-    kernels.combined(model.object_part, combined, count, target)
-    _temperature(model.second, target, temperature, work)
+def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
+    """Steps 2 and 3 in turns: the object (eq. 5, 6) and the first emissivity (eq. 7), in place."""
+    z, weights, temperature = work.first, work.weights, work.temperature
+    count, w, material = ratios.order + model.steps, ratios.weights, work.material
+    combined = w[0] * work.coefficients[0] + w[1] * work.coefficients[1]
+    kernels.combined(model.object_part, combined, count, work.target)
+    kernels.temperature(model.second, work.target, temperature)
     largest = max(1.0, ratios.ratio)
     middle = 0.5 * (1.0 + (largest - 1.0) / largest)
-    kernels.blackbody(model.first, temperature, emitted, spare, place)
-    weights[:] = 1.0
-    guess = kernels.moments(emitted, z, weights)[0]
+    # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
+    _responses(model, temperature, work)
+    guess = kernels.moments(work.emitted, z, work.ones)[0]
     emissivity = guess if 0 < guess < 1 else middle
-    _newton(model, ratios, emissivity, work)
+    _newton(ratios, emissivity, work)
     known = ratios.pooled and not np.isnan(material[2])
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
     for turn in range(emissions.ROUNDS):
-        kernels.blackbody(model.first, temperature, emitted, spare, place)
+        _responses(model, temperature, work)
         slope, variance, scale, energy = kernels.regress(
-            emitted, z, noise, weights, residual, few, turn > 0
+            work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
         )
-        constant = energy < emissions.OBJECT_TO_NOISE * count * null and not known
+        constant = energy < emissions.OBJECT_TO_NOISE * count * ratios.null_variance and not known
         emissivity = material[2] if known else middle if constant else slope
-        _newton(model, ratios, emissivity, work)
-    # The slope's variance, of the ordinate's noise, and of the abscissa's.
-    total, product, reflected, low, high = 0.0, 0.0, 0.0, np.inf, -np.inf
-    for t in range(frames):
-        total += weights[t]
-        product += weights[t] * emitted[t]
-        reflected += z[t] - emitted[t]
-        low, high = min(low, emitted[t]), max(high, emitted[t])
-    for t in range(frames):
-        kernel[t] = weights[t] * (emitted[t] - product / total) / energy
-    first = emissivity
-    noise_variance = variance + first**2 * _curve_variance(model, kernel, count, null)
-    walk, upper = _walk(model, first**2 * null, count, work)
-    limit = (1.0 - first) * model.drift
-    linear = _linear(model, ratios, first, scale, limit, work)
-    drift_variance = (limit / (high - low)) ** 2 + max(upper, linear)
-    if known:
-        noise_variance, drift_variance = material[3], material[4]
-    level = abs(reflected / frames) * sqrt(noise_variance + walk) / (1.0 - first) ** 2
-    widest = (model.highest - model.lowest) / sqrt(12.0)
-    level = widest if np.isnan(level) else min(level, widest)
-    level *= ratios.ratio * model.rate
-    by_level = w[1] * level
-    epsilon = ratios.inverse_energy * null + by_level**2
-    restless = _propagate(model, ratios, epsilon, first, work)
-    return Emission(
-        (first, 1.0 - ratios.ratio * (1.0 - first)),
-        _covariance(model, ratios, first, noise_variance + drift_variance, level),
-        epsilon,
-        level,
-        noise_variance,
-        drift_variance,
-        constant,
-        restless,
-    )
+        _newton(ratios, emissivity, work)
+    other = 1.0 - ratios.ratio * (1.0 - emissivity)
+    return Line((emissivity, other), variance, scale, energy, constant, known)
 
 
 @compiled
-def _covariance(
-    model: Model, ratios: Ratio, first: float, slope_variance: float, level: float
-) -> tuple[float, float, float]:
-    """Covariance of the emissivities (eq. 8), as `emission._emissivity_covariance`."""
-    k, w, energy = ratios.ratio, ratios.weights, ratios.inverse_energy
-    one, two, reflectivity = model.noise[0] ** 2, model.noise[1] ** 2, 1.0 - first
-    with_epsilon = two * w[1] - k * one * w[0]
-    variance = energy * (two + k**2 * one)
-    through, cross = (first * reflectivity) ** 2 * ratios.null_variance, first * reflectivity**2
-    a = slope_variance + through * energy
-    b = k * slope_variance + (k * through + cross * with_epsilon) * energy
-    d = k**2 * (slope_variance + through * energy) + 2.0 * cross * k * with_epsilon * energy
-    d += reflectivity**2 * variance
-    by_level = reflectivity * first * w[1] * level, reflectivity * (k * first * w[1] + 1.0) * level
-    return a + by_level[0] ** 2, b + by_level[0] * by_level[1], d + by_level[1] ** 2
-
-
-@compiled
-def _background(model: Model, ratios: Ratio, emission: Emission, work: Work) -> None:
-    """Step 4, as `emission.estimate_background` and `pattern_variances`, in place."""
-    z, other = work.first, work.second
-    emitted, second, slope, second_slope = (
-        work.emitted,
-        work.other_emitted,
-        work.slope,
-        work.second_slope,
-    )
-    temperature, background, mean, x = work.temperature, work.background, work.mean, work.place
-    of_object, variance = work.variance, work.background_variance
-    noise, pattern, w = model.noise, model.pattern, ratios.weights
-    (first, last), epsilon = emission.emissivity, emission.epsilon
-    one, two = ((1.0 - first) / noise[0]) ** 2, ((1.0 - last) / noise[1]) ** 2
-    precision = one + two
-    one, two = one / precision, two / precision
-    kernels.blackbody(model.first, temperature, emitted, slope, x)
-    kernels.blackbody(model.second, temperature, second, second_slope, x)
-    share = one * first / (1.0 - first) + two * last / (1.0 - last)
-    reflected, other_reflected = work.reflected, work.other_reflected
-    direct0, direct1 = one / (1.0 - first), two / (1.0 - last)
-    patterned = pattern[0] > 0.0 or pattern[1] > 0.0
+def background(model: Model, line: Line, work: Work) -> None:
+    """Step 4 (eq. 9), and the bend of the reflections (eq. 11), in place."""
+    z, other, mean, result, bend = work.first, work.second, work.mean, work.background, work.bend
+    at_object, other_at_object = work.at_object, work.other_at_object
+    kernels.blackbody(model.first, work.temperature, at_object, work.object_slope)
+    kernels.blackbody(model.second, work.temperature, other_at_object, work.other_object_slope)
+    first, last = line.emissivity
+    one, two = ((1.0 - first) / model.noise[0]) ** 2, ((1.0 - last) / model.noise[1]) ** 2
+    one, two = one / (one + two), two / (one + two)
+    inverse, other_inverse = 1.0 / (1.0 - first), 1.0 / (1.0 - last)
     for t in range(z.size):
-        reflected[t] = (z[t] - first * emitted[t]) / (1.0 - first)
-        other_reflected[t] = (other[t] - last * second[t]) / (1.0 - last)
-        mean[t] = one * reflected[t] + two * other_reflected[t]
-        variance[t] = 0.0
-    if patterned:
-        for t in range(z.size):
-            steepness = w[0] * first * slope[t] + w[1] * last * second_slope[t]
-            through = direct0 * first * slope[t] + direct1 * last * second_slope[t]
-            a, b = w[0] / steepness, w[1] / steepness
-            of_object[t] += (pattern[0] * a) ** 2 + (pattern[1] * b) ** 2
-            variance[t] = (pattern[0] * (direct0 - through * a)) ** 2
-            variance[t] += (pattern[1] * (direct1 - through * b)) ** 2
-    _temperature(model.first, mean, background, work)
-    kernels.blackbody(model.first, background, emitted, slope, x)
-    kernels.blackbody(model.second, background, second, second_slope, x)
-    covariance = 2.0 * noise[0] ** 2 * w[0] * ratios.inverse_energy
-    of_first = noise[0] ** 2 - 1.0 / (1.0 / noise[0] ** 2 + (ratios.ratio / noise[1]) ** 2)
-    steady = of_first * ratios.inverse_energy
-    steady += (emission.noise_variance + emission.drift_variance) / (1.0 - first) ** 2
+        reflected = (z[t] - first * at_object[t]) * inverse
+        work.reflected[t] = (other[t] - last * other_at_object[t]) * other_inverse
+        mean[t] = one * reflected + two * work.reflected[t]
+    # From the temperature of the mean signal, one Gauss-Newton step on the exact responses.
+    kernels.temperature(model.first, mean, result)
+    kernels.slopes(model.first, result, work.back_slope)
+    kernels.blackbody(model.second, result, bend, work.other_back_slope)
     for t in range(z.size):
-        a, b = slope[t], second_slope[t]
-        curvature = one * a**2 + two * b**2
-        step = one * a * (reflected[t] - emitted[t]) + two * b * (other_reflected[t] - second[t])
-        background[t] += step / curvature
-        contrast = background[t] - temperature[t]
-        through = contrast * first + share * work.sensitivity[t]
-        value = 1.0 / (precision * curvature) + share**2 * work.smooth_variance[t]
-        value += through * (through * epsilon - contrast * covariance)
-        value += contrast**2 * steady
-        reflected[t] = value
-    if patterned:
-        kernels.blackbody(model.first, background, emitted, slope, x)
-    for t in range(z.size):
-        variance[t] = reflected[t] + variance[t] / slope[t] ** 2
-
-
-@compiled
-def solve(model: Model, work: Work) -> tuple[Ratio, Emission]:
-    """Steps 1 to 4, and the bend of the reflections (eq. 11) in the work space."""
-    ratios = _ratios(model, work)
-    emission = _emission(model, ratios, work)
-    _background(model, ratios, emission, work)
-    first, last = emission.emissivity
-    bend, finite = work.bend, 0.0
-    kernels.blackbody(model.first, work.background, work.emitted, work.slope, work.place)
-    kernels.blackbody(model.second, work.background, work.other_emitted, work.slope, work.place)
+        a, b = work.back_slope[t], work.other_back_slope[t]
+        reflected = (z[t] - first * at_object[t]) * inverse
+        step = one * a * (reflected - mean[t]) + two * b * (work.reflected[t] - bend[t])
+        result[t] += step / (one * a**2 + two * b**2)
+    kernels.blackbody(model.second, result, bend, work.spare)
+    kernels.blackbody(model.first, result, mean, work.spare)
+    finite = 0.0
     for t in range(bend.size):
-        bend[t] = (1.0 - last) * (work.other_emitted[t] - work.emitted[t])
+        bend[t] = (1.0 - last) * (bend[t] - mean[t])
         finite += bend[t] * 0.0
     if not (0 < first < 1 and 0 < last < 1 and finite == 0):
         bend[:] = 0.0
-    return ratios, emission

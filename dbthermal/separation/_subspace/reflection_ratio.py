@@ -48,6 +48,7 @@ class ReflectionRatio:
     reduced_chi2: Array  # variance across the axis over the noise's, 1 if the model holds (pixel)
     coefficients: Array  # of the signals on the functions, 0 beyond the order (band, column, pixel)
     scatter: Array  # noise-whitened scatter of rapid changes less noise (band, band, pixel) [1]
+    rapid_scatter: Array  # the same at the `rapid_orders` (2, band, band, pixel) [1]
     pooled: Mask  # the material's ratios are used, and the pixel does not contradict them (pixel)
 
 
@@ -107,6 +108,7 @@ def estimate(
     if material is not None:
         inverse = np.where(pooled, material.inverse_energy, inverse)
     weights, variance = null_combination(ratio, noise)
+    rapid, unit = rapid_orders(functions.orders) - 1, np.eye(len(noise))[..., np.newaxis]
     contrast = np.full(order.shape, np.inf)
     np.divide(largest[-1] * others, null_energy[-1], out=contrast, where=null_energy[-1] > 0)
     return ReflectionRatio(
@@ -119,29 +121,20 @@ def estimate(
         contrast=contrast,
         reduced_chi2=null_energy[order, rows] / (others * free),
         coefficients=coefficients * noise[:, np.newaxis, np.newaxis] * functions.columns(order + 1),
-        scatter=np.moveaxis(chosen, 0, -1) - free * np.eye(len(noise))[..., np.newaxis],
+        scatter=np.moveaxis(chosen, 0, -1) - free * unit,
+        rapid_scatter=np.moveaxis(scatter[rapid], 1, -1) - freedom[rapid][..., None, None] * unit,
         pooled=pooled,
     )
 
 
-def rapid_orders(functions: smooth.Subspace) -> Whole:
-    """Two large orders (2,): that of all functions, and before it of a few less."""
-    return np.array([max(1, functions.orders - FEWER), functions.orders])
-
-
-def rapid_scatter(signals: Array, functions: smooth.Subspace, noise: Array) -> Array:
+def rapid_orders(orders: int) -> Whole:
     """
-    Noise-whitened scatter less noise (2, band, band, pixel), of what the largest orders leave.
+    Two large orders (2,): that of all functions, and before it of a few less.
 
     What the order of one pixel leaves of its object, unseen in its noise, adds up over the pixels
     of a material.
     """
-    whitened = signals / noise[:, np.newaxis, np.newaxis]
-    coefficients = np.einsum("tc,btp->bcp", functions.functions, whitened, optimize=True)
-    orders = rapid_orders(functions)
-    scatter = _scatter(whitened, coefficients, functions.steps)[orders - 1]
-    freedom = (signals.shape[1] - functions.steps - orders).reshape(2, 1, 1, 1)
-    return np.asarray(np.moveaxis(scatter, 1, -1) - freedom * np.eye(len(noise))[..., np.newaxis])
+    return np.array([max(1, orders - FEWER), orders])
 
 
 def principal_ratio(scatter: Array, noise: Array) -> Array:

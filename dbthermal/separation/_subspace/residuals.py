@@ -16,7 +16,7 @@ from scipy.special import chdtri, ndtri
 
 from dbthermal import _smooth as smooth
 from dbthermal.separation._subspace.reflection_ratio import CHANCE, ReflectionRatio
-from dbthermal.separation._tiles import Array, Mask, Whole
+from dbthermal.separation._tiles import Array, Mask, Pixels, Whole
 
 Precision = TypeVar("Precision", np.float32, np.float64)
 
@@ -52,7 +52,7 @@ _BLOCK: Final = 9
 
 
 @dataclass(frozen=True)
-class Line:
+class Line(Pixels):
     """Straight line fitted to each pixel's points."""
 
     slope: Array  # (pixel)

@@ -5,9 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal._arrays import Array
 from dbthermal.separation._subspace import kernels
-
-Array = npt.NDArray[np.float64]
 
 
 class Model(NamedTuple):
@@ -18,6 +17,7 @@ class Model(NamedTuple):
     functions: Array  # (column, time), of `smooth.Subspace`
     object_part: Array  # (column, time)
     rising: Array  # (degree, time)
+    spread: float  # of the first of these
     leverage: Array  # (order, time)
     steps: int
     noise: tuple[float, float]  # [K]
@@ -39,32 +39,39 @@ class Work(NamedTuple):
     first: Array  # signals [K]
     second: Array
     straight: Array  # the second less the bend of the reflections
-    emitted: Array
-    other_emitted: Array
+    ones: Array
+    target: Array  # null combination of the bands, smoothed (eq. 5)
+    temperature: Array  # of the object [K]
+    emitted: Array  # signals of the object at the last regression, and their slopes
+    other: Array
     slope: Array
-    second_slope: Array
-    place: Array
-    steepness: Array
+    other_slope: Array
+    steepness: Array  # see `emission._Fit`
     partial: Array
-    target: Array
-    temperature: Array
-    weights: Array
+    weights: Array  # of the regression
     residual: Array
     kernel: Array
     spare: Array
-    variance: Array
+    at_object: Array  # signals of the object, and their slopes
+    other_at_object: Array
+    object_slope: Array
+    other_object_slope: Array
+    mean: Array  # signal of the background
+    reflected: Array  # of the second band
+    background: Array  # [K]
+    back_slope: Array
+    other_back_slope: Array
+    bend: Array  # of the reflections (eq. 11), and as it was taken out
+    removed: Array
+    sensitivity: Array  # see `emission.Emission`
     smooth_variance: Array
-    sensitivity: Array
-    background: Array
+    variance: Array  # of the object, and of the background [K^2]
     background_variance: Array
-    bend: Array
     null_residual: Array
-    change: Array
     rapid: Array
-    reflected: Array
-    other_reflected: Array
-    mean: Array
     few: Any  # in single precision (6, time)
     coefficients: Array  # of the signals on the functions (2, column)
+    columns: Array  # (column)
+    spectrum: Array  # (column)
     scatter: Array  # see `reflection_ratio`, first, mixed and last element (order, 3)
     material: Array  # ratio, inverse energy, emissivity, its two variances; NaN for none

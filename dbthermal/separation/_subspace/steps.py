@@ -37,11 +37,12 @@ class Solution(Pixels):
     null_weights: Array
     null_variance: Array
     order: Whole
+    freedom: Whole  # frames less the functions used (pixel)
     contrast: Array
     reduced_chi2: Array
     pooled: Mask
     scatter: Array
-    rapid_scatter: Array  # see `reflection_ratio.rapid_scatter`
+    rapid_scatter: Array
     emissivity: Array  # see `emission.Emission` for this and what follows
     emissivity_covariance: Array
     epsilon_variance: Array
@@ -64,7 +65,7 @@ def solve(
 
     With the limit of the background's `drift` [K], and the `least` bend that matters.
     """
-    result, bend = _steps(tile, tile, functions, drift)
+    result, bend, line = _steps(tile, tile, functions, drift)
     part, removed, places = tile, np.zeros(1), np.arange(result.gray.size)
     for _ in range(emissions.BENDS):
         change = bend - removed
@@ -78,8 +79,9 @@ def solve(
         signals = part.signals.copy()
         signals[1:] -= removed
         straight = replace(part, signals=signals)
-        again, bend = _steps(part, straight, functions, drift, result.gray[places])
-        result = result.replace_pixels(places, again)
+        line = line.select_pixels(bent)
+        again, bend, line = _steps(part, straight, functions, drift, result.gray[places], line)
+        result.replace_pixels(places, again)
     return result
 
 
@@ -89,7 +91,8 @@ def _steps(
     functions: smooth.Subspace,
     drift: float,
     gray: Mask | None = None,
-) -> tuple[Solution, Array]:
+    start: residuals.Line | None = None,
+) -> tuple[Solution, Array, residuals.Line]:
     """
     Steps 1 to 4, the first three on signals whose reflections are proportional; and the bend.
 
@@ -102,7 +105,7 @@ def _steps(
         temperature = np.linspace(curve.lowest, curve.highest, reflection_ratio.TEMPERATURES)
         slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
         gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
-    emission = emissions.estimate(straight, functions, ratios, drift)
+    emission = emissions.estimate(straight, functions, ratios, drift, start)
     background, variance = emissions.estimate_background(tile, emission, ratios)
     of_object, of_background = emissions.pattern_variances(tile, emission, ratios, background)
     films = np.stack([emission.temperature, background])
@@ -116,6 +119,7 @@ def _steps(
     free = 1.0 - functions.leverage()[:, ratios.order - 1]
     common = ratios.null_weights[0] * noise[0] ** 2 * free
     curves = np.stack([residual, functions.object_part @ smoothed])
+    parts = vars(ratios) | vars(emission)
     solution = Solution(
         object_temperature=values[0, 0],
         object_temperature_std=values[1, 0],
@@ -124,28 +128,13 @@ def _steps(
         missing=np.isnan(films).sum(axis=1),
         lost=lost.sum(axis=1),
         beyond=np.any(beyond, axis=1),
-        ratio=ratios.ratio,
         ratio_variance=ratios.variance + emission.level_std**2,
-        inverse_energy=ratios.inverse_energy,
-        null_weights=ratios.null_weights,
-        null_variance=ratios.null_variance,
-        order=ratios.order,
-        contrast=ratios.contrast,
-        reduced_chi2=ratios.reduced_chi2,
-        pooled=ratios.pooled,
-        scatter=ratios.scatter,
-        rapid_scatter=reflection_ratio.rapid_scatter(signals, functions, noise),
-        emissivity=emission.emissivity,
-        emissivity_covariance=emission.emissivity_covariance,
-        epsilon_variance=emission.epsilon_variance,
-        noise_variance=emission.noise_variance,
-        drift_variance=emission.drift_variance,
-        constant=emission.constant,
-        restless=emission.restless,
+        freedom=frames - functions.steps - ratios.order,
         gray=gray,
         correlation=residuals.autocorrelation(residual),
         delay=residuals.interband_delay(residual, signals[0], functions, ratios, noise[0]),
         unexplained=residuals.unexplained(residual, rapid, ratios.null_variance, common),
         sums=np.add.reduceat(curves, pieces.blocks(frames)[:-1], axis=1),
+        **{name: parts[name] for name in parts if name in Solution.__dataclass_fields__},
     )
-    return solution, emissions.bend(tile, emission, background)
+    return solution, emissions.bend(tile, emission, background), emission.line

@@ -1,0 +1,319 @@
+"""Recordings of FLIR's cameras: counts, clock, and what the camera's record says."""
+
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from itertools import islice
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import _text as texts
+from dbthermal.readers import _flir_records as container
+from dbthermal.readers import _recording as recordings
+from dbthermal.readers._decoding import MEMORY
+from dbthermal.readers._flir_records import Content, Frame
+from dbthermal.readers._recording import Clock, Counts, FileFlag, Mask, Paths
+
+# Place in the camera's record [byte], type, and limits beyond which a value is implausible.
+_FIELDS: Final = {
+    "emissivity": (0x20, "f", 0.01, 1.0),
+    "object_distance": (0x24, "f", 0.0, 1e4),
+    "reflected_temperature": (0x28, "f", 173.0, 373.0),
+    "atmospheric_temperature": (0x2C, "f", 200.0, 340.0),
+    "window_temperature": (0x30, "f", 200.0, 340.0),
+    "window_transmission": (0x34, "f", 0.01, 1.0),
+    "relative_humidity": (0x3C, "f", 0.0, 1.0),
+    "planck_R1": (0x58, "f", 1.0, 1e9),
+    "planck_B": (0x5C, "f", 500.0, 10000.0),
+    "planck_F": (0x60, "f", 0.1, 10.0),
+    "planck_O": (0x308, "i", -65536, 65536),
+    "planck_R2": (0x30C, "f", 1e-6, 1e6),
+    "range_max": (0x90, "f", 200.0, 4000.0),
+    "range_min": (0x94, "f", 70.0, 2000.0),
+    "frame_rate": (0x464, "H", 1, 1000),
+}
+_TEXTS: Final = {
+    "camera_model": (0xD4, 32),
+    "camera_part_number": (0xF4, 16),
+    "camera_serial_number": (0x104, 16),
+    "camera_software": (0x114, 16),
+    "lens_model": (0x170, 32),
+    "lens_part_number": (0x190, 16),
+    "lens_serial_number": (0x1A0, 16),
+    "filter_model": (0x1EC, 16),
+    "filter_part_number": (0x1FC, 32),
+    "filter_serial_number": (0x21C, 32),
+}
+_TIME: Final = 0x384  # whole seconds since 1970 UTC, milliseconds
+_CAMERA_SIZE: Final = 0x466
+_IMAGE_SIZE: Final = 32  # of what precedes the counts
+_NUMBER: Final = 24  # place of the frame's number, in image and camera
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_FIRST_CLOCK: Final = datetime(2001, 1, 1, tzinfo=UTC).timestamp()  # clocks never set begin before
+_CONSTANTS: Final = ("planck_R1", "planck_R2", "planck_B", "planck_F", "planck_O")
+
+
+class _Image(NamedTuple):
+    """Counts as a file holds them: numbers as they are, or compressed by a codec of FFmpeg."""
+
+    shape: tuple[int, int]
+    order: str  # of the bytes, as numpy writes it; "" if a codec gives numbers
+    codec: str
+    body: bytes
+
+
+def flir(
+    path: Paths,
+    *,
+    frames: slice | None = None,
+    clock: Clock | None = None,
+    byte_order: str | None = None,
+    memory: float = MEMORY,
+) -> xr.Dataset:
+    """Counts of a FLIR recording or radiometric picture: .fff, .seq, .csq or .jpg.
+
+    The counts are those of the file. Emissivity, distance, reflected and atmospheric temperature
+    that somebody entered into the camera are shown as attributes and never applied;
+    `calibration.maker_response` makes a response of the maker's Planck constants.
+
+    The bytes of an image are in the order that its header states; in a PNG FLIR's cameras have
+    swapped them, against its standard. In the right order an image is smoother: that decides for
+    PNG, and is held against the header.
+
+    A record with a checksum (JPEG) must fit it. FLIR's sequences have none: a damaged pixel or, in
+    JPEG-LS, one flipped bit in ten changes counts without complaint, as it would in any copy.
+
+    Parameters
+    ----------
+    path : str, Path or sequence
+        Regular file, or the files of one camera in the order of time, such as pictures.
+    frames : slice, optional
+        Frames to read, not negative; of a long or damaged recording only those are looked at.
+    clock : float or array_like, optional
+        Frame rate [Hz] or time of each frame [s], in place of the file's times.
+    byte_order : {"little", "big"}, optional
+        Order of an image's bytes, in place of what is decided.
+    memory : float
+        Largest memory that the counts may take [byte]; refused before it is taken.
+
+    Returns
+    -------
+    Dataset
+        `counts` (time, y, x) [count], uint16; `exposure_time` (time) [s] since the first frame, by
+        the camera's clock (milliseconds), NaN where it stands; `frame_flags` (time), which mark
+        lost frames, by gaps of the clock, and images that are not of their frame's time. Attributes: ``start`` (UTC), ``source``, ``format``,
+        ``byte_order`` and ``byte_order_by``, ``implausible`` (values of the file that no
+        thermographer means), and the camera's record as ``file_...``, temperatures in K, distance
+        in m, rate in Hz.
+
+    Raises
+    ------
+    FileNotFoundError
+        If a file does not exist.
+    ImportError
+        If an image is compressed and PyAV, the extra ``video``, is not installed.
+    ValueError
+        If a file is no FLIR recording, damaged or truncated, or takes too much memory; frames
+        differ in size or in the maker's constants; the byte order is unclear or contradicts the
+        image; the counts have 8 bits; or the times are unknown or fall.
+
+    Examples
+    --------
+    >>> from dbthermal import readers
+    >>> readers.flir("recording.ravi")
+    Traceback (most recent call last):
+    ValueError: Refused 'recording.ravi': export its counts as 16-bit TIFF with the maker's program and use readers.tiff.
+    """  # noqa: E501
+    paths = recordings.files(path)
+    name = recordings.label(paths)
+    wanted = frames or slice(None)
+    with ExitStack() as stack:
+        try:
+            selected = islice(_walk(paths, memory, stack), wanted.start, wanted.stop, wanted.step)
+        except ValueError as error:
+            raise ValueError(f"Invalid frames {frames}. Must be >= 0, and the step > 0.") from error
+        listed = [*selected]
+        if not listed:
+            raise ValueError(f"No frames {frames} in '{name}'. Must select at least one.")
+        form = _image(*listed[0])._replace(body=b"")
+        recordings.check_memory((len(listed), *form.shape), memory, name)
+        counts = np.empty((len(listed), *form.shape), dtype=np.uint16)
+        for number, found in enumerate(listed):
+            image = _image(*found)
+            if image._replace(body=b"") != form:
+                unlike = f"{image.shape}, {image.codec} of {found[-1]}"
+                raise ValueError(f"Invalid image {unlike}. Must be {form.shape}, {form.codec}.")
+            if byte_order is not None and image.order:
+                image = image._replace(order=recordings.byte_order(name, byte_order))
+            counts[number] = _decoded(image, found[-1])
+        seconds, same, attrs = _cameras(listed)
+    order, by = _order(counts, form, byte_order, name)
+    flags = np.where(same, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
+    seconds = np.where(same, seconds, np.nan)
+    if clock is not None:
+        seconds = recordings.stamps(clock, len(counts), name)
+    about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
+    about |= {"byte_order_by": by, **attrs}
+    return recordings.recording(counts, seconds, name, about, flags)
+
+
+_Found = tuple[Content, Frame, str]
+
+
+def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_Found]:
+    """Yield content, records and name of each frame of some files."""
+    for path in paths:
+        content: Content = stack.enter_context(
+            mmap(stack.enter_context(path.open("rb")).fileno(), 0, access=ACCESS_READ)
+        )
+        if content[:2] == b"\xff\xd8":
+            texts.regular_file(path, int(memory))
+            content = container.of_jpeg(content, path.name)
+        number = 0
+        try:
+            for records in container.frames(content, path.name):
+                yield content, records, f"frame {number} of '{path.name}'"
+                number += 1
+        except ValueError as error:
+            before = f" Those before it: frames=slice(0, {number})." if number else ""
+            raise ValueError(f"{error}{before}") from error
+
+
+def _image(content: Content, records: Frame, place: str) -> _Image:
+    """Form and bytes of an image, whose sizes agree in all places that state them."""
+    body = container.body(content, records[container.IMAGE], place)
+    head, body = body[:_IMAGE_SIZE], body[_IMAGE_SIZE:]
+    order = {b"\2\0": "<", b"\0\2": ">"}.get(head[:2])
+    if order is None or len(head) < _IMAGE_SIZE:
+        raise ValueError(f"Damaged image in {place}: it begins with {head[:2]!r}. Must be 2.")
+    width, height = struct.unpack_from(f"{order}HH", head, 2)
+    image = _Image((height, width), order, "none", body)
+    stated = (height, width, 16)
+    if body[:8] == _PNG:
+        image = image._replace(order="", codec="png")
+        columns, rows, bits, *_ = struct.unpack_from(">IIB", body.ljust(25), 16)
+        stated = (rows, columns, bits)
+    elif body[:2] == b"\xff\xd8":
+        image = image._replace(order="", codec="jpegls")
+        stated = _jpegls_size(body, place)
+    elif len(body) != 2 * width * height:
+        found = f"{len(body)} bytes of counts in {place}"
+        raise ValueError(f"Truncated or damaged {found}. Must be 2 x {width} x {height}.")
+    if stated != (height, width, 16) or not width * height:
+        found = f"{stated[0]} x {stated[1]} pixels of {stated[2]} bits in {place}"
+        raise ValueError(f"Invalid {found}. Must be {height} x {width} of 16, as its header says.")
+    return image
+
+
+def _jpegls_size(body: bytes, place: str) -> tuple[int, int, int]:
+    """Height, width and bits that a JPEG-LS image states, which must be whole."""
+    if not body.rstrip(b"\0").endswith(b"\xff\xd9"):
+        raise ValueError(f"Truncated image in {place}: no end of JPEG. Must be whole.")
+    for marker, start, _ in container.segments(body, place):
+        if marker == 0xF7:
+            bits, height, width, _ = struct.unpack_from(">BHHB", body, start)
+            return height, width, 16 if bits > 8 else bits  # in 16, which FFmpeg does not scale
+    raise ValueError(f"Invalid JPEG in {place}, of 8 bits. Must be JPEG-LS: record 16-bit counts.")
+
+
+def _decoded(image: _Image, place: str) -> Counts:
+    """Counts (y, x) of an image; ValueError where its codec finds damage."""
+    if image.codec == "none":
+        return np.frombuffer(image.body, f"{image.order}u2").reshape(image.shape)
+    av = recordings.optional("av", "video")
+    codec = av.CodecContext.create(image.codec, "r")
+    largest = 4 * image.shape[0] * image.shape[1] + 2**16  # with what FFmpeg adds to each side
+    codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(largest)}
+    codec.thread_count = 1
+    try:
+        pictures = [*codec.decode(av.Packet(image.body)), *codec.decode(None)]
+    except av.FFmpegError as error:
+        raise ValueError(f"Damaged image in {place}: '{error}'. Must decode.") from error
+    sizes = [(one.height, one.width) for one in pictures if not one.is_corrupt]
+    if sizes != [image.shape] or not pictures[0].format.name.startswith("gray16"):
+        raise ValueError(f"Damaged image in {place}: {sizes}. Must be one of {image.shape}.")
+    return np.asarray(pictures[0].to_ndarray(), dtype=np.uint16)
+
+
+def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple[str, str]:
+    """Byte order of the counts, which are swapped in place if need be, and what decided it."""
+    if form.codec == "jpegls":
+        return "none: numbers are coded", "codec"
+    found = next((sign for frame in counts if (sign := recordings.smoother(frame))), 0)
+    if stated is None and (found < 0 if form.order else found == 0):
+        raise ValueError(
+            f"Unclear byte order in '{name}': its images are smoother with their bytes swapped, or "
+            "as smooth. Must be stated: byte_order='little' or 'big'."
+        )
+    if form.order:
+        order = {"<": "little", ">": "big"}[form.order] if stated is None else stated
+        return order, "caller" if stated else "header"
+    swap = found < 0 if stated is None else recordings.byte_order(name, stated) == "<"
+    if swap:  # a PNG has its highest byte first
+        counts.byteswap(inplace=True)
+    return "little" if swap else "big", "caller" if stated else "smoothness"
+
+
+def _cameras(listed: Sequence[_Found]) -> tuple[npt.NDArray[np.float64], Mask, dict[str, Any]]:
+    """Times (time) [s], agreement of the numbers (time), attributes, of the camera's records.
+
+    Image and camera begin with the same 32 bytes, of which two number the frame: different ones
+    mean that one of the two is of another frame. From frame to frame they may rise by any number.
+    """
+    same = np.ones(len(listed), dtype=bool)
+    milliseconds, first = np.full(len(listed), np.nan), dict[str, Any]()
+    for number, (content, records, place) in enumerate(listed):
+        if container.CAMERA not in records:
+            continue
+        body = container.body(content, records[container.CAMERA], place)
+        if len(body) < _CAMERA_SIZE or body[:2] not in {b"\2\0", b"\0\2"}:
+            found = f"record of the camera in {place}, {len(body)} bytes from {body[:2]!r}"
+            raise ValueError(f"Damaged {found}. Must be {_CAMERA_SIZE} at least, and begin with 2.")
+        order = "<" if body[0] else ">"
+        place_of = records[container.IMAGE].start + _NUMBER
+        same[number] = content[place_of : place_of + 2] == body[_NUMBER : _NUMBER + 2]
+        whole, thousandths = struct.unpack_from(f"{order}II", body, _TIME)
+        if whole:
+            milliseconds[number] = whole * 1000 + (thousandths & 0xFFFF)
+        camera = {
+            key: struct.unpack_from(order + code, body, start)[0]
+            for key, (start, code, *_) in _FIELDS.items()
+        }
+        first = first or camera | {"body": body}
+        for key in _CONSTANTS:
+            if camera[key] != first[key]:
+                change = f"{key} {camera[key]:g} of {place}, {first[key]:g} before"
+                rule = "Must be one range of the camera: select its frames by frames="
+                raise ValueError(f"Invalid {change}. {rule}.")
+    known = milliseconds[np.isfinite(milliseconds)][:1]
+    attrs = _attrs(first, *known / 1000) if first else {"implausible": ""}
+    return (milliseconds - (known if known.size else 0)) / 1000, same, attrs
+
+
+def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, Any]:
+    """Attributes of a camera's record: its values as written, and those that cannot be meant."""
+    body, attrs, implausible = camera.pop("body"), dict[str, Any](), list[str]()
+    for key, value in camera.items():
+        _, code, low, high = _FIELDS[key]
+        # The shortest number that is this one of 32 bit: 0.95, not 0.949999988.
+        number = float(str(np.float32(value))) if code == "f" else int(value)
+        if not low <= number <= high:
+            celsius = f" K ({number - 273.15:.1f} degrees Celsius)" if "temp" in key else ""
+            implausible.append(f"{key} {number:g}{celsius}")
+        if np.isfinite(number):
+            attrs[f"file_{key}"] = number
+    for key, (start, size) in _TEXTS.items():
+        text = body[start : start + size].partition(b"\0")[0].decode("latin-1")
+        attrs[f"file_{key}"] = "".join(letter for letter in text if letter.isprintable())
+    if seconds is not None:
+        moment = datetime.fromtimestamp(seconds, UTC)
+        attrs["start"] = moment.isoformat(timespec="milliseconds")
+        if seconds < _FIRST_CLOCK:
+            implausible.append(f"date {moment:%Y-%m-%d}, as of a clock that was never set")
+    return {"implausible": "; ".join(implausible), **attrs}

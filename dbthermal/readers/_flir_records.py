@@ -1,0 +1,131 @@
+"""Container of FLIR's recordings: its records, found by their directory, never by their mark.
+
+A frame is a header of 64 bytes (mark, maker of the file, at 20 the version, whose size tells the
+byte order, at 24 place and length of the directory), a directory of 32 bytes a record (type,
+subtype, version, number, at 12 offset and length, at 28 a CRC-32, 0 for none) and the records.
+Frames follow one another, zeros between. In a JPEG they lie in the joined APP1 segments that begin
+with ``FLIR``. Read from files, and from the table of P. Harvey's ExifTool (FLIR.pm).
+"""
+
+import re
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from mmap import mmap
+from typing import Final, NamedTuple
+
+IMAGE: Final = 1
+CAMERA: Final = 32
+
+_MARKS: Final = (b"FFF\0", b"AFF\0")
+_HEADER, _ENTRY = 64, 32  # sizes [byte]
+_MOST_RECORDS: Final = 1024  # in a frame; the files at hand have up to 14
+_PADDING: Final = 32  # by which the last record of a file may seem to pass its end [byte]
+_SEGMENT: Final = b"FLIR\0\x01"
+_NO_ZERO: Final = re.compile(rb"[^\0]")
+
+Content = bytes | mmap
+
+
+class Record(NamedTuple):
+    """Place of a record in its file [byte], and its CRC-32, 0 for none."""
+
+    start: int
+    stop: int
+    checksum: int
+
+
+Frame = Mapping[int, Record]  # record by its type
+
+
+def frames(content: Content, name: str) -> Iterator[Frame]:
+    """Yield the records of each frame of a file; ValueError by frame and byte where damaged."""
+    at, number = 0, 0
+    while (following := _NO_ZERO.search(content, at)) or number == 0:
+        at = following.start() if number and following else 0
+        place = f"frame {number} of '{name}', at byte {at}"
+        records, at = _frame(content, at, place)
+        yield records
+        number += 1
+
+
+def body(content: Content, record: Record, place: str) -> bytes:
+    """Bytes of a record, whose checksum, if it has one, must be right."""
+    value = content[record.start : record.stop]
+    if record.checksum and zlib.crc32(value) != record.checksum:
+        found = f"CRC-32 {zlib.crc32(value):08x} of a record of {place}"
+        raise ValueError(f"Damaged file: {found}. Must be {record.checksum:08x}, as listed.")
+    return value
+
+
+def segments(content: Content, name: str) -> Iterator[tuple[int, int, int]]:
+    """Yield (marker, start, stop) of the segments of a JPEG, up to its compressed data."""
+    at = 2
+    while content[at : at + 2] not in {b"\xff\xda", b"\xff\xd9"}:
+        if content[at : at + 2] == b"\xff\xff":  # a fill byte
+            at += 1
+            continue
+        head = content[at : at + 4]
+        length = int.from_bytes(head[2:])
+        if len(head) < 4 or head[0] != 0xFF or length < 2 or at + 2 + length > len(content):
+            rule = "Must be a marker and the length of a segment"
+            raise ValueError(f"Damaged JPEG '{name}': {head.hex()} at byte {at}. {rule}.")
+        yield head[1], at + 4, at + 2 + length
+        at += 2 + length
+
+
+def of_jpeg(content: Content, name: str) -> bytes:
+    """Container that the APP1 segments of a radiometric JPEG hold, joined."""
+    parts = [
+        content[start:stop]
+        for marker, start, stop in segments(content, name)
+        if marker == 0xE1 and content[start : start + len(_SEGMENT)] == _SEGMENT
+    ]
+    if not parts:
+        raise ValueError(
+            f"No thermal data of FLIR in '{name}', an ordinary JPEG or one of another maker. Must "
+            "be a radiometric JPEG; else export 16-bit counts as TIFF and use readers.tiff."
+        )
+    numbers = [tuple(part[6:8]) for part in parts]
+    if numbers != [(i, numbers[0][-1]) for i in range(numbers[0][-1] + 1)] or len(parts[-1]) < 8:
+        found = f"FLIR segments {[i for i, *_ in numbers]}"
+        raise ValueError(f"Damaged JPEG '{name}': {found}. Must be whole and in order.")
+    return b"".join(part[8:] for part in parts)
+
+
+def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
+    """Records of the frame that begins at a byte, and the byte after its last one."""
+    size = len(content)
+    if (mark := content[at : at + 4]) not in _MARKS or at + _HEADER > size:
+        raise ValueError(f"Invalid header {mark!r} of {place}. Must be FLIR's: 'FFF' or 'AFF'.")
+    orders = [o for o in "><" if 100 <= struct.unpack_from(f"{o}I", content, at + 20)[0] < 200]
+    if not orders:
+        version = content[at + 20 : at + 24].hex()
+        raise ValueError(f"Invalid version {version} of {place}. Must be from 100 to 199.")
+    directory, count = struct.unpack_from(f"{orders[0]}II", content, at + 24)
+    listed = directory + _ENTRY * count
+    if directory < _HEADER or count > _MOST_RECORDS or at + listed > size:
+        found = f"directory of {count} records at {directory} of {place}"
+        rule = f"Must be in the file, and of {_MOST_RECORDS} at most"
+        raise ValueError(f"Damaged file: {found}. {rule}.")
+    records, spans = {}, [(directory, listed)]
+    for entry in range(directory, listed, _ENTRY):
+        kind, *_, start, length, _, _, checksum = struct.unpack_from(
+            f"{orders[0]}HHIIIIIII", content, at + entry
+        )
+        if not kind or not length:
+            continue
+        spans.append((start, start + length))
+        if kind in {IMAGE, CAMERA} and kind in records:
+            raise ValueError(f"Repeated record of type {kind} in {place}. Must be listed once.")
+        records[kind] = Record(at + start, min(at + start + length, size), checksum)
+    spans.sort()
+    stops = [_HEADER, *(stop for _, stop in spans)]
+    for before, (start, stop) in zip(stops, spans, strict=False):
+        if start < before or at + stop > size + _PADDING:
+            found = f"record from {start} to {stop} of {place}"
+            rule = f"Must follow {before}, and end within the {size - at} bytes left"
+            raise ValueError(f"Truncated or damaged file: {found}. {rule}.")
+    if IMAGE not in records:
+        raise ValueError(f"Missing image in {place}. Has records {sorted(records)}.")
+    return records, min(at + stops[-1], size)

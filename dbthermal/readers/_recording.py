@@ -1,0 +1,165 @@
+"""Parts that all readers of recordings share: files, byte order, clock, and the Dataset made."""
+
+import re
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import _text as texts
+from dbthermal import schema
+
+Counts = npt.NDArray[np.uint16]
+Mask = npt.NDArray[np.bool_]
+Paths = str | Path | Sequence[str | Path]
+Clock = float | npt.ArrayLike
+
+_EXPORT: Final = "export its counts as 16-bit TIFF with the maker's program and use readers.tiff"
+_RECORD: Final = "its 8 bits are drawn, not measured: record 16-bit counts (readers.palette_video)"
+_REFUSED: Final = {
+    **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".sfmov"), _EXPORT),
+    **dict.fromkeys((".mp4", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".png", ".gif"), _RECORD),
+}
+_LARGEST: Final = 2**46  # of a file that is not read at once [byte]
+# A step of the clock longer than this many frame periods tells of a lost frame.
+_GAP: Final = 1.5
+# An image is smoother than with its bytes swapped, by this factor, or the order is not known.
+_SMOOTHER: Final = 2.0
+
+
+class FileFlag(schema.Flags):
+    """State of a frame of a file."""
+
+    FRAMES_LOST_BEFORE = 1, "the step of the clock is longer than 1.5 frame periods"
+    TIME_STANDS = 2, "the time does not rise, or is not known"
+    PADDED = 4, "no frame: the band has fewer than another, and its last one is repeated"
+    NUMBERS_DIFFER = 8, "image and time are of frames of different numbers"
+
+
+def files(path: Paths) -> list[Path]:
+    """Regular files of a recording, in the order of time; ValueError by what to do instead."""
+    paths = [Path(path)] if isinstance(path, str | Path) else [Path(one) for one in path]
+    if not paths:
+        raise ValueError("Empty list of files. Must name at least one.")
+    numbers = [[int(digits) for digits in re.findall("[0-9]+", one.stem)] for one in paths]
+    for before, after, one in zip(numbers, numbers[1:], paths[1:], strict=False):
+        if len(before) == len(after) and after <= before:
+            rule = "Must rise: 'frame10' comes after 'frame9', which the order of text does not"
+            raise ValueError(f"Unordered files: the numbers of '{one.name}' do not rise. {rule}.")
+    for one in paths:
+        if one.suffix.lower() in _REFUSED:
+            raise ValueError(f"Refused '{one.name}': {_REFUSED[one.suffix.lower()]}.")
+        if texts.regular_file(one, _LARGEST).stat().st_size == 0:
+            raise ValueError(f"Empty file '{one.name}'. Must hold at least one frame.")
+    return paths
+
+
+def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
+    """Raise ValueError if counts (time, y, x) take more memory than is allowed."""
+    if len(shape) != 3 or min(shape) < 1:
+        raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x).")
+    frames, height, width = map(int, shape)
+    if (needed := 2 * (frames + 3) * height * width) > memory:  # 3 while one is decoded
+        raise ValueError(
+            f"Invalid size of '{name}': {frames} frames of {height} x {width} pixels take "
+            f"{needed:.3g} bytes. Must be at most memory={memory:.3g}."
+        )
+
+
+def smoother(frame: Counts) -> int:
+    """Byte order in which a frame is clearly smoother: 1 as it is, -1 swapped, 0 unclear."""
+    as_is, swapped = _roughness(frame), _roughness(frame.byteswap())
+    return int(_SMOOTHER * as_is < swapped) - int(_SMOOTHER * swapped < as_is)
+
+
+def _roughness(frame: Counts) -> float:
+    values = frame.astype(np.int32)
+    return sum(float(np.abs(np.diff(values, axis=axis)).sum()) for axis in (0, 1))
+
+
+def byte_order(name: str, value: str) -> str:
+    """Byte order as numpy writes it, of 'little' or 'big'."""
+    if value not in {"little", "big"}:
+        raise ValueError(f"Invalid byte_order '{value}' for '{name}'. Must be 'little' or 'big'.")
+    return "<" if value == "little" else ">"
+
+
+def stamps(clock: Clock, frames: int, name: str) -> npt.NDArray[np.float64]:
+    """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s]."""
+    values = np.asarray(clock, dtype=np.float64)
+    if values.ndim == 0:
+        if not 0 < values < np.inf:
+            raise ValueError(f"Invalid clock {values} of '{name}'. Must be a positive rate in Hz.")
+        return np.arange(frames) / float(values)
+    if values.shape != (frames,) or not np.all(np.isfinite(values)):
+        found = f"clock of shape {values.shape} for {frames} frames of '{name}'"
+        raise ValueError(f"Invalid {found}. Must be a rate in Hz, or one finite time each in s.")
+    return np.asarray(values - values[0])
+
+
+def recording(
+    counts: Counts,
+    seconds: npt.NDArray[np.float64],
+    name: str,
+    attrs: Mapping[str, Any],
+    flags: npt.NDArray[np.uint16] | None = None,
+) -> xr.Dataset:
+    """Dataset of one band: `counts` (time, y, x), its clock and flags; see `readers.flir`."""
+    if not np.any(counts & 0xFF) or not np.any(counts >> 8):
+        raise ValueError(
+            f"Invalid counts of '{name}': one of their two bytes is always 0, as in pictures of 8 "
+            "bits or with automatic gain. Must be 16-bit counts of the detector: record those."
+        )
+    (known,) = np.nonzero(np.isfinite(seconds))
+    steps = np.diff(seconds[known])
+    if np.any(steps < 0):
+        place = known[1:][steps < 0][0]
+        found = f"frame {place} is {-steps[steps < 0][0]:.3f} s before the one that precedes it"
+        rule = "Must rise; else give the times as clock="
+        raise ValueError(f"Unordered times in '{name}': {found}. {rule}.")
+    known = np.delete(known, 1 + np.flatnonzero(steps == 0))
+    stands = ~np.isin(np.arange(seconds.size), known)
+    exposed = np.where(stands, np.nan, seconds)
+    if known.size < min(2, seconds.size):
+        raise ValueError(
+            f"Unknown times in '{name}': {known.size} of {seconds.size} frames have one. Must be "
+            "given: clock= is the frame rate [Hz], or the time of each frame [s]."
+        )
+    flags = np.zeros(seconds.size, dtype=np.uint16) if flags is None else flags
+    flags[stands] |= FileFlag.TIME_STANDS.value
+    period = np.median(np.diff(exposed[known]) / np.diff(known)) if known.size > 1 else 1.0
+    late = np.diff(exposed[known]) > _GAP * period * np.diff(known)
+    flags[known[1:][late]] |= FileFlag.FRAMES_LOST_BEFORE.value
+    variables = {
+        "counts": (("time", "y", "x"), counts, schema.STAGES["capture"]["counts"].attrs),
+        "exposure_time": ("time", exposed - exposed[known[0]], schema.EXPOSURE_TIME.attrs),
+        "frame_flags": ("time", flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)),
+    }
+    time = filled(exposed, period)
+    coordinate = ("time", time - time[0], schema.COORDINATES["time"].attrs)
+    return xr.Dataset(variables, {"time": coordinate}, {"origin": "measured", **attrs})
+
+
+def filled(exposed: npt.NDArray[np.float64], period: float) -> npt.NDArray[np.float64]:
+    """Times [s] of all frames, unknown ones (NaN) on the line between their neighbours."""
+    slots, (known,) = np.arange(exposed.size), np.nonzero(np.isfinite(exposed))
+    outside = slots - np.clip(slots, known[0], known[-1])
+    return np.asarray(np.interp(slots, known, exposed[known]) + period * outside)
+
+
+def label(paths: Sequence[Path]) -> str:
+    """Name of some files in a message."""
+    return paths[0].name if len(paths) == 1 else f"{paths[0].name} to {paths[-1].name}"
+
+
+def optional(module: str, extra: str) -> Any:
+    """Library of an extra; ImportError in one line if it is not installed."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        command = f"python -m pip install 'dbthermal[{extra}]'"
+        raise ImportError(f"Missing library '{module}'. Must be installed: {command}.") from error

@@ -1,0 +1,1 @@
+"""Separation of frames as they come: the stream, what it remembers, and compiled arithmetic."""

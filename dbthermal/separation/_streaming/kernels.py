@@ -1,0 +1,333 @@
+"""Compiled arithmetic of a stream: frames into means, and both into temperatures, row by row.
+
+Planes (y, x) are in single precision, and the loops along a row are taken many pixels at once.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from math import sqrt
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from dbthermal.schema import LARGEST, Status
+from dbthermal.separation._subspace import emission as emissions
+from dbthermal.separation._subspace import kernels
+from dbthermal.separation._subspace.kernels import Table, compiled
+from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS
+
+Planes = npt.NDArray[np.float32]
+
+# Deviations within which narrower fits agree with a wider one; see `_frames`.
+_AGREE: Final = 1.5
+_ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+_NAN, _SIGMAS, _LARGEST = np.float32(np.nan), np.float32(RANGE_SIGMAS), np.float32(LARGEST)
+_NEWTON: Final = 3  # steps towards the object
+_UNDEFINED: Final = int(Status.NO_BACKGROUND_MOTION | Status.GRAY | Status.INVALID_SAMPLES)
+_BEYOND: Final = np.uint32(Status.OUTSIDE_RESPONSE)
+_AMBIGUOUS: Final = int(Status.CONSTANT_OBJECT | Status.ROLES_MAY_BE_SWAPPED)
+
+
+class Camera(NamedTuple):
+    """Both bands: responses, and what turns counts into signals; the quietest band first."""
+
+    first: Table
+    second: Table
+    counts: tuple[float, float]  # of the reference temperature [count]
+    slopes: tuple[float, float]  # [count/K]
+    noise: tuple[float, float]  # of one frame [K]
+    pattern: tuple[float, float]  # [K]
+    lowest: float  # calibrated temperatures [K]
+    highest: float
+
+
+class Fit(NamedTuple):
+    """Local polynomials over the means around one, from the narrowest to the widest."""
+
+    weights: npt.NDArray[np.float64]  # of the means in value and slope (fit, 2, mean) [1, 1/s]
+    variance: npt.NDArray[np.float64]  # of the value, over that of a frame (fit)
+    time: npt.NDArray[np.float64]  # of the frames about the mean's time (frame) [s]
+
+
+class Block(NamedTuple):
+    """Frames of one mean, and what is known of their pixels."""
+
+    frames: Planes  # (band, frame, y, x) [count]
+    means: Planes  # around them (mean, band, y, x) [count]
+    order: npt.NDArray[np.intp]  # places of these, by time
+    maps: Planes  # ratio, its variance, emissivities, elements of their covariance (map, y, x)
+    gain: Planes  # noise of the second band over that of a frame (y, x)
+
+
+class Result(NamedTuple):
+    """Temperatures of the frames, and scratch rows; separate, so that none is taken to overlap."""
+
+    status: npt.NDArray[np.uint32]  # (y, x)
+    films: Planes  # object, deviation, background, deviation (film, frame, y, x) [K]
+    line: tuple[Planes, ...]  # terms of each pixel, see `_object`
+    out: tuple[Planes, ...]  # films of a frame, and if they are out of range
+
+
+ROWS: Final = (18, 5)
+"""Numbers of the scratch rows."""
+
+
+@compiled
+def _add(one: Any, two: Any, total: Any, other: Any, number: Any) -> None:
+    """Add a frame's row to the sums, and to the number of samples that are numbers in both."""
+    for x in range(one.size):
+        good = abs(one[x]) < _LARGEST and abs(two[x]) < _LARGEST
+        total[x] += one[x] if good else _ZERO
+        other[x] += two[x] if good else _ZERO
+        number[x] += _ONE if good else _ZERO
+
+
+@compiled
+def _absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
+    """
+    Means (band, y, x) of frames (band, frame, y, x) [count], in place; NaN of less than half.
+
+    A sample counts if it is a number in both bands.
+    """
+    width = frames.shape[3]
+    total, other = np.empty(width, np.float32), np.empty(width, np.float32)
+    number = np.empty(width, np.float32)
+    for y in range(top, stop):
+        total[:], other[:], number[:] = 0.0, 0.0, 0.0
+        for f in range(frames.shape[1]):
+            _add(frames[0, f, y], frames[1, f, y], total, other, number)
+        for x in range(width):
+            enough = 2 * number[x] >= frames.shape[1]
+            mean[0, y, x] = total[x] / number[x] if enough else np.nan
+            mean[1, y, x] = other[x] / number[x] if enough else np.nan
+
+
+@compiled
+def _bridge(means: Any) -> bool:
+    """Fill means (band, mean) that are NaN by lines between their neighbours; false if too many."""
+    size, missing = means.shape[1], 0
+    for i in range(size):
+        if np.isnan(means[0, i]) or np.isnan(means[1, i]):
+            missing += 1
+            before, after = i - 1, i + 1
+            while after < size and (np.isnan(means[0, after]) or np.isnan(means[1, after])):
+                after += 1
+            if before < 0 and after == size:
+                return False
+            for band in range(2):
+                if before < 0:
+                    means[band, i] = means[band, after]
+                elif after == size:
+                    means[band, i] = means[band, before]
+                else:
+                    step = means[band, after] - means[band, before]
+                    means[band, i] = means[band, before] + step / (after - before)
+    return bool(3 * missing <= size)
+
+
+@compiled
+def _fitted(means: Any, fit: Fit, w: tuple[float, float], null: float, found: Any) -> float:
+    """
+    Value and slope (band, 2) of the widest fit that agrees with all narrower ones, in place.
+
+    The variance of the null combination's value; see `_frames`.
+    """
+    low, high, variance = -np.inf, np.inf, np.nan
+    for j in range(fit.variance.size):
+        one0, one1, two0, two1 = 0.0, 0.0, 0.0, 0.0
+        for i in range(means.shape[1]):
+            value, slope = fit.weights[j, 0, i], fit.weights[j, 1, i]
+            one0 += value * means[0, i]
+            one1 += slope * means[0, i]
+            two0 += value * means[1, i]
+            two1 += slope * means[1, i]
+        combined, deviation = w[0] * one0 + w[1] * two0, sqrt(null * fit.variance[j])
+        low, high = (
+            max(low, combined - _AGREE * deviation),
+            min(high, combined + _AGREE * deviation),
+        )
+        if j > 0 and low > high:
+            break
+        found[0, 0], found[0, 1], found[1, 0], found[1, 1] = one0, one1, two0, two1
+        variance = null * fit.variance[j]
+    return variance
+
+
+@compiled
+def _object(
+    camera: Camera,
+    found: Any,
+    maps: Any,
+    noise: tuple[float, float],
+    variance: float,
+    e: tuple[float, float],
+    line: Any,
+    x: int,
+) -> None:
+    """Object, and the terms of its frames' background, of a pixel (eq. 6, 9 and 10)."""
+    k, first, last = maps[0], e[0], e[1]
+    w = -k / (1.0 - k), 1.0 / (1.0 - k)
+    one, two = w[0] * first, w[1] * last
+    target = w[0] * found[0, 0] + w[1] * found[1, 0]
+    table, other = camera.first, camera.second
+    t = kernels.polynomial(other.inverse, (target - other.middle_signal) / other.half_signal)
+    u, v, du, dv, steepness = 0.0, 0.0, 0.0, 0.0, 1.0
+    for _ in range(_NEWTON + 1):
+        p, q = (t - table.middle) / table.half, (t - other.middle) / other.half
+        u, v = kernels.polynomial(table.signal, p), kernels.polynomial(other.signal, q)
+        du, dv = kernels.polynomial(table.slope, p), kernels.polynomial(other.slope, q)
+        steepness = one * du + two * dv
+        step = (target - one * u - two * v) / steepness
+        t += step
+    u, v = u + du * step, v + dv * step
+    p = (t - table.middle) / table.half
+    # Eq. 6 by implicit differentiation, as in `emission`.
+    sensitivity = (v + first * (u - v) - found[0, 0]) / steepness
+    epsilon = w[1] ** 2 * maps[1]
+    through = sensitivity**2 * epsilon / (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
+    smooth = variance / steepness**2
+    patterned = camera.pattern[0] * w[0] / steepness, camera.pattern[1] * w[1] / steepness
+    std = sqrt(through + smooth + patterned[0] ** 2 + patterned[1] ** 2)
+    good = abs(p) <= 1.0 and std < USELESS
+    line[0][x] = t if good else np.nan
+    line[1][x] = (w[0] * found[0, 1] + w[1] * found[1, 1]) / steepness
+    line[2][x] = std if good else np.nan
+    # The background of eq. 9 with its variance, by the emissivities and their covariance:
+    # d u(y) = sum_m p_m (y - x) / (1 - e_m) de_m - r dx, dx = sum_m a_m de_m.
+    rest = found[0, 0] - first * u, found[1, 0] - last * v
+    scale = 1.0 / ((last - first) * steepness)
+    a = ((1.0 - last) * u - rest[1]) * scale, (rest[0] - (1.0 - first) * v) * scale
+    weight = ((1.0 - first) / noise[0]) ** 2, ((1.0 - last) / noise[1]) ** 2
+    total = weight[0] + weight[1]
+    direct = weight[0] / total / (1.0 - first), weight[1] / total / (1.0 - last)
+    share = direct[0] * first + direct[1] * last
+    slope = direct[0] * first * du + direct[1] * last * dv
+    offset0 = camera.pattern[0] * direct[0] - slope * patterned[0]
+    offset1 = camera.pattern[1] * direct[1] - slope * patterned[1]
+    physical = 0 < first < 1 and 0 < last < 1
+    line[3][x], line[4][x] = direct if physical else (np.nan, np.nan)
+    line[5][x], line[6][x] = first * u, first * du * line[1][x]
+    line[7][x], line[8][x] = last * v, last * dv * line[1][x]
+    line[9][x], line[10][x] = share * a[0], share * a[1]
+    line[11][x], line[12][x] = 1.0 / total, share**2 * smooth + offset0**2 + offset1**2
+    line[13][x], line[14][x] = weight[0] / total, weight[1] / total
+    for i in range(3):
+        line[15 + i][x] = maps[4 + i]
+
+
+@compiled
+def _blank(line: Any, x: int) -> None:
+    for row in line:
+        row[x] = np.nan
+
+
+@compiled
+def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -> None:
+    """Temperatures of a row of one frame, their deviations, and if they are in range, in place."""
+    table, other = camera.first, camera.second
+    for x in range(one.size):
+        z0 = (one[x] - camera.counts[0]) / camera.slopes[0]
+        z1 = (two[x] - camera.counts[1]) / camera.slopes[1]
+        valid = _ZERO * (z0 + z1)  # NaN where one is none
+        r0, r1 = (
+            line[3][x] * (z0 - line[5][x] - line[6][x] * dt),
+            line[4][x] * (z1 - line[7][x] - line[8][x] * dt),
+        )
+        guess = (r0 + r1 - table.middle_signal) / table.half_signal
+        t = kernels.polynomial(table.inverse, guess)
+        # One Gauss-Newton step of eq. 9.
+        p, q = (t - table.middle) / table.half, (t - other.middle) / other.half
+        du, dv = kernels.polynomial(table.slope, p), kernels.polynomial(other.slope, q)
+        curvature = line[13][x] * du * du + line[14][x] * dv * dv
+        step = du * (r0 - line[13][x] * kernels.polynomial(table.signal, p))
+        step += dv * (r1 - line[14][x] * kernels.polynomial(other.signal, q))
+        x_now, y_now = line[0][x] + line[1][x] * dt + valid, t + step / curvature
+        contrast = y_now - x_now
+        c0, c1 = line[3][x] * contrast - line[9][x], line[4][x] * contrast - line[10][x]
+        variance = line[11][x] / curvature + line[12][x]
+        variance += c0 * (c0 * line[15][x] + _TWO * c1 * line[16][x]) + c1 * c1 * line[17][x]
+        y_std = np.sqrt(variance) + (_ZERO if abs(p) <= _ONE else _NAN)
+        out[0][x], out[1][x] = x_now, line[2][x] + valid
+        out[2][x], out[3][x] = y_now + _ZERO * y_std, y_std
+        wide, y_wide = _SIGMAS * line[2][x], _SIGMAS * y_std
+        high = (x_now > camera.highest + wide) | (y_now > camera.highest + y_wide)
+        low = (x_now < camera.lowest - wide) | (y_now < camera.lowest - y_wide)
+        out[4][x] = _ONE if high | low else out[4][x]
+
+
+@compiled
+def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, work: Any) -> None:
+    """Terms of one pixel of a row, NaN where the object is not defined; see `_object`."""
+    line, here, found, pixel = work
+    size = block.order.size
+    if (status & _UNDEFINED) != 0 or (status & _AMBIGUOUS) == _AMBIGUOUS:
+        _blank(line, x)
+        return
+    for i in range(7):
+        pixel[i] = block.maps[i, y, x]
+    for i in range(size):
+        for band in range(2):
+            signal = block.means[block.order[i], band, y, x] - camera.counts[band]
+            here[band, i] = signal / camera.slopes[band]
+    bridged = _bridge(here)
+    k, noise = pixel[0], (camera.noise[0], camera.noise[1] * block.gain[y, x])
+    first, last = pixel[2], pixel[3]
+    if np.isnan(first):  # of a constant object, as in `emission`
+        largest = max(1.0, k)
+        first = 0.5 * (1.0 + (largest - 1.0) / largest)
+        last = 1.0 - k * (1.0 - first)
+    w = -k / (1.0 - k), 1.0 / (1.0 - k)
+    null = (w[0] * noise[0]) ** 2 + (w[1] * noise[1]) ** 2
+    variance = _fitted(here, fit, w, null, found)
+    _object(camera, found, pixel, noise, variance, (first, last), line, x)
+    if not bridged:
+        _blank(line, x)
+
+
+@compiled
+def _emit(
+    block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
+) -> None:
+    """Films of the frames of one mean, and in the status the calibrated range, in place.
+
+    With the camera's numbers in double and in single precision.
+    """
+    line, out, films = result.line, result.out, result.films
+    work = line, np.empty((2, block.order.size)), np.empty((2, 2)), np.empty(7)
+    for y in range(top, stop):
+        for x in range(films.shape[3]):
+            _terms(block, fit, camera, y, result.status[y, x], x, work)
+        out[4][:] = 0.0
+        for f in range(films.shape[1]):
+            one, two = block.frames[0, f, y], block.frames[1, f, y]
+            _frame(one, two, line, fine, np.float32(fit.time[f]), out)
+            for film in range(4):
+                films[film, f, y] = out[film]
+        for x in range(films.shape[3]):
+            result.status[y, x] |= _BEYOND if out[4][x] > 0.0 else np.uint32(0)
+
+
+def _kept(digest: str) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Both functions, compiled once for sources of one digest; see `fused`."""
+
+    @njit(nogil=True, error_model="numpy")
+    def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
+        if digest:
+            _absorb(frames, mean, top, stop)
+
+    @njit(nogil=True, error_model="numpy")
+    def emit(
+        block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
+    ) -> None:
+        if digest:
+            _emit(block, fit, camera, fine, result, top, stop)
+
+    with suppress(RuntimeError):  # without a folder that may be written each process compiles
+        absorb.enable_caching()
+        emit.enable_caching()
+    return absorb, emit
+
+
+absorb, emit = _kept(kernels.DIGEST)

@@ -1,0 +1,448 @@
+"""Separation while the cameras run: frames in, temperatures and reflections out a second later."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import planck, schema
+from dbthermal import response as responses
+from dbthermal.schema import Status
+from dbthermal.separation import _displaced as displaced
+from dbthermal.separation import _inputs
+from dbthermal.separation import _quality as quality
+from dbthermal.separation._streaming import kernels
+from dbthermal.separation._streaming.history import APART, History
+from dbthermal.separation._subspace import kernels as tables
+from dbthermal.separation._subspace.method import METHOD
+from dbthermal.separation._subspace.steps import FILMS
+
+if TYPE_CHECKING:
+    from dbthermal.separation._subspace.method import SubspaceSettings
+
+Array = npt.NDArray[np.float64]
+Planes = npt.NDArray[np.float32]
+
+_PARTS: Final = 5  # means over the latency
+# Latencies before and after a frame that its object is smoothed over, and the degree of the fit.
+_WINDOWS: Final = ((0.0, 0.0, 1), (0.5, 0.5, 1), (2.0, 1.0, 2), (4.0, 1.0, 2))
+_LOST: Final = 1.5  # intervals between frames, from which some are lost
+_GLANCE: Final = 24  # pixels along the shorter side, by which a frame is told from another
+_ROWS: Final = 16  # that a thread takes at once
+_KEPT: Final = ("origin", "radiometric", "source", "twin")
+
+
+class Stream:
+    r"""
+    Live separation of two bands: frames in as they come, temperatures out a fixed time later.
+
+    Of each pixel a history of 64 to 128 samples is kept, which are means of more and more frames,
+    and beside it the frames of the last `latency`. The history is separated as by `solve` with
+    the method "subspace", but without its pieces for rapid objects, some rows of the image at a
+    time: reflection ratios, emissivities and `status`. With these the object is the combination of
+    bands without background (eq. 5 and 6 of "subspace"), smoothed by a parabola over four
+    latencies before and one after, or over less where that does not agree; the background is that
+    of every frame (eq. 9). The first object compiles, which takes some seconds.
+
+    Parameters
+    ----------
+    template : Dataset
+        Stage `corrected` of `schema`, one frame or more: its bands, sizes, coordinates, and where
+        present its `status`, `pattern_std` and `noise_factor` are those of the stream.
+    response : Dataset
+        From `calibration.fit_response`, with `noise`.
+    frame_rate : float
+        Frames of each band in a second [Hz].
+    latency : float
+        Age of a frame when its temperatures are known, about [s].
+    memory : float
+        Time that is remembered, at least [s]; at most four times as long.
+    refresh : float
+        Time in which all rows are separated anew [s].
+    settings : SubspaceSettings, optional
+        Options of the method "subspace".
+    reflection_shift : Dataset, optional
+        From `alignment.reflection_shift`: the second camera's frames are resampled where they show
+        the same reflection. The object is taken to be as warm in both places.
+    response_kind : {"exact", "linear"}
+        As for `solve`.
+    workers : int
+        Number of threads.
+
+    Attributes
+    ----------
+    bands : tuple of str
+        Names of the bands, as in the template.
+    is_ready : bool
+        True once temperatures are known.
+    lost_frames : int
+        Frames that did not come, by the times of the others, or were of no use.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `solve`, for a template or a response that is not as described; if the bands are not two,
+        the response has no noise, or a number is not positive.
+
+    Notes
+    -----
+    With weights :math:`a_i` of the means in the parabola, the object's variance is that through
+    the ratio, as in `solve`, and :math:`\sum_i a_i^2 \, \mathrm{var}(q_i) / h'^2`. A change of the
+    reflection is told as well as from all frames if it lasts longer than a sample of the history;
+    a sample at the detector's limit, or frozen, if it lasts for three.
+
+    Examples
+    --------
+    Plate glass that warms up while people walk by, simulated, a frame at a time:
+
+    >>> import numpy as np, xarray as xr
+    >>> from dbthermal import simulation
+    >>> rig, rng = simulation.Rig(), np.random.default_rng(1)
+    >>> glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    >>> scene = simulation.walkers(np.arange(300) / 10, (4, 6), glass, rng)
+    >>> capture = simulation.observe(scene, rig.response(), rng)
+    >>> stream = Stream(capture.isel(time=[0]), rig.response(), frame_rate=10.0)
+    >>> for time, frame in zip(capture["time"], capture["counts"].transpose("time", ...)):
+    ...     live = stream.update(float(time), frame.values)
+    >>> live = stream.result()
+    >>> error = live["object_temperature"] - scene["object_temperature"]
+    >>> bool(abs(error).where(live["status"] == 0).median() < 0.3)  # K
+    True
+    """
+
+    def __init__(  # noqa: PLR0913 - all but the first two by name
+        self,
+        template: xr.Dataset,
+        response: xr.Dataset,
+        *,
+        frame_rate: float,
+        latency: float = 1.25,
+        memory: float = 30.0,
+        refresh: float = 15.0,
+        settings: "SubspaceSettings | None" = None,
+        reflection_shift: xr.Dataset | None = None,
+        response_kind: str = "exact",
+        workers: int = 2,
+    ) -> None:
+        numbers = {"frame_rate [Hz]": frame_rate, "latency [s]": latency, "memory [s]": memory}
+        for name, value in {**numbers, "refresh [s]": refresh, "workers": workers}.items():
+            planck.require_positive(name, value)
+        known: dict[str, Any] = dict.fromkeys(("emissivity", "emissivity_std", "mask", "pool"))
+        known |= {"settings": settings, "seed": 0, "response_kind": response_kind}
+        known |= {"reflection_shift": reflection_shift}
+        two = replace(METHOD, minimum_frames=1, any_bands=False)
+        inputs = _inputs.check(template, response, two, "stream", **known)
+        self.bands = tuple(curve.band for curve in inputs.curves)
+        responses.noise(response, list(self.bands))
+        # From here on the quietest band is the first one.
+        self._order, template = inputs.bands, template.isel(band=inputs.bands)
+        inputs = _inputs.check(template, response, two, "stream", **known)
+        self._template, self._kind = template.isel(time=0, drop=True), response_kind
+        self._shape = shape = (template.sizes["y"], template.sizes["x"])
+        self._camera = _camera(inputs)
+        self._fine = _single(self._camera)
+        self._status, self._gain = np.zeros(shape, np.uint32), np.ones(shape, np.float32)
+        if "status" in template:
+            self._status |= template["status"].values.astype(np.uint32)
+        self._resample = list[Any]()
+        if inputs.displacement is not None:
+            self._pair(inputs.displacement)
+        self._rate, self._block = frame_rate, max(1, round(frame_rate * latency / _PARTS))
+        self._half = half = max(1, int(frame_rate * latency / self._block) - 1)
+        timing = self._block / frame_rate, memory, refresh
+        inputs = replace(inputs, displacement=None)
+        self._history = History(inputs, self._status, self._gain, self._block, timing)
+        # The frames that wait, and the means around them [count]; their times [s], and segments.
+        self._frames = np.empty((half + 1, 2, self._block, *shape), np.float32)
+        self._means = np.empty((int(_WINDOWS[-1][0] + 1) * half + 1, 2, *shape), np.float32)
+        self._frame_times = np.empty((half + 1, self._block))
+        self._mean_times = np.empty((2, 0))
+        self._blocks, self._filled, self._now, self._segment = 0, 0, -np.inf, 0
+        self._glance: Planes = np.empty(0, np.float32)
+        self.lost_frames = 0
+        self._threads = ThreadPoolExecutor(int(workers))
+        self._result = self._dataset([], [], self._history.status)
+        self._warm()
+
+    @property
+    def is_ready(self) -> bool:
+        """True once temperatures are known."""
+        return self._result.sizes["time"] > 0
+
+    @property
+    def latency(self) -> float:
+        """Age of a frame when its temperatures become known, at most [s]."""
+        return (self._half + 1) * self._block / self._rate
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the state, which does not grow [byte]."""
+        history, own = self._history, (self._frames, self._means, self._gain, self._status)
+        return sum(part.nbytes for part in (*own, history.samples, history.maps, history.status))
+
+    def update(
+        self, time: npt.ArrayLike, frames: npt.NDArray[np.floating], *, segment: int = 0
+    ) -> xr.Dataset:
+        """
+        Take one frame of both bands, or several, and return the temperatures that became known.
+
+        Parameters
+        ----------
+        time : array_like
+            When the frame was exposed, or each of the frames (time) [s].
+        frames : ndarray
+            Corrected counts (band, y, x) or (band, time, y, x) [count], the bands as in the
+            template. A sample that is NaN is left out. A frame is lost if a band of it has no
+            number, or repeats the frame before.
+        segment : int
+            Number of shutter events before the frames.
+
+        Returns
+        -------
+        Dataset
+            Stage `separated` of `schema`, of the frames a `latency` ago, with
+            `emissivity_covariance`; of no frames while none became known. Emissivities and
+            `status` are those of now, and attribute `lost_frames` counts all that were lost.
+
+        Raises
+        ------
+        TypeError
+            If the frames are not floating: raw counts.
+        ValueError
+            If their shape is another one, a time is no number or does not rise, or the segment
+            falls.
+        """
+        times, counts = self._checked(time, frames, segment)
+        known, films, status = [], [], self._history.status
+        for now, frame in zip(times.tolist(), counts.swapaxes(0, 1), strict=True):
+            if not self._take(now, frame):
+                continue
+            self._absorb()
+            self._history.refresh(self._apply)
+            if self._history.solved and self._blocks > self._half:
+                time, block, status = self._emit()
+                known.append(time)
+                films.append(block)
+        if known:
+            self._result = self._dataset(known, films, status)
+            return self._result
+        return self._result.isel(time=slice(0)).assign_attrs(lost_frames=self.lost_frames)
+
+    def result(self) -> xr.Dataset:
+        """
+        Return what the last `update` returned that made any temperatures known.
+
+        Returns
+        -------
+        Dataset
+            As from `update`.
+
+        Raises
+        ------
+        ValueError
+            If none are known yet.
+        """
+        if not self.is_ready:
+            least = METHOD.minimum_frames * self._block
+            raise ValueError(
+                f"Missing frames: {self._blocks * self._block} came, and no temperatures are "
+                f"known. Must be at least {least}."
+            )
+        return self._result
+
+    def _checked(self, time: npt.ArrayLike, frames: Any, segment: int) -> tuple[Array, Planes]:
+        """Times (time) and frames (band, time, y, x), the quietest band first."""
+        times, counts = np.asarray(time, dtype=np.float64), np.asarray(frames)
+        if counts.dtype.kind != "f":
+            raise TypeError(
+                f"Invalid dtype {counts.dtype} of the frames: raw counts. Must be floating: "
+                "corrected by correction.correct."
+            )
+        expected = (2, *times.shape, *self._shape)
+        if times.ndim > 1 or counts.shape != expected:
+            raise ValueError(
+                f"Invalid shape {counts.shape} of the frames, at times of shape {times.shape}. "
+                f"Must be {expected}: bands, times if they are several, rows and columns."
+            )
+        times = times.reshape(-1)
+        before = np.concatenate([[self._now], times[:-1]])
+        bad = ~((times > before) & np.isfinite(times))
+        if np.any(bad):
+            place = int(np.argmax(bad))
+            raise ValueError(
+                f"Invalid time {times[place]} s of a frame, after {before[place]} s. Must rise."
+            )
+        if segment < self._segment:
+            raise ValueError(f"Invalid segment {segment} after {self._segment}. Must not fall.")
+        if segment > self._segment:  # a mean is of one segment
+            self._segment, self._filled = int(segment), 0
+        counts = counts.reshape(2, -1, *self._shape)
+        return times, counts if self._order[0] == 0 else counts[::-1]
+
+    def _take(self, now: float, frame: Planes) -> bool:
+        """Take a frame (band, y, x) into the block that is being filled; true if it is full."""
+        since = (now - self._now) * self._rate
+        if _LOST < since < np.inf:
+            self.lost_frames += round(since) - 1
+        if since > APART * self._block:
+            self._filled = 0
+        self._now = now
+        step = max(1, min(self._shape) // _GLANCE)
+        glance = frame[:, ::step, ::step].copy()
+        same = any(map(np.array_equal, glance, self._glance))
+        self._glance = glance
+        if same or not np.isfinite(glance).any(axis=(1, 2)).all():
+            self.lost_frames += 1
+            return False
+        slot = self._blocks % len(self._frames)
+        self._frame_times[slot, self._filled] = now
+        target = self._frames[slot, :, self._filled]
+        target[...] = frame
+        if self._resample:
+            other = np.where(quality.unusable(self._status), 0.0, frame[1]).ravel()
+            parts = self._threads.map(lambda part: part @ other, self._resample)
+            target[1] = np.concatenate([*parts]).reshape(self._shape)
+        self._filled = (self._filled + 1) % self._block
+        return self._filled == 0
+
+    def _absorb(self) -> None:
+        """Take the full block: its mean into those of now and into the history."""
+        slot, place = self._blocks % len(self._frames), self._blocks % len(self._means)
+        frames, mean, time = self._frames[slot], self._means[place], self._frame_times[slot].mean()
+        self._apply(lambda rows: kernels.absorb(frames, mean, rows.start, rows.stop), self._rows())
+        self._mean_times = np.column_stack([self._mean_times, (time, self._segment)])
+        self._mean_times = self._mean_times[:, -len(self._means) :]
+        self._history.add(mean, float(time), self._segment)
+        self._blocks += 1
+
+    def _emit(self) -> tuple[Array, Planes, quality.Bits]:
+        """Times, films (film, frame, y, x) and status of the block that has its latency now."""
+        slot = (self._blocks - 1 - self._half) % len(self._frames)
+        times, means = self._frame_times[slot].copy(), self._mean_times.shape[1]
+        order = np.arange(self._blocks - means, self._blocks) % len(self._means)
+        films = np.empty((4, self._block, *self._shape), np.float32)
+        status = self._history.status.copy()
+        fit = self._fit(means - 1 - self._half, times)
+        self._apply(
+            lambda rows: self._temperatures(slot, order, fit, films, status, rows), self._rows()
+        )
+        return times, films, status
+
+    def _temperatures(
+        self,
+        slot: int,
+        order: npt.NDArray[np.intp],
+        fit: kernels.Fit,
+        films: Planes,
+        status: quality.Bits,
+        rows: slice,
+    ) -> None:
+        """Films and status of some rows of a block, in place."""
+        maps = self._history.maps
+        block = kernels.Block(self._frames[slot], self._means, order, maps, self._gain)
+        scratch = (tuple(np.empty((n, self._shape[1]), np.float32)) for n in kernels.ROWS)
+        result = kernels.Result(status, films, *scratch)
+        kernels.emit(block, fit, self._camera, self._fine, result, rows.start, rows.stop)
+
+    def _warm(self) -> None:
+        """Compile all that frames need, before the first one comes."""
+        kernels.absorb(self._frames[0], self._means[0], 0, 0)
+        order, films = np.arange(1), np.empty((4, self._block, *self._shape), np.float32)
+        fit = kernels.Fit(np.zeros((len(_WINDOWS), 2, 1)), np.zeros(1), np.zeros(self._block))
+        self._temperatures(0, order, fit, films, self._history.status, slice(0, 0))
+        self._history.warm()
+
+    def _fit(self, centre: int, frames: Array) -> kernels.Fit:
+        """Local polynomials, from narrow to wide, over the means around one without a gap."""
+        times, segments = self._mean_times
+        apart = np.diff(times) > (1.0 + APART) * self._block / self._rate
+        piece = np.concatenate([[0], np.cumsum(apart | (np.diff(segments) > 0))])
+        reach, weights = np.arange(times.size) - centre, np.zeros((len(_WINDOWS), 2, times.size))
+        for both, (before, after, degree) in zip(weights, _WINDOWS, strict=True):
+            inside = (reach >= -max(1, int(before * self._half))) & (piece == piece[centre])
+            inside &= reach <= max(1, int(after * self._half))
+            order = min(int(degree) + 1, int(np.count_nonzero(inside)))
+            powers = (times[inside, np.newaxis] - times[centre]) ** np.arange(order)
+            both[:order, inside] = np.linalg.pinv(powers)[:2]
+        variance = (weights[:, 0] ** 2).sum(axis=1) / self._block
+        return kernels.Fit(weights, variance, frames - times[centre])
+
+    def _dataset(self, known: list[Array], films: list[Planes], status: quality.Bits) -> xr.Dataset:
+        """Stage `separated` of the films (film, frame, y, x) at the times, and the maps of now."""
+        k, variance, one, two, a, b, d = self._history.maps
+        none = np.float32(0.0) * k
+        maps = {
+            "emissivity": np.stack([one, two]),
+            "emissivity_std": np.sqrt([a, d]),
+            "emissivity_covariance": np.array([[a, b], [b, d]]),
+            "reflection_ratio": np.stack([none + 1.0, k]),
+            "reflection_ratio_std": np.stack([none, np.sqrt(variance)]),
+            "status": status,
+        }
+        together = np.concatenate([np.empty((4, 0, *self._shape), np.float32), *films], axis=1)
+        maps |= zip(FILMS, together, strict=True)
+        attrs = {name: v for name, v in self._template.attrs.items() if name in _KEPT}
+        stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
+        variables = {
+            name: (stage[name].dims, v, stage[name].attrs | attrs) for name, v in maps.items()
+        }
+        variables["status"][2].update(schema.status_attrs())
+        coords = {name: self._template[name] for name in self._template.coords}
+        coords["other_band"] = coords["band"].rename(band="other_band")
+        time = ("time", np.concatenate([[], *known]), schema.COORDINATES["time"].attrs)
+        result = xr.Dataset(variables, {**coords, "time": time}, attrs)
+        back = np.argsort(self._order)
+        return result.isel(band=back, other_band=back).assign_attrs(
+            method="stream",
+            response_kind=self._kind,
+            reference_band=str(self._template["band"].values[0]),
+            lost_frames=self.lost_frames,
+        )
+
+    def _rows(self) -> list[slice]:
+        """Rows that threads take at once."""
+        return [slice(y, min(y + _ROWS, self._shape[0])) for y in range(0, self._shape[0], _ROWS)]
+
+    def _apply(self, function: Callable[[Any], None], parts: Iterable[Any]) -> None:
+        """Apply a function to parts of the image, in threads."""
+        for _ in self._threads.map(function, parts):
+            pass
+
+    def _pair(self, displacement: displaced.Displacement) -> None:
+        """Resample the second camera by the shift of what is reflected; see `_displaced`."""
+        dead, width = quality.unusable(self._status), self._shape[1]
+        weights = displaced.without(displacement.resample, dead.ravel(), width).astype(np.float32)
+        self._gain[:] = np.sqrt((weights**2).sum(axis=1)).reshape(self._shape)
+        unpaired = (np.diff(weights.indptr) == 0).reshape(self._shape)
+        self._status |= quality.status_bits({Status.NO_REFLECTION_PAIR: unpaired})
+        edges = [rows.start * width for rows in self._rows()] + [weights.shape[0]]
+        self._resample = [weights[start:stop] for start, stop in pairwise(edges)]
+
+
+def _camera(inputs: _inputs.Inputs) -> kernels.Camera:
+    """Responses and noise of both bands, the quietest first."""
+    curves = inputs.curves
+    pattern = np.zeros(2) if inputs.pattern is None else inputs.pattern
+    return kernels.Camera(
+        first=tables.table(curves[0]),
+        second=tables.table(curves[1]),
+        counts=(curves[0].reference_counts, curves[1].reference_counts),
+        slopes=(curves[0].reference_slope, curves[1].reference_slope),
+        noise=(float(inputs.noise[0]), float(inputs.noise[1])),
+        pattern=(float(pattern[0]), float(pattern[1])),
+        lowest=curves[0].lowest,
+        highest=curves[0].highest,
+    )
+
+
+def _single(record: Any) -> Any:
+    """Record of numbers, and of tuples of them, in single precision."""
+    if not isinstance(record, tuple):
+        return np.float32(record) if isinstance(record, float) else record
+    parts = [_single(part) for part in record]
+    return type(record)(*parts) if hasattr(record, "_fields") else tuple(parts)

@@ -1,0 +1,333 @@
+"""Time and memory of every method on this machine: a table and a figure in results/bench.
+
+Times of one thread are its processor's, the better of two; those of processes and of the disk are
+the clock's. What a series would not end within `LONGEST` is left out of it. All captures are
+simulated plate glass before which people walk, at `RATE`.
+"""
+
+import argparse
+import os
+import platform
+import re
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from dbthermal import separation, simulation, store
+from dbthermal.figures import drawing
+from reproduction import experiments, paths
+
+RATE: Final = 10.0  # [Hz]
+LONGEST: Final = 10.0  # [s]
+FRAME: Final = 640 * 512  # pixels of a camera
+USUAL: Final = {"pixels": 512, "frames": 350, "bands": 2}
+SERIES: Final = {
+    "pixels": (128, 512, 2048, 8192, 32768),
+    "frames": (100, 300, 1000, 3000, 10000, 30000),
+    "bands": (2, 3, 4),
+}
+# Pixels of the series over frames: a long capture of many would take too long.
+FEW: Final = 32
+BANDS: Final = ("8-14", "9.5", "10.6", "12.1")
+NOISE: Final = (0.03, 0.35, 0.15, 0.4)  # [K]
+EMISSIVITY: Final = (0.86, 0.72, 0.88, 0.95)
+ON_DISK: Final = 2**16  # pixels of the capture on disk, as 512 rows
+DAY: Final = 24 * 3600 * 60  # frames of a day at 60 Hz
+ARCHIVE: Final = 10_000  # captures of a full frame, USUAL["frames"] each
+
+Times = dict[tuple[str, str], dict[int, float]]
+"""By method and size that is varied: seconds of one thread at each size."""
+
+
+@dataclass(frozen=True)
+class Disk:
+    """A capture on disk through `separation.run`."""
+
+    samples: int  # pixels times frames
+    read_write: float  # reading the capture and writing its result, by one process [s]
+    seconds: dict[int, float]  # of so many processes [s]
+    weak: dict[int, float]  # of so many processes on as many times the rows [s]
+    peak: float  # memory of a process, of `allowed` [byte]
+    allowed: float
+    source_bytes: int  # as stored
+    result_bytes: int
+
+
+@lru_cache(maxsize=2)
+def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
+    """Simulated plate glass of so many pixels; beyond 128 those are repeated in another order."""
+    few, rig = min(pixels, 128), simulation.Rig(bands=BANDS[:bands], noise=NOISE[:bands])
+    glass: dict[str, Any] = {"emissivity": list(EMISSIVITY[:bands]), "start": 20, "stop": 60}
+    row = experiments.simulate(glass, rig, np.arange(frames) / RATE, few, seed=1)[1]
+    rng, counts = np.random.default_rng(1), row["counts"].values.reshape(bands, frames, few)
+    movie = np.stack([counts[..., rng.permutation(few)] for _ in range(pixels // few)], axis=2)
+    films = {"counts": (("band", "time", "y", "x"), movie, row["counts"].attrs)}
+    return xr.Dataset(films, coords={"band": row["band"], "time": row["time"]})
+
+
+def solve(movie: xr.Dataset, method: str) -> xr.Dataset:
+    """Separate by one thread."""
+    names = [str(band) for band in movie["band"].values]
+    rig = simulation.Rig(bands=tuple(names), noise=NOISE[: len(names)])
+    known = xr.DataArray(list(EMISSIVITY[: len(names)]), dims="band", coords={"band": names})
+    emissivity = known if separation.get_method(method).knows_emissivity else None
+    return separation.solve(movie, rig.response(), method, emissivity=emissivity, workers=1)
+
+
+def seconds_of(method: str, sizes: dict[str, int]) -> float:
+    """Processor time [s] of a separation; the better of two if it is short."""
+    movie = capture(**sizes)
+    taken: list[float] = []
+    while not taken or (len(taken) < 2 and taken[0] < 1.0):
+        start = time.process_time()
+        solve(movie, method)
+        taken.append(time.process_time() - start)
+    return min(taken)
+
+
+def series(method: str, name: str) -> Iterator[tuple[int, float]]:
+    """Yield each size and its seconds, as long as the next one is expected to be short."""
+    usual = USUAL | ({"pixels": FEW} if name == "frames" else {})
+    record, last = separation.get_method(method), (0, 0.0)
+    for size in SERIES[name]:
+        few = size < record.minimum_frames if name == "frames" else False
+        if few or (name == "bands" and size > 2 and not record.any_bands):
+            continue
+        if last[0] and last[1] * size / last[0] > LONGEST:
+            return
+        last = (size, seconds_of(method, usual | {name: size}))
+        yield last
+
+
+def all_series() -> Times:
+    """Seconds of every method over pixels, frames and bands."""
+    times: Times = {}
+    for method in separation.METHODS:
+        solve(capture(**(USUAL | {"pixels": FEW})), method)  # imports and compiles
+        for name in SERIES:
+            times[method, name] = dict(series(method, name))
+            print(method, name, times[method, name], flush=True)
+    return times
+
+
+def exponent(times: dict[int, float]) -> float:
+    """Exponent of a power law through the times over the sizes: 1 is linear; NaN of one size."""
+    if len(times) < 2:
+        return float("nan")
+    return float(np.polyfit(np.log(list(times)), np.log(list(times.values())), 1)[0])
+
+
+def _ready(_: int) -> None:
+    """Import and compile in a process, before its time is taken."""
+    solve(capture(**(USUAL | {"pixels": FEW})), "subspace")
+    time.sleep(1.0)  # the others are to take one, too
+
+
+def _run(source: Path, target: Path, processes: int) -> float:
+    """Seconds of a run by so many processes that have been started before."""
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        list(pool.map(_ready, range(processes)))
+        start = time.perf_counter()
+        separation.run(source, target, simulation.Rig().response(), executor=pool, memory=1e9)
+        return time.perf_counter() - start
+
+
+def _peak(source: Path, target: Path, memory: float) -> float:
+    """Peak of the memory [byte] of this process, which separates by two threads."""
+    separation.run(source, target, simulation.Rig().response(), memory=memory)
+    found = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())
+    return 1024.0 * float(found[1]) if found else float("nan")
+
+
+def size_on_disk(folder: Path) -> int:
+    """Bytes of the files in a folder."""
+    return sum(one.stat().st_size for one in folder.rglob("*") if one.is_file())
+
+
+def from_disk(folder: Path) -> Disk:
+    """Measure runs from disk to disk: against the disk alone, by processes, and their memory."""
+    counts = [n for n in (1, 2, 4, 8, 16) if n <= (os.cpu_count() or 1)]
+    movie, source = capture(ON_DISK, USUAL["frames"], 2), folder / "1.zarr"
+    store.save(movie, source, {})
+    target, seconds, weak = folder / "result.zarr", {}, {}
+    for number in counts:
+        seconds[number] = _run(source, target, number)
+        result_bytes = size_on_disk(target)
+        result = store.open_dataset(target).load()
+        shutil.rmtree(target)
+        print("processes", number, seconds[number], flush=True)
+    start = time.perf_counter()
+    store.open_dataset(source).load()
+    store.save(result, folder / "again.zarr", {})
+    read_write = time.perf_counter() - start
+    for number in counts[1:]:
+        wide = folder / f"{number}.zarr"
+        store.save(xr.concat([movie] * number, "y"), wide, {})
+        weak[number] = _run(wide, target, number)
+        shutil.rmtree(target)
+        print("weak", number, weak[number], flush=True)
+    allowed = 1e9
+    with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+        peak = fresh.submit(_peak, source, target, allowed).result()
+    samples = movie["counts"][0].size
+    sizes = size_on_disk(source), result_bytes
+    return Disk(samples, read_write, seconds, weak | {1: seconds[1]}, peak, allowed, *sizes)
+
+
+def machine() -> str:
+    """Processor, memory and versions of this machine."""
+    model = platform.processor() or platform.machine()
+    if (info := Path("/proc/cpuinfo")).exists():
+        model = (re.search(r"model name\s*: (.*)", info.read_text()) or [model, model])[1]
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "zarr"))
+    return (
+        f"{model}, {os.cpu_count()} processors, {memory:.0f} GB; Python "
+        f"{platform.python_version()}, {packages}; no GPU is used"
+    )
+
+
+HEAD: Final = """# Benchmarks
+
+Made by `make bench` on {machine}.
+Load of the machine when it began: {busy:.1f}; where others work on it, what is of the clock is too
+slow. All captures are simulated.
+
+{ratios}
+
+Processor time of one thread, {frames} frames, two bands, {pixels} pixels. Exponents are those of a
+power law over the sizes in brackets; over frames of {few} pixels.
+
+{methods}
+
+`subspace`, processor time of a sample of both bands [ns] by the number of frames: {samples}.
+
+On paper, from the rate of {processes} processes, with nothing lost between machines, which share
+only a disk. A GPU was not at hand.
+
+{costs}
+"""
+
+
+def rows(*cells: Sequence[str]) -> str:
+    """Table in Markdown of a head and rows."""
+    head, *rest = [f"| {' | '.join(row)} |" for row in cells]
+    return "\n".join([head, "|---" * len(cells[0]) + "|", *rest])
+
+
+def table(times: Times, disk: Disk, busy: float) -> str:
+    """All that was measured, in Markdown, ratios first."""
+    most = max(disk.seconds)
+    frames = times["subspace", "frames"]
+    return HEAD.format(
+        machine=machine(),
+        busy=busy,
+        few=FEW,
+        processes=most,
+        ratios=rows(("ratio", ""), *ratios(times, disk)),
+        methods=methods(times),
+        samples=", ".join(f"{n}: {1e9 * s / FEW / n:.0f}" for n, s in frames.items()),
+        costs=costs(disk, disk.samples / disk.seconds[most]),
+        **USUAL,
+    )
+
+
+def ratios(times: Times, disk: Disk) -> Iterator[tuple[str, str]]:
+    """Yield each ratio with its name."""
+    one, most = disk.seconds[1], max(disk.seconds)
+    same, size = times["dbvt", "pixels"], USUAL["pixels"]
+    speed = disk.samples / disk.seconds[most] / FRAME / 60
+    yield "`dbvt` over `subspace`, a pixel", f"{same[size] / times['subspace', 'pixels'][size]:.0f}"
+    disk_to_disk = f"`subspace` from disk to disk, {most} processes, over reading and writing alone"
+    yield disk_to_disk, f"{disk.seconds[most] / disk.read_write:.1f}"
+    yield f"frames of 640x512 by {most} processes over a camera's 60 a second", f"{speed:.2f}"
+    yield f"peak memory over `memory={disk.allowed:g}`", f"{disk.peak / disk.allowed:.2f}"
+    for number in sorted(disk.weak)[1:]:
+        gain, weak = one / disk.seconds[number], number * one / disk.weak[number]
+        yield f"rate of {number} processes over one, the same capture", f"{gain:.2f}"
+        yield f"rate of {number} processes over one, {number} times the rows", f"{weak:.2f}"
+
+
+def methods(times: Times) -> str:
+    """Table of the methods' times and exponents."""
+    usual = {method: times[method, "pixels"][USUAL["pixels"]] for method in separation.METHODS}
+    lines = [("method", "us a pixel", "over `subspace`", "pixels", "frames", "3, 4 bands over 2")]
+    for method, seconds in usual.items():
+        bands = times[method, "bands"]
+        pixels, frames = (
+            f"{exponent(found):.2f} ({min(found)} to {max(found)})"
+            for found in (times[method, "pixels"], times[method, "frames"])
+        )
+        more = ", ".join(f"{bands[n] / bands[2]:.1f}" for n in sorted(bands) if n > 2) or "none"
+        cost, ratio = f"{1e6 * seconds / USUAL['pixels']:.0f}", f"{seconds / usual['subspace']:.2g}"
+        lines.append((f"`{method}`", cost, ratio, pixels, frames, more))
+    return rows(*lines)
+
+
+def costs(disk: Disk, rate: float) -> str:
+    """Table of what large tasks cost, on paper, at a rate [samples/s]."""
+    tasks = {
+        "a day at 60 Hz": DAY * FRAME,
+        f"{ARCHIVE} captures of {USUAL['frames']} frames": ARCHIVE * USUAL["frames"] * FRAME,
+    }
+    lines: list[tuple[str, ...]] = [
+        ("`subspace`, two bands of 640x512", "one machine", "ten", "capture", "result")
+    ]
+    for name, samples in tasks.items():
+        hours = samples / rate / 3600
+        stored = [samples / disk.samples * b / 1e12 for b in (disk.source_bytes, disk.result_bytes)]
+        sizes = [f"{one:.1f} TB" for one in stored]
+        lines.append((name, f"{hours:.0f} h", f"{hours / 10:.0f} h", *sizes))
+    return rows(*lines)
+
+
+def figure(times: Times) -> Figure:
+    """Processor time of one thread over pixels and over frames, a line a method."""
+    drawn, axes = drawing.canvas(1, 2, (9.0, 3.8))
+    for axis, name in zip(axes[0], ("pixels", "frames"), strict=True):
+        for number, method in enumerate(separation.METHODS):
+            found = times[method, name]
+            color = drawing.COLORS[number % len(drawing.COLORS)]
+            marker = drawing.MARKERS[number % len(drawing.MARKERS)]
+            axis.loglog(list(found), list(found.values()), marker + "-", color=color, label=method)
+        axis.set_xlabel(f"number of {name}")
+        axis.set_ylabel("processor time [s]")
+    axes[0, 1].legend(frameon=False, fontsize=8)
+    drawn.suptitle(f"One thread: {USUAL['frames']} frames, left; {FEW} pixels, right (simulated)")
+    return drawn
+
+
+def main(arguments: Sequence[str] | None = None, measure: Callable[[], Times] = all_series) -> int:
+    """Measure, and write results/bench/benchmarks.md and .png; the former in docs too, if asked."""
+    parser = argparse.ArgumentParser(prog="reproduction.benchmark", description=__doc__)
+    parser.add_argument("--write", action="store_true", help="write docs/benchmarks.md, too")
+    chosen = parser.parse_args(arguments)
+    busy, folder, record = os.getloadavg()[0], paths.results("bench"), store.provenance({})
+    folder.mkdir(parents=True, exist_ok=True)
+    times = measure()
+    with TemporaryDirectory(dir=folder) as place:
+        disk = from_disk(Path(place))
+    text = table(times, disk, busy)
+    store.save_text(text, folder / "benchmarks.md", record)
+    store.save_figure(figure(times), folder / "benchmarks.png", record)
+    if chosen.write:
+        (paths.root() / "docs" / "benchmarks.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,328 @@
+"""FLIR recordings: counts, clock and camera of golden files and of made-up ones, and damage."""
+
+import hashlib
+import re
+import resource
+import struct
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from flir_files import CONSTANTS, compressed, damaged, jpeg, scene, sequence
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dbthermal import readers, schema
+from dbthermal.readers import _recording
+
+# Of the counts (time, y, x), little-endian. Those of JPEG-LS and PNG are the same by imagecodecs
+# 2026.6, whose decoders are CharLS and libpng.
+GOLDEN = {
+    "SampleSEQ.seq": ((2, 480, 640), "little", "1953f0aa067cac00"),
+    "SampleCSQ.csq": ((8, 768, 1024), "none: numbers are coded", "cec34830cbf7df2f"),
+    "IR_2412.jpg": ((1, 480, 640), "little", "b85f16186f688e38"),
+    "ax8.jpg": ((1, 60, 80), "little", "deb866526985bf7a"),
+    "flir_example.jpg": ((1, 320, 240), "little", "02375a5e6c6a6254"),
+    "frame_000000.fff": ((1, 512, 640), "little", "0868740d7414ce78"),
+    "frame_000000_le.fff": ((1, 240, 320), "little", "88916e0aea22bd46"),
+}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Recording that is not yet written."""
+    return tmp_path / "a.seq"
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", GOLDEN)
+def test_golden_counts(mirror: Path, name: str) -> None:
+    """Counts, shape and byte order of real files, by hash."""
+    shape, order, digest = GOLDEN[name]
+    read = readers.flir(mirror / "recordings" / name)
+    assert read.counts.shape == shape
+    assert read.counts.dtype == np.uint16
+    assert read.attrs["byte_order"] == order
+    found = hashlib.sha256(read.counts.values.astype("<u2").tobytes()).hexdigest()
+    assert found[:16] == digest
+
+
+@pytest.mark.data
+def test_golden_clocks(mirror: Path) -> None:
+    """A sequence has the times of its camera, frame by frame, and no frame is lost."""
+    read = readers.flir(mirror / "recordings" / "SampleCSQ.csq")
+    assert_allclose(np.diff(read.time), 1 / 30, rtol=0, atol=1e-3)  # [s]
+    assert read.attrs["start"] == "2017-05-19T19:45:33.583+00:00"
+    assert not read.frame_flags.any()
+
+
+@pytest.mark.data
+def test_golden_metadata(mirror: Path) -> None:
+    """The camera's record is as ExifTool prints it."""
+    folder = mirror / "recordings"
+    read = readers.flir(folder / "frame_000000.fff").attrs
+    lines = (folder / "frame_000000.txt").read_text().splitlines()
+    printed = {key.strip(): value.strip() for key, _, value in (x.partition(":") for x in lines)}
+    for key in ("R1", "R2", "B", "F", "O"):
+        assert read[f"file_planck_{key}"] == float(printed[f"Planck {key}"])
+    for key, name in {
+        "Emissivity": "emissivity",
+        "Object Distance": "object_distance",
+        "IR Window Transmission": "window_transmission",
+        "Frame Rate": "frame_rate",
+    }.items():
+        assert_allclose(read[f"file_{name}"], float(printed[key].split()[0]), rtol=0, atol=0.005)
+    for key, name in {
+        "Reflected Apparent Temperature": "reflected_temperature",
+        "Atmospheric Temperature": "atmospheric_temperature",
+        "IR Window Temperature": "window_temperature",
+        "Camera Temperature Range Max": "range_max",
+        "Camera Temperature Range Min": "range_min",
+    }.items():
+        celsius = read[f"file_{name}"] - 273.15
+        assert_allclose(celsius, float(printed[key].split()[0]), rtol=0, atol=0.05)  # [K]
+    assert read["file_camera_model"] == printed["Camera Model"]
+    assert read["file_camera_serial_number"] == printed["Camera Serial Number"]
+    assert printed["Date/Time Original"] == "2018:11:05 12:14:43.084+01:00"
+    assert read["start"] == "2018-11-05T11:14:43.084+00:00"
+
+
+@pytest.mark.parametrize("codec", ["", "png", "jpegls"])
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("inner", ["<", ">"])
+def test_counts_come_back(path: Path, codec: str, order: str, inner: str) -> None:
+    """Every codec in every byte order of directory and records; marks in the pixels mislead not."""
+    counts = scene()
+    counts[1, 3, 4:6] = np.frombuffer(b"FFF\0", "<u2")
+    path.write_bytes(sequence(counts, codec, order, inner=inner))
+    read = readers.flir(path)
+    assert_array_equal(read.counts, counts)
+    assert_allclose(read.time, [0, 0.1, 0.2], rtol=0, atol=1e-9)
+    assert read.attrs["start"] == "2017-07-14T02:40:00.125+00:00"
+    assert read.attrs["file_camera_model"] == "Made up 1"
+    assert read.attrs["file_emissivity"] == 0.95
+    assert read.attrs["implausible"] == ""
+    schema.check(read[["counts"]].expand_dims(band=["a"]), "capture")
+
+
+@pytest.mark.parametrize("codec", ["", "png"])
+def test_pictures(tmp_path: Path, codec: str) -> None:
+    """Radiometric JPEGs, in many segments, make a recording in the order of their numbers."""
+    counts = scene()
+    paths = [tmp_path / f"IR_{number}.jpg" for number in (8, 9, 10)]
+    for number, path in enumerate(paths):
+        one = counts[number : number + 1]
+        path.write_bytes(jpeg(sequence(one, codec, seconds=[1.5e9 + number], sums=True)))
+    read = readers.flir(paths)
+    assert_array_equal(read.counts, counts)
+    assert_allclose(read.time, [0, 1, 2])
+    assert read.attrs["source"] == "IR_8.jpg to IR_10.jpg"
+    with pytest.raises(ValueError, match=r"Unordered files: the numbers of 'IR_8\.jpg' do not"):
+        readers.flir(sorted(paths))
+
+
+def test_checksum_of_a_record(path: Path) -> None:
+    """A record whose checksum is wrong is refused."""
+    content = bytearray(sequence(scene(1), sums=True))
+    content[-200] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"Damaged file: CRC-32 .* of frame 0 of 'a\.seq'. Must"):
+        readers.flir(path)
+
+
+def test_lost_frames_and_clocks(path: Path) -> None:
+    """A gap of the clock is a lost frame; a clock that stands gives no time."""
+    counts = scene(6)
+    path.write_bytes(sequence(counts, seconds=[1e9 + k for k in (0, 0.1, 0.2, 0.5, 0.6, 0.6)]))
+    read = readers.flir(path)
+    lost = schema.has_flag(read.frame_flags, "frames_lost_before")
+    assert lost.values.tolist() == [False, False, False, True, False, False]
+    stands = schema.has_flag(read.frame_flags, "time_stands")
+    assert stands.values.tolist() == [False] * 5 + [True]
+    assert np.isnan(read.exposure_time[5])
+    assert_allclose(read.time, [0, 0.1, 0.2, 0.5, 0.6, 0.7], rtol=0, atol=1e-9)
+    path.write_bytes(sequence(counts[:3], seconds=[1e9, 1e9 + 1, 1e9 + 0.5]))
+    with pytest.raises(ValueError, match=r"Unordered times in 'a\.seq': frame 2 is 0.500 s before"):
+        readers.flir(path)
+    assert_allclose(readers.flir(path, clock=50.0).time, [0, 0.02, 0.04])
+    path.write_bytes(sequence(counts, seconds=[0.0] * 6))
+    with pytest.raises(ValueError, match=r"Unknown times .* 0 of 6 frames have one. Must be given"):
+        readers.flir(path)
+    with pytest.raises(ValueError, match=r"Invalid clock of shape \(2,\) for 6 frames"):
+        readers.flir(path, clock=[0, 1])
+    with pytest.raises(ValueError, match=r"Invalid clock 0\.0 of"):
+        readers.flir(path, clock=0)
+
+
+def test_exchanged_images_are_marked(path: Path) -> None:
+    """An image that is not of its frame has no time."""
+    counts = scene(6)
+    content = sequence(counts)
+    size = len(content) // 6
+    image = content.index(counts[1].tobytes()) - 32
+    other, length = image + size, 32 + counts[0].nbytes
+    swapped = bytearray(content)
+    swapped[image : image + length] = content[other : other + length]
+    swapped[other : other + length] = content[image : image + length]
+    path.write_bytes(swapped)
+    read = readers.flir(path)
+    found = schema.has_flag(read.frame_flags, "numbers_differ").values
+    assert found.tolist() == [False, True, True, False, False, False]
+    assert_array_equal(np.isnan(read.exposure_time), found)
+
+
+def test_implausible_values_are_named(path: Path) -> None:
+    """Kelvin entered for Celsius, a date before the format: named, shown, and not applied."""
+    path.write_bytes(sequence(scene(1), seconds=[946706066.0], x28=571.15, x20=float("nan")))
+    read = readers.flir(path)
+    assert "reflected_temperature 571.15 K (298.0 degrees Celsius)" in read.attrs["implausible"]
+    assert "emissivity nan" in read.attrs["implausible"]
+    assert "date 2000-01-01" in read.attrs["implausible"]
+    assert read.attrs["file_reflected_temperature"] == 571.15
+    assert "file_emissivity" not in read.attrs
+
+
+def test_range_must_not_change(path: Path) -> None:
+    """Frames of two ranges of the camera are no recording."""
+    parts = [sequence(scene(1)), sequence(scene(1), seconds=[1.6e9], x58=16000.0)]
+    path.write_bytes(b"".join(parts))
+    with pytest.raises(
+        ValueError, match=r"planck_R1 16000 of frame 1 of 'a\.seq', 21106\.8 before"
+    ):
+        readers.flir(path)
+    assert readers.flir(path, frames=slice(1, None)).attrs["file_planck_R1"] == 16000
+    assert CONSTANTS[0x58] == readers.flir(path, frames=slice(1)).attrs["file_planck_R1"]
+
+
+def test_byte_order(path: Path) -> None:
+    """A header that contradicts its image, and an image that does not tell, ask the user."""
+    counts = scene(2)
+    path.write_bytes(sequence(counts.byteswap()))
+    with pytest.raises(ValueError, match=r"Unclear byte order in 'a\.seq'.* byte_order='little'"):
+        readers.flir(path)
+    read = readers.flir(path, byte_order="big")
+    assert_array_equal(read.counts, counts)
+    assert (read.attrs["byte_order"], read.attrs["byte_order_by"]) == ("big", "caller")
+    path.write_bytes(sequence(np.full((1, 8, 8), 17999, dtype=np.uint16), "png"))
+    with pytest.raises(ValueError, match="Unclear byte order"):
+        readers.flir(path)
+    assert readers.flir(path, byte_order="little").counts[0, 0, 0] == 17999
+    with pytest.raises(ValueError, match="Invalid byte_order 'middle'"):
+        readers.flir(path, byte_order="middle")
+
+
+def test_parts_of_a_recording(path: Path) -> None:
+    """Some frames of a recording whose end is cut off; how many can be read is said."""
+    content = sequence(counts := scene(4))
+    path.write_bytes(content[:-500])
+    with pytest.raises(ValueError, match=r"frame 3 of .* Those before it: frames=slice\(0, 3\)"):
+        readers.flir(path)
+    assert_array_equal(readers.flir(path, frames=slice(0, 3, 2)).counts, counts[:3:2])
+    with pytest.raises(ValueError, match=r"No frames slice\(2, 2, None\)"):
+        readers.flir(path, frames=slice(2, 2))
+    with pytest.raises(ValueError, match=r"Invalid frames slice\(-1, None, None\)"):
+        readers.flir(path, frames=slice(-1, None))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "rule"),
+    [
+        ("a.ravi", b"", r"Refused 'a\.ravi': export its counts as 16-bit TIFF"),
+        ("a.irb", b"", "readers.tiff"),
+        ("a.ats", b"", "readers.tiff"),
+        ("a.mp4", b"", r"8 bits are drawn, not measured.*palette_video"),
+        ("a.seq", b"", "Empty file"),
+        ("a.seq", b"RIFF" * 40, "Invalid header b'RIFF'"),
+        ("a.jpg", b"\xff\xd8\xff\xda\0\2", "No thermal data of FLIR .* of another maker"),
+        ("a.jpg", b"\xff\xd8\xff\xe1\xff\xff", "Damaged JPEG"),
+    ],
+)
+def test_refused_with_what_to_do(tmp_path: Path, name: str, content: bytes, rule: str) -> None:
+    """What is no FLIR recording says what it is, and what to do instead."""
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=rule):
+        readers.flir(tmp_path / name)
+
+
+def test_pictures_of_8_bits(path: Path) -> None:
+    """Counts with one byte empty are pictures."""
+    path.write_bytes(sequence(scene(1) // np.uint16(256)))
+    with pytest.raises(ValueError, match="one of their two bytes is always 0"):
+        readers.flir(path)
+
+
+def test_size_before_memory(path: Path) -> None:
+    """A small file that states a huge image is refused for its size; so is one of a bomb."""
+    body = bytearray(compressed(scene(1)[0], "png"))
+    body[16:24] = struct.pack(">II", 60000, 60000)
+    content = sequence(scene(1), "png").replace(compressed(scene(1)[0], "png"), bytes(body))
+    path.write_bytes(content.replace(struct.pack("<HH", 32, 24), struct.pack("<HH", 60000, 60000)))
+    with pytest.raises(ValueError, match=r"1 frames of 60000 x 60000 pixels take 2.88e\+10 bytes"):
+        readers.flir(path)
+
+
+def test_missing_library(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without PyAV the extra is named."""
+    path.write_bytes(sequence(scene(1), "jpegls"))
+
+    def absent(name: str) -> None:
+        raise ImportError(name)
+
+    monkeypatch.setattr(_recording, "import_module", absent)
+    with pytest.raises(ImportError, match=r"Missing library 'av'.*dbthermal\[video\]"):
+        readers.flir(path)
+
+
+def fates(path: Path, codec: str, number: int) -> Counter[str]:
+    """Count what damaged copies of a recording do: refused, the same, marked, or other counts.
+
+    Without a codec, damage of the pixels alone is told from other counts.
+    """
+    counts, found = scene(), Counter[str]()
+    whole = sequence(counts, codec, sums=codec == "png")
+    places = [whole.index(image.tobytes()) for image in counts] if not codec else []
+    for seed in range(number):
+        kind, changed = damaged(whole, seed)
+        path.write_bytes(changed)
+        begun = time.perf_counter()
+        try:
+            read = readers.flir(path)
+        except ValueError as refusal:
+            found["refused" if re.search("Must |Has |Refused", str(refusal)) else "unclear"] += 1
+        else:
+            size = counts[0].nbytes
+            pixels = [changed[place : place + size] for place in places[: read.sizes["time"]]]
+            found[f"{fate(read, counts, pixels)}, {kind}"] += 1
+        assert time.perf_counter() - begun < 5  # [s]
+    return found
+
+
+def fate(read: xr.Dataset, counts: np.ndarray, pixels: list[bytes]) -> str:
+    """What has been read of a damaged file."""
+    if read.frame_flags.any():
+        return "marked"
+    if np.array_equal(read.counts, counts[: read.sizes["time"]]):
+        return "same" if read.sizes["time"] == len(counts) else "fewer"
+    return "pixels" if read.counts.values.tobytes() == b"".join(pixels) else "other"
+
+
+@pytest.mark.parametrize(
+    "number", [pytest.param(300, id="300"), pytest.param(10_000, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("codec", ["", "png", "jpegls"])
+def test_damage(path: Path, codec: str, number: int) -> None:
+    """Damaged files are refused or harmless; unprotected pixels, damaged, are those of the file.
+
+    JPEG-LS has no checksum: a flipped bit may decode to other numbers. Nothing else may.
+    """
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = fates(path, codec, number)
+    taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    print(codec or "none", dict(found), f"{taken} KiB")
+    assert taken < 2**20  # KiB
+    other = sum(value for key, value in found.items() if key.startswith("other"))
+    assert found["refused"] > 0.2 * number
+    assert found["unclear"] == 0
+    assert other <= (0.05 * number if codec == "jpegls" else 0)

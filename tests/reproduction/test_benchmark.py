@@ -1,0 +1,65 @@
+"""The benchmark's table: exponents, ratios and costs are those of the times that were measured."""
+
+from pathlib import Path
+
+import pytest
+
+from dbthermal import separation
+from reproduction import benchmark
+from reproduction.benchmark import FRAME, Disk
+
+
+def times() -> benchmark.Times:
+    """Times, linear over pixels and square over frames; each method takes twice the one before."""
+    found: benchmark.Times = {}
+    for number, method in enumerate(separation.METHODS):
+        found[method, "pixels"] = {n: 2.0**number * n for n in (128, 512, 2048)}
+        found[method, "frames"] = {n: 1e-6 * n**2 for n in (100, 1000)}
+        found[method, "bands"] = {2: 1.0, 3: 1.5}
+    return found
+
+
+def test_the_table_says_what_was_measured() -> None:
+    """A rate of 60 full frames a second is the camera's, and a day of it takes a day."""
+    disk = Disk(
+        samples=600 * FRAME,
+        read_write=5.0,
+        seconds={1: 18.0, 2: 10.0},
+        weak={1: 18.0, 2: 20.0},
+        peak=8e8,
+        allowed=1e9,
+        source_bytes=8 * 600 * FRAME,
+        result_bytes=16 * 600 * FRAME,
+    )
+    text = benchmark.table(times(), disk, 0.5)
+    for line in (
+        "| `dbvt` over `subspace`, a pixel | 4 |",
+        "2 processes, over reading and writing alone | 2.0 |",
+        "over a camera's 60 a second | 1.00 |",
+        "| peak memory over `memory=1e+09` | 0.80 |",
+        "| rate of 2 processes over one, the same capture | 1.80 |",
+        "| rate of 2 processes over one, 2 times the rows | 1.80 |",
+        "| `calibrated` | 2000000 | 2 | 1.00 (128 to 2048) | 2.00 (100 to 1000) | 1.5 |",
+        "| a day at 60 Hz | 24 h | 2 h | 13.6 TB | 27.2 TB |",
+    ):
+        assert line in text, text
+
+
+def test_a_series_ends_before_it_is_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The size that would take longer than `LONGEST` is left out, and few frames are, too."""
+    monkeypatch.setattr(benchmark, "seconds_of", lambda _, sizes: sizes["frames"] / 250.0)
+    assert dict(benchmark.series("subspace", "frames")) == {100: 0.4, 300: 1.2, 1000: 4.0}
+    monkeypatch.setattr(benchmark, "seconds_of", lambda _, sizes: 1.0 * sizes["bands"])
+    assert dict(benchmark.series("naive", "bands")) == {2: 2.0}
+
+
+@pytest.mark.slow
+def test_a_small_capture_is_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On disk and in memory: every figure is positive, and the processes' memory holds."""
+    monkeypatch.setattr(benchmark, "ON_DISK", 128)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    assert benchmark.seconds_of("apparent", {"pixels": 32, "frames": 40, "bands": 2}) > 0
+    disk = benchmark.from_disk(tmp_path)
+    assert list(disk.seconds) == [1]
+    assert min(disk.read_write, disk.seconds[1], disk.source_bytes, disk.result_bytes) > 0
+    assert not disk.peak > disk.allowed

@@ -1,0 +1,285 @@
+"""Live separation: against the truth, against the whole capture at once, and with frames lost."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import xarray as xr
+
+from dbthermal import schema, simulation
+from dbthermal.schema import Status
+from dbthermal.separation import Stream, solve
+from dbthermal.simulation import Rig
+
+RATE = 10.0  # [Hz]
+Data = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+
+
+def walkers(seed: int, seconds: float, shape: tuple[int, int] = (12, 20), **rig: Any) -> Data:
+    """Scene, capture and response of plate glass that warms up while people walk by."""
+    rng, made = np.random.default_rng(seed), Rig(**rig)
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(made.bands)})
+    scene = simulation.walkers(np.arange(round(seconds * RATE)) / RATE, shape, glass, rng)
+    return scene, simulation.observe(scene, made.response(), rng), made.response()
+
+
+def live(
+    capture: xr.Dataset, response: xr.Dataset, frames: Any = slice(None), **options: Any
+) -> tuple[Stream, xr.Dataset]:
+    """Stream that has taken some frames, one at a time, and all that it has returned."""
+    stream = Stream(capture.isel(time=[0]), response, frame_rate=RATE, refresh=5.0, **options)
+    counts, time = capture["counts"].values, capture["time"].values
+    parts = [stream.update(time[i], counts[:, i]) for i in np.arange(time.size)[frames]]
+    films = [part[["object_temperature", "object_temperature_std"]] for part in parts]
+    whole = xr.concat(films, "time").assign(parts[-1].drop_dims("time").data_vars)
+    whole["background_temperature"] = xr.concat(
+        [p["background_temperature"] for p in parts], "time"
+    )
+    return stream, whole
+
+
+@pytest.fixture(scope="module")
+def glass() -> Data:
+    """Half a minute of glass."""
+    return walkers(3, 30.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_it_agrees_with_the_whole_capture(seed: int) -> None:
+    """Bars hold the truth, at all times and at the end, and the result of the whole capture."""
+    scene, capture, response = walkers(seed, 35.0, (24, 40))
+    stream, result = live(capture, response)
+    batch = solve(capture, response)
+    good = (result["status"] == 0) & (batch["status"] == 0)
+    covered, agreeing, errors = {}, {}, {}
+    for name, one in (("all", result), ("end", stream.result())):
+        std = one["object_temperature_std"]
+        error = (one["object_temperature"] - scene["object_temperature"]).where(good)
+        errors[name] = float(np.sqrt((error**2).mean()))
+        covered[name] = float((abs(error) < 1.96 * std).where(error.notnull()).mean())
+        apart = (one["object_temperature"] - batch["object_temperature"]).where(good)
+        agreeing[name] = float((abs(apart) < 1.96 * std).where(apart.notnull()).mean())
+    std = stream.result()["emissivity_std"]
+    for name, other in (("emissivity", scene), ("batch", batch)):
+        apart = (stream.result()["emissivity"] - other["emissivity"]).where(good)
+        covered[name] = float((abs(apart) < 1.96 * std).where(apart.notnull()).mean())
+    first, share = float(result["time"][0]), float(good.sum() / (batch["status"] == 0).sum())
+    print(f"seed {seed}: RMSE {errors} K, 95 % bars hold {covered}, batch {agreeing}")
+    print(f"first object of {first} s, latency {stream.latency} s; good of batch {share:.3f}")
+    assert 0.92 < covered["all"] < 0.98
+    assert covered["end"] > 0.90
+    assert min(covered["emissivity"], covered["batch"]) > 0.95
+    assert min(agreeing.values()) > 0.95
+    assert share > 0.95
+    assert errors["end"] < 0.3  # K
+
+
+def test_without_noise_the_truth_comes_back() -> None:
+    """Nearly noiseless, object and background of every frame are right."""
+    scene, capture, response = walkers(4, 30.0, noise=(1e-3, 1e-2))
+    result = live(capture, response)[1]
+    good = result["status"] == 0
+    for name, most in (("object_temperature", 0.05), ("background_temperature", 0.2)):
+        error = abs(result[name] - scene[name]).where(good)
+        high = float(error.quantile(0.99))
+        print(f"{name}: median {float(error.median()):.4f} K, 99 % {high:.3f} K")
+        assert high < most  # K
+    assert float(good.mean()) > 0.7
+
+
+def test_frames_together_are_frames_one_by_one(glass: Data) -> None:
+    """Several frames in one call give the same as one after another, to the last bit."""
+    _, capture, response = glass
+    one = live(capture, response)[0]
+    other = Stream(capture.isel(time=[0]), response, frame_rate=RATE, refresh=5.0)
+    other.update(capture["time"].values[:77], capture["counts"].values[:, :77])
+    result = other.update(capture["time"].values[77:], capture["counts"].values[:, 77:])
+    last = one.result()
+    xr.testing.assert_identical(result.isel(time=slice(-last.sizes["time"], None)), last)
+    schema.check(last, "separated")
+
+
+def test_bands_may_come_in_any_order(glass: Data) -> None:
+    """The result is in the order of the template's bands, and the same."""
+    _, capture, response = glass
+    here, there = (
+        live(part, response)[0].result() for part in (capture, capture.isel(band=[1, 0]))
+    )
+    assert list(there["band"].values) == list(capture["band"].values[::-1])
+    back = there.isel(band=[1, 0], other_band=[1, 0])
+    xr.testing.assert_identical(back.assign_attrs(here.attrs), here)
+
+
+def test_lost_frames_are_counted_and_left_out(glass: Data) -> None:
+    """Missing, empty and repeated frames are lost; the bars hold nevertheless."""
+    scene, capture, response = glass
+    lost = np.random.default_rng(5).choice(np.arange(20, 290), 40, replace=False)
+    empty, repeated = 150, 200
+    kept = np.setdiff1d(np.arange(capture.sizes["time"]), np.setdiff1d(lost, [empty, repeated]))
+    spoiled = capture.isel(time=kept).copy(deep=True)
+    spoiled["counts"].loc[{"time": capture["time"][empty]}] = np.nan
+    before = spoiled["counts"].isel(time=int(np.flatnonzero(kept == repeated)[0]) - 1)
+    spoiled["counts"].loc[{"time": capture["time"][repeated]}] = before.drop_vars("time")
+    stream, result = live(spoiled, response)
+    missing = capture.sizes["time"] - kept.size
+    assert stream.result().attrs["lost_frames"] == stream.lost_frames == missing + 2
+    shown = set(np.round(result["time"].values * RATE).astype(int))
+    assert shown.isdisjoint({empty, repeated, *lost})
+    error = (result["object_temperature"] - scene["object_temperature"]).where(
+        result["status"] == 0
+    )
+    hold = (abs(error) < 1.96 * result["object_temperature_std"]).where(error.notnull())
+    print(f"{stream.lost_frames} of {capture.sizes['time']} frames lost: {float(hold.mean()):.3f}")
+    assert float(hold.mean()) > 0.90
+
+
+def test_a_long_gap_is_not_smoothed_over(glass: Data) -> None:
+    """After five seconds without a frame the object is that of the frames since."""
+    scene, capture, response = glass
+    stream, result = live(capture, response, np.r_[0:180, 230:300])
+    error = (result["object_temperature"] - scene["object_temperature"]).where(
+        result["status"] == 0
+    )
+    after = error.where(result["time"] > 23.0, drop=True)
+    std = result["object_temperature_std"].where(result["time"] > 23.0, drop=True)
+    assert stream.lost_frames == 50
+    assert float((abs(after) < 1.96 * std).where(after.notnull()).mean()) > 0.90
+
+
+def test_samples_that_are_nan_stay_nan(glass: Data) -> None:
+    """A sample that is NaN has no temperatures; its pixel keeps those of the other frames."""
+    _, capture, response = glass
+    spoiled = capture.copy(deep=True)
+    spoiled["counts"].values[0, 250:252, 3, 4] = np.nan
+    spoiled["counts"].values[1, :, 5, 6] = np.nan
+    result = live(spoiled, response)[1].sel(time=slice(24.5, 26.0))
+    clean = live(capture, response)[1].sel(time=slice(24.5, 26.0))
+    at = np.isclose(result["time"], 25.0) | np.isclose(result["time"], 25.1)
+    pixel = result["object_temperature"][:, 3, 4]
+    assert clean["object_temperature"][:, 3, 4].notnull().all()
+    np.testing.assert_array_equal(pixel.isnull(), at)
+    assert int(result["status"][5, 6]) & Status.INVALID_SAMPLES
+    assert result["object_temperature"][:, 5, 6].isnull().all()
+
+
+def test_memory_does_not_grow_and_the_past_is_forgotten() -> None:
+    """A long stream takes no more memory than a new one, and a new object replaces the old."""
+    _, first, response = walkers(6, 60.0)
+    stream = Stream(first.isel(time=[0]), response, frame_rate=RATE, memory=12.0)
+    size = stream.nbytes
+    stream.update(first["time"].values, first["counts"].values)
+    made = xr.DataArray([0.6, 0.45], dims="band", coords={"band": first["band"].values})
+    rng = np.random.default_rng(7)
+    scene = simulation.walkers(np.arange(600) / RATE, (12, 20), made, rng)
+    second = simulation.observe(scene, response, rng)
+    stream.update(second["time"].values[:300] + 60.0, second["counts"].values[:, :300])
+    result = stream.result()
+    good = result["status"] == 0
+    off = abs(result["emissivity"] - scene["emissivity"]).where(good).median(["y", "x"])
+    print(f"{size / 240:.0f} byte a pixel; after another object, error {off.values}")
+    assert stream.nbytes == size
+    assert float(off.max()) < 0.05
+
+
+def test_a_shift_of_nothing_changes_nothing(glass: Data) -> None:
+    """Cameras in one place: the second one's frames are resampled to themselves."""
+    _, capture, response = glass
+    axes = {"axis": ["y", "x"], "y": capture["y"].values, "x": capture["x"].values}
+    none = np.zeros((2, capture.sizes["y"], capture.sizes["x"]), np.float32)
+    attrs = {"units": "pixel"}
+    field = xr.Dataset(
+        {
+            "shift": (("axis", "y", "x"), none, attrs),
+            "shift_std": (("axis", "y", "x"), none, attrs),
+            "known": (("y", "x"), none[0] == 0),
+        },
+        axes,
+    )
+    plain = live(capture, response)[0].result()
+    shifted = live(capture, response, reflection_shift=field)[0].result()
+    xr.testing.assert_allclose(shifted, plain, rtol=1e-5)
+
+
+def test_a_shutter_event_is_told_by_the_segment(glass: Data) -> None:
+    """Offsets renewed in the middle are told by the segment, and fewer pixels are flagged."""
+    _, capture, response = glass
+    spoiled = capture["counts"].values.copy()
+    rng = np.random.default_rng(8)
+    spoiled[:, 150:] += rng.normal(0, 10.0, (2, 1, *spoiled.shape[2:])).astype(np.float32)  # count
+    stream = Stream(capture.isel(time=[0]), response, frame_rate=RATE, refresh=5.0)
+    time = capture["time"].values
+    stream.update(time[:150], spoiled[:, :150])
+    stream.update(time[150:], spoiled[:, 150:], segment=1)
+    told = stream.result()["status"].values == 0
+    changed = capture.assign(counts=capture["counts"].copy(data=spoiled))
+    hidden = live(changed, response)[0].result()["status"].values == 0
+    print(f"good with the segment {told.mean():.3f}, without it {hidden.mean():.3f}")
+    assert told.mean() > max(0.6, hidden.mean())
+
+
+BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
+    ({"frames": np.zeros((2, 12, 20), np.uint16)}, TypeError, "Invalid dtype uint16 of the frames"),
+    ({"frames": np.zeros((2, 12, 21), np.float32)}, ValueError, r"Invalid shape \(2, 12, 21\)"),
+    ({"frames": np.zeros((3, 12, 20), np.float32)}, ValueError, r"Invalid shape \(3, 12, 20\)"),
+    ({"time": -1.0}, ValueError, "Invalid time -1.0 s of a frame, after 0.0 s. Must rise"),
+    ({"time": 0.0}, ValueError, "Invalid time 0.0 s"),
+    ({"time": np.nan}, ValueError, "Invalid time nan s"),
+    ({"segment": -1}, ValueError, "Invalid segment -1 after 0. Must not fall"),
+]
+
+
+@pytest.mark.parametrize(("change", "error", "match"), BAD, ids=[match for _, _, match in BAD])
+def test_a_bad_frame_is_named(
+    glass: Data, change: dict[str, Any], error: type[Exception], match: str
+) -> None:
+    """A frame that does not belong to the stream is refused, and the stream goes on."""
+    _, capture, response = glass
+    stream = Stream(capture.isel(time=[0]), response, frame_rate=RATE)
+    good: npt.NDArray[np.float32] = capture["counts"].values[:, 0]
+    stream.update(0.0, good)
+    arguments: dict[str, Any] = {"time": 1.0, "frames": capture["counts"].values[:, 1]} | change
+    with pytest.raises(error, match=match):
+        stream.update(**arguments)
+    with pytest.raises(ValueError, match="no temperatures are known"):
+        stream.result()
+    assert stream.update(0.1, capture["counts"].values[:, 1]).sizes["time"] == 0
+
+
+def test_a_bad_stream_is_named(glass: Data) -> None:
+    """Numbers that are not positive, and a response without noise, are refused."""
+    _, capture, response = glass
+    for name in ("frame_rate", "latency", "memory", "refresh"):
+        options: dict[str, Any] = {"frame_rate": RATE} | {name: 0.0}
+        with pytest.raises(ValueError, match=name):
+            Stream(capture, response, **options)
+    with pytest.raises(ValueError, match="Missing noise of the response"):
+        Stream(capture, response.drop_vars("noise"), frame_rate=RATE)
+
+
+@pytest.mark.bench
+def test_rate_of_full_frames() -> None:
+    """Frames of 640x512 in both bands: processor time of a frame, all rows separated."""
+    from time import perf_counter, process_time  # noqa: PLC0415
+
+    time, rng, made = np.arange(1500) / 60.0, np.random.default_rng(1), Rig()
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(made.bands)})
+    scene = simulation.walkers(time, (16, 20), glass, rng)
+    capture = simulation.observe(scene, made.response(), rng)
+    wide = xr.concat([xr.concat([capture.isel(time=[0])] * 32, "y")] * 32, "x")
+    stream = Stream(wide.drop_vars(["y", "x"], errors="ignore"), made.response(), frame_rate=60.0)
+    used, passed = [], []
+    for now, frame in zip(time, capture["counts"].values.swapaxes(0, 1), strict=True):
+        frames = np.tile(frame, (1, 32, 32))
+        start, clock = process_time(), perf_counter()
+        stream.update(now, frames)
+        used.append(process_time() - start)
+        passed.append(perf_counter() - clock)
+    steady = slice(1500 - 15 * 15, None)
+    cost, wall = np.mean(used[steady]), np.mean(passed[steady])
+    good = float((stream.result()["status"] == 0).mean())
+    print(
+        f"{1e3 * cost:.1f} ms of processor, {1e3 * wall:.1f} ms, a pair of frames; {good:.2f} good"
+    )
+    print(f"{stream.nbytes / 1e6:.0f} MB, latency {stream.latency} s")
+    assert cost < 2.0 / 60.0  # s, on two cores
