@@ -121,7 +121,7 @@ def fit_response(
         line = np.polynomial.Polynomial.fit(temperature, row, 1).convert().coef[::-1]
         reading = np.hypot(std, np.sqrt(_ROUNDING) if np.all(row == np.rint(row)) else 0.0)
         _check_growth(name, temperature, row, float(np.hypot(reading, temperature_std * line[0])))
-        curve = _fit_band(name, temperature, row)
+        curve = fit_band(name, temperature, row)
         slope = np.max(np.diff(curve.counts(temperature)) / np.diff(temperature))
         error = float(np.hypot(reading, temperature_std * slope))
         _check_residuals(curve, temperature, row, error)
@@ -206,7 +206,7 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
     fitting = []
     for place in range(counts.size):
         rest = np.arange(counts.size) != place
-        others = _fit_band(band, temperature[rest], counts[rest])
+        others = fit_band(band, temperature[rest], counts[rest])
         beside = counts - others.counts(temperature)
         if np.sum(beside[rest] ** 2) <= std**2 * chi2.isf(_FALSE_ALARM, counts.size - 3):
             fitting.append((place, beside[place]))
@@ -234,7 +234,7 @@ def _wavelengths(band: str) -> tuple[float, float]:
     return known.lower / _WAVELENGTH_MARGIN, known.upper * _WAVELENGTH_MARGIN
 
 
-def _fit_band(band: str, temperature: Array, counts: Array) -> Curve:
+def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
     """Curve of least squares of one band."""
     middle = 0.5 * (temperature[0] + temperature[-1])
     span = counts[-1] - counts[0]

@@ -85,6 +85,8 @@ def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
         notes.append("simulated twin" if "twin" in data.attrs else origin)
     if data.attrs.get("radiometric", 1) == 0:
         notes.append("not radiometric")
+    if "calibration" in data.attrs:
+        notes.append(str(data.attrs["calibration"]))
     return f" ({', '.join(notes)})" if notes else ""
 
 

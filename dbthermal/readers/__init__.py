@@ -5,17 +5,24 @@ opens was written by others: it must be a regular file of a limited size.
 """
 
 from dbthermal._text import read_yaml
+from dbthermal.readers._arrays import array
 from dbthermal.readers._flir import flir
 from dbthermal.readers._spectra import ecostress, slum, ucsb
+from dbthermal.readers._stacks import raw, tiff
+from dbthermal.readers._two_bands import two_bands
 from dbthermal.readers._videos import masked_palette_video, palette_video
 
 __all__ = [
+    "array",
     "ecostress",
     "flir",
     "masked_palette_video",
     "palette_video",
+    "raw",
     "read_yaml",
     "slum",
+    "tiff",
+    "two_bands",
     "ucsb",
 ]
 __dir__ = __all__.copy

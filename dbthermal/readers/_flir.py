@@ -117,7 +117,7 @@ def flir(
     FileNotFoundError
         If a file does not exist.
     ImportError
-        If an image is compressed and PyAV, the extra ``video``, is not installed.
+        If an image is compressed and PyAV, the extra ``recordings``, is not installed.
     ValueError
         If a file is no FLIR recording, damaged or truncated, or takes too much memory; frames
         differ in size or in the maker's constants; the byte order is unclear or contradicts the
@@ -218,7 +218,7 @@ def _jpegls_size(body: bytes, place: str) -> tuple[int, int, int]:
     for marker, start, _ in container.segments(body, place):
         if marker == 0xF7:
             bits, height, width, _ = struct.unpack_from(">BHHB", body, start)
-            return height, width, 16 if bits > 8 else bits  # in 16, which FFmpeg does not scale
+            return height, width, bits
     raise ValueError(f"Invalid JPEG in {place}, of 8 bits. Must be JPEG-LS: record 16-bit counts.")
 
 
@@ -226,7 +226,7 @@ def _decoded(image: _Image, place: str) -> Counts:
     """Counts (y, x) of an image; ValueError where its codec finds damage."""
     if image.codec == "none":
         return np.frombuffer(image.body, f"{image.order}u2").reshape(image.shape)
-    av = recordings.optional("av", "video")
+    av = recordings.optional("av", "recordings")
     codec = av.CodecContext.create(image.codec, "r")
     largest = 4 * image.shape[0] * image.shape[1] + 2**16  # with what FFmpeg adds to each side
     codec.options = {"err_detect": "crccheck+explode", "max_pixels": str(largest)}

@@ -81,6 +81,23 @@ def _roughness(frame: Counts) -> float:
     return sum(float(np.abs(np.diff(values, axis=axis)).sum()) for axis in (0, 1))
 
 
+def check_unit(unit: str, name: str) -> None:
+    """Raise ValueError if the numbers of a file are no counts."""
+    if unit != "count":
+        raise ValueError(
+            f"Invalid unit '{unit}' of '{name}'. Must be 'count': object and reflection add up in "
+            "counts, and no longer in temperatures (temperature-linear data). Record or export raw "
+            "counts."
+        )
+
+
+def check_order(counts: Counts, name: str) -> None:
+    """Raise ValueError if images are smoother with their bytes swapped."""
+    if next((sign for frame in counts if (sign := smoother(frame))), 0) < 0:
+        rule = "Must be the other byte order, or another shape or header"
+        raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
+
+
 def byte_order(name: str, value: str) -> str:
     """Byte order as numpy writes it, of 'little' or 'big'."""
     if value not in {"little", "big"}:
@@ -109,7 +126,8 @@ def recording(
     flags: npt.NDArray[np.uint16] | None = None,
 ) -> xr.Dataset:
     """Dataset of one band: `counts` (time, y, x), its clock and flags; see `readers.flir`."""
-    if not np.any(counts & 0xFF) or not np.any(counts >> 8):
+    empty = (not any(np.any(frame & byte) for frame in counts) for byte in (0x00FF, 0xFF00))
+    if any(empty):
         raise ValueError(
             f"Invalid counts of '{name}': one of their two bytes is always 0, as in pictures of 8 "
             "bits or with automatic gain. Must be 16-bit counts of the detector: record those."

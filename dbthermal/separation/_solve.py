@@ -244,6 +244,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         method=method,
         pooled=int(pool is not None),
         response_kind=response_kind,
+        **{key: response.attrs[key] for key in ("calibration",) if key in response.attrs},
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
         not_estimated=" ".join(inputs.method.not_estimated + ratios),

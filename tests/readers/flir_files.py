@@ -3,7 +3,7 @@
 import random
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Counts = NDArray[np.uint16]
+Values = Mapping[int, float] | None
 CONSTANTS = {0x58: 21106.77, 0x5C: 1501.0, 0x60: 1.0, 0x30C: 0.012545258}
 
 
@@ -42,13 +43,13 @@ def geometry(image: Counts, number: int, order: str) -> bytes:
     return struct.pack(order + "16H", 2, width, height, *[0] * 9, number, 0, 0, 0)
 
 
-def camera(image: Counts, number: int, seconds: float, order: str, **values: float) -> bytes:
+def camera(image: Counts, number: int, seconds: float, order: str, values: Values = None) -> bytes:
     """Camera's record of 2476 bytes."""
     record = bytearray(2476)
     record[:32] = geometry(image, number, order)
     stated = {0x20: 0.95, 0x24: 1.0, 0x28: 293.15, 0x2C: 293.15, 0x30: 293.15, 0x34: 1.0, 0x3C: 0.5}
     stated |= CONSTANTS | {0x90: 393.15, 0x94: 233.15}
-    stated |= {int(place[1:], 16): value for place, value in values.items()}
+    stated |= values or {}
     for place, value in stated.items():
         struct.pack_into(order + "f", record, place, value)
     struct.pack_into(order + "i", record, 0x308, -7340)
@@ -79,7 +80,7 @@ def sequence(
     inner: str = "<",
     seconds: Sequence[float] | None = None,
     sums: bool = False,
-    **values: float,
+    values: Values = None,
 ) -> bytes:
     """All frames, one after the other, zeros between; `inner` is the order in the records."""
     times = [1.5e9 + 0.125 + k / 10 for k in range(len(counts))] if seconds is None else seconds
@@ -88,7 +89,7 @@ def sequence(
         body = compressed(image, codec) if codec else image.astype(f"{inner}u2").tobytes()
         kind = {"": 2, "png": 3, "jpegls": 4}[codec]
         records = [
-            (32, 0, camera(image, number, moment, inner, **values)),
+            (32, 0, camera(image, number, moment, inner, values)),
             (1, kind, geometry(image, number, inner) + body),
             (43, 1, b"FFF\0 is no header in here"),
         ]

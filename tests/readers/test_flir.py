@@ -175,7 +175,9 @@ def test_exchanged_images_are_marked(path: Path) -> None:
 
 def test_implausible_values_are_named(path: Path) -> None:
     """Kelvin entered for Celsius, a date before the format: named, shown, and not applied."""
-    path.write_bytes(sequence(scene(1), seconds=[946706066.0], x28=571.15, x20=float("nan")))
+    path.write_bytes(
+        sequence(scene(1), seconds=[946706066.0], values={0x28: 571.15, 0x20: float("nan")})
+    )
     read = readers.flir(path)
     assert "reflected_temperature 571.15 K (298.0 degrees Celsius)" in read.attrs["implausible"]
     assert "emissivity nan" in read.attrs["implausible"]
@@ -186,7 +188,7 @@ def test_implausible_values_are_named(path: Path) -> None:
 
 def test_range_must_not_change(path: Path) -> None:
     """Frames of two ranges of the camera are no recording."""
-    parts = [sequence(scene(1)), sequence(scene(1), seconds=[1.6e9], x58=16000.0)]
+    parts = [sequence(scene(1)), sequence(scene(1), seconds=[1.6e9], values={0x58: 16000.0})]
     path.write_bytes(b"".join(parts))
     with pytest.raises(
         ValueError, match=r"planck_R1 16000 of frame 1 of 'a\.seq', 21106\.8 before"
@@ -271,7 +273,7 @@ def test_missing_library(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(_recording, "import_module", absent)
-    with pytest.raises(ImportError, match=r"Missing library 'av'.*dbthermal\[video\]"):
+    with pytest.raises(ImportError, match=r"Missing library 'av'.*dbthermal\[recordings\]"):
         readers.flir(path)
 
 
@@ -280,8 +282,11 @@ def fates(path: Path, codec: str, number: int) -> Counter[str]:
 
     Without a codec, damage of the pixels alone is told from other counts.
     """
-    counts, found = scene(), Counter[str]()
-    whole = sequence(counts, codec, sums=codec == "png")
+    counts, found = scene(1 if codec == "jpeg" else 3), Counter[str]()
+    if codec == "jpeg":
+        whole = jpeg(sequence(counts, "png", sums=True), 900)
+    else:
+        whole = sequence(counts, codec, sums=codec == "png")
     places = [whole.index(image.tobytes()) for image in counts] if not codec else []
     for seed in range(number):
         kind, changed = damaged(whole, seed)
@@ -311,7 +316,7 @@ def fate(read: xr.Dataset, counts: np.ndarray, pixels: list[bytes]) -> str:
 @pytest.mark.parametrize(
     "number", [pytest.param(300, id="300"), pytest.param(10_000, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("codec", ["", "png", "jpegls"])
+@pytest.mark.parametrize("codec", ["", "png", "jpegls", "jpeg"])
 def test_damage(path: Path, codec: str, number: int) -> None:
     """Damaged files are refused or harmless; unprotected pixels, damaged, are those of the file.
 

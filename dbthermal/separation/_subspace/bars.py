@@ -7,7 +7,7 @@ import numpy as np
 
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels, residuals
+from dbthermal.separation._subspace import kernels
 from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._subspace.pixel import Line, Ratio
 from dbthermal.separation._subspace.shared import Model, Work
@@ -76,11 +76,9 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
             size += kernel[t] * residual[t]
         size /= length
         if last == 0:
-            inverse = 1.0 / (residuals.TUNING * line.scale)
             for t in range(frames):
-                r = (residual[t] - size * (drift[t] - level - slope * emitted[t])) * inverse
-                inside = max(1.0 - r * r, 0.0)
-                again[t] = inside * inside
+                again[t] = residual[t] - size * (drift[t] - level - slope * emitted[t])
+            kernels.bisquare(again, line.scale, again)
             kept = again
     variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
     curve = _curve_variance(model, kernel, count, ratios.null_variance, work)
@@ -190,7 +188,7 @@ def _background(
         variance[t] = value + contrast**2 * steady
     if pattern[0] > 0.0 or pattern[1] > 0.0:
         direct0, direct1 = one / (1.0 - first), two / (1.0 - last)
-        kernels.slopes(model.first, work.background, work.spare)
+        kernels.response(model.first, work.background, work.spare, 1)
         for t in range(variance.size):
             slope0, slope1 = work.object_slope[t], work.other_object_slope[t]
             steepness = w[0] * first * slope0 + w[1] * last * slope1

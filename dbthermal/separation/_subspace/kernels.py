@@ -24,10 +24,13 @@ from dbthermal.separation._subspace import residuals
 _ERROR: Final = 1e-7  # of a response's polynomials [K]
 _MARGIN: Final = 0.25  # of the calibrated range, beside it, in which they hold
 _TERMS: Final = 12  # of a polynomial
+# Degrees, and shares of the range: of a wide one, such as a maker's, the outer parts stay exact.
+_TRIED: Final = (
+    *((degree, 1.0) for degree in range(1, _TERMS)),
+    *((_TERMS - 1, 0.85**k) for k in range(1, 14)),
+)
 _NEWTON: Final = 4  # steps of the inverse, at most
 _GUESSES: Final = 60  # of the value of a rank, at most
-
-_LARGE: Final = 1e18  # a residual of no weight
 
 _SOURCES: Final = [*Path(__file__).parent.glob("*.py"), Path(planck.__file__), Path(tiles.__file__)]
 DIGEST: Final = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(_SOURCES))).hexdigest()
@@ -61,13 +64,14 @@ class Table(NamedTuple):
 def table(curve: Curve) -> Table:
     """Polynomials of a response, of the least degree that keeps an error."""
     margin = _MARGIN * (curve.highest - curve.lowest)
-    low, high = max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin
-    dense = np.linspace(low, high, 1001)
+    widest = max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin
 
     def signal(temperature: Array) -> Array:
         return curve.signal(temperature) - curve.reference
 
-    for degree in range(1, _TERMS):
+    for degree, share in _TRIED:
+        low, high = (np.mean(widest) + share * np.diff(widest) * np.array([-0.5, 0.5])).tolist()
+        dense = np.linspace(low, high, 1001)
         u, slope = (Chebyshev.interpolate(f, degree, [low, high]) for f in (signal, curve.slope))
         errors = np.abs([u(dense) - signal(dense), slope(dense) - curve.slope(dense)])
         if errors.max() < _ERROR:
@@ -141,17 +145,17 @@ def blackbody(table: Table, temperature: Array, signal: Array, slope: Array) -> 
 
 
 @compiled
-def slopes(table: Table, temperature: Array, slope: Array) -> None:
-    """Slope [1] alone, as `blackbody`."""
-    outside, scale = 0.0, 1.0 / table.half
+def response(table: Table, temperature: Array, result: Array, slope: int) -> None:
+    """Signal less the reference [K], 0, or slope [1], 1, alone, as `blackbody`."""
+    outside, scale, terms = 0.0, 1.0 / table.half, table.slope if slope else table.signal
     for t in range(temperature.size):
         x = (temperature[t] - table.middle) * scale
         outside += 0.0 if abs(x) <= 1.0 else 1.0
-        slope[t] = polynomial(table.slope, x)
+        result[t] = polynomial(terms, x)
     if outside > 0.0:
         for t in range(temperature.size):
             if not abs(temperature[t] - table.middle) <= table.half:
-                slope[t] = _exact(table, temperature[t])[1]
+                result[t] = _exact(table, temperature[t])[slope]
 
 
 @compiled
@@ -275,24 +279,16 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
     return float(np.uint32(lowest + above).view(np.float32))
 
 
-def _line(real: type[np.float32] | type[np.float64]) -> Any:
-    """Weighted line of arrays of a precision, compiled."""
+def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
+    """Weighted line, and bisquare weights, of arrays of a precision, compiled."""
     zero, one = real(0.0), real(1.0)
 
     @compiled
-    def line(x: Any, y: Any, weights: Any, residual: Any, scale: float) -> tuple[Any, Any, Any]:
-        """
-        Slope and intercept of a weighted line, and the energy of the abscissa about its mean.
-
-        With weights as they are or, for a scale, Tukey's bisquare of residuals; these in place.
-        """
-        inverse = real(1.0 / (residuals.TUNING * scale))
+    def moments(x: Any, y: Any, weights: Any) -> tuple[Any, Any, Any]:
+        """Slope and intercept of a weighted line, and the energy of the abscissa about its mean."""
         total, first, second, square, product = zero, zero, zero, zero, zero
         for t in range(x.size):
-            r = residual[t] * inverse
-            kept = max(one - r * r, zero)
-            w = kept * kept
-            weights[t] = w
+            w = weights[t]
             wx = w * x[t]
             total += w
             first += wx
@@ -304,28 +300,20 @@ def _line(real: type[np.float32] | type[np.float64]) -> Any:
         slope = (product - total * middle * centre) / energy
         return slope, centre - slope * middle, energy
 
-    return line
+    @compiled
+    def bisquare(residual: Any, scale: float, weights: Any) -> None:
+        """Tukey's bisquare weights of residuals, in place."""
+        inverse = real(1.0 / (residuals.TUNING * scale))
+        for t in range(residual.size):
+            r = residual[t] * inverse
+            kept = max(one - r * r, zero)
+            weights[t] = kept * kept
+
+    return moments, bisquare
 
 
-_single, _double = _line(np.float32), _line(np.float64)
-
-
-@compiled
-def moments(x: Any, y: Any, weights: Any) -> tuple[float, float, float]:
-    """Slope and intercept of a weighted line, and the energy of the abscissa about its mean."""
-    total, first, second, square, product = 0.0, 0.0, 0.0, 0.0, 0.0
-    for t in range(x.size):
-        w = weights[t]
-        wx = w * x[t]
-        total += w
-        first += wx
-        second += w * y[t]
-        square += wx * x[t]
-        product += wx * y[t]
-    middle, centre = first / total, second / total
-    energy = square - total * middle**2
-    slope = (product - total * middle * centre) / energy
-    return slope, centre - slope * middle, energy
+moments, bisquare = _of(np.float64)
+_moments, _bisquare = _of(np.float32)
 
 
 @compiled
@@ -337,24 +325,25 @@ def _started(x: Array, y: Array, noise: float, residual: Array, few: Any) -> Non
     xs, ys, rest = few[0, :count], few[1, :count], few[2, :count]
     weights, plain, magnitude = few[3, :count], few[4, :count], few[5, :count]
     for i in range(count):
-        xs[i], ys[i], rest[i] = x[i * step] - middle, y[i * step] - centre, 0.0
-    slope, intercept, _ = _single(xs, ys, weights, rest, 1.0)
+        xs[i], ys[i], weights[i] = x[i * step] - middle, y[i * step] - centre, 1.0
+    slope, intercept, _ = _moments(xs, ys, weights)
     for i in range(count):
         plain[i] = ys[i] - intercept - slope * xs[i]
     rank, zero = int(residuals.SHARE * count), np.float32(0.0)
     best, best_slope, best_intercept = np.inf, np.inf, np.inf
     for start in range(3):
         sign = np.float32(2 * start - 3) if start > 0 else zero
-        scale, deviation = 1.0, noise
-        for i in range(count):  # a residual of 0 has the weight 1, a large one 0
-            rest[i] = np.float32(0.0) if sign * plain[i] >= zero else np.float32(_LARGE)
+        deviation = noise
+        for i in range(count):
+            weights[i] = 1.0 if sign * plain[i] >= zero else 0.0
         for _ in range(residuals.STARTING_STEPS):
-            slope, intercept, _ = _single(xs, ys, weights, rest, scale)
+            slope, intercept, _ = _moments(xs, ys, weights)
             for i in range(count):
                 rest[i] = ys[i] - intercept - slope * xs[i]
                 magnitude[i] = abs(rest[i])
             deviation = ranked(magnitude, rank, deviation)
             scale = max(noise, residuals.ANNEALING * residuals.TO_STD * deviation)
+            _bisquare(rest, scale, weights)
         if deviation < best:
             best, best_slope, best_intercept = deviation, slope, intercept
     for t in range(x.size):
@@ -383,7 +372,8 @@ def regress(
     for _ in range(residuals.STEPS):
         deviation = ranked(magnitude, rank, deviation)
         scale = max(noise, residuals.TO_STD * deviation)
-        slope, intercept, energy = _double(x, y, weights, residual, scale)
+        bisquare(residual, scale, weights)
+        slope, intercept, energy = moments(x, y, weights)
         for t in range(x.size):
             residual[t] = y[t] - intercept - slope * x[t]
             magnitude[t] = abs(residual[t])

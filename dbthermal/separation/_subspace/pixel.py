@@ -229,15 +229,15 @@ def background(model: Model, line: Line, work: Work) -> None:
         mean[t] = one * reflected + two * work.reflected[t]
     # From the temperature of the mean signal, one Gauss-Newton step on the exact responses.
     kernels.temperature(model.first, mean, result)
-    kernels.slopes(model.first, result, work.back_slope)
+    kernels.response(model.first, result, work.back_slope, 1)
     kernels.blackbody(model.second, result, bend, work.other_back_slope)
     for t in range(z.size):
         a, b = work.back_slope[t], work.other_back_slope[t]
         reflected = (z[t] - first * at_object[t]) * inverse
         step = one * a * (reflected - mean[t]) + two * b * (work.reflected[t] - bend[t])
         result[t] += step / (one * a**2 + two * b**2)
-    kernels.blackbody(model.second, result, bend, work.spare)
-    kernels.blackbody(model.first, result, mean, work.spare)
+    kernels.response(model.second, result, bend, 0)
+    kernels.response(model.first, result, mean, 0)
     finite = 0.0
     for t in range(bend.size):
         bend[t] = (1.0 - last) * (bend[t] - mean[t])

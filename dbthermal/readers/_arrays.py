@@ -1,0 +1,136 @@
+"""Counts in files of NumPy, or in an array that another library has opened."""
+
+import lzma
+import struct
+import warnings
+import zipfile
+import zlib
+from contextlib import ExitStack
+from pathlib import Path
+from tokenize import TokenError
+from typing import IO, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal.readers import _recording as recordings
+from dbthermal.readers._decoding import MEMORY
+from dbthermal.readers._recording import Clock
+
+_NO_ARCHIVE: Final = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
+    *(ValueError, OSError, EOFError, RuntimeError, LookupError),
+)
+_NO_HEADER: Final = (
+    *(ValueError, LookupError, SyntaxError, TypeError, AttributeError, ArithmeticError),
+    *(RecursionError, MemoryError, TokenError, Warning),
+)
+
+
+def array(
+    source: str | Path | npt.NDArray[Any] | xr.DataArray,
+    name: str | None = None,
+    *,
+    unit: str,
+    clock: Clock,
+    memory: float = MEMORY,
+) -> xr.Dataset:
+    """Counts of a .npy or .npz file, or of an array from HDF5, NetCDF, zarr or elsewhere.
+
+    Pickled objects are never loaded. Arrays in other formats are opened by their own libraries,
+    ``xarray.open_dataset("a.nc")["frames"]`` or ``h5py.File("a.h5")["frames"]``, and may be lazy.
+
+    Parameters
+    ----------
+    source : str, Path, array or DataArray
+        Regular file, or an array with `shape` and `dtype`: (time, y, x), uint16.
+    name : str, optional
+        Name of the array in a .npz of several.
+    unit, clock, memory
+        As for `tiff`; a DataArray's own ``units`` must agree.
+
+    Returns
+    -------
+    Dataset
+        As from `tiff`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    ValueError
+        If a file is neither .npy nor .npz, or damaged; the array is not one of three dimensions
+        and uint16, or is not in the file; as `tiff` for unit, clock, memory and 8 bits.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = np.arange(18000, 18024, dtype=np.uint16).reshape(2, 3, 4)
+    >>> array(frames, unit="count", clock=30.0).sizes["time"]
+    2
+    """
+    label = Path(source).name if isinstance(source, str | Path) else "array"
+    recordings.check_unit(unit, label)
+    with ExitStack() as stack:
+        if isinstance(source, str | Path):
+            (path,) = recordings.files([source])
+            values = _numpy_file(path, name, memory, stack)
+        else:
+            values = source
+            _check(values.shape, values.dtype, memory, label)
+            recordings.check_unit(str(getattr(values, "attrs", {}).get("units", unit)), label)
+        counts = np.asarray(values).astype(np.uint16)
+    seconds = recordings.stamps(clock, len(counts), label)
+    return recordings.recording(counts, seconds, label, {"source": label, "format": "array"})
+
+
+def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: str) -> None:
+    """Raise ValueError for what is no stack of counts, before it is read."""
+    if dtype.kind != "u" or dtype.itemsize != 2:
+        rule = "Must be uint16: counts, neither temperatures nor objects"
+        raise ValueError(f"Invalid dtype {dtype} of '{name}'. {rule}.")
+    recordings.check_memory(shape, memory, name)
+
+
+def _numpy_file(path: Path, name: str | None, memory: float, stack: ExitStack) -> Any:
+    """Array of a .npy or of a .npz, whose checksums must be right."""
+    stream: IO[bytes] = stack.enter_context(path.open("rb"))
+    try:
+        if stream.read(2) == b"PK":
+            archive = stack.enter_context(zipfile.ZipFile(path))
+            names = [member.removesuffix(".npy") for member in archive.namelist()]
+            wanted = names[0] if name is None and len(names) == 1 else name
+            if wanted not in names:
+                raise ValueError(
+                    f"Missing array '{wanted}' in '{path.name}'. Must be one of {names}."
+                )
+            stream = stack.enter_context(archive.open(archive.namelist()[names.index(wanted)]))
+        else:
+            stream.seek(0)
+        return _numpy_array(stream, path.name, memory)
+    except _NO_ARCHIVE as error:
+        if isinstance(error, ValueError) and "Must " in str(error):
+            raise
+        raise ValueError(f"Damaged '{path.name}': {error}. Must be a whole .npz.") from error
+
+
+def _numpy_array(stream: IO[bytes], name: str, memory: float) -> npt.NDArray[Any]:
+    """Array in NumPy's format, which must end where its header says."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        headers = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }
+        with warnings.catch_warnings(action="error"):  # of headers mended as of Python 2
+            shape, by_columns, dtype = headers[version](stream)
+    except _NO_HEADER as error:
+        message = " ".join(str(error).split())[:100]
+        raise ValueError(f"Invalid '{name}': {message}. Must be .npy or .npz.") from error
+    _check(shape, dtype, memory, name)
+    size = 2 * int(np.prod(shape, dtype=object))
+    if len(content := stream.read(size + 1)) != size:
+        found = f"{len(content)} bytes or more of counts in '{name}'"
+        raise ValueError(f"Truncated or damaged {found}. Must be {size}, as its header says.")
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if by_columns else "C")

@@ -1,0 +1,244 @@
+"""Counts that other programs wrote: TIFF stacks and bare numbers, which tell little else."""
+
+import json
+import math
+import re
+import struct
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from dbthermal.readers import _recording as recordings
+from dbthermal.readers._decoding import MEMORY
+from dbthermal.readers._recording import Clock, Paths
+
+# What a page must say: the attribute of tifffile's page, its name in messages, and the value.
+_FORM: Final = (
+    ("compression", "compression", 1, "none: save it uncompressed"),
+    ("bitspersample", "bits of a pixel", 16, "16: counts, not a picture"),
+    ("sampleformat", "sample format", 1, "1: whole numbers from 0, counts and no temperatures"),
+    ("samplesperpixel", "values of a pixel", 1, "1: counts, not colours"),
+    ("fillorder", "order of bits", 1, "1: the highest bit first"),
+    ("is_tiled", "tiled pages", False, "False: save it in strips"),
+)
+# What tifffile raises for damaged files, its own errors among them.
+_DAMAGE: Final = (
+    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError),
+    *(struct.error, OSError, MemoryError),
+)
+_ORDERS: Final = {"<": "little", ">": "big"}
+_IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re.MULTILINE)
+
+
+def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.Dataset:
+    """Counts of a TIFF or BigTIFF stack, or of one file a frame, in 16 bits.
+
+    TIFF tells neither the unit nor the time of its frames, so both must be stated.
+
+    Parameters
+    ----------
+    path : str, Path or sequence
+        Regular file of one page or many, or the files of one recording in the order of time; the
+        numbers in their names must rise.
+    unit : {"count"}
+        Unit of the pixels. Temperatures, also as whole numbers (temperature-linear data), are
+        refused: the camera made them with an emissivity, and mixtures add up in counts only.
+    clock : float or array_like
+        Frame rate [Hz] or time of each frame [s].
+    memory : float
+        Largest memory that the counts may take [byte]; refused before it is taken.
+
+    Returns
+    -------
+    Dataset
+        `counts` (time, y, x) [count], uint16, `exposure_time` and `frame_flags` (time), as from
+        `flir`; attributes ``source``, ``format``, ``byte_order``.
+
+    Raises
+    ------
+    FileNotFoundError
+        If a file does not exist.
+    ImportError
+        If tifffile, the extra ``recordings``, is not installed.
+    ValueError
+        If the unit is another one; a file is no TIFF, damaged, or has fewer pages than it states;
+        a page is compressed, in tiles, in colours or not of 16 bits, or differs in size; the counts
+        take too much memory or have 8 bits; or the clock does not fit.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np, tifffile
+    >>> frames = np.arange(18000, 18024, dtype=np.uint16).reshape(2, 3, 4)
+    >>> with TemporaryDirectory() as folder:
+    ...     tifffile.imwrite(f"{folder}/a.tif", frames, photometric="minisblack")
+    ...     capture = tiff(f"{folder}/a.tif", unit="count", clock=30.0)
+    >>> bool((capture.counts == frames).all()), capture.time.values.round(3).tolist()  # [s]
+    (True, [0.0, 0.033])
+    """
+    paths = recordings.files(path)
+    name = recordings.label(paths)
+    recordings.check_unit(unit, name)
+    pages = [page for one in paths for page in _pages(one)]
+    for page in pages:
+        if page.shape != pages[0].shape:
+            found = f"Invalid page of {page.shape} in '{page.path.name}'"
+            raise ValueError(f"{found}. Must be {pages[0].shape}, as the first.")
+    shape = (sum(page.images for page in pages), *pages[0].shape)
+    recordings.check_memory(shape, memory, name)
+    counts, at = np.empty(shape, dtype=np.uint16), 0
+    values = counts.reshape(-1)
+    for page in pages:
+        for offset, length in page.spans:
+            form = f"{page.order}u2"
+            values[at : at + length // 2] = np.fromfile(page.path, form, length // 2, offset=offset)
+            at += length // 2
+    order = " and ".join(sorted({_ORDERS[page.order] for page in pages}))
+    seconds = recordings.stamps(clock, len(counts), name)
+    attrs = {"source": name, "format": "TIFF", "byte_order": order, "byte_order_by": "header"}
+    return recordings.recording(counts, seconds, name, attrs)
+
+
+def raw(
+    path: str | Path,
+    shape: tuple[int, int],
+    *,
+    byte_order: str,
+    unit: str,
+    clock: Clock,
+    header: int = 0,
+    frame_header: int = 0,
+    memory: float = MEMORY,
+) -> xr.Dataset:
+    """Counts of a file of bare 16-bit numbers, frame after frame.
+
+    Nothing in such a file tells its form: what is stated must fit its size without remainder, and
+    an image that is smoother with its bytes swapped is refused.
+
+    Parameters
+    ----------
+    path : str or Path
+        Regular file.
+    shape : (int, int)
+        Rows and columns of a frame [pixel].
+    byte_order : {"little", "big"}
+        Order of the bytes of a number.
+    unit, clock, memory
+        As for `tiff`.
+    header, frame_header : int
+        Size of what precedes the first frame, and each frame [byte].
+
+    Returns
+    -------
+    Dataset
+        As from `tiff`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    ValueError
+        If the size of the file is not that of a whole number of frames, or the byte order
+        contradicts the image; as `tiff` for unit, clock, memory and 8 bits.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> frames = np.arange(18000, 18024, dtype=">u2").reshape(2, 3, 4)
+    >>> with TemporaryDirectory() as folder:
+    ...     frames.tofile(f"{folder}/a.raw")
+    ...     capture = raw(f"{folder}/a.raw", (3, 4), byte_order="big", unit="count", clock=30.0)
+    >>> bool((capture.counts == frames).all())
+    True
+    """
+    (one,) = recordings.files([path])
+    name = one.name
+    recordings.check_unit(unit, name)
+    order = recordings.byte_order(name, byte_order)
+    sizes = {"shape": min(shape, default=0) - 1, "header": header, "frame_header": frame_header}
+    for label, value in sizes.items():
+        if value < 0 or (label == "shape" and len(shape) != 2):
+            stated = {"shape": shape}.get(label, value)
+            raise ValueError(f"Invalid {label} {stated} of '{name}'. Must be of positive sizes.")
+    frame = frame_header + 2 * shape[0] * shape[1]
+    frames, rest = divmod(one.stat().st_size - header, frame)
+    if frames < 1 or rest:
+        found = f"{one.stat().st_size} bytes of '{name}': {frames} frames and {rest} bytes"
+        rule = f"Must be {header} + a whole number of {frame}, as shape and headers state"
+        raise ValueError(f"Invalid size {found}. {rule}.")
+    recordings.check_memory((frames, *shape), memory, name)
+    form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
+    counts = np.memmap(one, form, "r", offset=header)["counts"].astype(np.uint16)
+    recordings.check_order(counts, name)
+    seconds = recordings.stamps(clock, frames, name)
+    attrs = {"source": name, "format": "raw", "byte_order": byte_order, "byte_order_by": "caller"}
+    return recordings.recording(counts, seconds, name, attrs)
+
+
+class _Page(NamedTuple):
+    """Images in a file: shape (y, x), number, byte order, and spans (place, length) [byte]."""
+
+    path: Path
+    shape: tuple[int, int]
+    images: int
+    order: str
+    spans: list[tuple[int, int]]
+
+
+def _pages(path: Path) -> list[_Page]:
+    """Pages of a file, which must be as many as its description states."""
+    tifffile = recordings.optional("tifffile", "recordings")
+    size, pages, total = path.stat().st_size, list[_Page](), 0
+    try:
+        with tifffile.TiffFile(path) as file:
+            for number, page in enumerate(file.pages):
+                pages.append(_page(page, path, file.byteorder, number))
+                total += sum(length for _, length in pages[-1].spans)
+                if total > size:  # as of a chain of pages that returns to itself
+                    raise ValueError(f"{total} bytes of pixels. Must fit into its {size}.")
+            stated = _stated(str(file.pages[0].description))
+    except _DAMAGE as error:
+        rule = "" if "Must " in str(error) else ". Must be a whole TIFF or BigTIFF."
+        raise ValueError(f"Invalid or damaged TIFF '{path.name}': {error}{rule}") from error
+    if len(pages) == 1 and stated > 1:  # one page for a stack without gaps: ImageJ beyond 4 GB
+        (start, length), *others = pages[0].spans
+        if others or start + stated * length > size:
+            found = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"
+            raise ValueError(f"{found}. Must end within its {size}.")
+        return [pages[0]._replace(images=stated, spans=[(start, stated * length)])]
+    if stated not in {0, len(pages)}:
+        found = f"Truncated TIFF '{path.name}': {len(pages)} pages"
+        raise ValueError(f"{found}. Must be the {stated} that its description states.")
+    return pages
+
+
+def _page(page: Any, path: Path, order: str, number: int) -> _Page:
+    """Page of tifffile, as one image of uncompressed counts."""
+    for attribute, label, value, rule in _FORM:
+        if (found := getattr(page, attribute)) != value:
+            raise ValueError(f"Invalid {label} {found} of page {number}. Must be {rule}.")
+    shape = (int(page.imagelength), int(page.imagewidth))
+    spans = list[tuple[int, int]]()
+    for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
+        if start < 8 or length < 1 or length % 2 or start + length > path.stat().st_size:
+            found = f"{length} bytes at {start} of page {number}"
+            raise ValueError(f"Truncated: {found}. Must be within {path.stat().st_size}.")
+        begun, before = spans.pop() if spans and sum(spans[-1]) == start else (start, 0)
+        spans.append((int(begun), int(before + length)))
+    total = sum(length for _, length in spans)
+    if not shape[0] * shape[1] or total != 2 * shape[0] * shape[1]:
+        raise ValueError(f"Truncated: {total} bytes of page {number}. Must be 2 x {shape}.")
+    return _Page(path, shape, 1, order, spans)
+
+
+def _stated(description: str) -> int:
+    """Number of images that ImageJ or tifffile wrote into a description, 0 if none is there."""
+    if found := _IMAGEJ.match(description):
+        return int(found.group(1))
+    if not description.startswith('{"shape": ['):
+        return 0
+    shape = json.loads(description)["shape"]
+    return math.prod(shape[:-2]) if all(isinstance(size, int) for size in shape) else 0

@@ -1,0 +1,137 @@
+"""Two recordings as one capture of two bands."""
+
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import schema
+from dbthermal.readers._recording import FileFlag
+
+
+def two_bands(
+    first: xr.Dataset,
+    second: xr.Dataset,
+    *,
+    bands: tuple[str, str],
+    offset: float | None = None,
+) -> xr.Dataset:
+    """Two cameras' recordings as one capture, with both clocks.
+
+    Each band keeps its own frames and times; nothing is interpolated. `alignment.time_offset` and
+    `alignment.align` bring the two onto one clock: two cameras' dates are hardly ever right to a
+    frame.
+
+    Parameters
+    ----------
+    first, second : Dataset
+        Recordings of one band each, from `flir`, `tiff`, `raw` or `array`, of the same pixels.
+    bands : (str, str)
+        Names of the two bands, such as ``("8-14", "9.5")``.
+    offset : float, optional
+        Time from the beginning of the first to that of the second recording [s]. By default from
+        the dates of both files.
+
+    Returns
+    -------
+    Dataset
+        Stage `capture` of `schema`: `counts` (band, time, y, x), `exposure_time` and `frame_flags`
+        (band, time). The shorter band is filled with its last frame, flagged ``padded``, without a
+        time; `time` is the clock of the longer one. ``files`` has both recordings' attributes as a
+        mapping by band. Copies the counts: twice their memory is needed.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a recording is not one of counts in one band, sizes differ, bands repeat, there is no
+        offset and no date, or the recordings do not overlap in time.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import readers
+    >>> counts = np.arange(18000, 18060, dtype="<u2").reshape(5, 3, 4)
+    >>> with TemporaryDirectory() as folder:
+    ...     counts.tofile(f"{folder}/a.raw")
+    ...     one = readers.raw(
+    ...         f"{folder}/a.raw", (3, 4), byte_order="little", unit="count", clock=30.0
+    ...     )
+    >>> capture = two_bands(one, one.isel(time=slice(4)), bands=("8-14", "9.5"), offset=0.01)
+    >>> capture.exposure_time.sel(band="9.5").values.round(3)  # [s]
+    array([0.01 , 0.043, 0.077, 0.11 ,   nan])
+    """
+    pair = (first, second)
+    names = [str(band) for band in bands]
+    for name, one in zip(names, pair, strict=True):
+        _check(one, name)
+    if names[0] == names[1]:
+        raise ValueError(f"Repeated band '{names[0]}'. Must be two names.")
+    shapes = [(one.sizes["y"], one.sizes["x"]) for one in pair]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            f"Different sizes {shapes[0]} and {shapes[1]} pixels of the bands {names}. Must be "
+            "equal: resample the second recording, or crop the first."
+        )
+    late = _offset(first, second) if offset is None else float(offset)
+    starts, stops = zip(
+        *((one["time"].values[0], one["time"].values[-1]) for one in pair), strict=True
+    )
+    overlap = min(stops[0], stops[1] + late) - max(starts[0], starts[1] + late)
+    if not overlap > 0 and max(one.sizes["time"] for one in pair) > 1:
+        raise ValueError(
+            f"Invalid offset {late:g} s: the recordings of {stops[0]:g} and {stops[1]:g} s do not "
+            "overlap. Must overlap; give offset= if a camera's clock is wrong."
+        )
+    frames = max(one.sizes["time"] for one in pair)
+    counts = np.empty((2, frames, *shapes[0]), dtype=np.uint16)
+    times = np.full((2, frames), np.nan)
+    flags = np.full((2, frames), FileFlag.PADDED.value, dtype=np.uint16)
+    for place, (one, shift) in enumerate(zip(pair, (0.0, late), strict=True)):
+        own = one.sizes["time"]
+        counts[place, :own] = one["counts"].values
+        counts[place, own:] = one["counts"].values[-1]
+        times[place, :own] = one["exposure_time"].values + shift
+        flags[place, :own] = one["frame_flags"].values
+    longer = int(second.sizes["time"] > first.sizes["time"])
+    clock = pair[longer]["time"].values + (0.0, late)[longer]
+    stage = schema.STAGES["capture"]
+    variables: dict[str, Any] = {
+        "counts": (stage["counts"].dims, counts, stage["counts"].attrs),
+        "exposure_time": (("band", "time"), times, schema.EXPOSURE_TIME.attrs),
+        "frame_flags": (("band", "time"), flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)),
+    }
+    time = ("time", clock, schema.COORDINATES["time"].attrs)
+    attrs = {
+        "origin": "measured",
+        "source": " and ".join(str(one.attrs.get("source", "")) for one in pair),
+        "offset": late,
+        "offset_by": "dates" if offset is None else "caller",
+        "files": {name: dict(one.attrs) for name, one in zip(names, pair, strict=True)},
+    }
+    return schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
+
+
+def _check(one: xr.Dataset, name: str) -> None:
+    """Refuse what is no recording of counts in one band."""
+    needed = {"counts": ("time", "y", "x"), "exposure_time": ("time",), "frame_flags": ("time",)}
+    for variable, dims in needed.items():
+        if variable not in one or one[variable].dims != dims:
+            found = one[variable].dims if variable in one else "nothing"
+            raise ValueError(
+                f"Invalid recording of band '{name}': '{variable}' is {found}. Must be {dims}, as "
+                "from a reader of recordings."
+            )
+    if one["counts"].dtype != np.uint16:
+        dtype = one["counts"].dtype
+        raise TypeError(f"Invalid dtype {dtype} of the counts of band '{name}'. Must be uint16.")
+
+
+def _offset(first: xr.Dataset, second: xr.Dataset) -> float:
+    """Time from the date of one recording to that of another [s]."""
+    dates = [one.attrs.get("start") for one in (first, second)]
+    if None in dates:
+        raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
+    begun, later = (datetime.fromisoformat(str(date)) for date in dates)
+    return (later - begun).total_seconds()

@@ -1,0 +1,114 @@
+"""Arrays of counts: files of NumPy without objects, and what other libraries have opened."""
+
+import resource
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+from flir_files import damaged, scene
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dbthermal import readers
+
+
+def read(source: Any, name: str | None = None, **options: Any) -> xr.Dataset:
+    """Counts at 10 Hz."""
+    return readers.array(source, name, **{"unit": "count", "clock": 10.0, **options})
+
+
+@pytest.mark.parametrize("order", ["<u2", ">u2"])
+@pytest.mark.parametrize("layout", ["C", "F"])
+def test_files_of_numpy(tmp_path: Path, order: str, layout: Any) -> None:
+    """.npy and .npz in any order of bytes and dimensions."""
+    counts = np.asarray(scene().astype(order), order=layout)
+    np.save(tmp_path / "a.npy", counts)
+    np.savez(tmp_path / "a.npz", counts)
+    np.savez_compressed(tmp_path / "b.npz", warm=counts, dark=counts - 9)
+    for path, name in (("a.npy", None), ("a.npz", None), ("b.npz", "warm")):
+        found = read(tmp_path / path, name)
+        assert_array_equal(found.counts, scene())
+        assert found.counts.dtype == np.dtype("uint16")
+        assert_allclose(found.time, [0, 0.1, 0.2])
+    with pytest.raises(ValueError, match=r"Missing array 'None' .* one of \['warm', 'dark'\]"):
+        read(tmp_path / "b.npz")
+
+
+def test_arrays_of_other_libraries() -> None:
+    """A DataArray and an array; a unit of its own must agree."""
+    frames = xr.DataArray(scene().astype("i4"), dims=("t", "y", "x"), attrs={"units": "count"})
+    assert_array_equal(read(frames.astype("uint16")).counts, scene())
+    assert_array_equal(read(scene()).counts, scene())
+    with pytest.raises(ValueError, match=r"Invalid dtype int32 of 'array'\. Must be uint16"):
+        read(frames)
+    with pytest.raises(ValueError, match="Invalid unit 'K' of 'array'"):
+        read(frames.astype("uint16").assign_attrs(units="K"))
+    with pytest.raises(ValueError, match=r"Invalid shape \(24, 32\) of 'array'"):
+        read(scene()[0])
+
+
+def test_arrays_on_disk(tmp_path: Path) -> None:
+    """Arrays that zarr and xarray open and leave on disk are read when they are taken."""
+    path = tmp_path / "a.zarr"
+    zarr.create_array(store=path, name="frames", data=scene())
+    assert_array_equal(read(zarr.open_group(path, mode="r")["frames"]).counts, scene())
+    frames = xr.DataArray(scene(), dims=("t", "y", "x"), name="frames")
+    frames.astype("i4").to_netcdf(tmp_path / "a.nc", engine="scipy")
+    with xr.open_dataset(tmp_path / "a.nc") as opened:
+        assert_array_equal(read(opened["frames"].astype("uint16")).counts, scene())
+
+
+def test_objects_are_not_loaded(tmp_path: Path) -> None:
+    """A pickle is refused by its type, before it is read; so is a size beyond the memory."""
+    path = tmp_path / "a.npy"
+    np.save(path, np.array([[[print]]], dtype=object), allow_pickle=True)
+    with pytest.raises(ValueError, match=r"Invalid dtype object of 'a\.npy'"):
+        read(path)
+    np.save(path, scene())
+    with pytest.raises(ValueError, match="Must be at most memory=100"):
+        read(path, memory=100)
+    path.write_bytes(path.read_bytes().replace(b"(3, 24, 32)", b"(9, 99, 99999)"[:11]))
+    with pytest.raises(ValueError, match=r"Invalid|Truncated"):
+        read(path)
+    path.write_bytes(b"nothing at all")
+    with pytest.raises(ValueError, match=r"Invalid 'a\.npy': .*Must be \.npy or \.npz"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    "number", [pytest.param(300, id="300"), pytest.param(10_000, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("form", ["npy", "npz", "raw"])
+def test_damage(tmp_path: Path, form: str, number: int) -> None:
+    """Damaged files are refused, or read as they are; a .npz has checksums."""
+    path, counts, found = tmp_path / f"a.{form}", scene(), Counter[str]()
+    if form == "raw":
+        counts.tofile(path)
+    else:
+        (np.save if form == "npy" else np.savez_compressed)(path, counts)
+    whole = path.read_bytes()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for seed in range(number):
+        kind, changed = damaged(whole, seed)
+        path.write_bytes(changed)
+        begun = time.perf_counter()
+        try:
+            if form == "raw":
+                options: Any = {"byte_order": "little", "unit": "count", "clock": 10.0}
+                taken = readers.raw(path, (24, 32), **options).counts.values
+            else:
+                taken = read(path).counts.values
+        except ValueError as refusal:
+            found["refused" if "Must " in str(refusal) else f"unclear: {refusal}"] += 1
+        else:
+            pixels = changed[-counts.nbytes :] if form != "npz" else counts.tobytes()
+            found[f"{'same' if taken.tobytes() == pixels else 'other'}, {kind}"] += 1
+        assert time.perf_counter() - begun < 5  # [s]
+    taken_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    print(form, dict(found), f"{taken_memory} KiB")
+    assert taken_memory < 2**20  # KiB
+    assert not [key for key in found if key.startswith(("unclear", "other"))]

@@ -1,0 +1,167 @@
+"""TIFF stacks and raw numbers: all that other programs write, refused where it is no count."""
+
+import resource
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+from flir_files import damaged, scene
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dbthermal import readers
+
+FORMS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "pages": {"metadata": None},
+    "big-endian": {"byteorder": ">"},
+    "bigtiff": {"bigtiff": True},
+    "ImageJ": {"imagej": True},
+    "strips": {"rowsperstrip": 5},
+    "one page": {"truncate": True},
+}
+
+
+def write(path: Path, counts: Any, **options: Any) -> None:
+    """TIFF of gray values, unless it is to have colours."""
+    tifffile.imwrite(path, counts, **{"photometric": "minisblack", **options})
+
+
+def read(path: Path | list[Path]) -> xr.Dataset:
+    """Stack of counts at 10 Hz."""
+    return readers.tiff(path, unit="count", clock=10.0)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_stacks_come_back(tmp_path: Path, form: str) -> None:
+    """Counts of every form of TIFF, in the order of bytes that it states."""
+    write(path := tmp_path / "a.tif", scene(), **FORMS[form])
+    found = read(path)
+    assert_array_equal(found.counts, scene())
+    assert_allclose(found.time, [0, 0.1, 0.2])
+    assert found.attrs["byte_order"] == ("big" if form == "big-endian" else "little")
+
+
+def test_one_file_a_frame(tmp_path: Path) -> None:
+    """Files in the order of time; an order of text is noticed."""
+    paths = [tmp_path / f"frame{number}.tif" for number in (8, 9, 10)]
+    for path, image in zip(paths, scene(), strict=True):
+        write(path, image)
+    assert_array_equal(read(paths).counts, scene())
+    with pytest.raises(ValueError, match=r"numbers of 'frame8\.tif' do not rise"):
+        read(sorted(paths))
+    write(paths[1], scene()[0, :-1])
+    with pytest.raises(ValueError, match=r"Invalid page of \(23, 32\) in 'frame9\.tif'"):
+        read(paths)
+
+
+@pytest.mark.parametrize(
+    ("counts", "options", "message"),
+    [
+        (scene(), {"compression": "zlib"}, "Invalid compression 8 of page 0. Must be none"),
+        (scene().astype("f4"), {}, "Invalid bits of a pixel 32 of page 0"),
+        (scene().astype("i2"), {}, "Invalid sample format 2 of page 0"),
+        (scene().astype("u1"), {}, "Invalid bits of a pixel 8 of page 0"),
+        (scene(3), {"photometric": "rgb", "planarconfig": "separate"}, "values of a pixel 3"),
+        (scene(1, (32, 32)), {"tile": (16, 16)}, "Invalid tiled pages"),
+        (scene() // np.uint16(256), {}, "one of their two bytes is always 0"),
+    ],
+)
+def test_refused(tmp_path: Path, counts: Any, options: dict[str, Any], message: str) -> None:
+    """Pictures, temperatures and compressed pages are refused by page and rule."""
+    write(path := tmp_path / "a.tif", counts, **options)
+    with pytest.raises(ValueError, match=message):
+        read(path)
+
+
+def test_unit_must_be_stated(tmp_path: Path) -> None:
+    """Temperatures are refused with what to do."""
+    write(path := tmp_path / "a.tif", scene())
+    with pytest.raises(ValueError, match=r"Invalid unit 'K' of 'a\.tif'.*Record or export raw"):
+        readers.tiff(path, unit="K", clock=10)
+    path.write_bytes(b"II*\0" + bytes(20))
+    with pytest.raises(ValueError, match=r"Invalid or damaged TIFF 'a\.tif'"):
+        read(path)
+
+
+def test_missing_pages(tmp_path: Path) -> None:
+    """A stack that states more images than it holds is refused; so is a chain without an end."""
+    write(path := tmp_path / "a.tif", scene())
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b'{"shape": [3,', b'{"shape": [4,'))
+    with pytest.raises(ValueError, match=r"3 pages\. Must be the 4 that its description states"):
+        read(path)
+    write(path, scene(), truncate=True)
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b'{"shape": [3,', b'{"shape": [9,'))
+    with pytest.raises(ValueError, match=r"Truncated TIFF .* 9 images"):
+        read(path)
+
+
+def bare(path: Path, **options: Any) -> xr.Dataset:
+    """Raw counts of 24 x 32 pixels, little-endian, at 10 Hz."""
+    stated = {"byte_order": "little", "unit": "count", "clock": 10.0, **options}
+    return readers.raw(path, stated.pop("shape", (24, 32)), **stated)
+
+
+def test_raw(tmp_path: Path) -> None:
+    """Bare numbers with and without headers, in both orders; what does not fit is refused."""
+    path, counts = tmp_path / "a.raw", scene()
+    path.write_bytes(counts.tobytes())
+    assert_array_equal(bare(path).counts, counts)
+    path.write_bytes(b"h" * 100 + b"".join(b"frame" + image.tobytes() for image in counts))
+    assert_array_equal(bare(path, header=100, frame_header=5).counts, counts)
+    with pytest.raises(ValueError, match=r"4723 bytes of 'a\.raw': 3 frames and 115 bytes"):
+        bare(path)
+    path.write_bytes(counts.astype(">u2").tobytes())
+    assert_array_equal(bare(path, byte_order="big").counts, counts)
+    with pytest.raises(ValueError, match=r"rougher than with bytes swapped"):
+        bare(path)
+    with pytest.raises(ValueError, match=r"Invalid shape \(0, 32\)"):
+        bare(path, shape=(0, 32))
+    with pytest.raises(ValueError, match="Invalid frame_header -1"):
+        bare(path, frame_header=-1)
+    with pytest.raises(ValueError, match=r"Must be at most memory=100"):
+        bare(path, byte_order="big", memory=100)
+
+
+def tiff_fates(path: Path, options: dict[str, Any], number: int) -> Counter[str]:
+    """Count what damaged copies of a stack do: refused, as the file says, or other counts."""
+    write(path, scene(), **options)
+    whole, found, counts = path.read_bytes(), Counter[str](), scene()
+    order = options.get("byteorder", "<")
+    place = whole.index(counts.astype(f"{order}u2").tobytes())
+    for seed in range(number):
+        kind, changed = damaged(whole, seed)
+        path.write_bytes(changed)
+        begun = time.perf_counter()
+        try:
+            taken = read(path).counts.values
+        except ValueError as refusal:
+            found["refused" if "Must " in str(refusal) else f"unclear: {refusal}"] += 1
+        else:
+            pixels = changed[place : place + taken.nbytes]  # fewer where the chain of pages breaks
+            same = taken.astype(f"{order}u2").tobytes() == pixels
+            fate = "same" if len(taken) == len(counts) else "fewer"
+            found[f"{fate if same else 'other'}, {kind}"] += 1
+        assert time.perf_counter() - begun < 5  # [s]
+    return found
+
+
+@pytest.mark.parametrize(
+    "number", [pytest.param(300, id="300"), pytest.param(10_000, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("form", ["plain", "big-endian", "bigtiff"])
+def test_damage(tmp_path: Path, form: str, number: int) -> None:
+    """Damaged stacks are refused, or read as they are."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found = tiff_fates(tmp_path / "a.tif", FORMS[form], number)
+    taken = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    print(form, dict(found), f"{taken} KiB")
+    assert taken < 2**20  # KiB
+    assert not [key for key in found if key.startswith(("unclear", "other"))]
+    assert sum(value for key, value in found.items() if "fewer" in key) <= 0.02 * number

@@ -1,0 +1,192 @@
+"""Two recordings as one capture, with the maker's constants, all the way to temperatures."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from flir_files import Values, scene, sequence
+from numpy.testing import assert_allclose, assert_array_equal
+
+from dbthermal import (
+    alignment,
+    calibration,
+    correction,
+    readers,
+    schema,
+    separation,
+    store,
+)
+from dbthermal import response as responses
+from dbthermal.figures import drawing
+
+BANDS = ("8-14", "9.5")
+
+
+def recorded(
+    path: Path, counts: np.ndarray, start: float, rate: float, values: Values = None
+) -> xr.Dataset:
+    """Recording of counts by a made-up FLIR camera."""
+    seconds = [start + k / rate for k in range(len(counts))]
+    path.write_bytes(sequence(counts, seconds=seconds, values=values))
+    return readers.flir(path)
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> tuple[xr.Dataset, xr.Dataset]:
+    """Two recordings, the second with other constants, a quarter of a second later, and shorter."""
+    first = recorded(tmp_path / "a.seq", scene(40), 1.5e9, 10.0)
+    return first, recorded(tmp_path / "b.seq", scene(30), 1.5e9 + 0.25, 12.5, {0x58: 16000.0})
+
+
+def test_both_clocks_are_kept(pair: tuple[xr.Dataset, xr.Dataset], tmp_path: Path) -> None:
+    """Each band keeps its frames and times; the shorter is filled, flagged, and without times."""
+    capture = readers.two_bands(*pair, bands=BANDS)
+    schema.check(capture, "capture")
+    assert_array_equal(capture.counts[0], pair[0].counts)
+    assert_array_equal(capture.counts[1, :30], pair[1].counts)
+    times = alignment.exposure_times(capture)
+    assert_allclose(times[0], np.arange(40) / 10, rtol=0, atol=1e-9)
+    assert_allclose(times[1, :30], 0.25 + np.arange(30) / 12.5, rtol=0, atol=1e-9)
+    assert np.isnan(times[1, 30:]).all()
+    padded = schema.has_flag(capture.frame_flags, "padded").values
+    assert padded.sum() == 10
+    assert capture.attrs["files"]["9.5"]["file_planck_R1"] == 16000
+    store.save(capture, tmp_path / "capture.zarr", {})
+    again = store.open_dataset(tmp_path / "capture.zarr")
+    assert again.attrs["files"] == capture.attrs["files"]
+
+
+def test_a_capture_goes_through_corrections(pair: tuple[xr.Dataset, xr.Dataset]) -> None:
+    """Correction and alignment take the capture; padding and times are theirs."""
+    capture = readers.two_bands(*pair, bands=BANDS)
+    maps = capture.counts[:, 0].astype(float).drop_vars("time").drop_attrs()
+    terms = xr.Dataset({"gain": maps * 0 + 1, "offset": maps * 0, "bad": maps < 0})
+    corrected = correction.correct_capture(capture, terms, bad_pixels=None)
+    assert corrected.attrs["shutter_closed_frames"] == -1
+    assert corrected.attrs["damaged_frames"] == [0, 10]
+    aligned = alignment.align(corrected, offset=0.0)
+    assert aligned.sizes["band"] == 2
+    late = aligned.time > 0.25 + 29.5 / 12.5
+    assert late.any()
+    assert aligned.counts.sel(band="9.5")[late.values].isnull().all()
+    assert aligned.counts.sel(band="9.5")[~late.values].notnull().all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"offset": 100.0}, r"Invalid offset 100 s: .* do not overlap"),
+        ({"bands": ("a", "a")}, "Repeated band 'a'"),
+        ({"second": "crop"}, r"Different sizes \(24, 32\) and \(24, 31\)"),
+        ({"second": "undated"}, r"Unknown dates .* offset="),
+        ({"second": "temperatures"}, "Invalid dtype float32 of the counts of band '9.5'"),
+        ({"second": "picture"}, "'exposure_time' is nothing"),
+    ],
+)
+def test_what_makes_no_capture(
+    pair: tuple[xr.Dataset, xr.Dataset], changes: dict[str, object], message: str
+) -> None:
+    """Recordings that do not belong together are refused by band and rule."""
+    first, second = pair
+    others = {
+        "crop": second.isel(x=slice(1, None)),
+        "undated": second.drop_attrs(deep=False),
+        "temperatures": second.assign(counts=second.counts.astype("float32")),
+        "picture": second.drop_vars("exposure_time"),
+    }
+    options = {"bands": BANDS, **changes}
+    other = others.get(str(options.pop("second", "")), second)
+    with pytest.raises((ValueError, TypeError), match=message):
+        readers.two_bands(first, other, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["SampleSEQ.seq", "IR_2412.jpg", "flir_example.jpg", "ax8.jpg"])
+def test_maker_formula(mirror: Path, name: str) -> None:
+    """The response is the maker's formula, T = B / ln(R1 / (R2 (I + O)) + F), of real files."""
+    recording = readers.flir(mirror / "recordings" / name)
+    made = calibration.maker_response({"8-14": recording.attrs})
+    keys = ("R1", "R2", "B", "F", "O")
+    r1, r2, b, f, o = (recording.attrs[f"file_planck_{key}"] for key in keys)
+    counts = recording.counts.values.astype(float)
+    expected = b / np.log(r1 / (r2 * (counts + o)) + f)
+    found = responses.curve(made, "8-14").inverse(counts)
+    assert_allclose(found, expected, rtol=0, atol=1e-3)  # [K]
+    print(name, f"{expected.min() - 273.15:.1f} to {expected.max() - 273.15:.1f} degrees Celsius")
+    assert 240 < expected.min() < expected.max() < 400
+
+
+@pytest.mark.parametrize("f", [0.5, 1.0, 1.5, 2.0])
+def test_maker_form(f: float) -> None:
+    """For any F the Sakuma-Hattori form is within 0.2 K of the maker's, over the whole range."""
+    values = {"R1": 16000.0, "R2": 0.0125, "B": 1430.0, "F": f, "O": -6000}
+    attrs = {f"file_planck_{key}": value for key, value in values.items()}
+    attrs |= {"file_range_min": 233.15, "file_range_max": 423.15}
+    made = calibration.maker_response({"8-14": attrs})
+    temperature = np.linspace(233.15, 423.15, 500)
+    counts = 16000.0 / (0.0125 * (np.exp(1430.0 / temperature) - f)) + 6000
+    error = responses.curve(made, "8-14").inverse(counts) - temperature
+    print(f, np.abs(error).max(), made.attrs["form_error"])
+    assert np.abs(error).max() < 0.2  # [K]
+    assert f != 1 or np.abs(error).max() < 1e-6  # [K]
+    assert made.attrs["calibration"] == calibration.NO_BARS
+    assert "noise" not in made
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("planck_R1", None, "Missing planck_R1 of band '8-14'. Must be in the file, as in FLIR's"),
+        ("planck_B", 0.0, r"Invalid planck_B of band '8-14' 0\.0. Must be finite and positive"),
+        ("planck_F", 1e9, "Invalid planck_F"),
+        ("range_min", 600.0, r"Invalid ranges \[\[600\.0, 423\.15\]\] K"),
+    ],
+)
+def test_maker_constants_are_checked(key: str, value: float | None, message: str) -> None:
+    """A constant that is missing or impossible is named with its band."""
+    values = {"R1": 16000.0, "R2": 0.0125, "B": 1430.0, "F": 1.0, "O": -6000}
+    attrs = {f"file_planck_{name}": number for name, number in values.items()}
+    attrs |= {"file_range_min": 233.15, "file_range_max": 423.15}
+    if value is None:
+        del attrs[f"file_{key}"]
+    else:
+        attrs[f"file_{key}"] = value
+    with pytest.raises(ValueError, match=message):
+        calibration.maker_response({"8-14": attrs})
+
+
+def test_from_two_files_to_temperatures(
+    tmp_path: Path, glass: tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+) -> None:
+    """Simulated glass, written as two FLIR sequences, is separated from the files alone.
+
+    Counts are those of the maker's constants, so that these are the true response; the result
+    says that its deviations hold no error of the calibration.
+    """
+    truth, _, _ = glass
+    constants = {"8-14": {0x58: 21106.77}, "9.5": {0x58: 16000.0, 0x5C: 1520.0}}
+    emissivity, rng = {"8-14": 0.86, "9.5": 0.72}, np.random.default_rng(2)
+    recordings = []
+    for band, values in constants.items():
+        b, r1 = values.get(0x5C, 1501.0), values[0x58]
+        ideal = [
+            r1 / (0.012545258 * np.expm1(b / truth[name].values)) + 7340
+            for name in ("object_temperature", "background_temperature")
+        ]
+        mixed = emissivity[band] * ideal[0] + (1 - emissivity[band]) * ideal[1]
+        counts = np.rint(mixed + rng.normal(0, 3, mixed.shape)).astype(np.uint16)
+        recordings.append(recorded(tmp_path / f"{band}.seq", counts, 1.5e9, 10.0, values))
+    capture = readers.two_bands(recordings[0], recordings[1], bands=BANDS)
+    made = calibration.maker_response(capture.attrs["files"])
+    result = separation.solve(capture.assign(counts=capture.counts.astype("float32")), made)
+    assert result.attrs["calibration"] == calibration.NO_BARS
+    assert "without error bars" in drawing.provenance_note(result)
+    difference = result.object_temperature - truth.object_temperature.values
+    error = float(np.sqrt((difference**2).mean("time")).median())
+    print("median RMSE [K]", error)
+    assert error < 0.2  # [K]
+    # Over a narrow range the same response is a polynomial, over the camera's it is not.
+    narrow = made.assign(temperature_min=made.temperature_min * 0 + 270, temperature_max=345.0)
+    same = separation.solve(capture.assign(counts=capture.counts.astype("float32")), narrow)
+    assert_allclose(same.object_temperature, result.object_temperature, rtol=0, atol=1e-3)  # [K]
