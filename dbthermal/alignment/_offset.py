@@ -278,7 +278,7 @@ def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices, reach:
     result = np.empty((len(signals), times.size, signals.shape[2]))
     segments = np.empty(result.shape[:2], dtype=np.intp)
     for place, (movie, row) in enumerate(zip(signals, stamps, strict=True)):
-        plan = clocks.interpolation(row, present(movie), times).within(segment)
+        plan = clocks.interpolation(row, present(movie), times, segment, 1.0)
         plan.apply(movie, result[place])
         segments[place] = plan.labels(segment)
     return _Pair(result, segments, times)

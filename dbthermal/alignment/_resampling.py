@@ -53,15 +53,16 @@ def align(
 
     The samples of one band are not touched in time, and its noise stays white: the noisiest, by its
     noise relative to its signal, unless `clock` names another. The other bands are interpolated at
-    its exposure times, on the line between the frames before and after, which for a background that
-    moves in steps or at random is the expected value. An offset of whole frames is a pure shift.
+    its exposure times by what is to be expected between four frames: the line between two for a
+    random walk, nearly a cubic for what is smooth. An offset of whole frames is a pure shift.
 
-    Frames are NaN in a band where the line would reach over a gap, over a change of `segment`, or
+    Frames are NaN in a band where that would reach over a gap, over a change of `segment`, or
     past an end, and where its camera gave none: NaN, or a copy of the frame before. Nothing is
     extrapolated: a recording that pauses is aligned in its parts. Where a signal steps between two
-    frames, by five standard deviations of noise, the sample is NaN, too: when it changed is not
-    known. Interpolation makes the noise of a band smaller, by up to 0.7 (`noise_factor`), and
-    correlates neighbouring frames; in the quieter of two bands that hardly counts.
+    frames, by five standard deviations of noise, the sample is NaN, too, for when it changed is not
+    known, and those beside it, where a curve overshoots. Interpolation makes the noise of a band
+    smaller, by up to 0.8 (`noise_factor`), and correlates neighbouring frames; in the quieter of
+    two bands that hardly counts.
 
     Parameters
     ----------
@@ -143,11 +144,10 @@ def align(
     times, segment = clocks.fill_times(stamps[reference]), clocks.segments(corrected)
     plans, factors, missing = [], np.ones(len(names)), _missing(views)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
-        plan = clocks.interpolation(row, ~absent, times).within(segment)
+        plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))
         plans.append(replace(plan, valid=plan.valid & (plan.labels(segment) == segment)))
-        # (1 - w) I + w I' of two frames with independent noises, root mean square over time.
-        weight = plans[band].weight[plans[band].valid]
-        factors[band] = np.sqrt(np.mean((1.0 - weight) ** 2 + weight**2)) if weight.size else 1.0
+        power = plans[band].power()[plans[band].valid]  # of independent noises
+        factors[band] = np.sqrt(np.mean(power)) if power.size else 1.0
 
     def aligned(rows: slice) -> Movie:
         """Counts of some rows at the times of the reference."""

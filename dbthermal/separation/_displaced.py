@@ -7,14 +7,14 @@ cubic convolution by Keys (1981), doi:10.1109/TASSP.1981.1163711, so that the no
 sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates, uniform_filter
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array, kron
 
 from dbthermal import _samples as samples
 from dbthermal import schema
@@ -38,6 +38,8 @@ _LOST_WEIGHT: Final = 0.25
 _AROUND: Final = 5
 # Weight below which a pixel's flags do not count [1].
 _NO_WEIGHT: Final = 1e-3
+# Deviations of the blur beyond which it has no weight.
+_TAIL: Final = 3.0
 
 
 @dataclass(frozen=True)
@@ -50,15 +52,22 @@ class Displacement:
     resample: csr_array  # weights at p of the pixels around, p + d(p) = r (r, pixel); 0 without p
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
+    blur: float = 0.0  # deviation by which all bands are blurred, once they are paired [pixel]
 
     def source(self, rows: slice) -> slice:
         """Rows of the image that hold some rows, and what the second camera shows of them."""
         width = self.shape[1]
+        rows = self.around(rows)
         first, last = self.resample.indptr[[rows.start * width, rows.stop * width]]
         used = self.resample.indices[first:last] // width
         if used.size == 0:
             return rows
         return slice(min(rows.start, int(used.min())), max(rows.stop, int(used.max()) + 1))
+
+    def around(self, rows: slice) -> slice:
+        """Rows of which some rows are made by the blur."""
+        reach = int(np.ceil(_TAIL * self.blur))
+        return slice(max(rows.start - reach, 0), min(rows.stop + reach, self.shape[0]))
 
     def weights(self, rows: slice, source: slice) -> csr_array:
         """Weights of the pixels of some rows of the source, for those of some rows."""
@@ -179,8 +188,10 @@ def read(
     Read some rows of the reference band, and what the others show of the same reflections.
 
     Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
-    `quality.read`; and the noise (pixel) [1] of a resampled sample over that of a sample.
+    `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
     """
+    if displacement.blur > 0.0:
+        return _read_blurred(block, displacement, rows, source, fewest, grains)
     reference, others = displacement.reference, displacement.others
     own = displacement.source(rows)
     first = block.isel(
@@ -221,7 +232,46 @@ def read(
         ratio = np.divide(found, gain, out=np.zeros_like(gain), where=gain > 0.0).reshape(shape)
         mean, share = (uniform_filter(it, _AROUND) for it in (ratio, (ratio > 0.0) * 1.0))
         gain *= np.divide(mean, share, out=np.ones_like(mean), where=ratio > 0.0).ravel()
-    return counts, valid, status, gain
+    return counts, valid, status, np.stack([np.ones_like(gain), gain])
+
+
+def _read_blurred(
+    block: xr.Dataset,
+    displacement: Displacement,
+    rows: slice,
+    source: slice,
+    fewest: int,
+    grains: list[samples.Grain],
+) -> tuple[Array, Mask, Bits, Array]:
+    """As `read`, of all bands blurred alike over the pixels that are usable."""
+    more, width = displacement.around(rows), displacement.shape[1]
+    sharp = replace(displacement, blur=0.0)
+    counts, valid, status, gain = read(block, sharp, more, source, fewest, grains)
+    counts, known = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
+    here = slice((rows.start - more.start) * width, (rows.stop - more.start) * width)
+    usable = ~quality.unusable(status)
+    along = [(rows, more), (slice(width), slice(width))]
+    plain = csr_array(kron(*(_gaussian(*one, displacement.blur) for one in along)))
+    weights = plain @ diags_array(1.0 * usable)
+    total = weights.sum(axis=1)
+    inverse = np.divide(1.0, total, out=np.zeros_like(total), where=usable[here])
+    weights = csr_array(diags_array(inverse) @ weights)
+    share = np.maximum((weights @ (1.0 * known).T).T, _NO_WEIGHT)
+    blurred = np.stack([(weights @ (one * known).T).T / share for one in counts])
+    # Of independent noise, blurred, or resampled and blurred; and what was measured of shared one.
+    paired = sharp.weights(more, displacement.source(rows))
+    own, both, before = (
+        np.sqrt(np.asarray((one**2).sum(axis=1)).ravel())
+        for one in (weights, weights @ paired, paired)
+    )
+    measured = np.divide(gain[1], before, out=np.ones_like(before), where=before > 0.0)
+    return blurred, valid[:, here], status[here], np.stack([own, both * measured[here]])
+
+
+def _gaussian(rows: slice, among: slice, deviation: float) -> Array:
+    """Weights (row, row among) of a Gaussian, 0 in its tail."""
+    away = np.subtract.outer(np.arange(rows.stop)[rows], np.arange(among.stop)[among]) / deviation
+    return np.where(abs(away) <= _TAIL, np.exp(-0.5 * away**2), 0.0)
 
 
 def _roughness(counts: Array) -> Array:

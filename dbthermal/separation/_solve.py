@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from dbthermal import schema
 from dbthermal.separation import _joint as joint
+from dbthermal.separation import _neighbours as neighbours
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs, Labels, Method, check
 from dbthermal.separation._pooling import pool as pooling
@@ -169,8 +170,10 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. math:: I_1(r) = e_1 U_1(x(r)) + (1 - e_1) U_1(y), \quad
               I_m'(r) = e_m U_m(x(p)) + (1 - e_m) U_m(y)
 
-    The pixels are solved as if x(p) were x(r), all of them are then solved together for the object,
-    and each once more with what follows for x(p) in the other bands. It costs 2 to 3 times as much
+    The ratios are those of bands that are blurred alike, by a pixel, since no shift makes their
+    edges alike, and as certain as neighbours agree on them. With these the pixels are solved as if
+    x(p) were x(r), all of them are then solved together for the object,
+    and each once more with what follows for x(p) in the other bands. It costs 3 to 4 times as much
     where the object is not the same in both places, and makes the object more certain: an error of
     one pixel is averaged along the places p. A pixel of which the second camera does not see the
     reflection has the bit `no_reflection_pair`.
@@ -289,11 +292,17 @@ def _solve_jointly(
     """
     Separate twice, the second time with the object of each camera's own place.
 
+    With the ratios of bands that are blurred alike, found beforehand, if no materials are known.
     Where emissivities are pooled, they are those of the second time, and it is done once more.
     """
-    material = None
+    material, blur = None, 0.0
+    if inputs.labels is None and inputs.method.survey is not None:
+        alike = neighbours.blurred(inputs)
+        if alike is not None:
+            _separate_all(alike, material, result, threads, bar)
+            material, blur = neighbours.ratios(inputs, result), neighbours.BLUR
     _separate_all(inputs, material, result, threads, bar)
-    both = joint.solve(inputs, result, threads)
+    both = joint.solve(inputs, result, threads, blur=blur)
     if inputs.labels is not None:
         apart = inputs if both is None else replace(inputs, difference=both.difference)
         material = _materials(apart, threads, bar, every=True)
@@ -301,7 +310,7 @@ def _solve_jointly(
         both = joint.solve(inputs, result, threads, pooled=True)
     if both is not None:
         apart = replace(inputs, difference=both.difference)
-        material = _materials(apart, threads, bar)
+        material = material if inputs.labels is None else _materials(apart, threads, bar)
         _separate_all(apart, material, result, threads, bar)
         both.finish()
 

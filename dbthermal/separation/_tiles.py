@@ -290,7 +290,7 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     for window in windows(rows, width, size):
         places = numbers(window, width)
         grains = grains or quality.grains(block, inputs.noise * slopes)
-        gain = np.ones(places.size)
+        gain = np.ones((2, places.size))
         if displacement is None:
             local = slice(window[0].start - rows.start, window[0].stop - rows.start)
             view = block.isel(y=local, x=window[1])
@@ -354,13 +354,14 @@ def of_one_noise(
     frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
 ) -> Iterator[tuple[Mask, Mask, Tile]]:
     """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise."""
-    order = np.rint(np.log(gain[pixels]) / _NOISE_STEP).astype(np.intp)
+    order = np.rint(np.log(gain[1, pixels]) / _NOISE_STEP).astype(np.intp)
     for level in np.unique(order):
         alike = np.flatnonzero(order == level)
         for start in range(0, alike.size, most):
             chosen = alike[start : start + most]
             part = np.zeros_like(pixels)
             part[np.flatnonzero(pixels)[chosen]] = True
-            factor = float(np.exp(np.log(gain[part]).mean()))
-            noise = (tile.noise[0], *(factor * std for std in tile.noise[1:]))
+            factor = np.exp(np.log(gain[:, part]).mean(axis=1))
+            factors = [factor[0]] + [factor[1]] * (len(tile.noise) - 1)
+            noise = tuple(float(std * it) for std, it in zip(tile.noise, factors, strict=True))
             yield frames, part, replace(tile.select_pixels(chosen), noise=noise)

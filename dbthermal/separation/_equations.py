@@ -1,0 +1,169 @@
+"""Equations of the object of all pixels, of which each camera sees another place, see `_joint`."""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from numpy.polynomial import Polynomial
+from scipy.sparse import csr_array, diags_array
+
+from dbthermal.response import Curve
+from dbthermal.separation._displaced import without
+from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._subspace.reflection_ratio import null_combination
+
+Array = npt.NDArray[np.floating[Any]]
+Mask = npt.NDArray[np.bool_]
+Whole = npt.NDArray[np.intp]
+
+# Steps of the iteration, and the change that ends it [K].
+_STEPS: Final = 60
+CONVERGED: Final = 1e-3
+# Share of an error that a step may leave.
+_LARGEST: Final = 0.95
+# Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
+_MARGIN: Final = 0.02
+# Degree of the polynomial that the bend between two responses is.
+_DEGREE: Final = 4
+
+
+@dataclass(frozen=True)
+class Equations:
+    """Equations of all pixels, and by which way each is solved."""
+
+    first: Array  # e_1 (pixel) [1]
+    shares: Array  # c of eq. 6 (band, pixel) [1]
+    there: csr_array  # weights of x(p) (pixel, pixel), of the linked pixels
+    onward: csr_array  # weights of the equation at p + d(p) (backward pixel, pixel)
+    forward: Whole  # pixels solved for x(r)
+    backward: Whole  # pixels solved for x(p)
+    loose: Whole  # solved pixels without such neighbours
+    bends: list[Polynomial]  # u_m(x) - u_1(x) of u_1(x), for all bands but the first
+
+    def _there(self, signal: Array, change: Array) -> Array:
+        """Signal u_1(x(p)) (pixel, frame) [K]; of loose pixels by the change of e_1 u_1(x)."""
+        result = np.asarray(self.there @ signal)
+        result[self.loose] = signal[self.loose] + change / self.first[self.loose, np.newaxis]
+        return result
+
+    def other_bands(self, shares: Array, signal: Array) -> Array:
+        """Sum of shares (band - 1, pixel) times u_m(x), of u_1(x) (pixel, frame) [K]."""
+        parts = zip(shares, self.bends, strict=True)
+        return np.asarray(sum(one[:, np.newaxis] * (signal + bend(signal)) for one, bend in parts))
+
+    def solve(self, target: Array, alone: Array, change: Array) -> tuple[Array, Array, Array]:
+        """
+        Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
+
+        The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
+        beforehand. Also returns the last step (pixel) [K].
+        """
+        own, forward, backward = self.shares[0][:, np.newaxis], self.forward, self.backward
+        others, back = self.shares[1:], self.shares[1:, self.backward]
+        beyond = np.asarray((self.onward @ others.T).T)
+        slope = beyond.sum(axis=0)[:, np.newaxis]
+        rest = np.setdiff1d(self.loose, backward)
+        signal, step = alone, np.zeros_like(alone)
+        for _ in range(_STEPS):
+            there = self._there(signal, change)
+            right = target - self.other_bands(others, there)
+            following = signal.copy()
+            following[forward] = right[forward] / own[forward]
+            # Newton's steps, of a slope near sum c = 1.
+            following[rest] += right[rest] - own[rest] * signal[rest]
+            # The same for x(p), of the equation at p + d(p).
+            right = np.asarray(self.onward @ (target - own * signal))
+            following[backward] += (right - self.other_bands(beyond, signal[backward])) / slope
+            step, signal = np.abs(following - signal), following
+            if step.max(initial=0.0) < CONVERGED:
+                break
+        there = self._there(signal, change)
+        # A backward pixel's own equation holds for another x(p) than that between its neighbours.
+        right = target[backward] - own[backward] * signal[backward]
+        right -= self.other_bands(back, there[backward])
+        there[backward] += right / back.sum(axis=0)[:, np.newaxis]
+        return signal, there, step.max(axis=1)
+
+
+def first_emissivity(inputs: Inputs, result: xr.Dataset) -> Array:
+    """Emissivities (band, pixel) [1] by which a pixel is solved, the quietest band first."""
+    emissivity, ratio = (
+        result[name].values[inputs.bands].reshape(len(inputs.bands), -1).astype(np.float64)
+        for name in ("emissivity", "reflection_ratio")
+    )
+    ratio = np.where(np.isfinite(ratio), ratio, ratio_of(emissivity))
+    # That of a constant object is taken from the middle of what its ratios leave.
+    middle = 1.0 - ratio * (0.5 / np.maximum(ratio.max(axis=0), 1.0))
+    return np.where(np.isfinite(emissivity), emissivity, middle)
+
+
+def ratio_of(emissivity: Array) -> Array:
+    """Reflection ratios (band, pixel) [1] of emissivities."""
+    return np.asarray((1.0 - emissivity) / (1.0 - emissivity[0]))
+
+
+def inside(emissivity: Array) -> Array:
+    """Emissivities of the same ratios, none of them outside or at the end of (0, 1)."""
+    ratio = ratio_of(emissivity)
+    # e_m > 0 leaves 0 < 1 - e_1 < 1 / kappa.
+    most = 1.0 / np.maximum(ratio.max(axis=0), 1.0)
+    place = np.clip((1.0 - emissivity[0]) / most, _MARGIN, 1.0 - _MARGIN)
+    return np.asarray(1.0 - ratio * most * place)
+
+
+def weights(inputs: Inputs, emissivity: Array) -> Array:
+    """Weights w of eq. 5 (band, pixel) [1], of the bands without background."""
+    noise = inputs.noise[inputs.bands]
+    return null_combination(ratio_of(emissivity).astype(np.float64), noise)[0]
+
+
+def coefficients(inputs: Inputs, emissivity: Array, solved: Mask) -> Array:
+    """Coefficients c of eq. 6 (band, pixel) [1], of sum 1."""
+    shares = np.where(solved, weights(inputs, emissivity) * emissivity, 0.0)
+    shares[0, ~solved] = 1.0
+    return shares.astype(np.float32)
+
+
+def equations(inputs: Inputs, emissivity: Array, solved: Mask) -> Equations:
+    """Equations of the solved pixels: each for the place with the larger coefficient."""
+    displacement = inputs.displacement
+    assert displacement is not None
+    shares = coefficients(inputs, emissivity, solved)
+    there, linked = _among(displacement.resample, solved, displacement.shape[1])
+    onward, reached = _among(displacement.onward, solved, displacement.shape[1])
+    own, others = np.abs(shares[0]), shares[1:].sum(axis=0)
+    strong = np.abs(others) < own
+    # The error of a step: only where it contracts, with the weights' signs, are places linked.
+    forward, back = abs(there).sum(axis=1) * np.abs(others), abs(onward) @ own
+    reached &= back < _LARGEST * np.abs(onward @ others)
+    linked &= np.where(strong, forward < _LARGEST * own, reached)
+    backward = np.flatnonzero(linked & ~strong)
+    return Equations(
+        first=np.where(solved, emissivity[0], 1.0),
+        shares=shares,
+        there=csr_array(diags_array(linked.astype(np.float32)) @ there.astype(np.float32)),
+        onward=csr_array(onward[backward].astype(np.float32)),
+        forward=np.flatnonzero(linked & strong),
+        backward=backward,
+        loose=np.flatnonzero(solved & ~linked),
+        bends=_bends([inputs.curves[band] for band in inputs.bands]),
+    )
+
+
+def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mask]:
+    """Weights of solved pixels alone, and the solved pixels for which that is possible."""
+    weights = without(weights, ~solved, width)
+    weights.eliminate_zeros()
+    used = np.diff(weights.indptr) > 0
+    return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
+
+
+def _bends(curves: list[Curve]) -> list[Polynomial]:
+    """Polynomials of u_m(x) - u_1(x) in u_1(x), over the calibrated range, for bands m > 1."""
+    first = curves[0]
+    temperature = np.linspace(first.lowest, first.highest, 64)
+    own = first.signal(temperature)
+    place = own - first.reference
+    return [Polynomial.fit(place, one.signal(temperature) - own, _DEGREE) for one in curves[1:]]

@@ -1,0 +1,102 @@
+r"""What the pixels around one tell of it, where two cameras side by side see a reflection.
+
+Paired by the shift of the reflections, the bands differ by what a shift cannot undo: the blur of
+lenses and of resampling, which a curved mirror stretches in each camera by another amount, a shift
+that changes faster than its field, bodies at several depths. All of it makes the changes of one
+band smaller at the edges of what is mirrored, and its reflection ratio with them, by several per
+cent, which a pixel's own residual does not show. So the ratios are those of bands that are blurred
+alike, in which the edges count little; and as certain as neighbours agree on them.
+"""
+
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from scipy.ndimage import gaussian_filter
+
+from dbthermal.schema import Status
+from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._tiles import Material
+
+Array = npt.NDArray[np.floating[Any]]
+
+# Deviation of the blur of the bands of which ratios are told [pixel].
+BLUR: Final = 1.0
+# Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
+_WIDE: Final = 6.0
+# Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
+_SOME: Final = 0.1
+# Deviation of the neighbourhood that tells an emissivity, over the image's smaller side.
+_AROUND: Final = 0.125
+
+
+def blurred(inputs: Inputs) -> Inputs | None:
+    """Inputs with the bands blurred alike; None where the field of the shift is zero."""
+    displacement = inputs.displacement
+    assert displacement is not None
+    if displacement.resample.nnz <= displacement.resample.shape[0]:
+        return None
+    return replace(inputs, displacement=replace(displacement, blur=BLUR))
+
+
+def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
+    """
+    Ratios (band, pixel) of a result of blurred bands, as those of each pixel's own material.
+
+    Their variance is times the reduced chi-square about the mean of those around. A pixel that
+    shows its bands apart takes that mean, with the variance of the ratios around beside their mean.
+    """
+    noise, status = inputs.noise[inputs.bands][:, np.newaxis], result["status"].values
+    shape = (len(inputs.bands), *status.shape)
+    ratio, std = (
+        result[name].values[inputs.bands].astype(np.float64)
+        for name in ("reflection_ratio", "reflection_ratio_std")
+    )
+    known = ((status & ~np.uint32(Status.CONSTANT_OBJECT)) == 0) & np.all(std[1:] > 0, axis=0)
+    std[0] = 1.0
+    weight = np.divide(1.0, std**2, out=np.zeros(shape), where=np.broadcast_to(known, shape))
+    mean = _mean(ratio, weight, _WIDE)
+    chi = _mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), known, _WIDE)
+    apart = ((status & np.uint32(Status.BANDS_APART)) != 0) & (
+        gaussian_filter(known * 1.0, _WIDE, mode="constant") > _SOME
+    )
+    variance = np.where(
+        apart, _mean((ratio - mean) ** 2, weight, _WIDE), std**2 * np.maximum(chi, 1)
+    )
+    ratio = np.where(apart, mean, np.where(known, ratio, np.nan)).reshape(len(noise), -1)
+    # Eq. 4, solved for sigma^2.
+    error = noise[1:] ** 2 + (ratio[1:] * noise[0]) ** 2
+    none = np.full(status.size, np.nan)
+    return Material(
+        ratio=ratio,
+        inverse_energy=(variance[1:].reshape(error.shape) / error).mean(axis=0),
+        emissivity=none,
+        noise_variance=none,
+        drift_variance=none,
+    )
+
+
+def shared(value: Array, variance: Array, shape: tuple[int, ...]) -> Array:
+    """
+    Values (pixel) [1] that lean on those around, the more the less they are known.
+
+    The mean of their posterior, of a normal prior with the mean and variance of the neighbourhood.
+    """
+    value, weight = value.reshape(shape), 1.0 / variance.reshape(shape)
+    wide = _AROUND * min(shape)
+    mean = _mean(value, weight, wide)
+    mean = np.where(np.isfinite(mean), mean, value)
+    own = weight * np.nan_to_num(_mean((value - mean) ** 2, weight, wide))
+    return np.asarray((own * value + mean) / (own + 1.0)).ravel()
+
+
+def _mean(part: Array, weight: Array, deviation: float) -> Array:
+    """Weighted mean (..., y, x) of the pixels around; NaN without any."""
+    sums = [
+        gaussian_filter(one, deviation, mode="constant", axes=(-2, -1))
+        for one in (np.where(weight > 0, weight * part, 0.0), weight * 1.0)
+    ]
+    empty = np.full(sums[0].shape, np.nan)
+    return np.asarray(np.divide(sums[0], sums[1], out=empty, where=sums[1] > 0))
