@@ -12,7 +12,7 @@ from dbthermal.schema import Status
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import Bits
-from dbthermal.separation._subspace.method import METHOD, _functions, _report, _solve
+from dbthermal.separation._subspace.method import METHOD, separate_smooth
 
 Planes = npt.NDArray[np.float32]
 Threads = Callable[[Callable[[Any], None], Iterable[Any]], None]
@@ -105,10 +105,7 @@ class History:
             gain = self._gain[cut.window].ravel().astype(np.float64)
             for one in cut.parts:
                 for _, pixels, tile in tiles.of_one_noise(*one, gain, gain.size):
-                    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-                        functions = _functions(tile)
-                        solution = _solve(tile, functions, inputs.settings)
-                        found: Any = _report(tile, solution)
+                    found: Any = separate_smooth(tile, inputs.settings)
                     (a, b), (_, d) = found.emissivity_covariance
                     ratio = found.reflection_ratio[1], found.reflection_ratio_std[1] ** 2
                     maps[:, pixels] = [*ratio, *found.emissivity, a, b, d]
@@ -123,4 +120,4 @@ class History:
         signals, time = rng.standard_normal((2, frames, 1)), np.arange(1.0 * frames)
         curves = tuple(self._inputs.curves)
         tile = tiles.Tile(signals, time, curves, (1.0, 1.0), (1, 1), rng)
-        _solve(tile, _functions(tile), self._inputs.settings)
+        separate_smooth(tile, self._inputs.settings)

@@ -127,6 +127,12 @@ def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
         return _followed(tile, settings)[0]
 
 
+def separate_smooth(tile: Tile, settings: SubspaceSettings) -> Estimate:
+    """Separate one tile of objects that change smoothly, without pieces of time."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        return _report(tile, _solve(tile, _functions(tile), settings))
+
+
 def survey(tile: Tile, settings: SubspaceSettings) -> Survey:
     """Scatter and emissivity of the pixels of a tile, each alone; of those without a flag."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
