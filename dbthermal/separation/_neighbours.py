@@ -1,4 +1,4 @@
-r"""What the pixels around one tell of it, where two cameras side by side see a reflection.
+r"""Reflection ratios and emissivities as neighbouring pixels tell them, of cameras side by side.
 
 Paired by the shift of the reflections, the bands differ by what a shift cannot undo: the blur of
 lenses and of resampling, which a curved mirror stretches in each camera by another amount, a shift

@@ -102,9 +102,10 @@ class History:
         """Maps and status of some rows, as by the method "subspace" without its last step."""
         for cut in tiles.cut(inputs, slice(rows[0], rows[-1] + 1)):
             maps = np.full((7, cut.status.size), np.nan, np.float32)
-            gain = self._gain[cut.window].ravel().astype(np.float64)
+            second = self._gain[cut.window].ravel().astype(np.float64)
+            gain = np.stack([np.ones_like(second), second])
             for one in cut.parts:
-                for _, pixels, tile in tiles.of_one_noise(*one, gain, gain.size):
+                for _, pixels, tile in tiles.of_one_noise(*one, gain, second.size):
                     found: Any = separate_smooth(tile, inputs.settings)
                     (a, b), (_, d) = found.emissivity_covariance
                     ratio = found.reflection_ratio[1], found.reflection_ratio_std[1] ** 2
