@@ -37,6 +37,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     capture["segment"] = ("time", (TIME > 3.0).astype(np.int32))
     path = tmp_path_factory.mktemp("run") / "capture.zarr"
     store.save(capture, path, store.provenance({}))
+    # Compiles: the process that does may have other last digits than those that load the code.
+    separation.solve(capture, RIG.response())
     return path
 
 
@@ -127,10 +129,11 @@ def dask_backed(path: Path) -> xr.Dataset:
 @pytest.mark.parametrize("kind", ["zarr", "dask"])
 def test_a_lazy_dataset_is_a_source(path: Path, tmp_path: Path, kind: str) -> None:
     """Opened lazily, or dask's, and sent to a process by rows, it gives what the folder does."""
-    lazy = dask_backed(path) if kind == "dask" else store.open_dataset(path)
-    separation.run(path, tmp_path / "folder.zarr", RIG.response(), memory=MEMORY)
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
-        separation.run(lazy, tmp_path / "lazy.zarr", RIG.response(), memory=MEMORY, executor=one)
+    sources = {"lazy": dask_backed(path) if kind == "dask" else store.open_dataset(path)}
+    for name, source in {**sources, "folder": path}.items():
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
+            target = tmp_path / f"{name}.zarr"
+            separation.run(source, target, RIG.response(), memory=MEMORY, executor=one)
     results = [store.open_dataset(tmp_path / f"{name}.zarr").load() for name in ("folder", "lazy")]
     xr.testing.assert_equal(*results)
 
