@@ -129,8 +129,8 @@ def dask_backed(path: Path) -> xr.Dataset:
 @pytest.mark.parametrize("kind", ["zarr", "dask"])
 def test_a_lazy_dataset_is_a_source(path: Path, tmp_path: Path, kind: str) -> None:
     """Opened lazily, or dask's, and sent to a process by rows, it gives what the folder does."""
-    sources = {"lazy": dask_backed(path) if kind == "dask" else store.open_dataset(path)}
-    for name, source in {**sources, "folder": path}.items():
+    lazy = dask_backed(path) if kind == "dask" else store.open_dataset(path)
+    for name, source in (("folder", path), ("lazy", lazy)):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
             target = tmp_path / f"{name}.zarr"
             separation.run(source, target, RIG.response(), memory=MEMORY, executor=one)
