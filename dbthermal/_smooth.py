@@ -126,14 +126,14 @@ def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
 
     Parameters
     ----------
-    time : array_like, shape (time,)
-        Times [s], strictly increasing, not necessarily evenly spaced.
+    time : array_like, shape (..., time)
+        Times [s], strictly increasing, not necessarily evenly spaced; of many captures at once.
     order : int
         Number of functions, the constant included.
 
     Returns
     -------
-    ndarray, shape (time, order)
+    ndarray, shape (..., time, order)
         Column j is a polynomial of degree j; :math:`\Phi^T \Phi = 1`.
 
     Raises
@@ -142,16 +142,19 @@ def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
         If the order is not in [1, number of times].
     """
     time = np.asarray(time, dtype=np.float64)
-    if not 1 <= order <= time.size:
+    frames = time.shape[-1]
+    if not 1 <= order <= frames:
         raise ValueError(
-            f"Invalid order {order} of the smooth subspace. Must lie in [1, {time.size}], "
+            f"Invalid order {order} of the smooth subspace. Must lie in [1, {frames}], "
             "the number of frames."
         )
-    span = time[-1] - time[0] if time.size > 1 else 1.0
-    position = 2.0 * (time - time[0]) / span - 1.0
+    span = time[..., -1:] - time[..., :1] if frames > 1 else 1.0
+    position = 2.0 * (time - time[..., :1]) / span - 1.0
     columns, triangle = np.linalg.qr(np.polynomial.legendre.legvander(position, order - 1))
-    size = np.abs(np.diag(triangle))
-    return np.asarray(columns) if size.min() > _ROUNDED * size.max() else _arnoldi(position, order)
+    size = np.abs(np.einsum("...jj->...j", triangle))
+    for place in np.argwhere(size.min(axis=-1) <= _ROUNDED * size.max(axis=-1)):
+        columns[tuple(place)] = _arnoldi(position[tuple(place)], order)
+    return np.asarray(columns)
 
 
 def _arnoldi(position: Array, order: int) -> Array:
