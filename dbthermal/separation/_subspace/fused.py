@@ -26,7 +26,9 @@ from dbthermal.separation._subspace.shared import Model, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Tile
 
-_BLOCK: Final = 16  # pixels whose samples are turned at once
+# Samples that are turned at once, to stay in the cache, and the fewest pixels.
+_TURNED: Final = 2**14
+_BLOCK: Final = 8
 _ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 _SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
 
@@ -275,9 +277,10 @@ def _compiled(digest: str) -> Callable[..., None]:
         if not digest:  # a constant of the compiled code, which is kept with it
             return
         frames, pixels = signals.shape[1:]
-        inside, outside = np.empty((2, _BLOCK, frames)), np.empty((4, _BLOCK, frames), np.float32)
-        for start in range(0, pixels, _BLOCK):
-            size = min(_BLOCK, pixels - start)
+        block = max(_BLOCK, _TURNED // frames)
+        inside, outside = np.empty((2, block, frames)), np.empty((4, block, frames), np.float32)
+        for start in range(0, pixels, block):
+            size = min(block, pixels - start)
             _turn(signals, start, size, inside)
             for p in range(size):
                 here = start + p

@@ -22,6 +22,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import residuals
 
 _ERROR: Final = 1e-7  # of a response's polynomials [K]
+_INVERSE_ERROR: Final = 5e-7  # [K]
 _MARGIN: Final = 0.25  # of the calibrated range, beside it, in which they hold
 _TERMS: Final = 12  # of a polynomial
 # Degrees, and shares of the range: of a wide one, such as a maker's, the outer parts stay exact.
@@ -86,7 +87,7 @@ def table(curve: Curve, *others: Curve) -> Table:
         lambda s: curve.temperature(s + curve.reference), _TERMS - 1, ends
     )
     values, newton = inverse(_signal(dense, curve)), 0
-    while newton < _NEWTON and np.abs(values - dense).max() > _ERROR:
+    while newton < _NEWTON and np.abs(values - dense).max() > _INVERSE_ERROR:
         values, newton = values - (u(values) - _signal(dense, curve)) / slope(values), newton + 1
     return Table(
         signal=_coefficients(u),
@@ -234,34 +235,21 @@ def range_of(values: Array) -> float:
 
 @compiled
 def combined(columns: Array, spans: tiles.Whole, scales: Array, count: int, result: Array) -> None:
-    """Sum of the first columns (column, time) times scales, in place; two at once."""
+    """Sum of the first columns (column, time) times scales, in place."""
     result[:] = 0.0
-    for j in range(0, count - count % 2, 2):
-        start, stop = spans[j, 0], spans[j + 1, 1]
-        one, two, part = columns[j, start:stop], columns[j + 1, start:stop], result[start:stop]
-        a, b = scales[j], scales[j + 1]
+    for j in range(count):
+        start, stop = spans[j]
+        column, part, scale = columns[j, start:stop], result[start:stop], scales[j]
         for t in range(part.size):
-            part[t] += a * one[t] + b * two[t]
-    if count % 2:
-        start, stop = spans[count - 1]
-        one, part, a = columns[count - 1, start:stop], result[start:stop], scales[count - 1]
-        for t in range(part.size):
-            part[t] += a * one[t]
+            part[t] += scale * column[t]
 
 
 @compiled
 def projected(columns: Array, spans: tiles.Whole, count: int, curve: Array, result: Array) -> None:
-    """Products of the first columns (column, time) with a curve, in place; two at once."""
-    for j in range(0, count - count % 2, 2):
-        start, stop, a, b = spans[j, 0], spans[j + 1, 1], 0.0, 0.0
-        one, two, part = columns[j, start:stop], columns[j + 1, start:stop], curve[start:stop]
-        for t in range(part.size):
-            a += one[t] * part[t]
-            b += two[t] * part[t]
-        result[j], result[j + 1] = a, b
-    if count % 2:
-        start, stop = spans[count - 1]
-        result[count - 1] = dot(columns[count - 1, start:stop], curve[start:stop])
+    """Products of the first columns (column, time) with a curve, in place."""
+    for j in range(count):
+        start, stop = spans[j]
+        result[j] = dot(columns[j, start:stop], curve[start:stop])
 
 
 @compiled
