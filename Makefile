@@ -56,7 +56,7 @@ export PYTHONPATH := $(CURDIR)/notebooks
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install format check types pytest smoke chain interop test test-slow reproduce full verify record data bench attack lock clean FORCE
+.PHONY: help install format check types pytest smoke chain interop test test-slow reproduce full verify record report data bench attack lock clean FORCE
 
 help: ## list the tasks
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -111,6 +111,9 @@ record: .venv/installed ## keep the numbers of results/full as the reference, an
 
 data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
 	$(python) -m reproduction.manifest
+
+report: .venv/installed ## one page on everything in results/full: results/report.html
+	$(python) -m reproduction.report
 
 bench: .venv/installed ## measure every method's time, and a run from disk to disk, into results/bench
 	$(python) -m reproduction.benchmark

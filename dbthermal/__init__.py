@@ -7,7 +7,7 @@ optional package.
 """
 
 import importlib
-from types import ModuleType
+from typing import Any
 
 __version__ = "0.1.0"
 
@@ -26,6 +26,8 @@ __all__ = [
     "noise",
     "planck",
     "readers",
+    "report",
+    "reporting",
     "response",
     "scene",
     "schema",
@@ -36,8 +38,13 @@ __all__ = [
 __dir__ = __all__.copy
 
 
-def __getattr__(name: str) -> ModuleType:
-    """Import the module `name` of this package when it is first used (PEP 562)."""
+_FUNCTIONS = {"report": "reporting"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the module, or the function, of this package when it is first used (PEP 562)."""
+    if name in _FUNCTIONS:
+        return getattr(importlib.import_module(f"{__name__}.{_FUNCTIONS[name]}"), name)
     if name in __all__:
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"Unknown module {name!r} in {__name__}. Must be one of {__all__}.")

@@ -301,20 +301,21 @@ def _digest(content: Mapping[str, Any]) -> str:
 
 
 def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """Save a text in Markdown, with its provenance in a comment at its end.
+    """Save a text in Markdown or HTML, with its provenance in a comment at its end.
 
     Parameters
     ----------
     text : str
         The text.
     path : str or Path
-        File ``*.md``.
+        File ``*.md`` or ``*.html``. Its parents are made.
     provenance : mapping
         As from `provenance`.
     """
-    comment = f"\n<!-- {_json(provenance)} -->\n"
-    with whole(path, ".md") as part:
-        part.write_text(text + comment, encoding="utf-8")
+    suffix = ".html" if Path(path).suffix == ".html" else ".md"
+    content = _json(provenance).replace("--", "-\\u002d").replace("<", "\\u003c")  # no end, no tag
+    with whole(path, suffix) as part:
+        part.write_text(f"{text}\n<!-- {content} -->\n", encoding="utf-8")
 
 
 def save_figure(
