@@ -12,7 +12,6 @@ from typing import Any, Final
 __version__ = "0.1.0"
 
 __all__ = [
-    "acquire",
     "alignment",
     "bands",
     "calibration",
