@@ -224,7 +224,17 @@ def separated_film(
 
 @dataclass(frozen=True)
 class FilmPanel:
-    """Picture of a film: values (time, y, x), title, unit, and whether zero is in the middle."""
+    """Picture of a film.
+
+    Attributes
+    ----------
+    values : DataArray
+        (time, y, x); pixels without a value are gray.
+    title, unit : str
+        Title, and unit of the colour bar.
+    symmetric : bool
+        Zero in the middle of the range of colour.
+    """
 
     values: xr.DataArray
     title: str

@@ -109,7 +109,9 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     if "object_temperature" not in view.panes:
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
     result, unit = view.data, Unit(celsius=celsius)
-    chosen = dict(regions) or {"whole image": Region("rectangle", ((0, 0), view.shape[:2]))}
+    chosen = dict(regions) or {
+        "whole image": Region("rectangle", ((0, 0), (view.shape[0], view.shape[1])))
+    }
     curves = {
         name: {pane: view.curve(pane, region) for pane in view.panes if _is_averaged(pane)}
         for name, region in chosen.items()
@@ -160,7 +162,7 @@ def _scene_sentence(view: View) -> str:
 
 
 def _origin(view: View) -> str:
-    """What the data are: measured, simulated, emulated, or not stated."""
+    """Origin of the data: measured, simulated, emulated, or not stated."""
     holders = [one for one in (view.data, view.capture) if one is not None]
     return next(
         (str(one.attrs["origin"]) for one in holders if "origin" in one.attrs), "origin not stated"
@@ -221,7 +223,7 @@ def _outlines(view: View, unit: Unit, chosen: Mapping[str, Region]) -> Figure:
         figure, axes[0, 0], image, pane.label, label, limits=drawing.limits_of(image)
     )
     for (name, region), color in zip(chosen.items(), cycle(drawing.COLORS), strict=False):
-        mask = region.mask(view.shape)[::step, ::step]
+        mask = region.mask((view.shape[0], view.shape[1]))[::step, ::step]
         if mask.all():
             continue
         axes[0, 0].contour(mask, [0.5], colors=[color], linewidths=1.5)
@@ -324,7 +326,7 @@ def _emissivities(regions: Mapping[str, Mapping[str, Any]]) -> Iterator[Markup |
 
 
 def _assumed(view: View) -> Markup:
-    """What the separation took for granted, by the attributes of the result."""
+    """Assumptions of the separation, by the attributes of the result."""
     attrs = view.data.attrs
     rows = [[words, str(attrs[name])] for name, words in _WORDS.items() if str(attrs.get(name, ""))]
     events = ", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items())

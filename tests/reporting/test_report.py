@@ -124,7 +124,7 @@ def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the report is not tried in a browser")
 def test_page_works_without_a_network(tmp_path: Path) -> None:
-    """In a browser that reaches nothing: the film has its frames, a click and a key give a curve."""
+    """In a browser that reaches nothing: the film is there, a click and a key answer."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="no Playwright (extra 'test')")
     path = tmp_path / "scene.html"
     dbthermal.report(scene(), path, celsius=False)
