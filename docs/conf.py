@@ -38,6 +38,7 @@ nb_merge_streams = True
 suppress_warnings = ["mystnb.unknown_mime_type"]  # of pictures that HTML does not show
 
 html_theme = "pydata_sphinx_theme"
+html_title = "dbthermal"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_copy_source = False

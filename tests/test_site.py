@@ -128,6 +128,7 @@ def test_site_is_built_and_needs_no_network(tmp_path: Path) -> None:
         for name in ("index", "own_captures", "status", "notebooks/00_quickstart", FORMULAS):
             page.goto(f"{(tmp_path / 'html' / name).as_uri()}.html", wait_until="load")
             assert page.evaluate("document.documentElement.scrollWidth") <= 390, name
+            assert not page.locator(".output.stderr").count(), name
             assert page.evaluate("Array.from(document.images).every(i => i.naturalWidth)"), name
         assert page.locator("math").first.bounding_box()["height"] > 5  # [pixel]
         browser.close()
