@@ -1,12 +1,8 @@
 """The devices of a session, opened together: cameras, their command ports, wheel, thermocouples.
 
-Opening sends nothing that changes a camera, and moves nothing; the result is `Devices`.
-`Devices.prepare` sets the cameras for a measurement and homes the wheel, `Devices.select` turns a
-filter into the beam. Both are called by the user, or by a protocol. In an emulated session all
-emulators share one world, so that the wheel's position decides what the camera behind it sees; they
-are imported only then.
-
-Nothing here was ever run on hardware.
+Opening sends nothing that changes a camera, and moves nothing. In an emulated session all emulators
+share one world, so that the wheel's position decides what the camera behind it sees; they are
+imported only then. Nothing here was ever run on hardware.
 """
 
 import importlib
@@ -55,10 +51,7 @@ class ReadingError(RuntimeError):
 
 @dataclass
 class Thermocouples:
-    """The logger's channels, of which one scan gives the readings of all.
-
-    `names` maps channel to the place of its tip; `clock` is the host's [s], that of the logger.
-    """
+    """The logger's channels, by the places of their tips; one scan gives the readings of all."""
 
     logger: TC08
     names: Mapping[int, str]
@@ -111,8 +104,7 @@ class Devices:
         """Instruments that are read beside the frames, for `recording.record`.
 
         Each thermocouple by its name [K]; ``fpa <band>``, the temperature of the focal-plane array
-        [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam. They
-        raise RuntimeError or OSError where the instrument gives none.
+        [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam.
         """
         readings: dict[str, Reading] = {}
         if self.thermocouples is not None:
@@ -126,9 +118,8 @@ class Devices:
         return readings
 
     def identities(self) -> dict[str, Identity]:
-        """Names and numbers of the devices, for the record of a recording.
+        """Names and numbers of cameras, by band, and other devices; each says ``is_simulated``.
 
-        Keys are the bands, ``filter_wheel`` and ``thermocouples``; each says ``is_simulated``.
         ValueError if frames and command port of a band are those of two cameras; RuntimeError or
         OSError if a device does not answer.
         """
@@ -147,13 +138,11 @@ class Devices:
         return identities
 
     def prepare(self) -> None:
-        """
-        Make the devices ready to measure: set the cameras, correct their offsets, turn the wheel.
+        """Set the cameras, correct their offsets, home the wheel if need be, turn it to its band.
 
-        Each camera gives 16-bit counts, corrects its offsets on command only, and gives telemetry
-        as the session says; each setting is read back. Then the offsets are corrected, and the
-        wheel is homed if it has to be, and turned to the session's band. ValueError if a camera
-        does not keep a setting, RuntimeError or OSError if a device refuses, fails or is gone.
+        Cameras give 16-bit counts, correct their offsets on command only, and give the session's
+        telemetry. ValueError if a camera does not keep a setting, RuntimeError or OSError if a
+        device refuses, fails or is gone.
         """
         for camera in self.cameras.values():
             camera.prepare(self.session.telemetry_rows)
@@ -173,8 +162,8 @@ class Devices:
     def select(self, band: str) -> "Devices":
         """Turn one of the session's filters into the beam; as `FilterWheel.select`.
 
-        Returns the same devices, of which the camera behind the wheel is that of this band;
-        ValueError if the session has no wheel, or no such filter.
+        Returns the devices with the camera behind the wheel named after this band; ValueError if
+        the session has no wheel, or no such filter.
         """
         before = self.session.filtered
         if self.wheel is None or before is None:
@@ -192,10 +181,7 @@ class Devices:
         )
 
     def flush(self) -> None:
-        """Discard the frames that the drivers hold, which show the scene as it was before.
-
-        `SourceLostError` if a camera is gone.
-        """
+        """Discard frames that the drivers hold of the scene before; SourceLostError if lost."""
         start = system_time.monotonic()
         for source in self.sources.values():
             while system_time.monotonic() - start < FLUSH_TIMEOUT:
@@ -215,14 +201,9 @@ def open_devices(
 ) -> Iterator[Devices]:
     """Open the devices of a session: the real ones, or, by its one switch, the emulated ones.
 
-    Addresses are ``v4l2:///dev/video0``, ``serial:///dev/ttyACM0`` and ``tc08:``; and in an
-    emulated session ``sim://<kind>/<name>``, with the kind of camera and its name in the world, for
-    frames and commands alike, ``sim://apt/<any>`` and ``sim://tc08``.
-
     `world` is the emulated bench, an `emulated.world.World`, by default one at room temperature,
     and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
-    [s]; by default, with the default world, its blackbody, see
-    `dbthermal.instruments.emulated.blackbody`. The devices are closed in the end.
+    [s]; by default, with the default world, its blackbody. The devices are closed in the end.
 
     Raises
     ------

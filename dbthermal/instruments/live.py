@@ -3,15 +3,12 @@
 A `View` is passed to `dbthermal.instruments.recording.record` as `preview`, and shows one picture
 of each band, in place, in a notebook or nowhere::
 
-    from IPython.display import DisplayHandle
-
     view = live.View(DisplayHandle(), title=session.name, is_simulated=session.simulated)
     record(session, devices.sources, path, readings=devices.readings(), preview=view)
 
-With a `Separation` it shows the temperatures of object and background beside them, live.
-
-A `Watch` computes the numbers that are shown, and draws nothing: matplotlib is loaded with the
-first picture. The queue of the recording has to bridge the time that an update takes.
+With a `Separation` it shows the temperatures of object and background beside them. A `Watch`
+computes the numbers that are shown, and draws nothing: matplotlib is loaded with the first picture.
+The queue of the recording has to bridge the time that an update takes.
 """
 
 import io
@@ -270,11 +267,10 @@ class Separation:
 class View:
     """Live view: an instance is the `preview` of a recording, or of several.
 
-    One update of two bands of 640 x 512 takes about a tenth of a second of one core; the fetching
-    threads go on meanwhile. It is shown on a `display`; without one the figure is only kept.
-    `title` is the name of the recording, beside which the figure says if it `is_simulated`;
-    `period` is the least time from update to update [s], not negative, and `window` that over which
-    frame rates are measured [s], positive. With a `separation` it shows temperatures as well.
+    It is shown on a `display`; without one the figure is only kept. An update of two bands of 640 x
+    512 takes a tenth of a second of one core. `title` is the recording's name, `period` the least
+    time from update to update, `window` that over which frame rates are measured [s].
+    With a `separation` it shows temperatures as well.
 
     Examples
     --------

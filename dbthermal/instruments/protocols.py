@@ -1,10 +1,8 @@
 """Procedures of the rig: wait for the blackbody, record a blackbody sweep, record a scene.
 
-Gain, offset and response are calibrated before a blackbody that goes through several temperatures;
-the emissivity bench goes through them with samples. At each temperature the wheel goes through its
-filters, and each of these is a recording of its own, begun only when the temperature is stable.
-`dbthermal.instruments.recording` opens the recordings: `open_sweep`, `bench_series`,
-`open_capture`.
+Gain, offset and response are calibrated before a blackbody that goes through several temperatures,
+the emissivity bench with samples. At each temperature the wheel goes through its filters, and each
+of these is a recording of its own. `dbthermal.instruments.recording` opens the recordings.
 """
 
 import threading
@@ -73,17 +71,13 @@ def wait_stable(
         Session with a blackbody.
     temperature : float
         Set point [K].
-    read : callable
-        Reads the temperature [K].
-    clock, sleep : callable
-        Time [s], and a pause of some time [s].
+    read, clock, sleep : callable
+        Reads the temperature [K]; time [s], and a pause of some time [s].
 
     Raises
     ------
-    TimeoutError
-        After the session's `timeout`.
-    ValueError
-        If the session has no blackbody.
+    TimeoutError, ValueError
+        After the session's `timeout`; if it has no blackbody.
     """
     if session.blackbody is None:
         raise ValueError(f"Invalid session '{session.name}'. Must have a blackbody.")
@@ -115,10 +109,10 @@ def record_sweep(
 ) -> list[Step]:
     """Record a blackbody at each of its temperatures, once it is stable, through each filter.
 
-    The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep,
-    and a scene too is recorded after a correction. Recordings of this sweep that are in the folder
-    and complete are kept, so that a sweep that was interrupted goes on where it was. If the folder
-    is renamed or moved meanwhile the sweep goes on in it. Call `Devices.prepare` before.
+    The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep.
+    Recordings of this sweep that are in the folder and complete are kept, so that a sweep that was
+    interrupted goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on
+    in it. Call `Devices.prepare` before.
 
     Parameters
     ----------
@@ -142,12 +136,8 @@ def record_sweep(
     ValueError
         If the session has no blackbody, or no reading of it; or a recording exists that is
         incomplete, of another temperature, or during which the wheel turned.
-    TimeoutError
-        As `wait_stable`; the recordings before are kept.
-    SourceLostError
-        If a camera is lost on the way.
-    FileNotFoundError
-        If the folder was deleted meanwhile.
+    TimeoutError, SourceLostError, FileNotFoundError
+        As `wait_stable`; or a camera is lost, or the folder deleted. What was recorded is kept.
     """
     session = devices.session
     readings = devices.readings()
@@ -189,12 +179,7 @@ def record_scene(
     path : str or Path
         Folder ``*.zarr`` to make.
     limits, preview, stop : optional
-        As for `dbthermal.instruments.recording.record`, whose errors it raises.
-
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames.
+        As for `dbthermal.instruments.recording.record`, whose result and errors are those of this.
 
     Examples
     --------

@@ -103,12 +103,12 @@ DeviceName = Literal["filter_wheel", "thermocouples"]
 
 @dataclass(frozen=True, config=_CHECKED)
 class Device:
-    """Addresses of one device.
+    """Addresses of one device, such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``.
 
     Attributes
     ----------
     simulated, hardware : str
-        Such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``.
+        Addresses.
     """
 
     simulated: Annotated[str, _by(partial(addresses.parse, schemes=("sim", "pty")))]
@@ -128,14 +128,12 @@ def _check_schemes(name: str, device: Device) -> None:
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
-    """One camera: addresses of its frames and of its command port, if any, and its kind.
+    """One camera.
 
     Attributes
     ----------
-    video : Device
-        Addresses of its frames.
-    control : Device or None
-        Addresses of its command port.
+    video, control : Device
+        Addresses of its frames, and of its command port, if it has one.
     kind : str
         One of `dbthermal.instruments.camera.KINDS`, that of its simulated address.
     """
@@ -170,11 +168,9 @@ class Blackbody:
         Set points [K].
     stability, window : float
         Largest range of the readings [K] in a window, and how long it is [s].
-    tolerance : float
+    tolerance, timeout : float
         Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
-        by half a kelvin or so each, and the recordings keep the reading.
-    timeout : float
-        Longest wait for it [s].
+        by half a kelvin or so each, and the recordings keep the reading. Longest wait for it [s].
     """
 
     temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
@@ -194,10 +190,8 @@ class Wheel(filterwheel.Settings):
 
     Attributes
     ----------
-    filters : mapping
-        Empty: those of the session are taken.
-    addresses : tuple of tuple of int
-        As in `Settings`.
+    filters, addresses : mapping, tuple
+        Empty: those of the session are taken; as in `Settings`.
     """
 
     filters: Mapping[int, str] = field(default_factory=dict, init=False)
@@ -215,8 +209,7 @@ class Wheel(filterwheel.Settings):
 class Session:
     """Description of a recording: devices, procedure and duration; see the module.
 
-    All protocols but ``scene`` go through the blackbody's temperatures. Invalid values raise
-    pydantic's ValidationError, a ValueError.
+    Invalid values raise pydantic's ValidationError, a ValueError.
 
     Attributes
     ----------
@@ -225,25 +218,20 @@ class Session:
     simulated : bool
         One switch for all devices.
     protocol : str
-        ``"gain_offset"``, ``"response"``, ``"emissivity_bench"`` or ``"scene"``.
+        ``"gain_offset"``, ``"response"``, ``"emissivity_bench"``, which go through the blackbody's
+        temperatures, or ``"scene"``.
     duration : float
         Duration of the recording, or of each of its steps [s].
-    cameras : dict of str to Camera
-        Cameras by band, in the order of the recording.
+    cameras, devices : dict
+        Cameras by band, in the order of the recording; other devices by name.
     frame_rate : float
         Frame rate [Hz].
     shape : tuple of int
         Rows and columns.
     telemetry_rows : int
         Rows of telemetry in a frame, 0 or 2.
-    devices : dict of str to Device
-        Other devices by name.
-    filters : dict of int to str
-        Slot of the wheel to band.
-    wheel : Wheel
-        Settings of the wheel.
-    sweep : tuple of str
-        Filters at each temperature; see `swept`.
+    filters, wheel, sweep : dict of int to str, Wheel, tuple of str
+        Slot of the wheel to band; its settings; filters at each temperature, see `swept`.
     thermocouples : dict of int to str
         Channel to measured object.
     blackbody : Blackbody or None
@@ -365,11 +353,10 @@ class Session:
 
         Raises
         ------
-        FileNotFoundError
-            If a file does not exist.
-        ValueError
-            If it is not YAML, or a key is missing, unknown, repeated or in both files, or a value
-            is invalid: one line for each error, with file, place in it, value and rule.
+        FileNotFoundError, ValueError
+            If a file does not exist; if it is not YAML, or a key is missing, unknown, repeated or
+            in both files, or a value is invalid: one line for each error, with file, place and
+            rule.
         """
         content = texts.read_yaml(path)
         files = {}
