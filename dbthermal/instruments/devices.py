@@ -10,7 +10,7 @@ import threading
 import time as system_time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, Final
 
@@ -68,24 +68,20 @@ class Thermocouples:
         `ReadingError` if it is no temperature, or the logger fails.
         """
         with self._lock:
-            scan = self._current(channel)
+            scan = self._scan
+            if scan is None or channel in self._read or self.clock() - scan.time > SCAN_AGE:
+                try:
+                    self._scan = scan = self.logger.single()
+                except TC08Error as error:
+                    raise ReadingError(f"No temperatures: {error}") from error
+                self._read.clear()
+            self._read.add(channel)
         if scan.flag[channel]:
             raise ReadingError(
                 f"No temperature of thermocouple '{self.names[channel]}' in channel {channel}: "
                 f"{Flag(int(scan.flag[channel]))!r}. Must be connected, and within its range."
             )
         return float(scan.temperature[channel])
-
-    def _current(self, channel: int) -> Scan:
-        scan = self._scan
-        if scan is None or channel in self._read or self.clock() - scan.time > SCAN_AGE:
-            try:
-                self._scan = scan = self.logger.single()
-            except TC08Error as error:
-                raise ReadingError(f"No temperatures: {error}") from error
-            self._read.clear()
-        self._read.add(channel)
-        return scan
 
 
 @dataclass(frozen=True)
@@ -128,13 +124,18 @@ class Devices:
             identity: Identity = {**source.identity, "is_simulated": source.is_simulated}
             if band in self.cameras:
                 control = self.cameras[band].identity()
-                _require_same(band, identity, control)
+                numbers = identity.get("serial_number"), control["serial_number"]
+                if numbers[0] not in {None, numbers[1]}:
+                    raise ValueError(
+                        f"Invalid cameras {numbers} of band '{band}': frames come from the first, "
+                        "commands go to the second. Must be one camera."
+                    )
                 identity = {**identity, **control}
             identities[band] = identity
         if self.wheel is not None:
-            identities[WHEEL] = _record(self.wheel.identity())
+            identities[WHEEL] = self.wheel.identity()
         if self.logger is not None:
-            identities["thermocouples"] = _record(self.logger.identity())
+            identities["thermocouples"] = self.logger.identity()
         return identities
 
     def prepare(self) -> None:
@@ -234,10 +235,11 @@ def open_devices(
     with ExitStack() as stack:
         sources: dict[str, FrameSource] = {}
         cameras: dict[str, CameraControl] = {}
-        for band in session.bands:
+        for band, camera in session.cameras.items():
             sources[band] = stack.enter_context(_frames(session, band, world, pictures or {}))
-            control = _control(session, band, world)
-            if control is not None:
+            open_control = camera_kind(camera.kind).open_control
+            if camera.control is not None and open_control is not None:
+                control = open_control(session.url(camera.control), world)
                 cameras[band] = stack.enter_context(control)
         wheel = stack.enter_context(_wheel(session, world)) if session.filters else None
         logger = stack.enter_context(_logger(session, world)) if session.thermocouples else None
@@ -266,18 +268,6 @@ def _frames(
     return source
 
 
-def _control(
-    session: Session, band: str, world: Any
-) -> AbstractContextManager[CameraControl] | None:
-    """Open the command port of a band's camera, if it has one."""
-    camera = session.cameras[band]
-    if camera.control is None:
-        return None
-    open_control = camera_kind(camera.kind).open_control
-    assert open_control is not None, camera.kind  # as the session has checked
-    return open_control(session.url(camera.control), world)
-
-
 def _wheel(session: Session, world: Any) -> FilterWheel:
     chosen = {entry.name: getattr(session.wheel, entry.name) for entry in fields(session.wheel)}
     settings = filterwheel.Settings(**{**chosen, "filters": session.filters})
@@ -292,20 +282,3 @@ def _logger(session: Session, world: Any) -> TC08:
         logger.close()
         raise
     return logger
-
-
-def _record(identity: Any) -> Identity:
-    """Text by name, and whether it is simulated."""
-    return {
-        name: value if isinstance(value, bool) else str(value)
-        for name, value in asdict(identity).items()
-    }
-
-
-def _require_same(band: str, source: Identity, control: Identity) -> None:
-    numbers = source.get("serial_number"), control["serial_number"]
-    if numbers[0] not in {None, numbers[1]}:
-        raise ValueError(
-            f"Invalid cameras {numbers} of band '{band}': frames come from the first, commands go "
-            "to the second. Must be one camera."
-        )

@@ -8,15 +8,15 @@ of these is a recording of its own. `dbthermal.instruments.recording` opens the 
 import threading
 import time as system_time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from dbthermal import store
-from dbthermal.instruments.camera import SourceLostError
+from dbthermal.instruments.camera import Identity, SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary, record
 from dbthermal.instruments.recording._capture import mean_reading
@@ -145,8 +145,12 @@ def record_sweep(
         raise ValueError(f"Invalid session '{session.name}'. Must have and read a blackbody.")
     Path(folder).mkdir(parents=True, exist_ok=True)
     held = store.HeldFolder(Path(folder))
-    plan = _plan(session, folder)
-    kept = [_kept(number, temperature, band, path) for number, temperature, band, path in plan]
+    plan = [
+        (number, temperature, band, step_path(folder, session.name, number, band))
+        for number, temperature in enumerate(session.blackbody.temperatures)
+        for band in session.swept or (None,)
+    ]
+    kept = [_kept(*step) for step in plan]
     steps: list[Step] = []
     resting: int | None = None
     for (number, temperature, band, planned), was in zip(plan, kept, strict=True):
@@ -200,26 +204,16 @@ def record_scene(
     devices.flush()
     if devices.world is not None:
         devices.world.begin()
-    return record(
-        devices.session,
-        devices.sources,
-        path,
-        readings=devices.readings(),
-        identities=identities,
-        limits=limits,
-        preview=preview,
-        stop=stop,
-    )
+    options = {"limits": limits, "preview": preview, "stop": stop}
+    return _record(devices, path, identities, **options)
 
 
-def _plan(session: Session, folder: str | Path) -> list[tuple[int, float, str | None, Path]]:
-    """Number, temperature [K], band behind the wheel and path of each recording, in order."""
-    assert session.blackbody is not None
-    return [
-        (number, temperature, band, step_path(folder, session.name, number, band))
-        for number, temperature in enumerate(session.blackbody.temperatures)
-        for band in session.swept or (None,)
-    ]
+def _record(
+    devices: Devices, path: str | Path, identities: Mapping[str, Identity], **options: Any
+) -> Summary:
+    """Record all sources and readings of open devices, with the options of `record`."""
+    session, sources, readings = devices.session, devices.sources, devices.readings()
+    return record(session, sources, path, readings=readings, identities=identities, **options)
 
 
 def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
@@ -250,15 +244,7 @@ def _record_step(
     selected = devices if band is None else devices.select(band)
     identities = selected.identities()
     selected.flush()
-    summary = record(
-        selected.session,
-        selected.sources,
-        path,
-        readings=selected.readings(),
-        identities=identities,
-        limits=limits,
-        preview=preview,
-    )
+    summary = _record(selected, path, identities, limits=limits, preview=preview)
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
     require_filter(summary.path, band)

@@ -26,9 +26,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal.instruments import _addresses as addresses
+from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing
 
-__all__ = ["ERRORS", "TC08", "Flag", "Identity", "Scan", "TC08Error", "load"]
+__all__ = ["ERRORS", "TC08", "Flag", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
 
 Library = Any
@@ -125,18 +126,6 @@ class Scan:
     time: float
     temperature: npt.NDArray[np.float64]
     flag: npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class Identity:
-    """Serial number, calibration date (in the vendor's format) and versions of a unit."""
-
-    serial_number: str
-    calibration_date: str
-    driver: str
-    hardware: int
-    variant: int
-    is_simulated: bool
 
 
 class TC08(Closing):
@@ -236,8 +225,14 @@ class TC08(Closing):
             raise self._error("read its identity")
         texts = (unit[0].serial, unit[0].calibration_date, unit[0].driver)
         serial, date, driver = (text.decode("ascii", "backslashreplace") for text in texts)
-        versions = unit[0].hardware, unit[0].variant
-        return Identity(serial, date, driver, *versions, self.is_simulated)
+        return {
+            "serial_number": serial,
+            "calibration_date": date,  # in the vendor's format
+            "driver": driver,
+            "hardware": str(unit[0].hardware),
+            "variant": str(unit[0].variant),
+            "is_simulated": self.is_simulated,
+        }
 
     def set_channels(self, kinds: Mapping[int, str]) -> None:
         """Set the type of each thermocouple, a letter of B E J K N R S T by its channel, 1 to 8.

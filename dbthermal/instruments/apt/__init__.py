@@ -209,8 +209,9 @@ class Info(Record):
     def parse(cls, message: Message) -> Self:
         """Identity of HW_GET_INFO; bytes of the model that are not ASCII are spelled out."""
         number, model, kind, minor, interim, major, _, notes, *versions = cls._unpacked(message)
-        firmware = f"{major}.{interim}.{minor}"
-        return cls(number, _text(model.rstrip(b"\0 ")), kind, firmware, *versions, notes)
+        hardware, modification, channels = versions
+        name, firmware = _text(model.rstrip(b"\0 ")), f"{major}.{interim}.{minor}"
+        return cls(number, name, kind, firmware, hardware, modification, channels, notes)
 
     def pack(self) -> bytes:
         """Data of the message; ValueError if a number or a text does not fit its field."""

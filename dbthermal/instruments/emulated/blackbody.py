@@ -37,8 +37,8 @@ def of_rig(
 ) -> dict[str, Callable[[float], Counts]]:
     """Raw frames, by band, of the world's blackbody as a simulated rig records them.
 
-    Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise from the
-    seed, the fixed pattern of the detector (see `dbthermal.simulation.pattern`) and 16 bits.
+    Counts follow Planck's law at `World.blackbody_temperature`, with noise from the seed, and the
+    fixed pattern of the detector (see `dbthermal.simulation.pattern`).
     """
     response = rig.response()
     shape = detector.sizes["y"], detector.sizes["x"]
