@@ -18,6 +18,7 @@ from dbthermal.store._results import (
     save_numbers,
     save_text,
     save_video,
+    whole,
 )
 
 __all__ = [
@@ -36,5 +37,6 @@ __all__ = [
     "save_text",
     "save_video",
     "to_disk",
+    "whole",
 ]
 __dir__ = __all__.copy
