@@ -111,11 +111,9 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
     """
     suffix = ".html" if Path(path).suffix == ".html" else ".md"
     # A string in it can neither end the comment nor begin a tag.
-    content = as_json(provenance).replace("--", "-\u002d").replace("<", "\u003c")
+    content = as_json(provenance).replace("--", "-\\u002d").replace("<", "\\u003c")
     with whole(path, suffix) as part:
-        part.write_text(f"{text}
-<!-- {content} -->
-", encoding="utf-8")
+        part.write_text(f"{text}\n<!-- {content} -->\n", encoding="utf-8")
 
 
 def save_figure(
