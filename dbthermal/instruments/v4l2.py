@@ -44,7 +44,7 @@ __all__ = ["BUFFERS", "Y16", "Capture", "Kernel", "open_url"]
 __dir__ = __all__.copy
 
 Y16: Final = 0x20363159
-"""Pixel format ``Y16 ``: 16 bits a pixel, little-endian, before any gain control."""
+"""Pixel format ``Y16`` and a space: 16 bits a pixel, little-endian, before any gain control."""
 
 BUFFERS: Final = 32
 """Frames that the kernel holds while no program reads, the most it can; beyond, it drops: half a
