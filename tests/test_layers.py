@@ -18,6 +18,7 @@ LEVEL = {module: level for level, row in enumerate(LAYERS) for module in row.spl
 PLACES = {
     "zarr": {"readers", "store"},
     "h5py": {"readers"},
+    "anywidget": {"explorer"},
     "av": {"readers", "store"},
     "torch": {"separation"},
     "robust_laplacian": {"simulation"},
@@ -75,7 +76,8 @@ def test_only_store_opens_zarr() -> None:
 
 def test_importing_the_package_is_light() -> None:
     """`import dbthermal` loads neither optional nor heavy packages."""
-    code = "import sys, dbthermal; print({'torch', 'usb', 'serial', 'matplotlib'} & {*sys.modules})"
+    heavy = {"torch", "usb", "serial", "matplotlib", "anywidget"}
+    code = f"import sys, dbthermal; print({heavy} & {{*sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 
