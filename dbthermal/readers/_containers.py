@@ -14,7 +14,7 @@ from dbthermal.readers import _recording as recordings
 
 _DAMAGE: Final = (
     *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError),
-    *(OSError, EOFError, RuntimeError, MemoryError, SystemError, RuntimeWarning),
+    *(OSError, EOFError, RuntimeError, MemoryError, SystemError, RuntimeWarning, UserWarning),
 )
 
 
@@ -32,6 +32,7 @@ def read(path: Path, name: str | None, check: Callable[[Any], None], stack: Exit
     kind = kind_of(path)
     try:
         stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
+        warnings.simplefilter("error", UserWarning)  # as of one dimension twice
         found = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
         wanted = next(iter(found)) if name is None and len(found) == 1 else name
         if wanted not in found:
