@@ -17,7 +17,6 @@ import pages
 project, release = "dbthermal", dbthermal.__version__
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc", "myst_nb"]
 source_suffix = {".rst": "restructuredtext", ".md": "myst-nb", ".ipynb": "myst-nb"}
-exclude_patterns = ["**/.ipynb_checkpoints"]
 default_role = "autolink"
 add_module_names = False
 python_maximum_signature_line_length = 80
