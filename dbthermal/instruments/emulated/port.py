@@ -44,8 +44,6 @@ class EmulatedPort(Closing):
     are kept, without blocking the device, which only the thread calls once it is started.
     """
 
-    is_simulated: Final = True
-
     def __init__(self, device: Device) -> None:
         self.device = device
         self._master, self._slave = pty.openpty()
