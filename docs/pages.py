@@ -26,7 +26,8 @@ TOUR = "00_quickstart"
 def public_modules() -> list[str]:
     """Names of the modules that a user may import; the emulated devices are for tests."""
     found = pkgutil.walk_packages(dbthermal.__path__, "dbthermal.", onerror=lambda _: None)
-    return [module.name for module in found if not re.search(r"\.(_|emulated)", module.name)]
+    names = [module.name for module in found]
+    return ["dbthermal", *(name for name in names if not re.search(r"\.(_|emulated)", name))]
 
 
 def of_module(name: str) -> str:
