@@ -105,7 +105,7 @@ def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool
 @compiled
 def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
-) -> tuple[float, float, bool]:
+) -> tuple[Any, Any, Any]:
     """A temperature and its deviation, NaN where useless; and what is wrong with them."""
     lost, missing, beyond, zero, one = _ZERO, _ZERO, _ZERO, _ZERO, _ONE
     lowest, highest = np.float32(model.lowest), np.float32(model.highest)

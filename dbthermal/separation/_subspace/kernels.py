@@ -224,7 +224,7 @@ def mean(values: Array) -> float:
 
 
 @njit(nogil=True, fastmath=_FLAGS | {"nnan"}, error_model="numpy")
-def range_of(values: Array) -> float:
+def range_of(values: Array) -> Any:
     """Largest less smallest value; with a NaN any number, or these would be taken one by one."""
     low, high = values[0], values[0]
     for t in range(values.size):
@@ -321,7 +321,7 @@ def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
         return slope, centre - slope * middle, energy
 
     @compiled
-    def moments(x: Any, y: Any, weights: Any) -> tuple[Any, Any, Any]:
+    def moments(x: Any, y: Any, weights: Any) -> Any:
         """Slope and intercept of a weighted line, and the energy of the abscissa about its mean."""
         total, first, second, square, product = zero, zero, zero, zero, zero
         for t in range(x.size):
