@@ -251,6 +251,13 @@ class Cut:
     parts: list[tuple[Mask, Mask, Tile]]  # frames (time), pixels (pixel), and the tile of these
 
 
+def blocks(inputs: Inputs) -> list[slice]:
+    """Rows that are read at once."""
+    height = inputs.capture.sizes["y"]
+    rows = height if inputs.method.whole_image else BLOCK_ROWS
+    return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
+
+
 def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
     """Yield windows of at most so many pixels that cover some rows of an image."""
     columns = min(width, pixels)

@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -129,11 +130,6 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         response,
         _METHOD,
         "complete",
-        settings=None,
-        seed=0,
-        emissivity=None,
-        emissivity_std=None,
-        mask=None,
         pool=materials,
         reflection_shift=reflection_shift,
         response_kind=str(result.attrs.get("response_kind", "exact")),
@@ -151,11 +147,8 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         level = replace(scene.level, fluctuation=level.fluctuation)
     scene = replace(scene, level=level)
     completed = result.copy(deep=True)
-    height = corrected.sizes["y"]
-    tops = range(0, height, tiles.BLOCK_ROWS)
-    blocks = [slice(top, min(top + tiles.BLOCK_ROWS, height)) for top in tops]
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
-        for _ in threads.map(lambda rows: _complete_rows(scene, rows, completed), blocks):
+        for _ in threads.map(partial(_complete_rows, scene, completed), tiles.blocks(inputs)):
             pass
     completed["status"].attrs.update(schema.status_attrs())
     return completed.assign_attrs(
@@ -178,7 +171,7 @@ def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
     return laid_on(result, corrected, "the result", "the capture")
 
 
-def _complete_rows(scene: Scene, rows: slice, completed: xr.Dataset) -> None:
+def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
     """Complete the pixels of some rows, in place; what was measured is not touched."""
     lacking = np.zeros(completed["status"].values[rows].shape, dtype=bool)
     for name in (*FILMS, *MAPS):

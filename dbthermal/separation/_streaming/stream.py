@@ -132,9 +132,8 @@ class Stream:
         numbers = {"frame_rate [Hz]": frame_rate, "latency [s]": latency, "memory [s]": memory}
         for name, value in {**numbers, "refresh [s]": refresh, "workers": workers}.items():
             planck.require_positive(name, value)
-        known: dict[str, Any] = dict.fromkeys(("emissivity", "emissivity_std", "mask", "pool"))
-        known |= {"settings": settings, "seed": 0, "response_kind": response_kind}
-        known |= {"reflection_shift": reflection_shift}
+        known: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
+        known["reflection_shift"] = reflection_shift
         two = replace(METHOD, minimum_frames=1, any_bands=False)
         inputs = _inputs.check(template, response, two, "stream", **known)
         self.bands = tuple(curve.band for curve in inputs.curves)
