@@ -74,6 +74,13 @@ class Inputs:
         return function(tile) if self.settings is None else function(tile, self.settings)
 
 
+def require(settings: Any, method: str, name: str, holds: Any, rule: str) -> None:
+    """Refuse a setting of a method for which a rule does not hold."""
+    if not holds:
+        value = getattr(settings, name)
+        raise ValueError(f"Invalid {name} {value} of method '{method}'. Must {rule}.")
+
+
 def check(  # noqa: PLR0913 - all that the user gives, by name
     corrected: xr.Dataset,
     response: xr.Dataset,

@@ -193,16 +193,6 @@ class Estimate(Pixels):
             },
         )
 
-    def expand_frames(self, used: Mask) -> "Estimate":
-        """Return the estimate at all frames; the temperatures are NaN at those not used (time)."""
-        values = {}
-        for name in ("object_temperature", "background_temperature"):
-            for which in (name, f"{name}_std"):
-                part = getattr(self, which)
-                values[which] = np.full((used.size, part.shape[1]), np.nan)
-                values[which][used] = part
-        return replace(self, **values)
-
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """
         Flag temperatures outside the calibrated range of a response, and values without a number.
