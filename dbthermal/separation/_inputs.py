@@ -22,6 +22,9 @@ from dbthermal.separation._displaced import Displacement
 
 Labels = npt.NDArray[np.intp]
 
+BLOCK_ROWS: Final = 32
+"""Rows that are read at once: a lazy capture is then decoded about once."""
+
 # Pixels from which the noise is estimated where the response has none, and a clock is judged.
 _NOISE_PIXELS: Final = 4096
 _CLOCK_PIXELS: Final = 256
@@ -67,6 +70,13 @@ class Inputs:
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
     displacement: Displacement | None  # of the second camera's reflections
     difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `_joint.Joint`
+
+    @property
+    def blocks(self) -> list[slice]:
+        """Rows that are read at once."""
+        height = self.capture.sizes["y"]
+        rows = height if self.method.whole_image else BLOCK_ROWS
+        return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
 
     def apply(self, function: Callable[..., Any] | None, tile: Any) -> Any:
         """Apply a function of the method to a tile, with the settings where it has any."""

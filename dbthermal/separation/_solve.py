@@ -223,7 +223,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         ) as bar,
     ):
         if inputs.displacement is None:
-            _separate_all(inputs, pooling.materials(inputs, threads, bar), result, threads, bar)
+            pooled = None if pool is None else pooling.materials(inputs, threads, bar)
+            _separate_all(inputs, pooled, result, threads, bar)
         else:
             _solve_jointly(inputs, result, threads, bar)
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
@@ -314,7 +315,7 @@ def _separate_all(
 ) -> None:
     """Separate all blocks of rows into the result."""
     separate = partial(_separate, inputs, material, result, bar)
-    list(threads.map(separate, tiles.blocks(inputs)))
+    list(threads.map(separate, inputs.blocks))
 
 
 def _separate(

@@ -33,9 +33,6 @@ PIXELS: Final = 320
 SAMPLES: Final = 2**19
 """Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
 
-BLOCK_ROWS: Final = 32
-"""Rows that are read at once: a lazy capture is then decoded about once."""
-
 # Times as many pixels in a tile whose steps are compiled: these keep to the cache by themselves,
 # and the pixels that need more are then enough together.
 _COMPILED: Final = 8
@@ -239,13 +236,6 @@ class Cut:
     status: Bits  # (pixel)
     valid: Mask  # samples of the capture (time, pixel)
     parts: list[tuple[Mask, Mask, Tile]]  # frames (time), pixels (pixel), and the tile of these
-
-
-def blocks(inputs: Inputs) -> list[slice]:
-    """Rows that are read at once."""
-    height = inputs.capture.sizes["y"]
-    rows = height if inputs.method.whole_image else BLOCK_ROWS
-    return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
 
 
 def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:

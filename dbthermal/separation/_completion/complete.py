@@ -146,7 +146,7 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     scene = replace(scene, level=level)
     completed = result.copy(deep=True)
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
-        list(threads.map(partial(_complete_rows, scene, completed), tiles.blocks(inputs)))
+        list(threads.map(partial(_complete_rows, scene, completed), inputs.blocks))
     completed["status"].attrs.update(schema.status_attrs())
     curve = inputs.curves[inputs.bands[0]]
     return completed.assign_attrs(

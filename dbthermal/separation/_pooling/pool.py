@@ -40,7 +40,7 @@ def materials(
     labels = inputs.labels
     if labels is None:
         return None
-    selected, blocks = select(labels), tiles.blocks(inputs)
+    selected, blocks = select(labels), inputs.blocks
 
     def pooled(before: Material | None) -> tuple[Material | None, float]:
         """Materials, and the share of their pixels that have an emissivity."""
