@@ -1,7 +1,6 @@
 """Reader of a blackbody sweep: one recording for each temperature and filter.
 
-Only the folder is read: the recordings say which session they are of. Temperatures are the readings
-during the recordings, not the set points.
+The recordings say which session they are of; temperatures are the readings during them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -79,10 +78,8 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
 
     Parameters
     ----------
-    folder : str or Path
-        Of `dbthermal.instruments.protocols.record_sweep`.
-    name : str
-        Of the session.
+    folder, name : str or Path, str
+        Of `dbthermal.instruments.protocols.record_sweep`, and of the session.
     frames : int
         Frames to take of each: the first ones of each band that are whole and show the blackbody.
 
@@ -107,18 +104,12 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
     for paths in sweep.steps():
         temperatures.append(_agreed(paths, BLACKBODY, sweep.stability))
         movies.append(_movie(paths, frames))
-    order = np.argsort(temperatures)
-    axis = xr.DataArray(
-        np.array(temperatures)[order],
-        dims="temperature",
-        name="temperature",
-        attrs=schema.COORDINATES["temperature"].attrs,
-    )
-    counts = xr.concat([movies[place] for place in order], dim=axis)
+    order, attrs = np.argsort(temperatures), schema.COORDINATES["temperature"].attrs
+    axis = xr.Variable("temperature", np.array(temperatures)[order], attrs)
+    counts = xr.concat([movies[place] for place in order], "temperature")
     counts = counts.transpose("band", "temperature", "frame", "y", "x")
-    return schema.check(
-        counts.to_dataset(name="counts").assign_attrs(sweep.attrs), "blackbody_movies"
-    )
+    joined = counts.to_dataset(name="counts").assign_coords(temperature=axis)
+    return schema.check(joined.assign_attrs(sweep.attrs), "blackbody_movies")
 
 
 def bench_series(
@@ -131,10 +122,8 @@ def bench_series(
 
     Parameters
     ----------
-    folder : str or Path
-        Of `dbthermal.instruments.protocols.record_sweep`.
-    name : str
-        Of the session.
+    folder, name : str or Path, str
+        Of `dbthermal.instruments.protocols.record_sweep`, and of the session.
     region : mapping
         Material to its rows and columns. The thermocouple named like it is the object's.
     correction : Dataset, optional
