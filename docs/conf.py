@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from pygments.lexers.special import TextLexer
 from sphinx.errors import SphinxError
@@ -17,7 +18,6 @@ import pages
 project, release = "dbthermal", dbthermal.__version__
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc", "myst_nb"]
 source_suffix = {".rst": "restructuredtext", ".md": "myst-nb", ".ipynb": "myst-nb"}
-exclude_patterns = ["**/.ipynb_checkpoints"]
 default_role = "autolink"
 add_module_names = False
 python_maximum_signature_line_length = 80
@@ -57,7 +57,12 @@ def document_constant(_app: object, what: str, name: str, *rest: Any) -> None:
 def write_formula(translator: Any, node: Any) -> None:
     """Write a formula as MathML, which browsers draw by themselves."""
     block = isinstance(node, nodes.math_block)
-    formula = tex2mathml(node.astext(), as_block=block)
+    try:
+        formula = tex2mathml(node.astext(), as_block=block)
+    except MathError as error:
+        raise SphinxError(
+            f"{translator.builder.current_docname}: {error} {node.astext()}"
+        ) from error
     translator.body.append(f'<div class="formula">{formula}</div>' if block else formula)
     raise nodes.SkipNode
 

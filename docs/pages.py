@@ -26,14 +26,16 @@ TOUR = "00_quickstart"
 def public_modules() -> list[str]:
     """Names of the modules that a user may import; the emulated devices are for tests."""
     found = pkgutil.walk_packages(dbthermal.__path__, "dbthermal.", onerror=lambda _: None)
-    return [module.name for module in found if not re.search(r"\.(_|emulated)", module.name)]
+    names = [module.name for module in found]
+    return ["dbthermal", *(name for name in names if not re.search(r"\.(_|emulated)", name))]
 
 
 def of_module(name: str) -> str:
     """Page of a module: its own docstring, a table of its public names, and each of them."""
     module = importlib.import_module(name)
     names = [each for each in module.__all__ if not inspect.ismodule(getattr(module, each))]
-    lines = [name, "=" * len(name), "", f".. automodule:: {name}", "", ".. autosummary::"]
+    title = name.removeprefix("dbthermal.")
+    lines = [title, "=" * len(title), "", f".. automodule:: {name}", "", ".. autosummary::"]
     lines += ["   :nosignatures:", "", *(f"   {each}" for each in names), ""]
     for each in names:
         value = getattr(module, each)

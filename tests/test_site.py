@@ -1,5 +1,6 @@
 """The documentation site: its pages are there, its links lead somewhere, it asks for no network."""
 
+import ast
 import importlib.util
 import inspect
 import re
@@ -18,6 +19,7 @@ from test_surface import MODULES
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 FORMULAS = "api/dbthermal.limits"
+FORMULA = re.compile(r":math:`([^`]+)`|\.\. math::((?:.*(?:\n\n? +.*)*))")
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
@@ -58,7 +60,7 @@ def test_toctrees_name_pages() -> None:
     assert {entry for entry in entries if "*" not in entry} <= there
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if name != "dbthermal"])
+@pytest.mark.parametrize("name", MODULES)
 def test_public_names_are_on_a_page(name: str) -> None:
     """All that a public module exports is on its page, by its kind."""
     assert name in pages.public_modules()
@@ -69,6 +71,19 @@ def test_public_names_are_on_a_page(name: str) -> None:
     assert kinds.keys() == expected.keys()
     for each, value in expected.items():
         assert (kinds[each] == "class") == inspect.isclass(value)
+
+
+def test_formulas_are_drawn() -> None:
+    """Every formula of a docstring is one that browsers draw, as MathML."""
+    module = "docutils.utils.math.latex2mathml"
+    to_mathml = pytest.importorskip(module, reason="the extra docs").tex2mathml
+    for path in sorted((ROOT / "dbthermal").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            text = node.value if isinstance(node, ast.Constant) else None
+            for line, block in FORMULA.findall(
+                inspect.cleandoc(text) if isinstance(text, str) else ""
+            ):
+                to_mathml((line or block).strip(), as_block=bool(block))
 
 
 def test_constants_have_their_own_docstring() -> None:

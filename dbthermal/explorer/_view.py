@@ -266,7 +266,7 @@ class View:
         emissivities, completed pixels and pixels of cameras that stand apart, all of it. What
         remains is the noise of each pixel and frame,
 
-        .. math:: s^2 = \Big(\frac1n \sum_i c_i\Big)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
+        .. math:: s^2 = \left(\frac1n \sum_i c_i\right)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
 
         Parameters
         ----------
