@@ -3,10 +3,8 @@
 A camera that is busy answers late, after its driver gave up; read naively, every later command then
 gets the reply of the one before (openmv/openmv, pull request 3265). Here each request has a
 sequence number of its own, and frames that do not carry it are discarded and counted. Connecting
-sends nothing and resets nothing, and nothing is ever written to the camera's flash memory.
-
-Written from public descriptions and tested against public byte vectors and an emulator, not against
-hardware.
+sends and resets nothing, and nothing is ever written to the camera's flash memory. Written from
+public descriptions, tested against public byte vectors and an emulator, not against hardware.
 """
 
 import threading
@@ -99,8 +97,7 @@ class Boson(Closing):
 
     Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
     `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is
-    requested again if no reply comes; a command that changes the camera never is. Open it by
-    `from_url`; tests hand in a line, the number of the first request, clock and sleep [s].
+    requested again if no reply comes; a command that changes the camera never is.
 
     Examples
     --------
@@ -203,9 +200,9 @@ class Boson(Closing):
     def run_ffc(self, *, timeout: float = FFC_TIMEOUT) -> int:
         """Run a flat-field correction, wait until it is complete, return its frame number.
 
-        When it starts the camera still says "complete" of the one before. So another status has to
-        be seen, or the frame number of the last correction has to change. While the shutter is
-        closed the camera may not answer; `BosonTimeoutError` after `timeout` [s].
+        At its start the camera still says "complete" of the one before: another status has to be
+        seen, or another frame number of the last correction. While the shutter is closed the camera
+        may not answer; `BosonTimeoutError` after `timeout` [s].
         """
         before = self.read(commands.LAST_FFC_FRAME)
         changed = self.ffc_status() != FfcStatus.COMPLETE
@@ -262,8 +259,7 @@ class Boson(Closing):
         deadline = self._clock() + self.timeout
         received = 0
         while (remaining := deadline - self._clock()) > 0:
-            piece = self._transport.read(_READ_SIZE, remaining)
-            if not piece:
+            if not (piece := self._transport.read(_READ_SIZE, remaining)):
                 break
             received += len(piece)
             if received > MAXIMUM_RECEIVED:
@@ -271,26 +267,22 @@ class Boson(Closing):
                     f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. "
                     "Must be a Boson's command port that no other program uses."
                 )
-            reply = self._matching(self._decoder.feed(piece))
-            if reply is not None:
-                return reply
+            key = (fslp.COMMAND_CHANNEL, self._sequence)
+            frames = self._decoder.feed(piece)
+            replies = [
+                frame
+                for frame in frames
+                if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
+            ]
+            self.statistics.discarded += len(frames) - len(replies[:1])
+            self.statistics.damaged = self._decoder.damaged
+            if replies:
+                return replies[0]
         self.statistics.timeouts += 1
         raise BosonTimeoutError(
             f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
             "and the camera through with booting."
         )
-
-    def _matching(self, frames: list[fslp.Frame]) -> fslp.Frame | None:
-        """Reply to the last request, if it is among the frames; the others are counted."""
-        key = (fslp.COMMAND_CHANNEL, self._sequence)
-        replies = [
-            frame
-            for frame in frames
-            if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
-        ]
-        self.statistics.discarded += len(frames) - len(replies[:1])
-        self.statistics.damaged = self._decoder.damaged
-        return replies[0] if replies else None
 
 
 def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:

@@ -1,7 +1,4 @@
-"""The line between an emulated device and its driver: a raw pseudo-terminal in real time.
-
-Its path can be opened by any program.
-"""
+"""The line between an emulated device and its driver: a raw pseudo-terminal in real time."""
 
 import os
 import pty
@@ -42,12 +39,10 @@ class Device(Protocol):
 class EmulatedPort(Closing):
     """A raw pseudo-terminal on which a thread lets an emulated device answer.
 
-    `path` is of the end for the driver, as in ``/dev/pts/3``. If the device is pulled out, or an
-    error in it ends the thread, the terminal hangs up, as a real one does. Bytes that a driver does
-    not read are kept, without blocking the device, which only the thread calls once it is started.
+    `path` is the driver's end, as in ``/dev/pts/3``. If the device is pulled out, or an error in it
+    ends the thread, the terminal hangs up, as a real one does. Bytes that a driver does not read
+    are kept, without blocking the device, which only the thread calls once it is started.
     """
-
-    is_simulated: Final = True
 
     def __init__(self, device: Device) -> None:
         self.device = device
@@ -65,27 +60,23 @@ class EmulatedPort(Closing):
         self._thread.join()
 
     def _serve(self) -> None:
+        """Carry bytes until the device is pulled out, or the port is closed."""
+        waiting: deque[bytes] = deque()
         try:
-            self._let_talk()
+            while self.device.plugged and not self._ending.is_set():
+                timeout = min(TICK, max(0.0, self.device.next_due()))
+                writers = [self._master] if waiting else []
+                ready, writable, _ = select.select([self._master], writers, [], timeout)
+                if ready:
+                    self.device.receive(os.read(self._master, _READ_SIZE))
+                waiting.extend(self.device.poll())
+                if writable:
+                    piece = waiting.popleft()
+                    if rest := piece[os.write(self._master, piece) :]:
+                        waiting.appendleft(rest)
         finally:
             os.close(self._master)
             os.close(self._slave)
-
-    def _let_talk(self) -> None:
-        """Carry bytes until the device is pulled out, or the port is closed."""
-        waiting: deque[bytes] = deque()
-        while self.device.plugged and not self._ending.is_set():
-            timeout = min(TICK, max(0.0, self.device.next_due()))
-            writers = [self._master] if waiting else []
-            ready, writable, _ = select.select([self._master], writers, [], timeout)
-            if ready:
-                self.device.receive(os.read(self._master, _READ_SIZE))
-            waiting.extend(self.device.poll())
-            if writable:
-                piece = waiting.popleft()
-                rest = piece[os.write(self._master, piece) :]
-                if rest:
-                    waiting.appendleft(rest)
 
 
 def require_known(options: Mapping[str, str], names: Sequence[str]) -> None:
@@ -98,9 +89,9 @@ def require_known(options: Mapping[str, str], names: Sequence[str]) -> None:
 def number(
     options: Mapping[str, str], name: str, default: Number, limits: tuple[Number, Number]
 ) -> Number:
-    """Number that an option gives, as in ``sim://boson?sn=7``, within lowest and highest limit.
+    """Number that an option gives, as in ``sim://boson?sn=7``, of the type of `default`.
 
-    It is of the type of `default`; ValueError if it is no such number.
+    ValueError if it is no such number, or outside the limits.
     """
     if name not in options:
         return default
