@@ -11,7 +11,7 @@ import xarray as xr
 from dbthermal import mixing, planck, schema
 from dbthermal._arrays import Array
 from dbthermal.bands import FILTERS, Band
-from dbthermal.limits._fisher import TopHat, Truth, deviations, smallest_order
+from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, smallest_order
 
 # Entry of a material without a best filter: none of them determines its temperature.
 _NO_FILTER: Final = "none"
@@ -122,11 +122,9 @@ def plan(
 
     Raises
     ------
-    KeyError
-        If a band of the table is not in the filters.
-    TypeError, ValueError
-        If table or noise are not as `schema` has them, an emissivity lies outside (0, 1), the band
-        `beside` is missing, or there are fewer filters than are to be used together.
+    KeyError, TypeError, ValueError
+        If table or noise are not as `schema` has them, a band is not in the filters, an emissivity
+        lies outside (0, 1), or the band `beside` or as many others as used together are missing.
 
     Examples
     --------
@@ -177,7 +175,7 @@ def plan_durations(
     table, noise
         See `plan`.
     seconds : sequence of float
-        Lengths [s], strictly increasing. The object's rise and the pulses are the same in all.
+        Lengths [s], which must increase; the object's rise and the pulses are the same in all.
     design : CaptureDesign, optional
         All conditions but the length.
 
@@ -185,11 +183,6 @@ def plan_durations(
     -------
     Dataset
         That of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all.
-
-    Raises
-    ------
-    ValueError
-        As `plan`, or if the lengths do not increase.
 
     Examples
     --------
@@ -262,7 +255,7 @@ def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str,
     order = smallest_order(truth, truth.sensitivity(bodies, noise))
     sensitivity = truth.smoothed(order).sensitivity(bodies, noise)
     stds = deviations(sensitivity, truth.time, order, reference=0)
-    for name in ("object_temperature", "background_temperature"):
+    for name in TEMPERATURES:
         stds[name] = np.sqrt(np.mean(stds[name] ** 2, axis=0))
     return stds | {"condition_number": mixing.condition_number(truth.emissivity.T)}
 
@@ -272,17 +265,18 @@ def _dataset(
 ) -> xr.Dataset:
     """Deviations of all combinations, side by side."""
     size = (table.sizes["material"], len(labels))
-    variables: dict[str, tuple[tuple[str, ...], Array, dict[str, str]]] = {}
-    for name in ("object_temperature_std", "background_temperature_std", "condition_number"):
-        values = np.stack([part[name.removesuffix("_std")] for part in parts], axis=1)
-        units = "K" if "temperature" in name else "1"
+    variables = {}
+    for quantity in parts[0]:
+        name = quantity if quantity == "condition_number" else f"{quantity}_std"
+        units = "K" if quantity in TEMPERATURES else "1"
         attrs = {"units": units, "long_name": f"expected {name.replace('_', ' ')}"}
-        variables[name] = (("material", "filter"), values, attrs)
-    for name in ("emissivity_std", "reflection_ratio_std"):
-        values = np.full((*size, table.sizes["band"]), np.nan)
-        for place, (part, chosen) in enumerate(zip(parts, sets, strict=True)):
-            values[:, place, chosen] = part[name.removesuffix("_std")].T
-        attrs = {"units": "1", "long_name": f"expected {name.replace('_', ' ')}"}
-        variables[name] = (("material", "filter", "band"), values, attrs)
+        dims = ["material", "filter"]
+        if parts[0][quantity].ndim == 1:
+            values = np.stack([part[quantity] for part in parts], axis=1)
+        else:
+            dims, values = [*dims, "band"], np.full((*size, table.sizes["band"]), np.nan)
+            for place, (part, chosen) in enumerate(zip(parts, sets, strict=True)):
+                values[:, place, chosen] = part[quantity].T
+        variables[name] = (dims, values, attrs)
     coords = {"material": table["material"].values, "filter": labels, "band": table["band"].values}
     return xr.Dataset(variables, coords)
