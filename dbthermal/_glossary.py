@@ -1,7 +1,7 @@
 """Definitions of the glossary: every variable of every stage, its dims, type, unit and meaning."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -18,17 +18,20 @@ class Variable:
         Type as written; read, any real type of the same kind passes.
     units, long_name : str
         Unit and meaning.
+    more : mapping
+        Further attributes.
     """
 
     dims: tuple[str, ...]
     dtype: str
     units: str
     long_name: str
+    more: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     @property
     def attrs(self) -> dict[str, Any]:
         """Attributes to write on the variable."""
-        return {"units": self.units, "long_name": self.long_name}
+        return {"units": self.units, "long_name": self.long_name, **self.more}
 
 
 def _of(dims: str, units: str, long_name: str, dtype: str = "float64") -> Variable:

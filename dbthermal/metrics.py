@@ -20,7 +20,10 @@ __dir__ = __all__.copy
 def correlation(
     first: xr.DataArray, second: xr.DataArray, mask: xr.DataArray | None = None
 ) -> xr.DataArray:
-    """Pearson's correlation [1] of two maps, frame by frame.
+    """Pearson's correlation of two maps, in [-1, 1], over the dims other than y and x.
+
+    ValueError if coordinates differ, fewer than two pixels count, one is not finite, or a map is
+    constant.
 
     Parameters
     ----------
@@ -28,16 +31,6 @@ def correlation(
         Maps (..., y, x), each in a unit of its own.
     mask : DataArray of bool, optional
         Pixels (y, x) that count; all by default.
-
-    Returns
-    -------
-    DataArray
-        Correlation [1], in [-1, 1], over the dims other than y and x.
-
-    Raises
-    ------
-    ValueError
-        If coordinates differ, fewer than two pixels count, one is not finite, or a map is constant.
 
     Examples
     --------
@@ -71,17 +64,8 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     Parameters
     ----------
     estimate, truth : DataArray
-        Temperatures [K].
-
-    Returns
-    -------
-    DataArray
-        Error [percent], of the broadcast shape. NaN where the estimate is NaN.
-
-    Raises
-    ------
-    ValueError
-        If coordinates differ, a unit is not K, or a true temperature is not above 273.15 K.
+        Temperatures [K] of the same coordinates; ValueError if a true one is not above 273.15 K.
+        The result is NaN where the estimate is.
 
     Examples
     --------

@@ -167,12 +167,7 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
     curve : Curve
         Curve of a band.
     name : str
-        Name of the temperatures, for the error.
-
-    Raises
-    ------
-    ValueError
-        With the name and the first temperature that lies outside or is NaN.
+        Name of the temperatures, for the ValueError with the first that lies outside or is NaN.
     """
     values = np.asarray(temperature, dtype=np.float64)
     bad = ~((values >= curve.lowest) & (values <= curve.highest))
@@ -195,11 +190,6 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
         Name of the band.
     kind : {"exact", "linear"}
         Sakuma-Hattori, or the linear pair.
-
-    Returns
-    -------
-    Curve
-        Of the kind wanted; a `LinearCurve` if linear.
 
     Raises
     ------
@@ -239,15 +229,10 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     Parameters
     ----------
     response : Dataset
-        Response of stage `response`.
+        Stage `response` of `schema`, with a finite and positive `noise` of each band, or a
+        ValueError.
     bands : list of str
         Names of the bands, in the order of the result.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there is no noise, its dims or unit are others, a band is missing, or a value is not
-        finite and positive.
     """
     if "noise" not in response:
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
@@ -271,19 +256,9 @@ def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact")
     response : Dataset
         Stage `response` of `schema`.
     temperature : DataArray
-        Temperature [K], any dims but `band`.
+        Temperature [K] in the calibrated range, or a ValueError; any dims but `band`.
     kind : {"exact", "linear"}
         Kind of response.
-
-    Returns
-    -------
-    DataArray
-        Counts (band, ...) [count].
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the calibrated range of the response.
     """
     names = [str(name) for name in response["band"].values]
     curves = [curve(response, name, kind) for name in names]
@@ -296,7 +271,9 @@ def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact")
 def apparent_temperature(
     response: xr.Dataset, counts: xr.DataArray, kind: str = "exact"
 ) -> xr.DataArray:
-    """Temperature of the blackbody that would give the same counts, band by band.
+    """Temperature (band, ...) [K] of the blackbody that would give the same counts, band by band.
+
+    Extrapolated beyond the calibrated range; NaN where no temperature gives such counts.
 
     Parameters
     ----------
@@ -306,17 +283,6 @@ def apparent_temperature(
         (band, ...) [count].
     kind : {"exact", "linear"}
         Kind of response.
-
-    Returns
-    -------
-    DataArray
-        Apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN where
-        no temperature gives such counts.
-
-    Raises
-    ------
-    ValueError
-        If a band is missing in the response.
 
     Examples
     --------

@@ -14,15 +14,13 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from dbthermal import noise as noises
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _matching as matching
-from dbthermal.alignment._delay import delay
-from dbthermal.alignment._matching import Field, Information, Movies, Spline
+from dbthermal.alignment._field import Field, Information, Spline
+from dbthermal.alignment._matching import Movies
 from dbthermal.alignment._offset import sample
 from dbthermal.schema import Status
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 _UNUSABLE: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 _SMALLEST: Final = 24  # rows and columns of an image, at least
@@ -102,7 +100,7 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
             pictures = capture.rapid(period, used)
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
             times = corrected["time"].values[capture.frames[used]]
-            late = delay(level, field.on(level.centres()), times)
+            late = matching.delay(level, field.on(level.centres()), times)
             return _result(corrected, capture, field, data, spread).assign_attrs(delay=late)
 
 

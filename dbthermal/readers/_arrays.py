@@ -40,6 +40,8 @@ def array(
 
     Pickled objects are never loaded. Arrays in other formats are opened by their own libraries,
     ``xarray.open_dataset("a.nc")["frames"]`` or ``h5py.File("a.h5")["frames"]``, and may be lazy.
+    Errors as `tiff`; ValueError if a file is neither .npy nor .npz, or damaged, or the array is not
+    one of three dimensions and uint16.
 
     Parameters
     ----------
@@ -54,14 +56,6 @@ def array(
     -------
     Dataset
         As from `tiff`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If a file is neither .npy nor .npz, or damaged; the array is not one of three dimensions
-        and uint16, or is not in the file; as `tiff` for unit, clock, memory and 8 bits.
 
     Examples
     --------
@@ -81,8 +75,7 @@ def array(
             _check(values.shape, values.dtype, memory, label)
             recordings.check_unit(str(getattr(values, "attrs", {}).get("units", unit)), label)
         counts = np.asarray(values).astype(np.uint16)
-    seconds = recordings.stamps(clock, len(counts), label)
-    return recordings.recording(counts, seconds, label, {"source": label, "format": "array"})
+    return recordings.clocked(counts, clock, label, format="array")
 
 
 def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: str) -> None:

@@ -162,6 +162,12 @@ def recording(
     return xr.Dataset(variables, {"time": coordinate}, {"origin": "measured", **attrs})
 
 
+def clocked(counts: Counts, clock: Clock, name: str, **attrs: str) -> xr.Dataset:
+    """Dataset of one band of a file that tells no times, from a rate [Hz] or times [s]."""
+    seconds = stamps(clock, len(counts), name)
+    return recording(counts, seconds, name, {"source": name, **attrs})
+
+
 def filled(exposed: npt.NDArray[np.float64], period: float) -> npt.NDArray[np.float64]:
     """Times [s] of all frames, unknown ones (NaN) on the line between their neighbours."""
     slots, (known,) = np.arange(exposed.size), np.nonzero(np.isfinite(exposed))

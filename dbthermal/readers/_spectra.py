@@ -65,8 +65,8 @@ def ecostress(path: str | Path) -> xr.Dataset:
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
+    OSError
+        If the file cannot be opened.
     ValueError
         If it is truncated or longer than declared, is no hemispherical reflectance in percent over
         micrometres, an emissivity is outside `schema.EMISSIVITY_LIMITS`, or a wavelength is outside
@@ -121,11 +121,9 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If the columns are not these, a row is short, missing or added, the last line has no end,
-        the table does not reach so far, or a value is refused as by `ecostress`.
+    OSError, ValueError
+        As `ecostress`, or if the columns are not these, a row is short, missing or added, or the
+        table does not reach so far.
 
     References
     ----------
@@ -159,7 +157,7 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
 
 
 def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
-    r"""Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
+    r"""Spectrum, as `ecostress`, of the MODIS UCSB emissivity library in comma-separated columns.
 
     Parameters
     ----------
@@ -169,18 +167,10 @@ def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.
     reach : tuple of float
         Wavelengths that the table must reach [micrometre], as for `slum`.
 
-    Returns
-    -------
-    Dataset
-        A spectrum as `ecostress`.
-
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or the
-        table or a value is refused as by `slum`.
+    OSError, ValueError
+        As `slum`, or if wavelength and wavenumber disagree by more than 0.1 %.
 
     Examples
     --------
@@ -295,10 +285,9 @@ def _spectrum(
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
     unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))
     attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
-    variable = schema.STAGES["spectrum"]["emissivity"]
-    coordinate = schema.COORDINATES["wavelength"]
+    coordinate = ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)
     return xr.Dataset(
-        {"emissivity": ("wavelength", emissivity, variable.attrs)},
-        {"wavelength": ("wavelength", wavelength * 1e-6, coordinate.attrs)},
+        schema.variables("spectrum", {"emissivity": emissivity}),
+        {"wavelength": coordinate},
         {**attrs, "unphysical_values": unphysical},
     )

@@ -43,11 +43,9 @@ def palette_video(
     """Video drawn in a palette, as positions in the palette.
 
     Each pixel gets the position of the nearest point on the line through the palette's colours in
-    Y'CbCr, finer than its steps. Luma counts whole and chroma half: in these videos four pixels
-    share a chroma sample. Measured on synthetic H.264 videos, the RMS error is 6-28 % (plasma) and
-    7-15 % (turbo) below that of the nearest of 256 colours in RGB. Luma alone is no better, and not
-    unique in turbo. A palette and its reverse fit alike and cannot be told apart.
-
+    Y'CbCr, finer than its steps; luma counts whole and chroma half, of which four pixels share a
+    sample. Measured on synthetic H.264 videos, the RMS error is 6-28 % (plasma) and 7-15 % (turbo)
+    below that of the nearest of 256 colours in RGB. A palette and its reverse cannot be told apart.
     Noise takes pixels off the palette: how far is stated, and only a video that another common
     palette fits better is refused.
 
@@ -78,8 +76,8 @@ def palette_video(
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
+    OSError
+        If the file cannot be opened.
     ValueError
         If the palette is unknown or another fits better; the file is of another container or
         checksum, takes more than `memory`, cannot be decoded to its end or has a damaged frame; its
