@@ -309,7 +309,6 @@ def _result(
     slopes = np.square(np.gradient(shift, axis=(1, 2))).sum(axis=0)[:, known]
     growth = np.multiply.outer(slopes.sum(axis=1) / max(1, known.sum()), distance**2)
     std = np.sqrt(np.maximum(variance, 0.0) + growth)
-    definitions = schema.STAGES["reflection_shift"]
     names = [str(name) for name in corrected["band"].values[capture.bands]]
     values = {
         "shift": np.where(near, shift, np.nan).astype(np.float32),
@@ -318,7 +317,7 @@ def _result(
     }
     places = {name: corrected[name] for name in ("y", "x") if name in corrected.coords}
     result = xr.Dataset(
-        {name: (one.dims, values[name], one.attrs) for name, one in definitions.items()},
+        schema.variables("reflection_shift", values),
         coords={"axis": ["y", "x"], **places},
         attrs={**corrected.attrs, "reference_band": names[0], "bands": names[1:]},
     )

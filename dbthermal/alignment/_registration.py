@@ -78,8 +78,8 @@ def register(
     ImportError
         If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
-        If the model is unknown, the image is smaller than 16 pixels either way, a mean is not
-        finite, the correlation of two views is below 0.5, or they share less than half the image.
+        If the image is smaller than 16 pixels either way, a mean is not finite, the correlation of
+        two views is below 0.5, or they share less than half the image.
 
     References
     ----------
