@@ -323,7 +323,7 @@ def _lagged(first: Array, second: Array, here: Mask, lag: int) -> Array:
 
 def _peak(cross: Array, label: str) -> int:
     """Lag of the largest covariance (group, lag) of the bands [frame]; it must be significant."""
-    middle = cross.shape[1] // 2
+    middle: int = cross.shape[1] // 2
     lag = 2 + int(np.argmax(cross.sum(axis=0)[2:-2])) - middle
     groups = cross[:, lag + middle]
     score = groups.mean() / (groups.std(ddof=1) / np.sqrt(_GROUPS))

@@ -121,7 +121,9 @@ def fit_response(
     values = counts.values.astype(np.float64)
     noises = np.zeros(len(names))
     if noise is not None:
-        noises = schema.band_values(noise, names, "noise", "count")
+        if not isinstance(noise, xr.DataArray):
+            raise TypeError(f"Invalid noise of type {type(noise).__name__}. Must be a DataArray.")
+        noises = schema.band_values(noise, names, "the noise", "count")
         planck.require_positive("noise [count]", noises)
     curves, lines = [], []
     for name, row, std in zip(names, values, noises, strict=True):

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from dbthermal.figures import drawing
-from dbthermal.figures.drawing import COLORS, MARKERS, canvas, plain_decades
+from dbthermal.figures.drawing import canvas, plain_decades
 
 # Deviations [K] at the ends of the colour map; beyond, a filter is as good or as bad as can be.
 _SCALE: Final = (0.1, 10.0)
@@ -49,11 +49,8 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
         right.loglog(
             durations["seconds"],
             durations["object_temperature_std"].sel(material=name, filter=chosen),
-            color=COLORS[index % len(COLORS)],
-            marker=MARKERS[index % len(MARKERS)],
-            markersize=4,
-            linewidth=1,
             label=f"{name}, {chosen} {_MICRO}",
+            **drawing.marked_line(index),
         )
     drawing.plain_ticks(right, durations["seconds"])
     plain_decades(right)

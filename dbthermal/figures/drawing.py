@@ -1,6 +1,6 @@
 """Parts that all figures share: canvas, colours, labels, images, limits, plain ticks."""
 
-from typing import Final
+from typing import Any, Final
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,6 +17,7 @@ __all__ = [
     "canvas",
     "draw_image",
     "limits_of",
+    "marked_line",
     "percent",
     "plain_decades",
     "plain_ticks",
@@ -130,6 +131,18 @@ def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, f
         highest = max(abs(lowest), abs(highest))
         lowest = -highest
     return float(lowest), float(highest) if highest > lowest else float(lowest) + 1.0
+
+
+def marked_line(index: int) -> dict[str, Any]:
+    """Style of one of several lines with markers, for matplotlib.
+
+    Parameters
+    ----------
+    index : int
+        Number of the line; colours and markers begin anew behind their last.
+    """
+    color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
+    return {"color": color, "marker": marker, "markersize": 4, "linewidth": 1}
 
 
 def plain_ticks(axis: Axes, places: xr.DataArray) -> None:

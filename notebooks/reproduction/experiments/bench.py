@@ -16,33 +16,13 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import calibration, mixing, planck
+from dbthermal import calibration, mixing, schema
 from dbthermal import response as responses
 from dbthermal.emissivity import embedded_table
 from dbthermal.response import Curve, require_range
 
 Array = npt.NDArray[np.float64]
 
-_POSITIVE: Final = (
-    "object_temperatures",
-    "blackbody_temperatures",
-    "air_temperature",
-    "reading_std",
-    "blackbody_std",
-    "foil_std",
-)
-"""Attributes of a bench that are finite and positive [K]."""
-_LIMITS: Final = {
-    "probe_tolerance": np.inf,
-    "logger_tolerance": np.inf,
-    "blackbody_tolerance": np.inf,
-    "foil_emissivity": 1.0,
-    "foil_warming": 1.0,
-    "least_excess": np.inf,
-}
-"""Attributes that are not negative, and their upper limits: [K] or [1]."""
-_RANGES: Final = {"contact": (0.0, 1.0), "mirrored_excess": (-np.inf, np.inf)}
-"""Attributes that are ranges, and their limits: [1] and [K]."""
 _CAMERA_BAND: Final = "8-14"
 
 
@@ -67,15 +47,6 @@ class Sample:
     emissivity: float
     kin: str
     stray: float
-
-    def __post_init__(self) -> None:
-        """Check emissivity and share."""
-        if not 0 < self.emissivity < 1:
-            raise ValueError(
-                f"Invalid emissivity {self.emissivity} of '{self.name}'. Must lie in (0, 1)."
-            )
-        if not 0 <= self.stray <= 1:
-            raise ValueError(f"Invalid stray {self.stray} of '{self.name}'. Must lie in [0, 1].")
 
 
 OBJECTS: Final = (
@@ -158,26 +129,6 @@ class Bench:
     mirrored_excess: tuple[float, float] = (0.0, 11.0)
     least_excess: float = 10.0
 
-    def __post_init__(self) -> None:
-        """Check steps, tolerances and ranges."""
-        for name in ("object_temperatures", "blackbody_temperatures"):
-            if not getattr(self, name):
-                raise ValueError(f"Invalid {name} () of the bench. Must be one or more.")
-        for name in _POSITIVE:
-            planck.require_positive(f"{name} [K] of the bench", getattr(self, name))
-        for name, limit in _LIMITS.items():
-            if not 0 <= getattr(self, name) < limit:  # a NaN fails it, too
-                raise ValueError(
-                    f"Invalid {name} {getattr(self, name)} of the bench. Must lie in [0, {limit})."
-                )
-        for name, (lowest, highest) in _RANGES.items():
-            least, largest = getattr(self, name)
-            if not (np.isfinite(least) and lowest <= least <= largest < highest):
-                raise ValueError(
-                    f"Invalid {name} ({least}, {largest}) of the bench. Must be least and largest, "
-                    f"finite, in [{lowest}, {highest})."
-                )
-
     def bias(self, sample: Sample) -> calibration.Bias:
         """Common errors that an experimenter would state, for `calibration.fit_emissivity`."""
         return calibration.Bias(
@@ -231,8 +182,9 @@ def bench_series(
     read = {
         "object_temperature": _thermocouple(warm, bench, rng),
         "background_temperature": shown + rng.normal(0, bench.blackbody_std, cold.size),
+        "counts": _noisy(response, counts, rng),
     }
-    return _dataset(response, {"counts": _noisy(response, counts, rng)}, read)
+    return _series(response, "contact", read)
 
 
 def reflector_series(
@@ -275,11 +227,12 @@ def reflector_series(
     uneven = _blackbody(curves, air + rng.normal(0, bench.foil_std, air.size))
     emitted = _blackbody(curves, air + bench.foil_warming * (warm - air))
     foil = mixing.leaving(bench.foil_emissivity, emitted, uneven)
-    return _dataset(
-        response,
-        {"counts": _noisy(response, counts, rng), "reflected_counts": _noisy(response, foil, rng)},
-        {"object_temperature": _thermocouple(warm, bench, rng)},
-    )
+    read = {
+        "counts": _noisy(response, counts, rng),
+        "reflected_counts": _noisy(response, foil, rng),
+        "object_temperature": _thermocouple(warm, bench, rng),
+    }
+    return _series(response, "reflector", read)
 
 
 def _curves(response: xr.Dataset) -> list[Curve]:
@@ -310,12 +263,7 @@ def _thermocouple(temperature: Array, bench: Bench, rng: np.random.Generator) ->
     return np.asarray(temperature + offset - missed + scatter)
 
 
-def _dataset(
-    response: xr.Dataset, counts: dict[str, Array], temperatures: dict[str, Array]
-) -> xr.Dataset:
-    """Series of counts (band, measurement) and temperatures (measurement)."""
-    dims, units = ("band", "measurement"), {"units": "count"}
-    parts = {name: xr.DataArray(value, dims=dims, attrs=units) for name, value in counts.items()}
-    for name, value in temperatures.items():
-        parts[name] = xr.DataArray(value, dims="measurement", attrs={"units": "K"})
-    return xr.Dataset(parts, {"band": response["band"].values}, {"origin": "simulated"})
+def _series(response: xr.Dataset, stage: str, read: dict[str, Array]) -> xr.Dataset:
+    """Readings by name as a series of a stage."""
+    variables = schema.variables(stage, read)
+    return xr.Dataset(variables, {"band": response["band"].values}, {"origin": "simulated"})
