@@ -248,7 +248,7 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     return values
 
 
-def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact") -> xr.DataArray:
+def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
     """Counts (band, ...) [count] of a blackbody in every band of a response.
 
     Parameters
@@ -257,20 +257,16 @@ def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact")
         Stage `response` of `schema`.
     temperature : DataArray
         Temperature [K] in the calibrated range, or a ValueError; any dims but `band`.
-    kind : {"exact", "linear"}
-        Kind of response.
     """
     names = [str(name) for name in response["band"].values]
-    curves = [curve(response, name, kind) for name in names]
+    curves = [curve(response, name) for name in names]
     values = require_range(temperature.values, curves[0], "temperature")
     parts = [temperature.copy(data=one.counts(values)) for one in curves]
     result = xr.concat(parts, dim=xr.DataArray(names, dims="band", name="band"))
     return result.assign_attrs(schema.STAGES["blackbody"]["counts"].attrs).rename("counts")
 
 
-def apparent_temperature(
-    response: xr.Dataset, counts: xr.DataArray, kind: str = "exact"
-) -> xr.DataArray:
+def apparent_temperature(response: xr.Dataset, counts: xr.DataArray) -> xr.DataArray:
     """Temperature (band, ...) [K] of the blackbody that would give the same counts, band by band.
 
     Extrapolated beyond the calibrated range; NaN where no temperature gives such counts.
@@ -281,8 +277,6 @@ def apparent_temperature(
         Stage `response` of `schema`.
     counts : DataArray
         (band, ...) [count].
-    kind : {"exact", "linear"}
-        Kind of response.
 
     Examples
     --------
@@ -298,8 +292,7 @@ def apparent_temperature(
         raise ValueError(f"Invalid dims {counts.dims} of the counts. Must begin with 'band'.")
     names = [str(name) for name in counts["band"].values]
     values = [
-        curve(response, name, kind).inverse(part)
-        for name, part in zip(names, counts.values, strict=True)
+        curve(response, name).inverse(part) for name, part in zip(names, counts.values, strict=True)
     ]
     result = counts.copy(data=np.stack(values)).rename("apparent_temperature")
     return result.assign_attrs(units="K", long_name="apparent temperature")

@@ -6,6 +6,8 @@ import xarray as xr
 from dbthermal import mixing, planck, schema
 from dbthermal.emissivity._tables import CAMERA_BAND, Bands, chosen_bands
 
+_TEMPERATURE = 300.0  # of the object, at which a noise is stated [K]
+
 
 def condition_numbers(table: xr.Dataset) -> xr.DataArray:
     """Condition number of the mixing matrix for each material and pair of bands.
@@ -81,10 +83,10 @@ def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
     )
 
 
-def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.DataArray:
+def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
     r"""Noise (band) [K] of a camera behind filters, from its noise without one.
 
-    The noise in counts is the camera's own and does not change, while a kelvin gives fewer counts:
+    The noise in counts is the camera's own and does not change, a kelvin at 300 K gives fewer:
 
     .. math:: s_m = s_1 \frac{dB_1 / dT}{dB_m / dT}
 
@@ -96,8 +98,6 @@ def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.Da
         Noise-equivalent temperature difference in the first band [K].
     bands : mapping or iterable of Band or str
         Bands, or names of `bands.FILTERS`, each once; the first is the one that `netd` belongs to.
-    temperature : float
-        Temperature of the object [K].
 
     Examples
     --------
@@ -106,7 +106,7 @@ def filter_noise(netd: float, bands: Bands, temperature: float = 300.0) -> xr.Da
     """
     chosen = chosen_bands(bands)
     netd = float(planck.require_positive("netd [K]", netd))
-    slopes = np.array([float(band.slope(temperature)) for band in chosen])
+    slopes = np.array([float(band.slope(_TEMPERATURE)) for band in chosen])
     return xr.DataArray(
         netd * slopes[0] / slopes,
         coords={"band": [band.name for band in chosen]},

@@ -1,6 +1,6 @@
 """Accuracy to expect of a capture before it is recorded, and the filter to record it with."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final
@@ -8,9 +8,8 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import mixing, planck, schema
+from dbthermal import bands, mixing, planck, schema
 from dbthermal._arrays import Array
-from dbthermal.bands import FILTERS, Band
 from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, smallest_order
 
 # Entry of a material without a best filter: none of them determines its temperature.
@@ -83,7 +82,6 @@ def plan(
     *,
     beside: str = "8-14",
     together: int = 1,
-    filters: Mapping[str, Band] = FILTERS,
     temperature: float = 300.0,
 ) -> xr.Dataset:
     r"""Expected accuracy of one pixel for each material and filter, and the best filter.
@@ -95,7 +93,7 @@ def plan(
     Parameters
     ----------
     table : Dataset
-        Stage `emissivity_table`, of the camera's own band and the filters.
+        Stage `emissivity_table`, of bands of `bands.FILTERS`: the camera's own and filters.
     noise : DataArray
         Noise (band) [K] of every band of the table, such as from `emissivity.filter_noise`.
     design : CaptureDesign, optional
@@ -104,8 +102,6 @@ def plan(
         Name of the band that is always recorded.
     together : int
         Number of filters recorded beside it at once.
-    filters : mapping of str to Band
-        The bands of the table, by name.
     temperature : float
         Temperature [K] at which the noise is stated; in counts it is the same at all.
 
@@ -123,7 +119,7 @@ def plan(
     Raises
     ------
     KeyError, TypeError, ValueError
-        If table or noise are not as `schema` has them, a band is not in the filters, an emissivity
+        If table or noise are not as `schema` has them, a band is unknown, an emissivity
         lies outside (0, 1), or the band `beside` or as many others as used together are missing.
 
     Examples
@@ -139,10 +135,7 @@ def plan(
     names = [str(name) for name in table["band"].values]
     sets = _combinations(names, beside, together)
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
-    for name in names:
-        if name not in filters:
-            raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
-    bodies = [TopHat(filters[name], temperature) for name in names]
+    bodies = [TopHat(bands.get(name), temperature) for name in names]
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
     parts = [
         _expected(truth, [bodies[band] for band in chosen], std[chosen])

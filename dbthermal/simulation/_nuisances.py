@@ -15,6 +15,8 @@ from dbthermal.simulation._rig import observe
 SPOILED: Final = ("good", "noisy", "blinking", "stuck")
 """Kinds of pixel of `spoil_pixels`, by their number."""
 
+# Of bad pixels: noise and step [count], and mean time between steps [s].
+_NOISE, _STEP, _DWELL = 15.0, 60.0, 3.0
 _STAMP: Final = {"units": "s", "long_name": "time of exposure"}
 
 
@@ -186,16 +188,11 @@ def fire_shutter(
     return corrected.assign(counts=counts)
 
 
-def spoil_pixels(
-    corrected: xr.Dataset,
-    share: float,
-    rng: np.random.Generator,
-    *,
-    noise_std: float = 15.0,
-    amplitude: float = 60.0,
-    dwell: float = 3.0,
-) -> xr.Dataset:
+def spoil_pixels(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
     """Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
+
+    Noise of 15 counts is added to a noisy pixel; a blinking one steps by 60, every 3 s on average
+    and once at least.
 
     The result has `spoiled` (band, y, x), int8, the position in `SPOILED`, beside the counts.
 
@@ -207,17 +204,10 @@ def spoil_pixels(
         Share of pixels that are bad in a band, a third of each kind on average, in [0, 1).
     rng : Generator
         Source of the pixels and of their signals.
-    noise_std : float
-        Noise added to a noisy pixel [count].
-    amplitude : float
-        Step of a blinking pixel [count].
-    dwell : float
-        Mean time between its steps [s]; there is at least one step.
     """
     counts = _floating(corrected)
     if not 0 <= share < 1:
         raise ValueError(f"Invalid share {share} of bad pixels. Must lie in [0, 1).")
-    planck.require_positive("dwell [s]", dwell)
     shape = (counts.sizes["band"], counts.sizes["y"], counts.sizes["x"])
     kind = np.where(rng.random(shape) < share, rng.integers(1, len(SPOILED), shape), 0)
     frames, time = counts.sizes["time"], counts["time"].values.astype(np.float64)
@@ -225,9 +215,9 @@ def spoil_pixels(
         signal = counts.values[band, :, row, column]
         match SPOILED[kind[band, row, column]]:
             case "noisy":
-                signal += rng.normal(0.0, noise_std, frames).astype(signal.dtype)
+                signal += rng.normal(0.0, _NOISE, frames).astype(signal.dtype)
             case "blinking":
-                signal += (amplitude * _telegraph(time, dwell, rng)).astype(signal.dtype)
+                signal += (_STEP * _telegraph(time, _DWELL, rng)).astype(signal.dtype)
             case "stuck":
                 signal[:] = signal[0]
     numbers = np.arange(len(SPOILED), dtype=np.int8)
