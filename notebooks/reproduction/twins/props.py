@@ -97,12 +97,6 @@ class Writing:
     drop: float = 6.0
     drying: float = 40.0
 
-    def __post_init__(self) -> None:
-        """Check the letters."""
-        unknown = [letter for letter in self.text if letter not in LETTERS]
-        if unknown:
-            raise ValueError(f"Unknown letter '{unknown[0]}'. Must be one of {[*LETTERS]}.")
-
     def path(self) -> tuple[Array, Array]:
         """Times (point,) [s] and places (point, 2) [m] of the finger, about the text's middle."""
         times, places, now = [], [], self.start

@@ -67,13 +67,6 @@ class Vessel:
     air: float = 6.0
     emissivity: float = 0.9
 
-    def __post_init__(self) -> None:
-        """Check levels and duration."""
-        if not self.bottom < self.level:
-            raise ValueError(f"Invalid level {self.level} m. Must be above {self.bottom} m.")
-        if not self.duration > 0:
-            raise ValueError(f"Invalid duration {self.duration} s of pouring. Must be positive.")
-
     def _poured(self, time: float) -> float:
         """Share of the drink that is poured at a time [s]."""
         return float(np.clip((time - self.start) / self.duration, 0.0, 1.0))
