@@ -50,7 +50,8 @@ def correlation(
     if np.any(norm <= 0):
         raise ValueError(f"Constant map in {np.sum(norm <= 0)} of {norm.size} frames. Must vary.")
     result = first.isel(y=0, x=0, drop=True).copy(data=np.sum(left * right, axis=-1) / norm)
-    return _labelled(result, "correlation", "1", "correlation of the maps")
+    attrs = {"long_name": "correlation of the maps", "units": "1"}
+    return result.drop_attrs(deep=False).rename("correlation").assign_attrs(attrs)
 
 
 def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.DataArray:
@@ -87,7 +88,8 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     truth = laid_on(truth, estimate, "the truth", "the estimate")
     result = 100.0 * abs(estimate - truth) / (truth - zero_Celsius)
     label = "error relative to the true temperature in degrees Celsius"
-    return _labelled(result, "relative_error", "percent", label)
+    bare: xr.DataArray = result.drop_attrs(deep=False).rename("relative_error")
+    return bare.assign_attrs(long_name=label, units="percent")
 
 
 def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
@@ -111,8 +113,3 @@ def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
     # The correlation has no unit: in that of the largest value no square overflows.
     chosen /= max(float(np.abs(chosen).max()), np.finfo(np.float64).tiny)
     return np.asarray(chosen - chosen.mean(axis=-1, keepdims=True))
-
-
-def _labelled(result: xr.DataArray, name: str, units: str, long_name: str) -> xr.DataArray:
-    """Result with a name, a unit and a meaning."""
-    return result.drop_attrs(deep=False).rename(name).assign_attrs(long_name=long_name, units=units)

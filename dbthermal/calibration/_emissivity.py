@@ -265,9 +265,9 @@ def reflector_emissivity(
     .. math:: e = \frac{W - W_r}{W_o - W_r}, \qquad
               s_e = \frac{\sqrt{s_W^2 + e^2 s_{W_o}^2 + (1 - e)^2 s_{W_r}^2}}{|W_o - W_r|}
 
-    Several measurements are combined by least squares with these weights. Its weak point is outside
-    the formula: a foil reflects the whole surroundings, a smooth object one direction of them, and
-    where the emissivity is low the difference is taken for emission.
+    Several measurements are combined by least squares with these weights. A foil reflects the whole
+    surroundings, a smooth object one direction of them: where the emissivity is low the difference
+    is taken for emission.
 
     Parameters
     ----------
@@ -285,12 +285,8 @@ def reflector_emissivity(
     Returns
     -------
     Dataset
-        As `fit_emissivity`. With one measurement the reduced chi-square is NaN.
-
-    Raises
-    ------
-    ValueError, ArithmeticError
-        As `fit_emissivity`, but one measurement is enough.
+        As `fit_emissivity`, and its errors, but one measurement is enough: the reduced chi-square
+        is then NaN.
 
     References
     ----------
@@ -366,17 +362,11 @@ def _require_contrast(difference: Array, stds: Array, beside: str) -> None:
 def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
     """Emissivities of all bands; the reduced chi-square of a single measurement is NaN."""
     fits = [_fit_band(band, name) for name, band in signals.items()]
-    value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
-    unit = {"units": "1"}
-    return xr.Dataset(
-        {
-            "emissivity": ("band", value, unit),
-            "emissivity_std": ("band", std, unit),
-            "reduced_chi2": ("band", chi2, unit),
-            "residual": (("band", "measurement"), residual, {"units": "count"}),
-        },
-        coords={"band": list(signals)},
-    )
+    *values, residual = (np.array(part) for part in zip(*fits, strict=True))
+    names = ("emissivity", "emissivity_std", "reduced_chi2")
+    parts = {name: ("band", one, {"units": "1"}) for name, one in zip(names, values, strict=True)}
+    residuals = (("band", "measurement"), residual, {"units": "count"})
+    return xr.Dataset({**parts, "residual": residuals}, {"band": list(signals)})
 
 
 def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:
@@ -405,5 +395,4 @@ def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]
 
 
 def _uniform_std(span: tuple[float, float]) -> float:
-    """Standard deviation of a uniform distribution."""
     return float((span[1] - span[0]) / np.sqrt(12.0))

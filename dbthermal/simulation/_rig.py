@@ -144,11 +144,10 @@ def observe(
         noise = float(response["noise"].sel(band=name))
         movie[index] = clean + rng.normal(0.0, noise, clean.shape)
     twin = {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
-    return xr.Dataset(
-        {"counts": (schema.STAGES["corrected"]["counts"].dims, movie)},
-        coords={"band": names, **{name: scene[name] for name in ("time", "y", "x")}},
-        attrs={"origin": "simulated", **twin},
-    ).pipe(_described, "corrected")
+    coords = {"band": names, **{name: scene[name] for name in ("time", "y", "x")}}
+    variables = schema.variables("corrected", {"counts": movie})
+    result = xr.Dataset(variables, coords, {"origin": "simulated", **twin})
+    return schema.check(result, "corrected")
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
@@ -218,7 +217,8 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
         counts[index] = digitise(movie.values, _of_band(detector, str(movie["band"].item())))
-    return corrected.assign(counts=(corrected["counts"].dims, counts)).pipe(_described, "capture")
+    raw = corrected.assign(schema.variables("capture", {"counts": counts}))
+    return schema.check(raw, "capture")
 
 
 def blackbody_movies(
@@ -336,10 +336,3 @@ def _of_band(detector: xr.Dataset, band: str) -> xr.Dataset:
     """Pattern (y, x) of one band."""
     schema.band_positions(detector, [band], "the detector")
     return detector.sel(band=band)
-
-
-def _described(dataset: xr.Dataset, stage: str) -> xr.Dataset:
-    """Dataset with the attributes of a stage, checked."""
-    dataset["counts"].attrs.update(schema.STAGES[stage]["counts"].attrs)
-    dataset["time"].attrs.setdefault("units", "s")
-    return schema.check(dataset, stage)
