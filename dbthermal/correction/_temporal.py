@@ -148,12 +148,11 @@ def undo_drift(
 
 def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -> Array:
     """Time constant of each band [s]."""
-    values = np.asarray(time_constant, dtype=np.float64)
+    names = [str(name) for name in counts["band"].values]
     if isinstance(time_constant, xr.DataArray):
-        names = [str(name) for name in counts["band"].values]
-        values = values[schema.band_positions(time_constant, names, "the time constants")]
-    values = planck.require_positive("time_constant [s]", values)
-    return np.broadcast_to(values, counts.sizes["band"])
+        values = schema.band_values(time_constant, names, "the time constants", "s")
+        return planck.require_positive("time_constant [s]", values)
+    return np.full(len(names), float(planck.require_positive("time_constant [s]", time_constant)))
 
 
 def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:

@@ -15,9 +15,6 @@ import numpy.typing as npt
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-__all__ = ["MISSED", "Camera", "Caster", "Hits", "mirror", "unit", "vertex_normals"]
-__dir__ = __all__.copy
-
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Point = tuple[float, float, float]

@@ -16,9 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from reproduction.twins.rays import Array, Caster, Hits
 
-__all__ = ["Actor", "Pose", "gliding", "hinged", "incident", "painted"]
-__dir__ = __all__.copy
-
 
 @dataclass(frozen=True)
 class Pose:
