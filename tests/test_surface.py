@@ -89,7 +89,7 @@ def test_options_are_explicit(name: str) -> None:
 
 
 SECTION = r"(?ms)^(?:Parameters|Attributes)\n-+\n(.*?)(?:\n\n[A-Z]\w+\n-|\Z)"
-DRIVERS = re.compile(r"dbthermal\.(acquire|instruments\.(?!protocols|recording|session))")
+DRIVERS = re.compile(r"dbthermal\.instruments\.(?!protocols|recording|session)")
 
 
 @pytest.mark.parametrize("name", [name for name in public_functions() if not DRIVERS.match(name)])

@@ -16,13 +16,16 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import usb.core
 import usb.util
 from serial.tools import list_ports
 
-__all__ = ["KINDS", "Device", "Kind", "LibusbMissingError", "describe", "find"]
+if TYPE_CHECKING:
+    from dbthermal.instruments.session import Session
+
+__all__ = ["KINDS", "Device", "Kind", "LibusbMissingError", "describe", "find", "plugged_in"]
 __dir__ = __all__.copy
 
 
@@ -300,3 +303,13 @@ def _udev_advice(kind: Kind, subsystem: str) -> str:
         f"Type this, and plug it in again: echo '{rule}' | sudo tee -a {RULES} "
         "&& sudo udevadm control --reload"
     )
+
+
+def plugged_in(session: "Session") -> str:
+    """Report of the USB bus for a session; of an emulated one the bus is not looked at."""
+    if session.simulated:
+        return f"Session '{session.name}' is emulated: the USB bus was not looked at."
+    try:
+        return describe(find(frame_rate=session.frame_rate))
+    except LibusbMissingError as error:
+        return f"The USB bus was not looked at: {error}"

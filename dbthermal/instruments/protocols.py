@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy.constants import zero_Celsius
 
 from dbthermal import store
 from dbthermal.instruments.camera import SourceLostError
@@ -25,7 +26,7 @@ from dbthermal.instruments.recording._capture import mean_reading
 from dbthermal.instruments.recording._sweep import BLACKBODY, is_complete, require_filter, step_path
 from dbthermal.instruments.session import Session
 
-__all__ = ["Step", "record_scene", "record_sweep", "wait_stable"]
+__all__ = ["Step", "ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
 __dir__ = __all__.copy
 
 STABILITY_PERIOD: Final = 1.0  # time from reading to reading while a temperature is awaited [s]
@@ -52,6 +53,34 @@ class Step:
     blackbody: float
     band: str | None
     summary: Summary
+
+
+def ask_for_blackbody(name: str, temperature: float) -> None:
+    """Ask the user to set the blackbody to a temperature, and wait for Enter.
+
+    Parameters
+    ----------
+    name : str
+        Name of the session, for the question.
+    temperature : float
+        Temperature [K].
+
+    Raises
+    ------
+    RuntimeError
+        If there is no keyboard, as under papermill.
+    """
+    celsius = f"{temperature - zero_Celsius:.2f} degC"
+    question = (
+        f"\n{name}: set the blackbody to {celsius} and press Enter; then its rest is awaited. "
+    )
+    try:
+        input(question)
+    except (EOFError, NotImplementedError) as error:
+        raise RuntimeError(
+            f"Nobody at a keyboard sets the blackbody to {celsius}. Must be run in a terminal, or "
+            "in Jupyter."
+        ) from error
 
 
 def wait_stable(

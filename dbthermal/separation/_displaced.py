@@ -18,13 +18,11 @@ from scipy.sparse import csr_array, diags_array, kron
 
 from dbthermal import _samples as samples
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._quality import Bits
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 # Rounds in which p + d(p) = r is solved, and the error that is left [pixel].
 _ROUNDS: Final = 100
@@ -191,7 +189,9 @@ def read(
     `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
     """
     if displacement.blur > 0.0:
-        return _read_blurred(block, displacement, rows, source, fewest, grains)
+        more, sharp = displacement.around(rows), replace(displacement, blur=0.0)
+        sharp_rows = read(block, sharp, more, source, fewest, grains)
+        return _blurred(displacement, rows, block["time"].values.astype(np.float64), *sharp_rows)
     reference, others = displacement.reference, displacement.others
     own = displacement.source(rows)
     first = block.isel(
@@ -235,19 +235,18 @@ def read(
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
 
 
-def _read_blurred(
-    block: xr.Dataset,
+def _blurred(
     displacement: Displacement,
     rows: slice,
-    source: slice,
-    fewest: int,
-    grains: list[samples.Grain],
+    time: Array,
+    counts: Array,
+    valid: Mask,
+    status: Bits,
+    gain: Array,
 ) -> tuple[Array, Mask, Bits, Array]:
-    """As `read`, of all bands blurred alike over the pixels that are usable."""
+    """What `read` gives of the rows around, blurred alike over the pixels that are usable."""
     more, width = displacement.around(rows), displacement.shape[1]
-    sharp = replace(displacement, blur=0.0)
-    counts, valid, status, gain = read(block, sharp, more, source, fewest, grains)
-    counts, known = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
+    counts, known = quality.bridge(counts, valid, time)
     here = slice((rows.start - more.start) * width, (rows.stop - more.start) * width)
     usable = ~quality.unusable(status)
     along = [(rows, more), (slice(width), slice(width))]
@@ -259,7 +258,7 @@ def _read_blurred(
     share = np.maximum((weights @ (1.0 * known).T).T, _NO_WEIGHT)
     blurred = np.stack([(weights @ (one * known).T).T / share for one in counts])
     # Of independent noise, blurred, or resampled and blurred; and what was measured of shared one.
-    paired = sharp.weights(more, displacement.source(rows))
+    paired = displacement.weights(more, displacement.source(rows))
     own, both, before = (
         np.sqrt(np.asarray((one**2).sum(axis=1)).ravel())
         for one in (weights, weights @ paired, paired)

@@ -19,28 +19,24 @@ with the weights :math:`(1 - g) g^j`.
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from numpy.polynomial import Polynomial
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
+from dbthermal._arrays import Array as Signal
 from dbthermal.schema import Status
 from dbthermal.separation import _equations as system
 from dbthermal.separation import _neighbours as neighbours
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._displaced import without
+from dbthermal.separation._equations import Array, Mask, Whole
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import residuals
-
-Array = npt.NDArray[np.floating[Any]]
-Mask = npt.NDArray[np.bool_]
-Whole = npt.NDArray[np.intp]
-Signal = npt.NDArray[np.float64]
 
 # Rounds of the emissivities and the object, and the change that ends them [1].
 _ROUNDS: Final = 20

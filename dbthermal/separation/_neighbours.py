@@ -9,18 +9,16 @@ alike, in which the edges count little; and as certain as neighbours agree on th
 """
 
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from dbthermal.schema import Status
+from dbthermal.separation._equations import Array
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._tiles import Material
-
-Array = npt.NDArray[np.floating[Any]]
 
 # Deviation of the blur of the bands of which ratios are told [pixel].
 BLUR: Final = 1.0

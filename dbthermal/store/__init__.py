@@ -21,6 +21,7 @@ from dbthermal.store._results import (
     save_rows,
     save_text,
     save_video,
+    whole,
 )
 
 __all__ = [
@@ -40,5 +41,6 @@ __all__ = [
     "save_text",
     "save_video",
     "to_disk",
+    "whole",
 ]
 __dir__ = __all__.copy

@@ -401,7 +401,15 @@ def save_video(
 
 @contextmanager
 def whole(path: str | Path, suffix: str) -> Iterator[Path]:
-    """Yield a place beside `path` to write to; move it to `path` unless an error is raised."""
+    """Yield a place beside `path` to write to, which becomes `path` unless an error is raised.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder that is to be whole, or as it was. Its parents are made.
+    suffix : str
+        End of its name; ValueError for another one.
+    """
     path = Path(path)
     if path.suffix != suffix:
         raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")

@@ -17,7 +17,8 @@ import yaml
 from attack.oracle import Attack, Verdict
 from attack.scenes import pick, scene
 from attack.stages import wrong
-from dbthermal import acquire, schema, store
+from dbthermal import schema, store
+from dbthermal.__main__ import main
 from dbthermal.instruments.recording import open_capture
 from dbthermal.instruments.session import Session
 from reproduction import cache, manifest, paths
@@ -397,11 +398,11 @@ def _broken(rng: Rng, text: str) -> str:
 
 
 def _dry_run(path: Path) -> tuple[int, str, str]:
-    """Exit status, output and error of ``python -m dbthermal.acquire --simulate --dry-run``."""
+    """Exit status, output and error of ``dbthermal record --simulate --dry-run``."""
     out, err = StringIO(), StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         folder = str(workplace() / "recordings")
-        status = acquire.main([str(path), folder, "--simulate", "--dry-run"])
+        status = main(["record", str(path), folder, "--simulate", "--dry-run"])
     return status, out.getvalue(), err.getvalue()
 
 

@@ -16,7 +16,8 @@ from attack.files import SESSION, originals, workplace
 from attack.oracle import Attack, Verdict
 from attack.scenes import scene
 from attack.stages import RIGHT, wrong
-from dbthermal import acquire, store
+from dbthermal import store
+from dbthermal.__main__ import main
 
 Rng = np.random.Generator
 
@@ -102,7 +103,7 @@ def _save(path: Path) -> int:
 
 def _record(folder: Path) -> int:
     (folder / "session.yaml").write_text(_SCENE, encoding="utf-8")
-    return acquire.main([str(folder / "session.yaml"), str(folder / "recordings")])
+    return main(["record", str(folder / "session.yaml"), str(folder / "recordings")])
 
 
 def _recorded(folder: Path, what: str, status: int) -> Verdict:

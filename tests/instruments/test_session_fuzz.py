@@ -10,7 +10,7 @@ import pytest
 import yaml
 from rig_session import TEXT, from_yaml, replaced
 
-from dbthermal import acquire
+from dbthermal.__main__ import main
 from dbthermal.instruments.session import Session
 from reproduction import paths
 
@@ -137,12 +137,12 @@ def test_many_mutants_are_refused_in_words() -> None:
 def test_invalid_content_ends_the_command_with_its_line(
     old: str, new: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Status 2 and one line with file, key, value and rule, even for a dry run."""
+    """Status 1 and one line with file, key, value and rule, even for a dry run."""
     path = tmp_path / "a.yaml"
     path.write_text(replaced((old, new)), encoding="utf-8")
-    assert acquire.main([str(path), str(tmp_path), "--dry-run"]) == 2
+    assert main(["record", str(path), str(tmp_path), "--dry-run"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"Invalid session: {path}")
+    assert line.startswith(f"dbthermal record: {path}")
     assert message.removeprefix("session: ") in line
 
 
@@ -156,11 +156,11 @@ def test_one_device_is_not_two() -> None:
 
 @pytest.mark.parametrize("content", [b"\xff\xfe", b"\x00", b"name: \xff", b"", b"[" * 10_000])
 def test_files_that_are_no_session(content: bytes, tmp_path: Path) -> None:
-    """Bytes that are no text and text that is no mapping end with status 2, not in a traceback."""
+    """Bytes that are no text and text that is no mapping end with status 1, not in a traceback."""
     path = tmp_path / "a.yaml"
     path.write_bytes(content)
-    assert acquire.main([str(path), str(tmp_path), "--dry-run"]) == 2
-    assert acquire.main([str(tmp_path), str(tmp_path), "--dry-run"]) == 2
+    assert main(["record", str(path), str(tmp_path), "--dry-run"]) == 1
+    assert main(["record", str(tmp_path), str(tmp_path), "--dry-run"]) == 1
 
 
 @pytest.mark.parametrize("rig", ["[1]", "null", '"a\\0b"', "5", "."])

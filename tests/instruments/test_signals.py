@@ -35,8 +35,16 @@ def acquiring(
     """Run the command in a process of its own, once it writes frames."""
     text = replaced(("duration: 0.15", f"duration: {duration}"), text=SCENE)
     (folder / "a.yaml").write_text(text, encoding="utf-8")
-    code = f"import sys; {before}; from dbthermal import acquire; sys.exit(acquire.main())"
-    command = [sys.executable, "-c", code, str(folder / "a.yaml"), str(folder), "--simulate"]
+    code = f"import sys; {before}; from dbthermal.__main__ import main; sys.exit(main())"
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "record",
+        str(folder / "a.yaml"),
+        str(folder),
+        "--simulate",
+    ]
     process = subprocess.Popen(command, stdout=output, stderr=output, start_new_session=True)
     try:
         until = time.monotonic() + 60

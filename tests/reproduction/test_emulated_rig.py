@@ -52,6 +52,17 @@ def test_blackbody_follows_the_world() -> None:
             assert frames.std() == pytest.approx(np.hypot(noise, 0.29), rel=0.03)
 
 
+def test_recordings_have_each_its_own_noise() -> None:
+    """What a calibration leaves of its noise does not cancel against that of a scene."""
+    made, world = views(), World(blackbody_temperature=300.0)
+    pictures = [made.blackbody(world), made.blackbody(world), made.movie(scene())]
+    for band in RIG.bands:
+        frames = [picture[band](0.0).astype(np.float64).ravel() for picture in pictures]
+        # 192 pixels: of independent noise within four deviations.
+        together = np.asarray(np.corrcoef(frames))[np.triu_indices(3, 1)]
+        assert np.abs(together).max() < 4 / 192**0.5
+
+
 def test_fixed_pattern_is_the_detectors() -> None:
     """A rig with a fixed pattern shows it, and its dead pixels at 0."""
     rig = simulation.Rig(bad_fraction=0.05)

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-import xarray as xr
 
 from dbthermal import response as responses
 from dbthermal import simulation
@@ -20,7 +19,8 @@ Counts = npt.NDArray[np.uint16]
 def pictures(session: Session, world: World) -> dict[str, Callable[[float], Counts]]:
     """Raw frames, by band, of the world's blackbody as the cameras of a session see it.
 
-    The detectors have a fixed pattern and noise of `NETD`; see `of_rig`. Bands that are not in
+    Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise of `NETD`,
+    a fixed pattern (see `dbthermal.simulation.pattern`) and 16 bits. Bands that are not in
     `dbthermal.bands.FILTERS` get no picture.
     """
     names = dict.fromkeys((*session.bands, *session.filters.values()))
@@ -29,29 +29,17 @@ def pictures(session: Session, world: World) -> dict[str, Callable[[float], Coun
         return {}
     rig = simulation.Rig(bands=bands, noise=(NETD,) * len(bands))
     detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
-    return of_rig(rig, detector, 0, world)
-
-
-def of_rig(
-    rig: simulation.Rig, detector: xr.Dataset, seed: int, world: World
-) -> dict[str, Callable[[float], Counts]]:
-    """Raw frames, by band, of the world's blackbody as a simulated rig records them.
-
-    Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise from the
-    seed, the fixed pattern of the detector (see `dbthermal.simulation.pattern`) and 16 bits.
-    """
     response = rig.response()
-    shape = detector.sizes["y"], detector.sizes["x"]
 
     def of_band(number: int, band: str) -> Callable[[float], Counts]:
         curve, pattern = responses.curve(response, band), detector.sel(band=band)
         noise = float(response["noise"].sel(band=band))
-        rng = np.random.default_rng([seed, number])
+        rng = np.random.default_rng([0, number])
 
         def picture(_: float) -> Counts:
             level = float(curve.counts(np.array(world.blackbody_temperature)))
-            return simulation.digitise(level + rng.normal(0.0, noise, shape), pattern)
+            return simulation.digitise(level + rng.normal(0.0, noise, session.shape), pattern)
 
         return picture
 
-    return {band: of_band(number, band) for number, band in enumerate(rig.bands)}
+    return {band: of_band(number, band) for number, band in enumerate(bands)}

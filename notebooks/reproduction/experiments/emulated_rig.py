@@ -17,7 +17,6 @@ import xarray as xr
 
 from dbthermal import mixing, store
 from dbthermal import response as responses
-from dbthermal.instruments.emulated import blackbody
 from dbthermal.instruments.emulated.world import World
 from dbthermal.response import Curve
 from dbthermal.simulation import Rig, digitise
@@ -36,21 +35,25 @@ _TRUTH: Final = "truth_"
 class Views:
     """Views of the cameras of a simulated rig.
 
-    Of a rig, a detector from `simulation.pattern`, and the seed of the noise.
+    Of a rig, a detector from `simulation.pattern`, and the seed of the noise, of which each
+    recording has its own: that of a calibration would else cancel against the scene's.
     """
 
     rig: Rig
     detector: xr.Dataset
     seed: int
     response: xr.Dataset = field(init=False)
+    _noise: np.random.SeedSequence = field(init=False)
 
     def __post_init__(self) -> None:
         """Compute the rig's response, once."""
         object.__setattr__(self, "response", self.rig.response())
+        object.__setattr__(self, "_noise", np.random.SeedSequence(self.seed))
 
     def blackbody(self, world: World) -> dict[str, Picture]:
         """Frames, by band, of the world's blackbody, which fills the view."""
-        return blackbody.of_rig(self.rig, self.detector, self.seed, world)
+        curves = self._curves().items()
+        return self._pictures({name: _bench(world, it, {}, {}, self._shape) for name, it in curves})
 
     def samples(self, world: World, emissivity: xr.DataArray, places: Places) -> dict[str, Picture]:
         """
@@ -83,7 +86,7 @@ class Views:
 
     def _picture(self, band: str, look: Look) -> Picture:
         """Counts of a view with noise, fixed pattern and 16 bits."""
-        rng = np.random.default_rng([self.seed, self.rig.bands.index(band)])
+        rng = np.random.default_rng(self._noise.spawn(1)[0])
         noise = float(self.response["noise"].sel(band=band))
         detector = self.detector.sel(band=band)
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from rig_session import LEVELS, TEXT, from_yaml, replaced, rig, scene_text
 
-from dbthermal import acquire
+from dbthermal.__main__ import main
+from dbthermal._cli import record as command
 from dbthermal.instruments import inventory, protocols, recording
 from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices, open_devices
@@ -33,7 +34,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         is_known = session.simulated and "11" in session.filters.values()
         return rig(session) if is_known else open_devices(session)
 
-    monkeypatch.setattr(acquire, "open_devices", opened)
+    monkeypatch.setattr(command, "open_devices", opened)
 
 
 def written(path: Path, text: str) -> str:
@@ -45,7 +46,7 @@ def written(path: Path, text: str) -> str:
 def test_sweep_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A sweep prints its emulated devices and its progress, and its movies open."""
     file, folder = written(tmp_path / "a.yaml", ONE), tmp_path / "recorded"
-    assert acquire.main([file, str(folder)]) == 0
+    assert main(["record", file, str(folder)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("Session 'plate': every device is emulated, nothing is measured.")
     assert "filter_wheel: model BSC201" in said
@@ -62,7 +63,7 @@ def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
     """Told to simulate, a session of hardware is recorded from the simulation's blackbody."""
     text = scene_text().replace("simulated: true", "simulated: false")
     file = written(tmp_path / "a.yaml", text.replace('3: "11"', "3: 10.6"))
-    assert acquire.main([file, str(tmp_path), "--simulate"]) == 0
+    assert main(["record", file, str(tmp_path), "--simulate"]) == 0
     capture = open_capture(tmp_path / "plate.zarr")
     assert capture.attrs["is_simulated"] is True
     assert float(capture["counts"].std("x").mean()) > 1
@@ -70,8 +71,8 @@ def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
 
 def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A dry run opens and names the devices, and records nothing."""
-    arguments = [written(tmp_path / "a.yaml", TEXT), str(tmp_path / "b"), "--dry-run"]
-    assert acquire.main(arguments) == 0
+    arguments = ["record", written(tmp_path / "a.yaml", TEXT), str(tmp_path / "b"), "--dry-run"]
+    assert main(arguments) == 0
     said = capsys.readouterr().out
     assert "9.5: device sim://boson/narrow" in said
     assert "Preparing" not in said
@@ -81,9 +82,13 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
 @pytest.mark.parametrize(
     ("text", "status", "message"),
     [
-        ("name: plate", 2, "Missing 'simulated'. Must be set"),
-        (TEXT.replace("sim://tc08", "sim://tc09"), 2, "Invalid address 'sim://tc09' of thermo"),
-        (TEXT.replace("sim://apt/wheel", "sim://apt?sn=x"), 1, "Failed: Invalid option sn=x"),
+        ("name: plate", 1, "Missing 'simulated'. Must be set"),
+        (TEXT.replace("sim://tc08", "sim://tc09"), 1, "Invalid address 'sim://tc09' of thermo"),
+        (
+            TEXT.replace("sim://apt/wheel", "sim://apt?sn=x"),
+            1,
+            "dbthermal record: Invalid option sn=x",
+        ),
     ],
 )
 def test_failures_have_a_status(
@@ -91,7 +96,7 @@ def test_failures_have_a_status(
 ) -> None:
     """A failure prints its message and exits with the documented status."""
     file = written(tmp_path / "a.yaml", text)
-    assert acquire.main([file, str(tmp_path)]) == status
+    assert main(["record", file, str(tmp_path)]) == status
     assert message in capsys.readouterr().err
 
 
@@ -101,16 +106,16 @@ def test_recorded_scene_is_refused_at_once(
     """An existing scene raises an error before a device is opened; a dry run opens them."""
     file = written(tmp_path / "a.yaml", scene_text())
     (tmp_path / "plate.zarr").mkdir()
-    assert acquire.main([file, str(tmp_path), "--dry-run"]) == 0
-    monkeypatch.setattr(acquire, "open_devices", lambda _: pytest.fail("a device was opened"))
-    assert acquire.main([file, str(tmp_path)]) == 1
+    assert main(["record", file, str(tmp_path), "--dry-run"]) == 0
+    monkeypatch.setattr(command, "open_devices", lambda _: pytest.fail("a device was opened"))
+    assert main(["record", file, str(tmp_path)]) == 1
     assert "plate.zarr'. Must be a new recording." in capsys.readouterr().err
 
 
 def test_no_session(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A missing session file is reported as an invalid session, with exit status 2."""
-    assert acquire.main([str(tmp_path / "a.yaml"), str(tmp_path)]) == 2
-    assert "Invalid session: " in capsys.readouterr().err
+    """A missing session file is named, with exit status 1."""
+    assert main(["record", str(tmp_path / "a.yaml"), str(tmp_path)]) == 1
+    assert "a.yaml" in capsys.readouterr().err
 
 
 def test_interrupted(
@@ -121,9 +126,9 @@ def test_interrupted(
     def interrupt(*_: object) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(acquire, "_progress", interrupt)
+    monkeypatch.setattr(command, "_progress", interrupt)
     file = written(tmp_path / "a.yaml", scene_text())
-    assert acquire.main([file, str(tmp_path)]) == 130
+    assert main(["record", file, str(tmp_path)]) == 130
     assert "Interrupted: what was recorded is kept." in capsys.readouterr().err
     assert (tmp_path / "plate.zarr").is_dir()
 
@@ -134,7 +139,7 @@ def test_hardware_is_looked_for_and_asked(
     """Without the rig the report of the bus and the first address name the missing devices."""
     monkeypatch.setattr(inventory, "find", lambda **_: [])
     real = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
-    assert acquire.main([written(tmp_path / "a.yaml", real), str(tmp_path)]) == 1
+    assert main(["record", written(tmp_path / "a.yaml", real), str(tmp_path)]) == 1
     said = capsys.readouterr()
     assert inventory.describe([]) in said.out
     assert "/dev/none/" in said.err
@@ -145,7 +150,7 @@ def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
     monkeypatch.setattr("builtins.input", asked.append)
     devices = Devices(from_yaml(TEXT), {})
-    acquire._set_blackbody(devices, 300.0)
+    command._set_blackbody(devices, 300.0)
     assert asked == [
         "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
     ]
@@ -160,7 +165,7 @@ def test_nobody_at_the_keyboard(error: type[Exception], monkeypatch: pytest.Monk
 
     monkeypatch.setattr("builtins.input", refuse)
     with pytest.raises(RuntimeError, match=r"26\.85 degC\. Must be run in a terminal, or in Jup"):
-        acquire.ask_for_blackbody("plate", 300.0)
+        protocols.ask_for_blackbody("plate", 300.0)
 
 
 def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,15 +177,15 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inventory, "find", missing)
     emulated = from_yaml(TEXT)
     real = replace(emulated, simulated=False)
-    assert acquire.plugged_in(real) == "The USB bus was not looked at: no libusb"
-    assert "is emulated: the USB bus was not" in acquire.plugged_in(emulated)
+    assert inventory.plugged_in(real) == "The USB bus was not looked at: no libusb"
+    assert "is emulated: the USB bus was not" in inventory.plugged_in(emulated)
 
 
 def test_progress_is_a_line() -> None:
     """The progress is one line with the losses, temperatures and shutter of each band."""
     totals = {"9.5": {"frames": 10, "lost": 3, "refused": 0, "damaged": 0}}
     readings = {"fpa 9.5": 308.15, "ffc 9.5": float(FfcStatus.IN_PROGRESS)}
-    line = acquire._progress(Watch(), Preview(1.0, {}, totals, readings))
+    line = command._progress(Watch(), Preview(1.0, {}, totals, readings))
     assert line.startswith("\r   1.0 s  9.5: ")
     for part in ("3 lost", "0 refused", "FPA 35.0 \N{DEGREE SIGN}C", "FFC in progress"):
         assert part in line

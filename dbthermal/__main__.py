@@ -1,0 +1,298 @@
+"""Command line of dual-band thermal videography: ``dbthermal``, or ``python -m dbthermal``.
+
+Exit status: 0 if done, 1 if refused, with the reason in one line, 2 if the command is not
+understood, 130 if it was interrupted. The summary goes to the standard output, all else to the
+standard error.
+"""
+
+import argparse
+import json
+import os
+import re
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+from dbthermal._cli import is_source, leaves
+
+__all__ = ["main"]
+__dir__ = __all__.copy
+
+_EXTRAS: Final = {
+    **dict.fromkeys(("anywidget", "ipywidgets"), "explorer"),
+    **dict.fromkeys(("pydantic", "serial", "usb", "yaml"), "instruments"),
+    **dict.fromkeys(("h5netcdf", "h5py", "tifffile"), "recordings"),
+    "av": "video",
+    "cv2": "alignment",
+    "matplotlib": "figures",
+    "skimage": "materials",
+    "torch": "torch",
+}
+"""Library -> the extra that has it."""
+
+
+def _kelvin(text: str) -> float:
+    """Temperature [K] of a text with its unit; 273.15 as in scipy, whose import takes long."""
+    try:
+        return float(text[:-1]) + {"C": 273.15, "K": 0.0}[text[-1:]]
+    except (KeyError, ValueError) as error:
+        rule = "Must be a number with its unit, such as 20C or 293.15K"
+        raise argparse.ArgumentTypeError(f"Invalid temperature '{text}'. {rule}.") from error
+
+
+def _kelvin_or_path(text: str) -> float | Path:
+    return _kelvin(text) if text[:1].isdigit() and text[-1:] in "CK" else Path(text)
+
+
+_KINDS: Final[dict[str, Any]] = {
+    "path": Path,
+    "text": str,
+    "number": float,
+    "whole": int,
+    "kelvin": _kelvin,
+    "point": _kelvin_or_path,
+}
+_ARGUMENTS: Final = """
+files path+             files of one camera, then a '+' and the other's; or a store
+session path            YAML file, see dbthermal.instruments.session
+folder path             where the recordings go
+capture path            store of a capture
+correction path?        store of gain and offset; none if the cameras correct them
+response path           store of the cameras' response
+result path             store of a result
+materials text*         as listed by 'data'; all by default
+--output path!          store *.zarr that is made; of 'export' *.csv, *.tif, *.png or *.nc
+--overwrite flag        replace the output
+--dry-run flag          only say what would be read and written
+--json flag             print the summary as JSON
+--traceback flag        show where an error was raised
+--bands text2           names of both bands: 8-14 9.5
+--unit text             of the numbers in TIFF, raw files and arrays: must be 'count'
+--clock number          frame rate [Hz]; FLIR's files have their own times
+--shape whole2          rows and columns of raw files [pixel]
+--byte-order little|big of the numbers in raw files
+--header whole=0        before the first frame of raw files [byte]
+--frame-header whole=0  before each frame of raw files [byte]
+--variable text         name of an array in a file of several, or in a result
+--offset number         how much later the second camera began, or was exposed [s]; else found
+--simulate flag         use emulated devices
+--at point+&            temperature of a blackbody, as 20C or 293.15K, and its files; repeated
+--blackbody path        in place of --at: a store of all temperatures
+--sweep text2           in place of --at: folder and session of a sweep by 'record'
+--maker path            in place of --at: a capture of FLIR's files, for the maker's constants
+--frames whole=64       at most, of each temperature
+--correction-output path   store of gain and offset, where the blackbody fills the view
+--no-shutter flag       no camera has a shutter
+--time-constant number  thermal, of the pixels [s]
+--register none|translation|affine|homography   transform between the views, none if on one grid
+--reference text        band whose frames are left as they are in time
+--correction path       store of gain and offset: all steps of a raw capture, by rows
+--method text           one step alone, by rows: subspace, calibrated, naive, ratio, bcp, dbvt
+--emissivity number+    of each band, for the method 'calibrated'
+--surroundings kelvin   temperature of what is reflected, as 22C
+--prior text            material of pixels that cannot be measured, as listed by 'data'
+--workers whole=2       number of threads
+--noise number!         of the camera without a filter [K]
+--seconds number=35     length of the capture
+--rate number=10        frame rate [Hz]
+--span number=25        rise of the object's temperature [K]
+--amplitude number=3    height of the reflected changes [K]
+--pixel whole2&         y x of a curve; repeated
+--region whole4&        y0 y1 x0 x1 of a curve; repeated
+"""
+"""Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
+
+_FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable"
+_COMMANDS: Final = f"""
+info describe.info files {_FORM}
+say what a store or recording is: sizes, clock, bands, provenance, shares of the status
+capture.zarr
+video.seq
+a.tif --unit count --clock 30
+
+import files.make_capture files --bands --offset {_FORM} --output
+make a capture of two cameras' files: FLIR, TIFF, raw, NumPy, HDF5, NetCDF, zarr
+a.tif b.tif --bands 8-14 9.5 --unit count --clock 30 --offset 0 -o scene.zarr
+a*.tif + b*.tif --bands 8-14 9.5 --unit count --clock 30 --offset 0 -o scene.zarr
+wide.seq narrow.seq --bands 8-14 9.5 -o scene.zarr
+
+calibrate steps.calibrate --at --blackbody --sweep --maker --frames --bands {_FORM} \
+    --correction-output --output
+fit the cameras' response, and each pixel's gain and offset, to a blackbody
+--at 10C a10.tif b10.tif --at 30C a30.tif b30.tif --at 50C a50.tif b50.tif --at 70C a70.tif \
+    b70.tif --bands 8-14 9.5 --unit count --clock 30 -o response.zarr --correction-output nuc.zarr
+--sweep recordings response -o response.zarr
+--maker scene.zarr -o response.zarr
+
+correct steps.correct capture correction --no-shutter --time-constant --output
+correct a capture: gain and offset, shutter events, bad pixels, lag
+scene.zarr nuc.zarr -o corrected.zarr
+
+align steps.align capture --register --offset --reference --output
+bring two cameras onto one clock and one pixel grid
+corrected.zarr -o aligned.zarr
+corrected.zarr --register none --offset 0 -o aligned.zarr
+
+separate steps.separate capture response --correction --register --method --emissivity \
+    --surroundings --prior --workers --output
+separate emission and reflection: temperatures, emissivities, deviations, status
+aligned.zarr response.zarr -o result.zarr
+scene.zarr response.zarr --correction nuc.zarr -o result.zarr
+aligned.zarr response.zarr --method calibrated --emissivity 0.86 0.72 -o result.zarr
+
+complete steps.complete result capture response --surroundings --prior --workers --output
+complete the result of a single method by what is known of the scene
+result.zarr aligned.zarr response.zarr --surroundings 22C -o completed.zarr
+
+plan steps.plan materials --noise --seconds --rate --span --amplitude
+say which accuracy a capture can have, by material and filter, before it is recorded
+'plate window glass' water --noise 0.03
+
+record record.record session folder --simulate
+record a session with the rig, or with emulated devices; a dry run names the devices
+sessions/scene.yaml recordings --dry-run
+sessions/scene.yaml recordings --simulate
+
+export export.export result --variable --pixel --region --output
+write a result for other programs: curves, film, picture, or everything as NetCDF
+result.zarr --pixel 120 200 --region 10 60 10 90 -o curves.csv
+result.zarr --variable background_temperature -o film.tif
+result.zarr -o object.png
+result.zarr -o result.nc
+
+data steps.data
+list the filters and materials that come with the package
+--json
+"""
+"""Command, its function and arguments; its summary; examples."""
+
+
+def _parser() -> argparse.ArgumentParser:
+    plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+    parser = argparse.ArgumentParser("dbthermal", description=__doc__, **plain)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    table = {line.split()[0]: line.split(maxsplit=2)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
+    for block in _COMMANDS.replace(" \\\n    ", " ").strip().split("\n\n"):
+        head, summary, *lines = block.splitlines()
+        name, place, *arguments = head.split()
+        ends = "\n".join(["examples:", *(f"  dbthermal {name} {line}" for line in lines)])
+        title = f"{summary[0].upper()}{summary[1:]}."
+        added = commands.add_parser(name, help=summary, description=title, epilog=ends, **plain)
+        added.set_defaults(place=place)
+        writes = ["--overwrite"] if "--output" in arguments else []
+        for argument in (*arguments, *writes, "--dry-run", "--json", "--traceback"):
+            short = ["-o"] if argument == "--output" else []
+            added.add_argument(*short, argument, **_options(*table[argument]))
+    return parser
+
+
+def _options(kind: str, text: str) -> dict[str, Any]:
+    """Options of argparse for a kind and a help; see `_ARGUMENTS`."""
+    if kind == "flag":
+        return {"action": "store_true", "help": text}
+    if "|" in kind:
+        choices = kind.split("|")
+        default = "homography" if "homography" in choices else None
+        return {"choices": choices, "default": default, "help": text}
+    ((name, number, default),) = re.findall(r"^([a-z]+)([0-9+*?]?)[!&]?=?(.*)$", kind)
+    made: dict[str, Any] = {"type": _KINDS[name], "help": text}
+    made |= {"nargs": int(number) if number.isdigit() else number} if number else {}
+    made |= {"required": True} if "!" in kind else {}
+    made |= {"action": "append", "default": []} if "&" in kind else {}
+    return made | (
+        {"default": _KINDS[name](default), "help": f"{text} ({default})"} if default else {}
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Carry out one command, and return its exit status; see the module."""
+    options = _parser().parse_args(arguments)
+    warnings.showwarning = lambda message, *_, **__: print(f"Warning: {message}", file=sys.stderr)
+    try:
+        return _carry_out(options)
+    except BrokenPipeError:  # nobody reads the summary any more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 0
+    except KeyboardInterrupt:
+        status, reason = 130, "interrupted"
+    except Exception as error:
+        if options.traceback:
+            raise
+        status, reason = 1, _reason(error)
+    print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
+    return status
+
+
+def _reason(error: Exception) -> str:
+    """Message of an error in one line, with the extra that a missing library belongs to."""
+    if isinstance(error, ImportError) and (extra := _EXTRAS.get(str(error.name).split(".")[0])):
+        rule = f"Must be installed: python -m pip install 'dbthermal[{extra}]'"
+        return f"Missing library '{error.name}', of the extra '{extra}'. {rule}."
+    message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
+    if isinstance(error, OSError | ValueError | TypeError | KeyError | ImportError | RuntimeError):
+        return message
+    return f"{type(error).__name__}: {message} (--traceback shows where)"
+
+
+def _carry_out(options: argparse.Namespace) -> int:
+    """Check what is read and written, run the command, and print its summary."""
+    if options.command == "record":
+        return int(_function(options)(options))
+    values = vars(options).items()
+    sources = [one for name, value in values for one in leaves(value) if is_source(name, one)]
+    targets = [one for name, one in values if name.endswith("output") and one]
+    for path in sources:
+        if not path.exists():
+            raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
+    for path in targets:
+        if path.resolve() in {source.resolve() for source in sources}:
+            raise ValueError(f"Invalid output '{path}': it is read. Must be another place.")
+        if path.exists() and not options.overwrite:
+            raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
+    if options.dry_run:
+        summary = {"would_read": [*map(str, sources)], "would_write": [*map(str, targets)]}
+    else:
+        began = time.monotonic()
+        summary = _function(options)(options)
+        if not sys.stderr.isatty():  # where no bar was shown
+            print(f"{options.command}: {time.monotonic() - began:.1f} s", file=sys.stderr)
+    text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
+    print(text, flush=True)
+    return 0
+
+
+def _function(options: argparse.Namespace) -> Any:
+    """Function of a command, imported when nothing speaks against it."""
+    module, function = options.place.split(".")
+    return getattr(import_module(f"dbthermal._cli.{module}"), function)
+
+
+def _plain(value: Any) -> Any:
+    """Array or number of NumPy as JSON takes it, and others as text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _lines(summary: Any, indent: str = "") -> Iterator[str]:
+    """Summary as text: a line for each entry that is not empty, numbers in one line."""
+    for key, value in summary.items():
+        if isinstance(value, dict) and any(
+            isinstance(one, dict | list | str) for one in value.values()
+        ):
+            yield f"{indent}{key}:"
+            yield from _lines(value, indent + "  ")
+            continue
+        parts = (
+            [f"{name} {number:g}" for name, number in value.items()]
+            if isinstance(value, dict)
+            else leaves(value)
+        )
+        if shown := ", ".join(map(str, parts)):
+            yield f"{indent}{key}: {shown}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

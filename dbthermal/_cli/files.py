@@ -1,0 +1,104 @@
+"""Stores and files that commands read, and the stores that they write."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+from tqdm import tqdm
+
+from dbthermal import _rows, readers, store
+from dbthermal._cli import PLUS, is_source, leaves
+from dbthermal._cli.describe import summary
+
+_TIFF = {".tif", ".tiff", ".btf"}
+_ARRAYS = {".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr"}
+
+
+def opened(path: Path) -> xr.Dataset:
+    """Dataset of a store, or stage `capture` of a recording."""
+    dataset = store.open_dataset(path)
+    if "frames_written" not in dataset.attrs:
+        return dataset
+    from dbthermal.instruments import recording  # noqa: PLC0415 - optional
+
+    return recording.open_capture(path)
+
+
+def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
+    """Recording of one camera, by the kind of its files."""
+    kind, clock = paths[0].suffix.lower(), options.clock
+    if options.shape is None and kind not in _TIFF | _ARRAYS:
+        return readers.flir(paths, clock=clock)
+    for name in ("unit", "clock"):
+        if getattr(options, name) is None:
+            raise ValueError(f"Missing --{name}: '{paths[0].name}' does not tell. Must be stated.")
+    if kind in _TIFF:
+        return readers.tiff(paths, unit=options.unit, clock=clock)
+    if len(paths) > 1:
+        raise ValueError(f"Invalid list of {len(paths)} '{kind}'. Must be one file of all frames.")
+    if kind in _ARRAYS:
+        return readers.array(paths[0], options.variable, unit=options.unit, clock=clock)
+    return readers.raw(
+        paths[0],
+        tuple(options.shape),
+        byte_order=options.byte_order or "unknown",
+        unit=options.unit,
+        clock=clock,
+        header=options.header,
+        frame_header=options.frame_header,
+    )
+
+
+def capture(paths: list[Path], options: argparse.Namespace, offset: float | None) -> xr.Dataset:
+    """Capture of two bands: a store, or the files of one camera, a '+', and of the other."""
+    if len(paths) == 1 and paths[0].is_dir():
+        return opened(paths[0])
+    if len(paths) == 2 and PLUS not in paths:
+        paths = [paths[0], PLUS, paths[1]]
+    place = paths.index(PLUS) if PLUS in paths else 0
+    if paths.count(PLUS) != 1 or place in {0, len(paths) - 1}:
+        found = f"{len(paths)} files: which are of the second camera is not clear"
+        raise ValueError(f"Invalid {found}. Must be one of each, or: a*.tif + b*.tif.")
+    if options.bands is None:
+        raise ValueError("Missing --bands. Must name both, such as: --bands 8-14 9.5.")
+    first, second = options.bands
+    both = [recording(part, options) for part in (paths[:place], paths[place + 1 :])]
+    return readers.two_bands(*both, bands=(first, second), offset=offset)
+
+
+def make_capture(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `import`."""
+    return saved(capture(options.files, options, options.offset), options)
+
+
+def saved(
+    result: xr.Dataset, options: argparse.Namespace, path: Path | None = None
+) -> dict[str, Any]:
+    """Save a result with its provenance, a capture by rows, which may be lazy, and describe it."""
+    path, parts = path or options.output, [slice(None)]
+    if "counts" in result and result["counts"].ndim == 4:
+        parts = [*_rows.blocks(result["counts"].shape)]
+    shown = tqdm(parts, desc=options.command, unit="block", disable=not sys.stderr.isatty())
+    rows = (result.isel(y=one, missing_dims="ignore") for one in shown)
+    store.save_rows(rows, path, provenance(options))
+    return described(path)
+
+
+def described(path: Path) -> dict[str, Any]:
+    """Summary of a store that was written."""
+    return {str(path): summary(store.open_dataset(path))}
+
+
+def provenance(options: argparse.Namespace) -> dict[str, Any]:
+    """Provenance of a command: its options, and the checksums of what it reads."""
+    parameters, inputs = dict[str, Any](), dict[str, Path]()
+    for name, value in vars(options).items():
+        parts = [*leaves(value)]
+        sources = [one for one in parts if is_source(name, one)]
+        inputs |= {f"{name} {number}": path for number, path in enumerate(sources)}
+        plain = [one for one in parts if one is not None and not isinstance(one, Path)]
+        if plain:
+            parameters[name] = plain if isinstance(value, list) else value
+    return store.provenance(parameters, inputs)

@@ -1,0 +1,186 @@
+"""Steps from a capture to a result, the plan of a capture, and the data of the package."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import (
+    alignment,
+    bands,
+    calibration,
+    correction,
+    emissivity,
+    limits,
+    scene,
+    separation,
+)
+from dbthermal._cli.files import capture, described, opened, provenance, saved
+
+_REGISTERED = 200  # frames whose mean is registered
+
+
+def calibrate(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `calibrate`."""
+    stated = [name for name in ("at", "blackbody", "sweep", "maker") if getattr(options, name)]
+    if len(stated) != 1:
+        raise ValueError(
+            f"Invalid sources {stated}. Must be --at, --blackbody, --sweep or --maker."
+        )
+    if options.maker:
+        response = calibration.maker_response(opened(options.maker).attrs.get("files", {}))
+        return saved(response, options)
+    blackbody = _blackbody(options)
+    if "frame" in blackbody.dims:
+        blackbody = correction.blackbody_statistics(blackbody)
+    fitted = correction.fit_correction(blackbody) if "y" in blackbody.dims else None
+    counts = blackbody["counts"] if fitted is None else fitted["level"]
+    said = saved(calibration.fit_response(counts, blackbody.get("noise")), options)
+    if fitted is not None and options.correction_output:
+        said |= saved(fitted, options, options.correction_output)
+    return said
+
+
+def _blackbody(options: argparse.Namespace) -> xr.Dataset:
+    """Counts of a blackbody at all temperatures."""
+    if options.blackbody:
+        return opened(options.blackbody).load()
+    if options.sweep:
+        from dbthermal.instruments import recording  # noqa: PLC0415 - optional
+
+        return recording.open_sweep(*options.sweep, frames=options.frames)
+    movies = []
+    for temperature, *paths in options.at:
+        if isinstance(temperature, Path):
+            raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
+        one = capture(paths, options, offset=0.0)  # of what rests
+        good = np.arange(one.sizes["time"])
+        if "exposure_time" in one:  # frames that are padded, or damaged, have none
+            good = np.flatnonzero(one["exposure_time"].notnull().all("band"))
+        frames = one["counts"].isel(time=good[: options.frames]).load()
+        movie = frames.drop_vars("time").rename(time="frame")
+        movies.append(movie.expand_dims(temperature=[temperature]))
+    number = min(movie.sizes["frame"] for movie in movies)
+    counts = xr.concat([movie.isel(frame=slice(number)) for movie in movies], dim="temperature")
+    counts = counts.transpose("band", "temperature", "frame", "y", "x").sortby("temperature")
+    return counts.to_dataset(name="counts")
+
+
+def correct(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `correct`."""
+    raw = opened(options.capture)
+    if options.correction:
+        fitted = opened(options.correction).load()
+    else:
+        ones = xr.ones_like(raw["counts"].isel(time=0, drop=True), dtype=np.float64)
+        fitted = xr.Dataset({"gain": ones, "offset": 0 * ones, "bad": ones < 0}).drop_attrs()
+    chosen = {"shutter": not options.no_shutter, "time_constant": options.time_constant}
+    return saved(correction.correct_capture(raw, fitted, lazy=True, **chosen), options)
+
+
+def align(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `align`."""
+    corrected, transform = opened(options.capture), None
+    if options.register != "none":
+        some = slice(None, None, max(1, corrected.sizes["time"] // _REGISTERED))
+        transform = alignment.register(corrected.isel(time=some).load(), model=options.register)
+    chosen = {"offset": options.offset, "clock": options.reference, "transform": transform}
+    return saved(alignment.align(corrected, lazy=True, **chosen), options)
+
+
+def separate(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `separate`."""
+    source, response = opened(options.capture), opened(options.response).load()
+    known, shown = _known(options), sys.stderr.isatty()
+    if options.correction:
+        scene.separate_capture(
+            source,
+            opened(options.correction).load(),
+            response,
+            registration=None if options.register == "none" else options.register,
+            separating={**known, "progress": shown},
+            target=options.output,
+            provenance=provenance(options),
+        )
+    elif options.method is None:
+        return saved(separation.separate(source.load(), response, **known, progress=shown), options)
+    else:
+        emissivities = None
+        if options.emissivity:
+            axis = {"band": source["band"].values}
+            emissivities = xr.DataArray(options.emissivity, dims="band", coords=axis)
+        separation.run(
+            options.capture,
+            options.output,
+            response,
+            options.method,
+            emissivity=emissivities,
+            provenance=provenance(options),
+            progress=shown,
+        )
+    return described(options.output)
+
+
+def _known(options: argparse.Namespace) -> dict[str, Any]:
+    """Options of the completion, and the number of threads."""
+    return {name: getattr(options, name) for name in ("surroundings", "prior", "workers")}
+
+
+def complete(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `complete`."""
+    result, source, response = (
+        opened(path).load() for path in (options.result, options.capture, options.response)
+    )
+    completed = separation.complete(
+        result, source, response, result.get("material"), **_known(options)
+    )
+    return saved(completed, options)
+
+
+def plan(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `plan`."""
+    table = emissivity.embedded_table()
+    if options.materials:
+        known = table["material"].values.tolist()
+        for name in options.materials:
+            if name not in known:
+                raise ValueError(f"Unknown material '{name}'. Must be one of {known}.")
+        table = table.sel(material=options.materials)
+    numbers = {name: getattr(options, name) for name in ("seconds", "rate", "span", "amplitude")}
+    noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
+    expected = limits.plan(table, noise, limits.CaptureDesign(**numbers))
+    names = [str(name) for name in expected["filter"].values]
+    rows = zip(
+        expected["material"].values,
+        expected["best"].values,
+        expected["object_temperature_std"].values.round(4).tolist(),
+        strict=True,
+    )
+    return {
+        str(material): {
+            "best_filter": str(best),
+            "object_temperature_std_K": dict(zip(names, stds, strict=True)),
+        }
+        for material, best, stds in rows
+    }
+
+
+def data(_: argparse.Namespace) -> dict[str, Any]:
+    """Command `data`."""
+    table = emissivity.embedded_table()["emissivity"]
+    return {
+        "filters_um": {
+            name: [round(1e6 * band.lower, 3), round(1e6 * band.upper, 3)]
+            for name, band in bands.FILTERS.items()
+        },
+        "emissivity": {
+            str(one["material"].values): dict(
+                zip(table["band"].values.tolist(), one.values.round(3).tolist(), strict=True)
+            )
+            for one in table
+        },
+        "outside_files": "listed by data_manifest.yaml of a clone, and fetched there by: make data",
+    }

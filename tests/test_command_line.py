@@ -1,0 +1,321 @@
+"""The command line, on two TIFF stacks of a simulated scene."""
+
+import csv
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Sequence
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+
+from dbthermal import __main__ as command_line
+from dbthermal import simulation, store
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+STATED = ["--bands", "8-14", "9.5", "--unit", "count", "--clock", "10"]
+COMMANDS = re.findall(r"(?m)^(\w+) \w+\.\w+", command_line._COMMANDS)
+
+
+def run(folder: Path, *arguments: str, before: str = "") -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder, in a process of its own."""
+    code = f"import sys; {before}from dbthermal.__main__ import main; sys.exit(main())"
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def said(folder: Path, *arguments: str) -> tuple[int, str, str]:
+    """Exit status, output and error of a command, in this process, which has imported all."""
+    out, error = StringIO(), StringIO()
+    with chdir(folder), redirect_stdout(out), redirect_stderr(error):
+        status = command_line.main(arguments)
+    return status, out.getvalue(), error.getvalue()
+
+
+def done(folder: Path, *arguments: str) -> dict[str, Any]:
+    """Summary of a command that ends well, as JSON."""
+    status, out, error = said(folder, *arguments, "--json")
+    assert status == 0, error
+    summary: dict[str, Any] = json.loads(out)
+    return summary
+
+
+def refused(folder: Path, *arguments: str) -> str:
+    """Reason of a command that is refused: one line without a traceback."""
+    status, out, error = said(folder, *arguments)
+    assert (status, out) == (1, ""), error
+    (line,) = error.splitlines()
+    assert line.startswith(f"dbthermal {arguments[0]}: ")
+    return line
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
+    """Truth of a plate of glass, its raw counts, and those of a blackbody."""
+    rig, rng, shape = simulation.Rig(), np.random.default_rng(1), (24, 32)
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    truth = simulation.walkers(np.arange(200) / 10, shape, glass, rng)
+    detector = simulation.pattern(rig, shape, rng)
+    kelvin = np.array([278.15, 298.15, 318.15, 343.15])
+    movies = simulation.blackbody_movies(rig, kelvin, 16, detector, rng)
+    raw = simulation.capture(simulation.observe(truth, rig.response(), rng), detector)
+    return truth, raw, movies
+
+
+@pytest.fixture(scope="module")
+def files(
+    tmp_path_factory: pytest.TempPathFactory, scene: tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+) -> Path:
+    """Folder of what the user has: TIFF stacks, as another program writes them."""
+    folder, (_, raw, movies) = tmp_path_factory.mktemp("user"), scene
+    for camera, stack in zip("ab", raw["counts"].values, strict=True):
+        tifffile.imwrite(folder / f"{camera}.tif", stack, photometric="minisblack")
+    for camera, steps in zip("ab", movies["counts"].values, strict=True):
+        for celsius, stack in zip((5, 25, 45, 70), steps, strict=True):
+            tifffile.imwrite(folder / f"{camera}{celsius}.tif", stack, photometric="minisblack")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(files: Path) -> Path:
+    """Folder in which the README's commands have been carried out as written."""
+    (block,) = re.findall(r"```sh\n(dbthermal import .*?)```", README, re.DOTALL)
+    commands = shlex.split(block.replace("\n", " ; ").replace("\\ ; ", ""))
+    while commands:
+        end = commands.index(";")
+        program, *arguments = commands[:end]
+        commands = commands[end + 1 :]
+        assert program == "dbthermal"
+        found = run(files, *arguments)
+        assert found.returncode == 0, found.stderr
+    return files
+
+
+def test_two_stacks_to_temperatures(
+    results: Path, scene: tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+) -> None:
+    """By at most ten commands of the README the object is known to a quarter of a kelvin."""
+    assert 5 < README.partition("## Two commands")[0].count("\ndbthermal ") <= 10
+    result = store.open_dataset(results / "result.zarr")
+    error = result["object_temperature"].values - scene[0]["object_temperature"].values
+    print(f"median error {np.nanmedian(abs(error)):.3f} K")
+    assert np.nanmedian(abs(error)) < 0.25  # [K]
+    provenance = result.attrs["provenance"]
+    assert provenance["parameters"]["command"] == "separate"
+    assert provenance["inputs"]["capture 0"] == store.checksum(results / "aligned.zarr")
+
+
+def test_raw_capture_in_one_command(results: Path) -> None:
+    """All steps of a raw capture by rows give what the steps one by one give."""
+    names = ["separate", "scene.zarr", "response.zarr", "--correction", "nuc.zarr"]
+    done(results, *names, "-o", "whole.zarr")
+    whole, steps = (store.open_dataset(results / f"{name}.zarr") for name in ("whole", "result"))
+    difference = whole["object_temperature"].values - steps["object_temperature"].values
+    assert np.nanmedian(abs(difference)) < 0.02  # [K]
+
+
+def test_one_method_and_its_completion(results: Path) -> None:
+    """A method by name with known emissivities, and its completion."""
+    known = ["--method", "calibrated", "--emissivity", "0.86", "0.72"]
+    made = done(results, "separate", "aligned.zarr", "response.zarr", *known, "-o", "one.zarr")
+    assert made["one.zarr"]["stage"] == "separated"
+    names = ["complete", "one.zarr", "aligned.zarr", "response.zarr", "--surroundings", "22C"]
+    found = run(results, *names, "-o", "completed.zarr")
+    assert found.returncode == 0, found.stderr
+    completed = store.open_dataset(results / "completed.zarr")
+    assert completed.attrs["surroundings"] == pytest.approx(295.15)
+    emissivity = store.open_dataset(results / "one.zarr")["emissivity"]
+    assert np.nanmax(abs(emissivity.values - [[[0.86]], [[0.72]]])) < 1e-6
+
+
+def test_info_of_stores_and_files(results: Path) -> None:
+    """A store says its stage, sizes, clock, bands, status and provenance; a file what it tells."""
+    found = done(results, "info", "result.zarr")["result.zarr"]
+    assert found["stage"] == "separated"
+    assert found["sizes"]["time"] == 200
+    assert found["bands"] == ["8-14", "9.5"]
+    assert found["frame_rate_Hz"] == pytest.approx(10, abs=0.01)
+    status = store.open_dataset(results / "result.zarr")["status"].values
+    assert found["status_shares"]["none"] == pytest.approx((status == 0).mean(), abs=1e-6)
+    assert found["provenance"]["parameters"]["command"] == "separate"
+    one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
+    assert one["stage"] == "recording of one band"
+    assert one["attributes"]["byte_order"] == "little"
+    assert "Missing --unit: 'a.tif' does not tell" in refused(results, "info", "a.tif")
+
+
+def test_raw_files_need_their_form(results: Path) -> None:
+    """Raw numbers of a stated form, and lists with a '+', give the same capture."""
+    stack = tifffile.imread(results / "a.tif")[:40]
+    (stack.astype(">u2")).tofile(results / "a.raw")
+    np.save(results / "a.npy", stack)
+    for place in (0, 1):
+        tifffile.imwrite(results / f"part{place}.tif", stack[20 * place : 20 * place + 20])
+    form = ["--shape", "24", "32", "--byte-order", "big", "--offset", "0", *STATED]
+    done(results, "import", "a.raw", "a.raw", *form, "-o", "raw.zarr")
+    parts = ["part0.tif", "part1.tif", "+", "a.npy"]
+    done(results, "import", *parts, "--offset", "0", *STATED, "-o", "parts.zarr")
+    for name in ("raw", "parts"):
+        counts = store.open_dataset(results / f"{name}.zarr")["counts"]
+        np.testing.assert_array_equal(counts.values, [stack, stack])
+    line = refused(results, "import", "a.raw", "b.tif", *form[:3], *STATED, "-o", "x.zarr")
+    assert "Invalid byte_order" in line
+
+
+def test_blackbody_in_a_store(
+    results: Path, scene: tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+) -> None:
+    """Movies in a store give the response that the files give; a second source is refused."""
+    store.save(scene[2], results / "blackbody.zarr", store.provenance({}))
+    names = ["calibrate", "--blackbody", "blackbody.zarr"]
+    done(results, *names, "-o", "response2.zarr")
+    first, second = (store.open_dataset(results / f"response{n}.zarr") for n in ("", "2"))
+    np.testing.assert_allclose(second["offset"], first["offset"], rtol=0, atol=1e-6)
+    line = refused(results, *names, "--maker", "scene.zarr", "-o", "response3.zarr")
+    assert "Invalid sources ['blackbody', 'maker']" in line
+    line = refused(results, "calibrate", "--maker", "scene.zarr", "-o", "response3.zarr")
+    assert "Missing range_min of band '8-14'" in line
+
+
+def test_curves_films_pictures(results: Path) -> None:
+    """Exports hold the values of the store."""
+    result = store.open_dataset(results / "result.zarr")
+    object_ = result["object_temperature"].values
+    with (results / "curve.csv").open(encoding="utf-8", newline="") as stream:
+        rows = [*csv.reader(stream)]
+    assert len(rows) == 201
+    assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16], abs=1e-3)  # [K]
+    for suffix in ("tif", "png", "nc"):
+        done(results, "export", "result.zarr", "-o", f"out.{suffix}")
+    np.testing.assert_array_equal(tifffile.imread(results / "out.tif"), object_)
+    with xr.open_dataset(results / "out.nc", engine="scipy") as opened:
+        np.testing.assert_array_equal(opened["object_temperature"], object_)
+        np.testing.assert_array_equal(opened["status"], result["status"])
+    assert (results / "out.png").read_bytes().startswith(b"\x89PNG")
+    line = refused(results, "export", "result.zarr", "-o", "out.xyz")
+    assert "Must end in one of ['.csv', '.tif', '.png', '.nc']" in line
+    line = refused(results, "export", "result.zarr", "--pixel", "24", "0", "-o", "no.csv")
+    assert "Must lie in the image of 24 x 32" in line
+
+
+def test_plan_and_data(tmp_path: Path) -> None:
+    """The plan names the filter for glass; the list has it; an unknown material is refused."""
+    found = run(tmp_path, "plan", "plate window glass", "brass plate", "--noise", "0.03")
+    assert found.returncode == 0, found.stderr
+    assert "best_filter: 9.5\n" in found.stdout
+    assert "best_filter: none\n" in found.stdout
+    listed = json.loads(run(tmp_path, "data", "--json").stdout)
+    assert listed["filters_um"]["9.5"] == [9.25, 9.75]
+    assert listed["emissivity"]["plate window glass"]["9.5"] == 0.718
+    assert "Unknown material 'gold'" in refused(tmp_path, "plan", "gold", "--noise", "0.03")
+
+
+def test_record_names_the_devices(tmp_path: Path) -> None:
+    """A dry run of an emulated session opens its devices, and records nothing."""
+    session = ROOT / "params" / "sessions" / "scene.yaml"
+    found = run(tmp_path, "record", str(session), "out", "--simulate", "--dry-run")
+    assert found.returncode == 0, found.stderr
+    assert "8-14: device sim://boson/wide" in found.stdout
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_is_overwritten(results: Path) -> None:
+    """A dry run writes nothing; an output that is there is kept, unless it may be replaced."""
+    command = ["correct", "scene.zarr", "-o", "again.zarr"]
+    planned = done(results, *command, "--dry-run")
+    assert planned == {"would_read": ["scene.zarr"], "would_write": ["again.zarr"]}
+    assert not (results / "again.zarr").exists()
+    shutil.copytree(results / "response.zarr", results / "again.zarr")
+    before = store.checksum(results / "again.zarr")
+    assert "Must be new, or --overwrite" in refused(results, *command)
+    assert store.checksum(results / "again.zarr") == before
+    done(results, *command, "--overwrite", "--no-shutter")
+    again = store.open_dataset(results / "again.zarr")
+    np.testing.assert_allclose(
+        again["counts"][:, 0], store.open_dataset(results / "scene.zarr")["counts"][:, 0]
+    )
+    line = refused(results, "correct", "scene.zarr", "-o", "scene.zarr", "--overwrite")
+    assert "it is read. Must be another place" in line
+    assert "No file or folder 'none.zarr'" in refused(results, "info", "none.zarr")
+
+
+def test_refusals_are_one_line(results: Path) -> None:
+    """An error of the library is its message, or with --traceback all of it; usage has status 2."""
+    command = ["import", "a.tif", "b.tif", *STATED, "-o", "no.zarr"]
+    assert "Unknown dates of the recordings" in refused(results, *command)
+    with pytest.raises(ValueError, match="Unknown dates"):
+        said(results, *command, "--traceback")
+    for wrong in (["separate", "scene.zarr"], ["complete", *"abc", "--surroundings", "22"], ["no"]):
+        with pytest.raises(SystemExit, match="2"):
+            said(results, *wrong)
+    assert (
+        run(results, "complete", "a", "b", "c", "--surroundings", "22", "-o", "d").returncode == 2
+    )
+    assert run(results, "nothing").returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("library", "extra", "arguments"),
+    [
+        ("cv2", "alignment", ["align", "corrected.zarr", "-o", "no.zarr"]),
+        ("tifffile", "recordings", ["info", "a.tif", "--unit", "count", "--clock", "10"]),
+        ("matplotlib", "figures", ["export", "result.zarr", "-o", "no.png"]),
+        ("pydantic", "instruments", ["record", "a.tif", "folder"]),
+    ],
+)
+def test_missing_extras_are_named(
+    library: str,
+    extra: str,
+    arguments: Sequence[str],
+    results: Path,
+) -> None:
+    """A part whose library is not installed says in one line which extra to install."""
+    found = run(results, *arguments, before=f"sys.modules['{library}'] = None; ")
+    assert found.returncode == 1
+    (line,) = found.stderr.splitlines()
+    assert f"pip install 'dbthermal[{extra}]'" in line
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_examples(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The help of every command has examples that the parser takes."""
+    with pytest.raises(SystemExit, match="0"):
+        command_line.main([name, "--help"])
+    lines = re.findall(r"(?m)^  dbthermal (.*)$", capsys.readouterr().out.partition("examples:")[2])
+    assert lines
+    for line in lines:
+        assert command_line._parser().parse_args(shlex.split(line)).command == name
+
+
+def test_help_is_quick_and_the_script_declared() -> None:
+    """`dbthermal --help` imports nothing heavy, and answers within half a second."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["scripts"] == {"dbthermal": "dbthermal.__main__:main"}
+    loaded = "{'numpy', 'scipy', 'xarray', 'zarr', 'tqdm'} & {*sys.modules}"
+    code = f"import sys, dbthermal.__main__ as m; m._parser(); sys.exit(bool({loaded}))"
+    assert subprocess.run([sys.executable, "-c", code], check=False, cwd=ROOT).returncode == 0
+    script = Path(sys.executable).with_name("dbthermal")
+    if script.exists():
+        began = sum(os.times()[2:4])
+        found = subprocess.run([str(script), "--help"], capture_output=True, text=True, check=False)
+        assert sum(os.times()[2:4]) - began < 0.5  # [s]
+        assert found.returncode == 0
+        assert all(f"\n    {name}" in found.stdout for name in COMMANDS)
