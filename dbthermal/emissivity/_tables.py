@@ -98,8 +98,7 @@ def band_table(
     for row, (material, spectrum) in enumerate(spectra.items()):
         wavelength, emissivity = _values(spectrum, material)
         for column, band in enumerate(chosen):
-            mean, radiance = _average(wavelength, emissivity, band, temperature)
-            covered = radiance / whole[column]
+            mean, covered = _average(wavelength, emissivity, band, temperature, whole[column])
             if covered < minimum_coverage:
                 reach = f"{wavelength[0]:.4g} to {wavelength[-1]:.4g} m"
                 raise ValueError(
@@ -245,11 +244,11 @@ def _values(spectrum: xr.Dataset, material: str) -> tuple[Array, Array]:
 
 
 def _average(
-    wavelength: Array, emissivity: Array, band: Band, temperature: float
+    wavelength: Array, emissivity: Array, band: Band, temperature: float, whole: float
 ) -> tuple[float, float]:
     """Planck-weighted mean [1] of a piecewise linear spectrum, by Gauss's rule on each piece.
 
-    And the blackbody's radiance [W m^-2 sr^-1] in the part of the band that the spectrum covers.
+    And the share [1] that it covers of the `whole` blackbody's radiance of the band.
     """
     lower = max(band.lower, float(wavelength[0]))
     upper = min(band.upper, float(wavelength[-1]))
@@ -261,7 +260,9 @@ def _average(
     nodes = knots[:-1, np.newaxis] + half * (1.0 + _NODES)
     weights = half * _WEIGHTS * planck.spectral_radiance(nodes, temperature)
     mean = float(np.sum(weights * np.interp(nodes, wavelength, emissivity)) / np.sum(weights))
-    return mean, float(Band(band.name, lower, upper).radiance(temperature))
+    if (lower, upper) == (band.lower, band.upper):
+        return mean, 1.0
+    return mean, float(Band(band.name, lower, upper).radiance(temperature)) / whole
 
 
 def _dataset(materials: list[str], names: list[str], values: Array, coverage: Array) -> xr.Dataset:
