@@ -28,25 +28,12 @@ _CAMERA_BAND: Final = "8-14"
 
 @dataclass(frozen=True)
 class Sample:
-    """An object on the bench.
-
-    Attributes
-    ----------
-    name : str
-        Name.
-    emissivity : float
-        Emissivity in the band 8-14 um, in (0, 1).
-    kin : str
-        Material of `emissivity.embedded_table` after which the other bands are scaled.
-    stray : float
-        Largest share of its reflection that is not mirror-like but comes from the whole room, in
-        [0, 1].
-    """
+    """An object on the bench."""
 
     name: str
-    emissivity: float
-    kin: str
-    stray: float
+    emissivity: float  # in the band 8-14 um, in (0, 1)
+    kin: str  # material of `emissivity.embedded_table` after which the other bands are scaled
+    stray: float  # largest share of its reflection that is of the whole room, not mirror-like
 
 
 OBJECTS: Final = (
@@ -80,53 +67,30 @@ def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
 class Bench:
     """Steps and errors of the bench; each `tolerance` is the half width of a uniform error.
 
-    Attributes
-    ----------
-    object_temperatures, blackbody_temperatures : tuple of float
-        Steps [K]; every pair is measured.
-    air_temperature : float
-        Temperature of the room: of its air, and of its walls as a mean [K].
-    reading_std : float
-        Scatter of a thermocouple's reading [K].
-    probe_tolerance : float
-        Offset of the probe [K]: type T, class 1 of IEC 60584-1:2013 up to 125 C.
-    logger_tolerance : float
-        Offset of the logger [K]: data sheet of the paper's, a Pico TC-08. The 0.2 % of the reading
-        that it states beside, at most 0.13 K here, is left out.
-    contact : tuple of float
-        Least and largest fraction of the object's excess over the air that the thermocouple misses.
-    blackbody_std, blackbody_tolerance : float
-        Scatter and offset of the blackbody's temperature [K].
-    foil_emissivity : float
-        Emissivity of crumpled aluminium foil [1].
-    foil_warming : float
-        Fraction of the object's excess over the air that the foil before it takes on [1].
-    foil_std : float
-        Scatter of the foil's signal from one part of it to another [K].
-    mirrored_excess : tuple of float
-        Least and largest excess, over the mean of the room, of what a smooth object reflects [K]:
-        the camera, and who stands beside it, fill part of that direction. 11 K is a direction
-        nearly filled by skin. The failure at low emissivity is this assumption: with a room of one
-        temperature, (0, 0), the method is right within 0.01; with (0, 5) and (0, 11) a chrome ball
-        of 0.10 seems to have 0.15 and 0.21.
-    least_excess : float
-        Excess over the air from which the reflector method takes a step [K]; ASTM E1933 asks for
-        10 K.
+    The mirrored excess, over the mean of the room, is that of what a smooth object reflects: the
+    camera, and who stands beside it, fill part of that direction. 11 K is a direction nearly filled
+    by skin. The reflector method's failure at low emissivity is this assumption: with a room of one
+    temperature, (0, 0), it is right within 0.01; with (0, 5) and (0, 11) a chrome ball of 0.10
+    seems to have 0.15 and 0.21.
     """
 
+    # Steps [K], of which every pair is measured, and the room: its air, and its walls as a mean.
     object_temperatures: tuple[float, ...] = (300.15, 313.15, 325.15, 338.15)
     blackbody_temperatures: tuple[float, ...] = (288.15, 318.15, 348.15)
     air_temperature: float = 295.15
-    reading_std: float = 0.2
-    probe_tolerance: float = 0.5
+    reading_std: float = 0.2  # of a thermocouple's reading [K]
+    probe_tolerance: float = 0.5  # [K]: type T, class 1 of IEC 60584-1:2013 up to 125 C
+    # [K]: data sheet of the paper's Pico TC-08, but for 0.2 % of the reading, at most 0.13 K here.
     logger_tolerance: float = 0.5
+    # Least and largest fraction of the object's excess over the air that the thermocouple misses.
     contact: tuple[float, float] = (0.0, 0.05)
-    blackbody_std: float = 0.05
-    blackbody_tolerance: float = 0.3
-    foil_emissivity: float = 0.04
-    foil_warming: float = 0.2
-    foil_std: float = 0.3
-    mirrored_excess: tuple[float, float] = (0.0, 11.0)
+    blackbody_std: float = 0.05  # [K]
+    blackbody_tolerance: float = 0.3  # [K]
+    foil_emissivity: float = 0.04  # of crumpled aluminium foil [1]
+    foil_warming: float = 0.2  # fraction of the object's excess that the foil before it takes on
+    foil_std: float = 0.3  # of the foil's signal from one part of it to another [K]
+    mirrored_excess: tuple[float, float] = (0.0, 11.0)  # least and largest [K]
+    # Excess over the air from which the reflector method takes a step [K]; ASTM E1933: 10 K.
     least_excess: float = 10.0
 
     def bias(self, sample: Sample) -> calibration.Bias:

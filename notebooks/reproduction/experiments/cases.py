@@ -28,21 +28,11 @@ _OPTIONAL: Final = frozenset(
 
 @dataclass(frozen=True)
 class Jump:
-    """Change of the object that is not a smooth curve, as when a palm is laid on a bulb.
+    """Change of the object that is not a smooth curve, as when a palm is laid on a bulb."""
 
-    Attributes
-    ----------
-    height : float
-        Permanent change [K].
-    between : tuple of float
-        Earliest and latest beginning, drawn for each pixel [s].
-    duration : float
-        Time in which it is reached, linearly; 0 is sudden [s].
-    """
-
-    height: float = 6.0
-    between: tuple[float, float] = (10.0, 25.0)
-    duration: float = 0.0
+    height: float = 6.0  # permanent change [K]
+    between: tuple[float, float] = (10.0, 25.0)  # earliest and latest beginning of a pixel [s]
+    duration: float = 0.0  # time in which it is reached, linearly; 0 is sudden [s]
 
     def __post_init__(self) -> None:
         """Check beginning and duration."""

@@ -44,30 +44,17 @@ def clock(frames: int = 350, rate: float = 10.0) -> Array:
 class Capture:
     """Recording conditions of a twin: emissivity, image size, times, baseline and sharpness.
 
-    Attributes
-    ----------
-    emissivity : DataArray
-        Emissivity of the object (band) [1], the band of the first camera first.
-    shape : tuple of int
-        Rows and columns.
-    time : ndarray, shape (time,)
-        Times [s], two or more; 350 frames at 10 Hz.
-    baseline : float
-        How far the second camera is to the right of the first [m]. With 0 both are one.
-    blur : float
-        Standard deviation of the lens's blur [pixel], taken as Gaussian. Diffraction alone gives
-        0.42 wavelengths times the f-number: 0.35 pixel of 12 um at 10 um and f/1; with aberrations
-        and the focus of a real lens 0.5 to 0.7.
-    rays : int
-        Rays for each pixel along either side. At 3 a body's outline is drawn to 0.05 pixel.
+    The lens's blur is taken as Gaussian. Diffraction alone gives 0.42 wavelengths times the
+    f-number: 0.35 pixel of 12 um at 10 um and f/1; with aberrations and the focus of a real lens
+    0.5 to 0.7. With three rays a pixel along either side a body's outline is drawn to 0.05 pixel.
     """
 
-    emissivity: xr.DataArray
-    shape: tuple[int, int] = (144, 192)
-    time: Array = field(default_factory=clock)
-    baseline: float = 0.0
-    blur: float = 0.6
-    rays: int = 3
+    emissivity: xr.DataArray  # of the object (band) [1], the band of the first camera first
+    shape: tuple[int, int] = (144, 192)  # rows and columns
+    time: Array = field(default_factory=clock)  # (time,) [s]
+    baseline: float = 0.0  # how far the second camera is to the right of the first [m]
+    blur: float = 0.6  # standard deviation [pixel]
+    rays: int = 3  # for each pixel along either side
 
     def __post_init__(self) -> None:
         """Check bands, baseline and rays."""
