@@ -15,8 +15,7 @@ from xarray.core import indexing
 
 Values = npt.NDArray[Any]
 
-# Samples of a block that is computed at once.
-_BLOCK: Final = 2**24
+_BLOCK: Final = 2**24  # samples of a block that is computed at once
 
 
 class _Rows(BackendArray):

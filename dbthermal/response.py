@@ -36,8 +36,7 @@ KINDS: Final = ("exact", "linear")
 COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", "offset")
 """Variables of a response that hold the Sakuma-Hattori curve."""
 
-# Temperatures at which the slope of a curve is checked.
-_SLOPE_POINTS: Final = 16
+_SLOPE_POINTS: Final = 16  # temperatures at which the slope of a curve is checked
 
 
 @dataclass(frozen=True)

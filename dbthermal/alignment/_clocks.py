@@ -15,8 +15,7 @@ Indices = npt.NDArray[np.intp]
 
 # A sample nearer than this to the wanted time is taken as it is [frame period].
 _COINCIDENT: Final = 0.01
-# Longest gap that is interpolated across [frame period].
-_GAP: Final = 1.5
+_GAP: Final = 1.5  # longest gap that is interpolated across [frame period]
 # Largest relative deviation of a time step from the median of an even clock [1].
 _EVEN: Final = 0.05
 _MINIMUM_FRAMES: Final = 2

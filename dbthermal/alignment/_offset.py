@@ -39,10 +39,8 @@ SEARCH: Final = 5  # largest lag that is searched by default, either way [frame]
 # Step of one clock against the other from which a lost frame, or a clock that is set, is suspected
 # [frame period].
 _CLOCK_STEP: Final = 0.5
-# Least share of the frames that both bands must have [1].
-_COMMON: Final = 0.5
-# Fewest frames from which an offset is estimated.
-_MINIMUM_FRAMES: Final = 32
+_COMMON: Final = 0.5  # least share of the frames that both bands must have [1]
+_MINIMUM_FRAMES: Final = 32  # fewest frames from which an offset is estimated
 # Groups of pixels of the jackknife, which gives the offset's standard deviation.
 _GROUPS: Final = 16
 _SIGNIFICANCE: Final = 6.0

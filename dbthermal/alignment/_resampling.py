@@ -29,13 +29,10 @@ MAP: Final = schema.Variable(
 )
 """Transform of a curved surface: for each band where each pixel of the first view lies in it."""
 
-# Pixels a side that a sample between pixels is made of.
-_TAPS: Final = 6
-# A weight that is none [1].
-_ROUNDING: Final = 1e-7
+_TAPS: Final = 6  # pixels a side that a sample between pixels is made of
+_ROUNDING: Final = 1e-7  # a weight that is none [1]
 
-# Standard deviations of noise beyond which a step lies between two frames.
-_STEP: Final = 5.0
+_STEP: Final = 5.0  # standard deviations of noise beyond which a step lies between two frames
 # A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
 _DIGITS: Final = 9
 

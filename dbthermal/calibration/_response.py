@@ -34,12 +34,9 @@ _THERMAL: Final = bands.Band("thermal infrared", 2e-6, 20e-6)
 # 3-14 um; more than 1 in no band, but for the little that a detector is not linear.
 _GROWTH: Final = (0.6, 1.1)
 _SHAPE_UNIT: Final = planck.SECOND_RADIATION_CONSTANT / 5.0
-# Good counts are refused once in so many sweeps.
-_FALSE_ALARM: Final = 1e-4
-# Standard deviations of a difference by which noise may let counts fall.
-_FALLING: Final = 5.0
-# Variance of rounding to whole counts [count^2].
-_ROUNDING: Final = 1.0 / 12.0
+_FALSE_ALARM: Final = 1e-4  # good counts are refused once in so many sweeps
+_FALLING: Final = 5.0  # standard deviations of a difference by which noise may let counts fall
+_ROUNDING: Final = 1.0 / 12.0  # variance of rounding to whole counts [count^2]
 # Points at which a maker's curve is fitted over the camera's range, and its largest error [K].
 _POINTS, _LARGEST_ERROR = 64, 0.2
 

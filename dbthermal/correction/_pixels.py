@@ -28,12 +28,9 @@ _NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
 _SHARED = 0.3
 _REACH_SECONDS = 0.2
 _REACH_FRAMES = 5
-# Samples in a row that may be NaN within a jump.
-_LONGEST_GAP: Final = 2
-# Differences of the logarithm of the noise that are rounding [1].
-_ROUNDING = 0.01
-# Samples of a block of rows.
-_BLOCK = 8_000_000
+_LONGEST_GAP: Final = 2  # samples in a row that may be NaN within a jump
+_ROUNDING = 0.01  # differences of the logarithm of the noise that are rounding [1]
+_BLOCK = 8_000_000  # samples of a block of rows
 
 
 def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset:

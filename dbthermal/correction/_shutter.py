@@ -24,8 +24,7 @@ _MINIMUM_PIXELS: Final = 16
 # event that is missed biases the separation, lost frames that are counted as one cost it one degree
 # of freedom a band.
 _FEWEST_COPIES: Final = 3
-# About as many pixels, on an even grid, are compared first.
-_SAMPLE = 4096
+_SAMPLE = 4096  # about as many pixels, on an even grid, are compared first
 # Most samples of a block of rows that is read at once.
 _BLOCK = 4_000_000
 _EVENT = ("band", "first_frame", "frames", "renewed")

@@ -25,8 +25,7 @@ _REFUSED: Final = {
     **dict.fromkeys((".mp4", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".png", ".gif"), _RECORD),
 }
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
-# A step of the clock longer than this many frame periods tells of a lost frame.
-_GAP: Final = 1.5
+_GAP: Final = 1.5  # a step of the clock longer than this many frame periods tells of a lost frame
 # An image is smoother than with its bytes swapped, by this factor, or the order is not known.
 _SMOOTHER: Final = 2.0
 

@@ -18,8 +18,7 @@ Array = npt.NDArray[np.float64]
 
 ROOM: Final = 295.15
 """Temperature of the room [K]."""
-# Logistic steps from 10 to 90 % take so many of their scales.
-_RISE: Final = 2.0 * np.log(9.0)
+_RISE: Final = 2.0 * np.log(9.0)  # logistic steps from 10 to 90 % take so many of their scales
 
 
 @dataclass(frozen=True)

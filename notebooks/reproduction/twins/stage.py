@@ -23,16 +23,12 @@ TABLE: Final = 0.75
 STEP: Final = 0.1
 """Longest step of the heat transport [s]."""
 
-# Share of a pixel's light from which it shows nothing but the object [1].
-_WHOLE: Final = 0.99
-# Standard deviations of the blur beyond which a lens sends no light.
-_TAIL: Final = 4.0
-# Frames that are ray-traced at once, for the memory.
-_FRAMES: Final = 25
+_WHOLE: Final = 0.99  # share of a pixel's light from which it shows nothing but the object [1]
+_TAIL: Final = 4.0  # standard deviations of the blur beyond which a lens sends no light
+_FRAMES: Final = 25  # frames that are ray-traced at once, for the memory
 # Newton's method: steps, length of a difference, longest step, and last step [pixel].
 _NEWTON, _SLOPE, _LARGEST, _CONVERGED = 30, 0.05, 3.0, 3e-3
-# Share of the squared slopes that is added to them.
-_DAMPING: Final = 1e-3
+_DAMPING: Final = 1e-3  # share of the squared slopes that is added to them
 
 
 def clock(frames: int = 350, rate: float = 10.0) -> Array:
