@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask
 
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 
@@ -39,7 +39,7 @@ class Subspace:
         r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
         return np.asarray(np.cumsum(self.object_part**2, axis=1)[:, self.steps :])
 
-    def columns(self, order: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+    def columns(self, order: npt.NDArray[np.intp]) -> Mask:
         """Columns in use (column, pixel) at each pixel's order, 1 for the constant alone."""
         places = np.arange(self.functions.shape[1])[:, np.newaxis]
         return np.asarray(places < order + self.steps)
@@ -68,7 +68,7 @@ def subspace(
 
 def piecewise(
     time: npt.ArrayLike,
-    first: npt.NDArray[np.bool_],
+    first: Mask,
     rising: Array,
     *,
     segment: npt.NDArray[np.integer] | None = None,

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import _rows, schema
 from dbthermal import noise as noises
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
@@ -196,7 +196,7 @@ def interpolation(places: Array, taps: int) -> csr_array:
     return csr_array((weight[kept], pixel[kept], ends), shape=(inside.size, inside.size))
 
 
-def _weights(places: Array, bad: npt.NDArray[np.bool_]) -> csr_array:
+def _weights(places: Array, bad: Mask) -> csr_array:
     """Weights as `interpolation`, of lines near the border and near bad pixels."""
     if np.array_equal(places, np.indices(bad.shape)):
         return eye_array(bad.size, dtype=np.float32, format="csr")
@@ -303,7 +303,7 @@ def _noise(signals: Array, stamps: Array) -> Array:
     return np.array(levels).T
 
 
-def _missing(views: xr.DataArray) -> npt.NDArray[np.bool_]:
+def _missing(views: xr.DataArray) -> Mask:
     """Frames (band, time) that are NaN, or a copy of the one before, in every block of rows."""
     parts = [
         [clocks.missing(_single(movie)) for movie in views.isel(y=rows).values]

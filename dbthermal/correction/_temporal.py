@@ -6,7 +6,7 @@ import xarray as xr
 
 from dbthermal import _rows, planck, schema
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
 
@@ -155,7 +155,7 @@ def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -
     return np.full(len(names), float(planck.require_positive("time_constant [s]", time_constant)))
 
 
-def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:
+def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> Mask:
     """Good pixels (y, x) of the reference patch."""
     dtype = getattr(reference, "dtype", type(reference).__name__)
     if str(dtype) != "bool":

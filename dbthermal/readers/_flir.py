@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _text as texts
+from dbthermal._arrays import Array, Mask
 from dbthermal.readers import _flir_records as container
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._decoding import MEMORY
 from dbthermal.readers._flir_records import Content, Frame
-from dbthermal.readers._recording import Clock, Counts, FileFlag, Mask, Paths
+from dbthermal.readers._recording import Clock, Counts, FileFlag, Paths
 
 # Place in the camera's record [byte], type, and limits beyond which a value is implausible.
 _FIELDS: Final = {
@@ -257,7 +257,7 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     return "little" if swap else "big", "caller" if stated else "smoothness"
 
 
-def _cameras(listed: Sequence[_Found]) -> tuple[npt.NDArray[np.float64], Mask, dict[str, Any]]:
+def _cameras(listed: Sequence[_Found]) -> tuple[Array, Mask, dict[str, Any]]:
     """Times (time) [s], agreement of the numbers (time), attributes, of the camera's records.
 
     Image and camera begin with the same 32 bytes, of which two number the frame: different ones

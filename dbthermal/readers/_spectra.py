@@ -15,12 +15,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from dbthermal import _text as texts
 from dbthermal import schema
-
-Floats = NDArray[np.float64]
+from dbthermal._arrays import Array
 
 NOTES: Final = MappingProxyType(
     {
@@ -222,7 +220,7 @@ def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
     return header
 
 
-def _check_extent(header: Mapping[str, str], wavelength: Floats, path: Path) -> None:
+def _check_extent(header: Mapping[str, str], wavelength: Array, path: Path) -> None:
     """Compare the values with the number and the ends that the header declares."""
     actual = {
         "Number of X Values": wavelength.size,
@@ -244,7 +242,7 @@ def _table(path: Path) -> tuple[list[str], list[texts.Row]]:
     return titles, rows
 
 
-def _check_reach(wavelength: Floats, reach: tuple[float, float], file: _File) -> None:
+def _check_reach(wavelength: Array, reach: tuple[float, float], file: _File) -> None:
     """Raise ValueError if rows are missing, at the ends or between two others."""
     (low, high), (least, most) = (wavelength.min(), wavelength.max()), reach
     if low > least or high < most:
@@ -263,7 +261,7 @@ def _check_reach(wavelength: Floats, reach: tuple[float, float], file: _File) ->
 
 
 def _spectrum(
-    wavelength: Floats, emissivity: Floats, notes: Mapping[str, str], file: _File
+    wavelength: Array, emissivity: Array, notes: Mapping[str, str], file: _File
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
     name, (low, high) = f"'{notes['name']}' of '{file.name}'", schema.EMISSIVITY_LIMITS

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dbthermal import schema
+from dbthermal._arrays import Array
 from dbthermal.readers._decoding import MEMORY, Film, decode
-
-Floats = NDArray[np.float64]
 
 # Palettes in which thermal pictures are drawn, compared in so many pixels; another is better only
 # if it is nearer by a step of 8 bit.
@@ -186,8 +185,8 @@ def masked_palette_video(
 class _Video:
     """Frames as `index` (time, y, x) into their distinct `colours` (n, 3), and each one's share."""
 
-    colours: Floats
-    share: Floats
+    colours: Array
+    share: Array
     index: NDArray[np.uint32]
     coords: dict[str, Any]
 
@@ -213,7 +212,7 @@ def _distinct(film: Film) -> _Video:
     return _Video(colours, count / count.sum(), codes, coords)
 
 
-def _palette(name: str) -> Floats:
+def _palette(name: str) -> Array:
     """Colours (n, 3) [0-255] along a palette, `_SUBSTEPS` to each of its steps."""
     from matplotlib import colormaps  # noqa: PLC0415  (drawing is not needed to read a spectrum)
 
@@ -225,12 +224,12 @@ def _palette(name: str) -> Floats:
     return np.stack([np.interp(fine, steps, channel) for channel in colours.T], axis=1)
 
 
-def _ycc(colours: Floats) -> Floats:
-    ycc: Floats = colours @ _YCC.T
+def _ycc(colours: Array) -> Array:
+    ycc: Array = colours @ _YCC.T
     return ycc
 
 
-def _nearest(colours: Floats, palette: Floats) -> tuple[NDArray[np.float32], Floats, Floats]:
+def _nearest(colours: Array, palette: Array) -> tuple[NDArray[np.float32], Array, Array]:
     """Position in the palette, distance from it in the measure, and in RGB [0-255]."""
     distance, nearest = KDTree(_ycc(palette)).query(_ycc(colours))
     position = (nearest / (len(palette) - 1)).astype(np.float32)
@@ -238,7 +237,7 @@ def _nearest(colours: Floats, palette: Floats) -> tuple[NDArray[np.float32], Flo
 
 
 def _attrs(
-    path: Path, palette: str, residual: float, colours: Floats, share: Floats
+    path: Path, palette: str, residual: float, colours: Array, share: Array
 ) -> dict[str, Any]:
     """Attributes of positions in a palette; ValueError if another fits the colours better."""
     summed = np.cumsum(share)
