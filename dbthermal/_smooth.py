@@ -124,9 +124,14 @@ def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Arr
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
     r"""Orthonormal polynomials over given times, the discrete Legendre polynomials.
 
-    Column j (time, order) is a polynomial of degree j, and :math:`\Phi^T \Phi = 1`. The times [s]
-    increase strictly, not necessarily evenly; ValueError if the order, the constant included, is
-    not in [1, number of times].
+    Column j (time, order) is a polynomial of degree j, and :math:`\Phi^T \Phi = 1`.
+
+    Parameters
+    ----------
+    time : array_like, shape (time,)
+        Times [s], strictly increasing, not necessarily evenly spaced.
+    order : int
+        Number of functions, the constant included, at most that of the times, or a ValueError.
     """
     time = np.asarray(time, dtype=np.float64)
     if not 1 <= order <= time.size:
