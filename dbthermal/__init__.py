@@ -1,13 +1,13 @@
 """Object temperature, emissivity and reflections from two bands of thermal video.
 
 Begin with `calibration.fit_response`, `correction.correct_capture` and `separation.solve`. The
-functions exchange an `xarray.Dataset` in kelvin and SI units, whose variables `schema` names. A
-module is imported when it is first used, so that ``import dbthermal`` is quick and asks for no
-optional package.
+functions exchange an `xarray.Dataset` in kelvin and SI units, whose variables `schema` names;
+`explore` looks around in one. A module is imported when it is first used, so that
+``import dbthermal`` is quick and asks for no optional package.
 """
 
 import importlib
-from types import ModuleType
+from typing import Any, Final
 
 __version__ = "0.1.0"
 
@@ -17,6 +17,8 @@ __all__ = [
     "calibration",
     "correction",
     "emissivity",
+    "explore",
+    "explorer",
     "figures",
     "instruments",
     "limits",
@@ -34,9 +36,13 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
+_FUNCTIONS: Final = {"explore": "explorer"}  # name to its module
 
-def __getattr__(name: str) -> ModuleType:
-    """Import the module `name` of this package when it is first used (PEP 562)."""
+
+def __getattr__(name: str) -> Any:
+    """Import a module of this package, or that of a function, when first used (PEP 562)."""
+    if name in _FUNCTIONS:
+        return getattr(importlib.import_module(f"{__name__}.{_FUNCTIONS[name]}"), name)
     if name in __all__:
         return importlib.import_module(f"{__name__}.{name}")
-    raise AttributeError(f"Unknown module {name!r} in {__name__}. Must be one of {__all__}.")
+    raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")

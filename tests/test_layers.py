@@ -16,6 +16,7 @@ ARCHITECTURE = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding=
 LAYERS = BLOCK.splitlines()[::-1]
 LEVEL = {module: level for level, row in enumerate(LAYERS) for module in row.split()}
 PLACES = {
+    "anywidget": {"explorer"},
     "zarr": {"store"},
     "av": {"readers", "store"},
     "torch": {"separation"},
@@ -74,7 +75,8 @@ def test_only_store_opens_zarr() -> None:
 
 def test_importing_the_package_is_light() -> None:
     """`import dbthermal` loads neither optional nor heavy packages."""
-    code = "import sys, dbthermal; print({'torch', 'usb', 'serial', 'matplotlib'} & {*sys.modules})"
+    heavy = {"torch", "usb", "serial", "matplotlib", "anywidget"}
+    code = f"import sys, dbthermal; print({heavy} & {{*sys.modules}})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

@@ -4,13 +4,10 @@ Begin with a `session`, a YAML file of the recording and its devices' addresses;
 them, `protocols` records a scene or a blackbody sweep, `live` shows it meanwhile, and `recording`
 opens it again. `inventory` lists what is on the USB bus. Below are the drivers: `boson` over
 `fslp`, `filterwheel` over `apt`, and `tc08`; `camera` is the interface of any camera, and
-`thermocouple` converts type T. Imported by name, as in ``import dbthermal.instruments.v4l2``, are
-``v4l2`` (frames), ``telemetry`` (what a Boson writes into them), ``transport`` (serial lines),
-``signals`` (those that end a program), and ``emulated``: devices behind ``sim://`` addresses, below
-the same drivers, that say what they are; `_addresses` has the rules of all addresses.
-The drivers were written from public descriptions of the protocols and tested against public byte
-vectors and emulators, never against hardware. Those that talk to a device need the optional
-packages of ``dbthermal[instruments]``; a module is imported when it is first used.
+`thermocouple` converts type T. Imported by name are ``v4l2`` (frames), ``telemetry``, ``transport``
+(serial lines), ``signals`` and ``emulated``: devices behind ``sim://`` addresses, below the same
+drivers. The drivers were written from public descriptions and tested against public byte vectors
+and emulators, never against hardware. They need the packages of ``dbthermal[instruments]``.
 """
 
 import importlib

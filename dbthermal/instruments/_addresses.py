@@ -30,6 +30,14 @@ RULES: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
 
 _LONGEST: Final = 200  # [character]
 
+# Schemes of a device's simulated address, and of that of the hardware.
+_SCHEMES: Final[Mapping[str, tuple[tuple[str, ...], str]]] = {
+    "video": (("sim",), "v4l2"),
+    "control": (("sim", "pty"), "serial"),
+    "filter_wheel": (("sim", "pty"), "serial"),
+    "thermocouples": (("sim",), "tc08"),
+}
+
 
 class Address(NamedTuple):
     """Parts of an address: `target` is the device's file, or the kind of emulator."""
@@ -54,3 +62,13 @@ def parse(url: str, schemes: Iterable[str] = tuple(RULES)) -> Address:
     for option in texts.repeated([*named, *(option for option, _ in pairs)]):
         raise ValueError(f"Repeated option '{option}' in address '{url}'. Must be listed once.")
     return Address(scheme, parts["target"], parts.get("name", ""), dict(pairs))
+
+
+def check_schemes(name: str, simulated: str, hardware: str) -> None:
+    """ValueError unless a device's addresses are of its schemes, by the name of its use."""
+    allowed, real = _SCHEMES[name]
+    url = parse(simulated, allowed)
+    parse(hardware, (real,))
+    emulator = {"filter_wheel": "apt", "thermocouples": "tc08"}.get(name, url.target)
+    if url.scheme == "sim" and (url.target != emulator or (emulator == "tc08" and url.name)):
+        raise ValueError(f"Invalid address '{simulated}' of {name}. Must be sim://{emulator}")

@@ -2,9 +2,8 @@
 
 `FrameSource` gives frames with two clocks, a number, flags and metadata; `CameraControl`, which a
 camera may lack, sets its modes and reads its temperature and the state of its shutter. `KINDS`
-names the module of each kind of camera, which is imported when a session asks for it.
-`next_shutter` makes the flag of a closed shutter from telemetry, serial line and image, for all
-cameras alike. A damaged frame is handed on with flags: to hide or mend it is not the driver's task.
+names the module of each kind of camera, which is imported when a session asks for it. A damaged
+frame is handed on with flags: to hide or mend it is not the driver's task.
 """
 
 import importlib
@@ -116,10 +115,7 @@ class FfcStatus(IntEnum):
 
 
 class FfcMode(IntEnum):
-    """Trigger of a flat-field correction: a command, the camera itself, or an external target.
-
-    In `EXTERNAL` the shutter stays open, and the scene has to be uniform.
-    """
+    """Trigger of a flat-field correction; in `EXTERNAL` the shutter stays open before the scene."""
 
     MANUAL = 0
     AUTO = 1
@@ -156,11 +152,7 @@ class Metadata:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One frame as it came.
-
-    No driver writes to the counts again. A leap of the sequence number is a loss. Metadata are
-    missing without telemetry, or if the frame is damaged.
-    """
+    """One frame as it came: its counts are not written to again, a leap of the number is a loss."""
 
     counts: Counts  # raw signal (y, x) [count]
     device_time: float  # exposure, by the camera's or the kernel's stamp [s]; NaN if not known
@@ -209,8 +201,7 @@ class FrameSource(Protocol):
         """True if the camera is emulated."""
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
-        """
-        Wait at most `timeout` [s] for the next frame; damaged ones are returned, too, with flags.
+        """Wait at most `timeout` [s] for the next frame; damaged ones come with flags.
 
         `NoFrameError` if none came in time, `SourceLostError` if the camera is gone or closed.
         """
@@ -251,11 +242,7 @@ OpenControl = Callable[[str, object | None], AbstractContextManager[CameraContro
 
 @dataclass(frozen=True)
 class CameraKind:
-    """One kind of camera, as its module names it in ``KIND``.
-
-    `open_frames` opens the frames of a hardware address in a format, `open_control` the command
-    port of an address, given the emulated bench or None.
-    """
+    """One kind of camera: how to open frames and command port; see ``KIND`` of its module."""
 
     open_frames: OpenFrames
     open_control: OpenControl | None = None
@@ -301,14 +288,10 @@ def next_shutter(
     - it is the `FEWEST_COPIES`-th copy in a row or a later one, of a camera without telemetry. A
       serial line alone may miss an event: it is read once a second, and stalls meanwhile.
 
-    The flag is per band and frame, and is known with the frame. It marks an event, not always from
-    its first copy: `dbthermal.correction.find_shutter(capture, closed=...)` takes ``(frame_flags &
-    SHUTTER_CLOSED) != 0`` (band, time) as `closed`, and every run of copies that holds or touches a
-    flagged frame becomes one event with renewed offsets, which `dbthermal.correction.mark_shutter`
-    takes out.
-
-    `last_ffc_frame` is None without telemetry, or if the frame is damaged, and `ffc_status` without
-    a reading of the serial line, or if it is too old.
+    The flag marks an event, not always from its first copy: `dbthermal.correction.find_shutter`
+    makes one event with renewed offsets of every run of copies that holds or touches a flagged
+    frame. `last_ffc_frame` is None without telemetry, or if the frame is damaged, and `ffc_status`
+    without a reading of the serial line, or if it is too old.
     """
     known = before.last_ffc_frame if last_ffc_frame is None else last_ffc_frame
     renewed = before.last_ffc_frame not in {None, known}

@@ -1,12 +1,8 @@
 """The devices of a session, opened together: cameras, their command ports, wheel, thermocouples.
 
-Opening sends nothing that changes a camera, and moves nothing; the result is `Devices`.
-`Devices.prepare` sets the cameras for a measurement and homes the wheel, `Devices.select` turns a
-filter into the beam. Both are called by the user, or by a protocol. In an emulated session all
-emulators share one world, so that the wheel's position decides what the camera behind it sees; they
-are imported only then.
-
-Nothing here was ever run on hardware.
+Opening sends nothing that changes a camera, and moves nothing. In an emulated session all emulators
+share one world, so that the wheel's position decides what the camera behind it sees; they are
+imported only then. Nothing here was ever run on hardware.
 """
 
 import importlib
@@ -14,7 +10,7 @@ import threading
 import time as system_time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, Final
 
@@ -55,10 +51,7 @@ class ReadingError(RuntimeError):
 
 @dataclass
 class Thermocouples:
-    """The logger's channels, of which one scan gives the readings of all.
-
-    `names` maps channel to the place of its tip; `clock` is the host's [s], that of the logger.
-    """
+    """The logger's channels, by the places of their tips; one scan gives the readings of all."""
 
     logger: TC08
     names: Mapping[int, str]
@@ -75,24 +68,20 @@ class Thermocouples:
         `ReadingError` if it is no temperature, or the logger fails.
         """
         with self._lock:
-            scan = self._current(channel)
+            scan = self._scan
+            if scan is None or channel in self._read or self.clock() - scan.time > SCAN_AGE:
+                try:
+                    self._scan = scan = self.logger.single()
+                except TC08Error as error:
+                    raise ReadingError(f"No temperatures: {error}") from error
+                self._read.clear()
+            self._read.add(channel)
         if scan.flag[channel]:
             raise ReadingError(
                 f"No temperature of thermocouple '{self.names[channel]}' in channel {channel}: "
                 f"{Flag(int(scan.flag[channel]))!r}. Must be connected, and within its range."
             )
         return float(scan.temperature[channel])
-
-    def _current(self, channel: int) -> Scan:
-        scan = self._scan
-        if scan is None or channel in self._read or self.clock() - scan.time > SCAN_AGE:
-            try:
-                self._scan = scan = self.logger.single()
-            except TC08Error as error:
-                raise ReadingError(f"No temperatures: {error}") from error
-            self._read.clear()
-        self._read.add(channel)
-        return scan
 
 
 @dataclass(frozen=True)
@@ -111,8 +100,7 @@ class Devices:
         """Instruments that are read beside the frames, for `recording.record`.
 
         Each thermocouple by its name [K]; ``fpa <band>``, the temperature of the focal-plane array
-        [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam. They
-        raise RuntimeError or OSError where the instrument gives none.
+        [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam.
         """
         readings: dict[str, Reading] = {}
         if self.thermocouples is not None:
@@ -126,9 +114,8 @@ class Devices:
         return readings
 
     def identities(self) -> dict[str, Identity]:
-        """Names and numbers of the devices, for the record of a recording.
+        """Names and numbers of cameras, by band, and other devices; each says ``is_simulated``.
 
-        Keys are the bands, ``filter_wheel`` and ``thermocouples``; each says ``is_simulated``.
         ValueError if frames and command port of a band are those of two cameras; RuntimeError or
         OSError if a device does not answer.
         """
@@ -137,23 +124,26 @@ class Devices:
             identity: Identity = {**source.identity, "is_simulated": source.is_simulated}
             if band in self.cameras:
                 control = self.cameras[band].identity()
-                _require_same(band, identity, control)
+                numbers = identity.get("serial_number"), control["serial_number"]
+                if numbers[0] not in {None, numbers[1]}:
+                    raise ValueError(
+                        f"Invalid cameras {numbers} of band '{band}': frames come from the first, "
+                        "commands go to the second. Must be one camera."
+                    )
                 identity = {**identity, **control}
             identities[band] = identity
         if self.wheel is not None:
-            identities[WHEEL] = _record(self.wheel.identity())
+            identities[WHEEL] = self.wheel.identity()
         if self.logger is not None:
-            identities["thermocouples"] = _record(self.logger.identity())
+            identities["thermocouples"] = self.logger.identity()
         return identities
 
     def prepare(self) -> None:
-        """
-        Make the devices ready to measure: set the cameras, correct their offsets, turn the wheel.
+        """Set the cameras, correct their offsets, home the wheel if need be, turn it to its band.
 
-        Each camera gives 16-bit counts, corrects its offsets on command only, and gives telemetry
-        as the session says; each setting is read back. Then the offsets are corrected, and the
-        wheel is homed if it has to be, and turned to the session's band. ValueError if a camera
-        does not keep a setting, RuntimeError or OSError if a device refuses, fails or is gone.
+        Cameras give 16-bit counts, correct their offsets on command only, and give the session's
+        telemetry. ValueError if a camera does not keep a setting, RuntimeError or OSError if a
+        device refuses, fails or is gone.
         """
         for camera in self.cameras.values():
             camera.prepare(self.session.telemetry_rows)
@@ -173,8 +163,8 @@ class Devices:
     def select(self, band: str) -> "Devices":
         """Turn one of the session's filters into the beam; as `FilterWheel.select`.
 
-        Returns the same devices, of which the camera behind the wheel is that of this band;
-        ValueError if the session has no wheel, or no such filter.
+        Returns the devices with the camera behind the wheel named after this band; ValueError if
+        the session has no wheel, or no such filter.
         """
         before = self.session.filtered
         if self.wheel is None or before is None:
@@ -192,10 +182,7 @@ class Devices:
         )
 
     def flush(self) -> None:
-        """Discard the frames that the drivers hold, which show the scene as it was before.
-
-        `SourceLostError` if a camera is gone.
-        """
+        """Discard frames that the drivers hold of the scene before; SourceLostError if lost."""
         start = system_time.monotonic()
         for source in self.sources.values():
             while system_time.monotonic() - start < FLUSH_TIMEOUT:
@@ -215,14 +202,9 @@ def open_devices(
 ) -> Iterator[Devices]:
     """Open the devices of a session: the real ones, or, by its one switch, the emulated ones.
 
-    Addresses are ``v4l2:///dev/video0``, ``serial:///dev/ttyACM0`` and ``tc08:``; and in an
-    emulated session ``sim://<kind>/<name>``, with the kind of camera and its name in the world, for
-    frames and commands alike, ``sim://apt/<any>`` and ``sim://tc08``.
-
     `world` is the emulated bench, an `emulated.world.World`, by default one at room temperature,
     and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
-    [s]; by default, with the default world, its blackbody, see
-    `dbthermal.instruments.emulated.blackbody`. The devices are closed in the end.
+    [s]; by default, with the default world, its blackbody. The devices are closed in the end.
 
     Raises
     ------
@@ -253,10 +235,11 @@ def open_devices(
     with ExitStack() as stack:
         sources: dict[str, FrameSource] = {}
         cameras: dict[str, CameraControl] = {}
-        for band in session.bands:
+        for band, camera in session.cameras.items():
             sources[band] = stack.enter_context(_frames(session, band, world, pictures or {}))
-            control = _control(session, band, world)
-            if control is not None:
+            open_control = camera_kind(camera.kind).open_control
+            if camera.control is not None and open_control is not None:
+                control = open_control(session.url(camera.control), world)
                 cameras[band] = stack.enter_context(control)
         wheel = stack.enter_context(_wheel(session, world)) if session.filters else None
         logger = stack.enter_context(_logger(session, world)) if session.thermocouples else None
@@ -285,18 +268,6 @@ def _frames(
     return source
 
 
-def _control(
-    session: Session, band: str, world: Any
-) -> AbstractContextManager[CameraControl] | None:
-    """Open the command port of a band's camera, if it has one."""
-    camera = session.cameras[band]
-    if camera.control is None:
-        return None
-    open_control = camera_kind(camera.kind).open_control
-    assert open_control is not None, camera.kind  # as the session has checked
-    return open_control(session.url(camera.control), world)
-
-
 def _wheel(session: Session, world: Any) -> FilterWheel:
     chosen = {entry.name: getattr(session.wheel, entry.name) for entry in fields(session.wheel)}
     settings = filterwheel.Settings(**{**chosen, "filters": session.filters})
@@ -311,20 +282,3 @@ def _logger(session: Session, world: Any) -> TC08:
         logger.close()
         raise
     return logger
-
-
-def _record(identity: Any) -> Identity:
-    """Text by name, and whether it is simulated."""
-    return {
-        name: value if isinstance(value, bool) else str(value)
-        for name, value in asdict(identity).items()
-    }
-
-
-def _require_same(band: str, source: Identity, control: Identity) -> None:
-    numbers = source.get("serial_number"), control["serial_number"]
-    if numbers[0] not in {None, numbers[1]}:
-        raise ValueError(
-            f"Invalid cameras {numbers} of band '{band}': frames come from the first, commands go "
-            "to the second. Must be one camera."
-        )

@@ -77,9 +77,8 @@ def encode(
     *,
     channel: int = COMMAND_CHANNEL,
 ) -> bytes:
-    """Bytes of a frame, 17 or more, ready to send.
+    """Bytes of a frame, 17 or more; header, data and checksum are all escaped.
 
-    Header, data and checksum are all escaped, so that start and end bytes occur nowhere else.
     Numbers are as in `Frame`: sequence, command and status in [0, 2^32), the channel in [0, 256),
     and at most `MAXIMUM_DATA` bytes of data; TypeError or ValueError for any other.
 
@@ -112,8 +111,7 @@ def _escaped(content: bytes) -> bytes:
 def next_sequence(sequence: int) -> int:
     """Sequence number that follows another, with no byte that would be escaped.
 
-    The vendor's software avoids such numbers too, perhaps because one of its receivers does not
-    unescape the header. The numbers increase, so that none returns within 32 bits.
+    The vendor's software avoids such numbers too. They increase: none returns within 32 bits.
     """
     following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
     for position, value in enumerate(following):

@@ -1,12 +1,10 @@
 """Devices of the rig on the USB bus: their nodes, and warnings about drivers and permissions.
 
 The bus is only listed, through pyusb, and the serial ports by pyserial: no configuration is set,
-nothing is reset, claimed or detached from its kernel driver, for the devices may be recording. A
-camera's video nodes are those below its USB device in Linux's sysfs, so that two equal cameras are
-distinguished by the ports they are plugged into.
-
-A Boson's USB serial number may not always be the camera's own: ask the camera itself. Tested
-against an emulated backend and a written sysfs tree, not against hardware.
+nothing is reset or claimed, for the devices may be recording. A camera's video nodes are those
+below its USB device in Linux's sysfs, so that two equal cameras are told apart by their ports. A
+Boson's USB serial number may not always be the camera's own: ask the camera itself. Tested against
+an emulated backend and a written sysfs tree, not against hardware.
 """
 
 import errno
@@ -72,10 +70,8 @@ class Device:
     """One device that is plugged in.
 
     `bus` is the number of its bus, `ports` the port of each hub on the way, the root's first,
-    `speed` one of `SPEEDS` or ``"unknown"``; `serial` its USB serial number, from its serial port
-    where the device itself may not be opened. Of its nodes, ``/dev/video0`` and ``/dev/ttyACM0``, a
-    camera has several for video, one with images. `warnings` are obstacles to its use, each with
-    the remedy.
+    `serial` its USB serial number, from its serial port where the device itself may not be opened.
+    `warnings` are obstacles to its use, each with the remedy.
     """
 
     kind: Kind
@@ -107,10 +103,9 @@ def find(
 ) -> list[Device]:
     """List the rig's devices that are plugged in, in the order of `KINDS`, then of bus and ports.
 
-    By default with the libusb that is installed as the `backend` of pyusb, and the serial ports
-    that pyserial lists; these and Linux's trees of devices and nodes are replaced in tests. The
-    frame rate of the cameras [Hz] is for the bandwidth. LibusbMissingError without a libusb,
-    usb.core.USBError if the bus itself cannot be listed.
+    By default with the libusb and the serial ports that are installed and Linux's trees of devices
+    and nodes; all are replaced in tests. The cameras' frame rate [Hz] is for the bandwidth.
+    LibusbMissingError without a libusb, usb.core.USBError if the bus cannot be listed.
     """
     terminals = list(list_ports.comports() if serial_ports is None else serial_ports)
     devices = []

@@ -3,15 +3,12 @@
 A `View` is passed to `dbthermal.instruments.recording.record` as `preview`, and shows one picture
 of each band, in place, in a notebook or nowhere::
 
-    from IPython.display import DisplayHandle
-
     view = live.View(DisplayHandle(), title=session.name, is_simulated=session.simulated)
     record(session, devices.sources, path, readings=devices.readings(), preview=view)
 
-With a `Separation` it shows the temperatures of object and background beside them, live.
-
-A `Watch` computes the numbers that are shown, and draws nothing: matplotlib is loaded with the
-first picture. The queue of the recording has to bridge the time that an update takes.
+With a `Separation` it shows the temperatures of object and background beside them. A `Watch`
+computes the numbers that are shown, and draws nothing: matplotlib is loaded with the first picture.
+The queue of the recording has to bridge the time that an update takes.
 """
 
 import io
@@ -103,10 +100,7 @@ def _at(share: float, counts: int, meaning: str) -> str:
 
 
 class Watch:
-    """Numbers of a recording while it goes on, from its previews.
-
-    `window` is the time over which frame rates are measured [s]; ValueError if not positive.
-    """
+    """Numbers of a recording, from its previews; `window` is the one of its rates [s]."""
 
     def __init__(self, window: float = _WINDOW) -> None:
         if not 0 < window < math.inf:
@@ -143,24 +137,14 @@ class Watch:
         return {
             band: Status(
                 band,
-                frame_rate=self._rate(band),
-                frames=totals["frames"],
-                lost=totals["lost"],
-                refused=totals["refused"],
-                damaged=totals["damaged"],
-                fpa_temperature=self._fpa_temperature(band, last),
+                self._rate(band),
+                fpa_temperature=_fpa_temperature(band, last),
                 ffc=_ffc(band, last),
                 ffc_age=last.time - self._ffc_seen.get(band, math.nan),
-                **_levels(last.frames.get(band)),
+                **{**_levels(last.frames.get(band)), **totals},
             )
             for band, totals in last.totals.items()
         }
-
-    @staticmethod
-    def _fpa_temperature(band: str, preview: Preview) -> float:
-        """Temperature of the focal-plane array by its reading, else by the telemetry [K]."""
-        reading = preview.readings.get(FPA_READING + band, math.nan)
-        return reading if math.isfinite(reading) else _metadata(band, preview).fpa_temperature
 
     def _rate(self, band: str) -> float:
         """Rate by the times at which the frames came: they are written in bursts."""
@@ -181,6 +165,12 @@ def _is_other(before: Preview, now: Preview) -> bool:
         or now.time < before.time
         or any(now.totals[band]["frames"] < before.totals[band]["frames"] for band in now.totals)
     )
+
+
+def _fpa_temperature(band: str, preview: Preview) -> float:
+    """Temperature of the focal-plane array by its reading, else by the telemetry [K]."""
+    reading = preview.readings.get(FPA_READING + band, math.nan)
+    return reading if math.isfinite(reading) else _metadata(band, preview).fpa_temperature
 
 
 def _metadata(band: str, preview: Preview | None) -> Metadata:
@@ -270,11 +260,10 @@ class Separation:
 class View:
     """Live view: an instance is the `preview` of a recording, or of several.
 
-    One update of two bands of 640 x 512 takes about a tenth of a second of one core; the fetching
-    threads go on meanwhile. It is shown on a `display`; without one the figure is only kept.
-    `title` is the name of the recording, beside which the figure says if it `is_simulated`;
-    `period` is the least time from update to update [s], not negative, and `window` that over which
-    frame rates are measured [s], positive. With a `separation` it shows temperatures as well.
+    It is shown on a `display`; without one the figure is only kept. An update of two bands of 640 x
+    512 takes a tenth of a second of one core. `title` is the recording's name, `period` the least
+    time from update to update, `window` that over which frame rates are measured [s].
+    With a `separation` it shows temperatures as well.
 
     Examples
     --------
@@ -333,8 +322,10 @@ class View:
             self._drawn = LiveFigure(bands, shape, _FILMS if self._separation else ())
         panels = {}
         for band, one in status.items():
-            image = frames[band].counts if band in frames else None
-            panels[band] = Panel(image, _apart(one.limits), one.text, one.warning)
+            image, (low, high) = frames[band].counts if band in frames else None, one.limits
+            # Black and white are distinct even in a uniform picture.
+            limits = (0.0, 1.0) if image is None else (low, max(high, low + 1.0))
+            panels[band] = Panel(image, limits, one.text, one.warning)
         if self._separation:
             panels |= {name: _temperature(name, self._separated) for name in _FILMS}
         title, foot = f"{self._title}, {preview.time:.1f} s", _foot(preview)
@@ -357,14 +348,6 @@ def _temperature(name: str, separated: xr.Dataset | None) -> "Panel":
     known = image[np.isfinite(image)]
     low, high = np.percentile(known, _PERCENTILES) if known.size else (0.0, 1.0)
     return Panel(image, (low, max(high, low + 0.1)), f"{good:.0f} % of the pixels without a flag")
-
-
-def _apart(limits: tuple[float, float]) -> tuple[float, float]:
-    """Counts drawn black and white: distinct even in a uniform picture, 0 and 1 without one."""
-    low, high = limits
-    if math.isnan(low):
-        return 0.0, 1.0
-    return low, max(high, low + 1.0)
 
 
 def _foot(preview: Preview) -> str:

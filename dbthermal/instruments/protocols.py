@@ -1,25 +1,23 @@
 """Procedures of the rig: wait for the blackbody, record a blackbody sweep, record a scene.
 
-Gain, offset and response are calibrated before a blackbody that goes through several temperatures;
-the emissivity bench goes through them with samples. At each temperature the wheel goes through its
-filters, and each of these is a recording of its own, begun only when the temperature is stable.
-`dbthermal.instruments.recording` opens the recordings: `open_sweep`, `bench_series`,
-`open_capture`.
+Gain, offset and response are calibrated before a blackbody that goes through several temperatures,
+the emissivity bench with samples. At each temperature the wheel goes through its filters, and each
+of these is a recording of its own. `dbthermal.instruments.recording` opens the recordings.
 """
 
 import threading
 import time as system_time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.constants import zero_Celsius
 
 from dbthermal import store
-from dbthermal.instruments.camera import SourceLostError
+from dbthermal.instruments.camera import Identity, SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary, record
 from dbthermal.instruments.recording._capture import mean_reading
@@ -102,17 +100,13 @@ def wait_stable(
         Session with a blackbody.
     temperature : float
         Set point [K].
-    read : callable
-        Reads the temperature [K].
-    clock, sleep : callable
-        Time [s], and a pause of some time [s].
+    read, clock, sleep : callable
+        Reads the temperature [K]; time [s], and a pause of some time [s].
 
     Raises
     ------
-    TimeoutError
-        After the session's `timeout`.
-    ValueError
-        If the session has no blackbody.
+    TimeoutError, ValueError
+        After the session's `timeout`; if it has no blackbody.
     """
     if session.blackbody is None:
         raise ValueError(f"Invalid session '{session.name}'. Must have a blackbody.")
@@ -144,10 +138,10 @@ def record_sweep(
 ) -> list[Step]:
     """Record a blackbody at each of its temperatures, once it is stable, through each filter.
 
-    The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep,
-    and a scene too is recorded after a correction. Recordings of this sweep that are in the folder
-    and complete are kept, so that a sweep that was interrupted goes on where it was. If the folder
-    is renamed or moved meanwhile the sweep goes on in it. Call `Devices.prepare` before.
+    The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep.
+    Recordings of this sweep that are in the folder and complete are kept, so that a sweep that was
+    interrupted goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on
+    in it. Call `Devices.prepare` before.
 
     Parameters
     ----------
@@ -171,12 +165,8 @@ def record_sweep(
     ValueError
         If the session has no blackbody, or no reading of it; or a recording exists that is
         incomplete, of another temperature, or during which the wheel turned.
-    TimeoutError
-        As `wait_stable`; the recordings before are kept.
-    SourceLostError
-        If a camera is lost on the way.
-    FileNotFoundError
-        If the folder was deleted meanwhile.
+    TimeoutError, SourceLostError, FileNotFoundError
+        As `wait_stable`; or a camera is lost, or the folder deleted. What was recorded is kept.
     """
     session = devices.session
     readings = devices.readings()
@@ -184,8 +174,12 @@ def record_sweep(
         raise ValueError(f"Invalid session '{session.name}'. Must have and read a blackbody.")
     Path(folder).mkdir(parents=True, exist_ok=True)
     held = store.HeldFolder(Path(folder))
-    plan = _plan(session, folder)
-    kept = [_kept(number, temperature, band, path) for number, temperature, band, path in plan]
+    plan = [
+        (number, temperature, band, step_path(folder, session.name, number, band))
+        for number, temperature in enumerate(session.blackbody.temperatures)
+        for band in session.swept or (None,)
+    ]
+    kept = [_kept(*step) for step in plan]
     steps: list[Step] = []
     resting: int | None = None
     for (number, temperature, band, planned), was in zip(plan, kept, strict=True):
@@ -218,12 +212,7 @@ def record_scene(
     path : str or Path
         Folder ``*.zarr`` to make.
     limits, preview, stop : optional
-        As for `dbthermal.instruments.recording.record`, whose errors it raises.
-
-    Returns
-    -------
-    Summary
-        How it ended, and numbers of frames.
+        As for `dbthermal.instruments.recording.record`, whose result and errors are those of this.
 
     Examples
     --------
@@ -244,26 +233,16 @@ def record_scene(
     devices.flush()
     if devices.world is not None:
         devices.world.begin()
-    return record(
-        devices.session,
-        devices.sources,
-        path,
-        readings=devices.readings(),
-        identities=identities,
-        limits=limits,
-        preview=preview,
-        stop=stop,
-    )
+    options = {"limits": limits, "preview": preview, "stop": stop}
+    return _record(devices, path, identities, **options)
 
 
-def _plan(session: Session, folder: str | Path) -> list[tuple[int, float, str | None, Path]]:
-    """Number, temperature [K], band behind the wheel and path of each recording, in order."""
-    assert session.blackbody is not None
-    return [
-        (number, temperature, band, step_path(folder, session.name, number, band))
-        for number, temperature in enumerate(session.blackbody.temperatures)
-        for band in session.swept or (None,)
-    ]
+def _record(
+    devices: Devices, path: str | Path, identities: Mapping[str, Identity], **options: Any
+) -> Summary:
+    """Record all sources and readings of open devices, with the options of `record`."""
+    session, sources, readings = devices.session, devices.sources, devices.readings()
+    return record(session, sources, path, readings=readings, identities=identities, **options)
 
 
 def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
@@ -294,15 +273,7 @@ def _record_step(
     selected = devices if band is None else devices.select(band)
     identities = selected.identities()
     selected.flush()
-    summary = record(
-        selected.session,
-        selected.sources,
-        path,
-        readings=selected.readings(),
-        identities=identities,
-        limits=limits,
-        preview=preview,
-    )
+    summary = _record(selected, path, identities, limits=limits, preview=preview)
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
     require_filter(summary.path, band)

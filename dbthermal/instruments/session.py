@@ -25,11 +25,10 @@ One key, ``simulated``, switches the whole rig; every device has an address for 
     thermocouples: {1: blackbody, 2: plate}
     blackbody: {temperatures: [293.15, 303.15], stability: 0.02, window: 30, timeout: 1800}
 
-Temperatures are in kelvin, times in seconds. A key that is not known or listed twice is an error,
-and so is a value that YAML 1.1 and 1.2 read differently, see `dbthermal.readers.read_yaml`. The
-camera whose band is one of the filters is the one behind the wheel. The simulated address of its
-frames names the camera's kind. No address names a library: that of the thermocouple logger is the
-environment variable ``DBTHERMAL_USBTC08``.
+Temperatures are in kelvin, times in seconds. An unknown or repeated key is an error, and so is a
+value that YAML 1.1 and 1.2 read differently, see `dbthermal.readers.read_yaml`. The camera whose
+band is one of the filters is behind the wheel. No address names a library: that of the thermocouple
+logger is the environment variable ``DBTHERMAL_USBTC08``.
 """
 
 import errno
@@ -38,7 +37,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import field
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import (
@@ -63,16 +61,6 @@ __dir__ = __all__.copy
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
 BLACKBODY: Final = "blackbody"  # name of its thermocouple
-
-_SCHEMES: Final[Mapping[str, tuple[tuple[str, ...], str]]] = MappingProxyType(
-    {
-        "video": (("sim",), "v4l2"),
-        "control": (("sim", "pty"), "serial"),
-        "filter_wheel": (("sim", "pty"), "serial"),
-        "thermocouples": (("sim",), "tc08"),
-    }
-)
-"""Schemes of a device's simulated address, and of that of the hardware."""
 
 
 def _by(check: Callable[[Any], object]) -> AfterValidator:
@@ -103,12 +91,12 @@ DeviceName = Literal["filter_wheel", "thermocouples"]
 
 @dataclass(frozen=True, config=_CHECKED)
 class Device:
-    """Addresses of one device.
+    """Addresses of one device, such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``.
 
     Attributes
     ----------
     simulated, hardware : str
-        Such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``.
+        Addresses.
     """
 
     simulated: Annotated[str, _by(partial(addresses.parse, schemes=("sim", "pty")))]
@@ -116,26 +104,17 @@ class Device:
 
 
 def _check_schemes(name: str, device: Device) -> None:
-    """Raise ValueError unless the addresses are of the schemes of a device of this name."""
-    simulated, hardware = _SCHEMES[name]
-    url = addresses.parse(device.simulated, simulated)
-    addresses.parse(device.hardware, (hardware,))
-    emulator = {"filter_wheel": "apt", "thermocouples": "tc08"}.get(name, url.target)
-    if url.scheme == "sim" and (url.target != emulator or (emulator == "tc08" and url.name)):
-        rule = f"Must be sim://{emulator}"
-        raise ValueError(f"Invalid address '{device.simulated}' of {name}. {rule}")
+    addresses.check_schemes(name, device.simulated, device.hardware)
 
 
 @dataclass(frozen=True, config=_CHECKED)
 class Camera:
-    """One camera: addresses of its frames and of its command port, if any, and its kind.
+    """One camera.
 
     Attributes
     ----------
-    video : Device
-        Addresses of its frames.
-    control : Device or None
-        Addresses of its command port.
+    video, control : Device
+        Addresses of its frames, and of its command port, if it has one.
     kind : str
         One of `dbthermal.instruments.camera.KINDS`, that of its simulated address.
     """
@@ -170,11 +149,9 @@ class Blackbody:
         Set points [K].
     stability, window : float
         Largest range of the readings [K] in a window, and how long it is [s].
-    tolerance : float
+    tolerance, timeout : float
         Largest distance of their mean from the set point [K]: a thermocouple and its logger are off
-        by half a kelvin or so each, and the recordings keep the reading.
-    timeout : float
-        Longest wait for it [s].
+        by half a kelvin or so each, and the recordings keep the reading. Longest wait for it [s].
     """
 
     temperatures: Annotated[tuple[Temperature, ...], Field(min_length=1, max_length=1000)]
@@ -194,10 +171,8 @@ class Wheel(filterwheel.Settings):
 
     Attributes
     ----------
-    filters : mapping
-        Empty: those of the session are taken.
-    addresses : tuple of tuple of int
-        As in `Settings`.
+    filters, addresses : mapping, tuple
+        Empty: those of the session are taken; as in `Settings`.
     """
 
     filters: Mapping[int, str] = field(default_factory=dict, init=False)
@@ -215,8 +190,7 @@ class Wheel(filterwheel.Settings):
 class Session:
     """Description of a recording: devices, procedure and duration; see the module.
 
-    All protocols but ``scene`` go through the blackbody's temperatures. Invalid values raise
-    pydantic's ValidationError, a ValueError.
+    Invalid values raise pydantic's ValidationError, a ValueError.
 
     Attributes
     ----------
@@ -225,25 +199,16 @@ class Session:
     simulated : bool
         One switch for all devices.
     protocol : str
-        ``"gain_offset"``, ``"response"``, ``"emissivity_bench"`` or ``"scene"``.
-    duration : float
-        Duration of the recording, or of each of its steps [s].
-    cameras : dict of str to Camera
-        Cameras by band, in the order of the recording.
-    frame_rate : float
-        Frame rate [Hz].
-    shape : tuple of int
-        Rows and columns.
-    telemetry_rows : int
-        Rows of telemetry in a frame, 0 or 2.
-    devices : dict of str to Device
-        Other devices by name.
-    filters : dict of int to str
-        Slot of the wheel to band.
-    wheel : Wheel
-        Settings of the wheel.
-    sweep : tuple of str
-        Filters at each temperature; see `swept`.
+        ``"gain_offset"``, ``"response"``, ``"emissivity_bench"``, which go through the blackbody's
+        temperatures, or ``"scene"``.
+    duration, frame_rate : float
+        Duration of the recording, or of each of its steps [s]; frame rate [Hz].
+    cameras, devices : dict
+        Cameras by band, in the order of the recording; other devices by name.
+    shape, telemetry_rows : tuple of int, int
+        Rows and columns; rows of telemetry in a frame, 0 or 2.
+    filters, wheel, sweep : dict of int to str, Wheel, tuple of str
+        Slot of the wheel to band; its settings; filters at each temperature, see `swept`.
     thermocouples : dict of int to str
         Channel to measured object.
     blackbody : Blackbody or None
@@ -339,8 +304,7 @@ class Session:
     @property
     def filtered(self) -> str | None:
         """Band of the camera behind the wheel; None without a wheel."""
-        behind = (band for band in self.cameras if band in self.filters.values())
-        return next(behind, None)
+        return next((band for band in self.cameras if band in self.filters.values()), None)
 
     @property
     def swept(self) -> tuple[str, ...]:
@@ -365,14 +329,12 @@ class Session:
 
         Raises
         ------
-        FileNotFoundError
-            If a file does not exist.
-        ValueError
-            If it is not YAML, or a key is missing, unknown, repeated or in both files, or a value
-            is invalid: one line for each error, with file, place in it, value and rule.
+        FileNotFoundError, ValueError
+            If a file does not exist; if it is not YAML, or a key is missing, unknown, repeated or
+            in both files, or a value is invalid: one line for each error, with file, place and
+            rule.
         """
-        content = texts.read_yaml(path)
-        files = {}
+        content, files = texts.read_yaml(path), dict[str, str]()  # file of each key of the rig's
         if "rig" in content:
             name = content.pop("rig")
             if not isinstance(name, str) or not name.isprintable():
@@ -383,8 +345,8 @@ class Session:
                 raise FileNotFoundError(errno.ENOENT, message, str(rig))
             shared = texts.read_yaml(rig)
             for key in texts.repeated([*content, *shared]):
-                name = f"key of session and rig '{key}'"
-                raise ValueError(f"{path}: Repeated {name}. Must be listed once.")
+                rule = "Must be listed once"
+                raise ValueError(f"{path}: Repeated key of session and rig '{key}'. {rule}.")
             files = dict.fromkeys(shared, str(rig))
             content = {**shared, **content}
         changed = {**content, **(changes or {})}
@@ -398,10 +360,9 @@ class Session:
         try:
             session: Self = TypeAdapter(cls).validate_python(content)
         except ValidationError as error:
-            messages = [
-                f"{files.get(str(one['loc'][0]), path) if one['loc'] else path}: {_message(one)}"
-                for one in error.errors()
-            ]
+            places = [str(one["loc"][0]) if one["loc"] else "" for one in error.errors()]
+            pairs = zip(places, error.errors(), strict=True)
+            messages = [f"{files.get(key, path)}: {_message(one)}" for key, one in pairs]
             raise ValueError("\n".join(messages)) from None
         return session
 

@@ -1,8 +1,7 @@
 """Signals that end a program, SIGTERM and SIGHUP, as exceptions: what is open is closed.
 
 A terminal that is closed sends SIGHUP; ``kill``, a service manager and a shutdown send SIGTERM.
-Both end a Python program at once, unless they are raised in its main thread, as an interrupt by the
-keyboard is.
+Both end a Python program at once, unless they are raised, as an interrupt by the keyboard is.
 """
 
 import signal
@@ -34,8 +33,8 @@ def raised_signals() -> Iterator[None]:
     """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
 
     The first one is raised, those after it are passed over: a closed terminal sends several, and
-    what is being closed must be left to end. Nothing changes in other threads, nor for a signal
-    that the program handles by itself or ignores, as under ``nohup``.
+    what is being closed must be left to end. Nothing changes for a signal that the program handles
+    by itself or ignores, as under ``nohup``.
     """
     previous: dict[int, Any] = {}
     raised: list[int] = []

@@ -5,11 +5,9 @@ The TC-08's USB protocol is not public. Its readings come through the vendor's o
 types and error numbers are those of the header ``usbtc08.h`` that the vendor publishes.
 
 A reading without a temperature is NaN, and `Flag` says why. Not every open thermocouple can be
-detected: according to the vendor's support forum (picotech.com, topic 29871) one may also read a
-noisy room temperature. Move the blackbody, and see whether the reading follows.
-
-Tested against an emulated library object and a stub compiled from the public signatures, not
-against hardware.
+detected: one may also read a noisy room temperature (picotech.com, topic 29871). Move the
+blackbody, and see whether the reading follows. Tested against an emulated library object and a stub
+compiled from the public signatures, not against hardware.
 """
 
 import ctypes
@@ -28,9 +26,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal.instruments import _addresses as addresses
+from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing
 
-__all__ = ["ERRORS", "TC08", "Flag", "Identity", "Scan", "TC08Error", "load"]
+__all__ = ["ERRORS", "TC08", "Flag", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
 
 Library = Any
@@ -121,8 +120,7 @@ class Scan:
     """One reading of all nine channels, of which index 0 is the cold junction.
 
     `time` is the middle of the scan on the host's clock [s], for the channels are converted one
-    after another; `temperature` (9,) [K] is NaN unless the `flag` (9,) is 0: see `Flag`; channels
-    that are off are `Flag.MISSING`.
+    after another; `temperature` (9,) [K] is NaN unless the `flag` (9,) is 0: see `Flag`.
     """
 
     time: float
@@ -130,23 +128,10 @@ class Scan:
     flag: npt.NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
-class Identity:
-    """Serial number, calibration date (in the vendor's format) and versions of a unit."""
-
-    serial_number: str
-    calibration_date: str
-    driver: str
-    hardware: int
-    variant: int
-    is_simulated: bool
-
-
 class TC08(Closing):
     """A TC-08, for one thread at a time; opened by `from_url`, `open` or ``with``.
 
-    The library is from `load`, or an emulated one; the host's clock [s] and its sleep are replaced
-    in tests.
+    The `library` is from `load`, or an emulated one; `clock` [s] and `sleep` are the host's.
     """
 
     def __init__(
@@ -163,12 +148,11 @@ class TC08(Closing):
 
     @classmethod
     def from_url(cls, url: str = "tc08:", *, world: object | None = None) -> Self:
-        """Load the library and open the first free unit.
+        """Load the library and open the first free unit, at ``tc08:`` or ``sim://tc08`` in a world.
 
-        The address is ``tc08:``, the library being found as by `load`, or ``sim://tc08`` for a unit
-        of an emulated bench, the `world`. No address names a library: only the variable
-        `ENVIRONMENT` does. ValueError if it is another one, or the world is missing, or given to a
-        real unit; else the errors of `load` and `open`.
+        No address names a library: only the variable `ENVIRONMENT` does. ValueError if it is
+        another address, or the world is missing or given to a real unit; else the errors of `load`
+        and `open`.
 
         Examples
         --------
@@ -199,7 +183,7 @@ class TC08(Closing):
         """Open the first free unit, within `timeout` [s].
 
         RuntimeError or ConnectionError if it is open already, or no unit is free; TC08Error or
-        TimeoutError if the library reports an error, or the firmware is not downloaded in time.
+        TimeoutError if the library fails, or the firmware is not downloaded in time.
         """
         if self._handle:
             raise RuntimeError("The TC-08 is open already. Must be closed first.")
@@ -224,10 +208,7 @@ class TC08(Closing):
         return self
 
     def close(self) -> None:
-        """Close the unit; a second call does nothing.
-
-        TC08Error if the library could not, as after unplugging; the unit counts as closed.
-        """
+        """Close the unit, once; TC08Error if the library could not, as after unplugging."""
         handle, self._handle = self._handle, 0
         self._has_channels = False
         if handle and not self._library.usb_tc08_close_unit(handle):
@@ -244,8 +225,14 @@ class TC08(Closing):
             raise self._error("read its identity")
         texts = (unit[0].serial, unit[0].calibration_date, unit[0].driver)
         serial, date, driver = (text.decode("ascii", "backslashreplace") for text in texts)
-        versions = unit[0].hardware, unit[0].variant
-        return Identity(serial, date, driver, *versions, self.is_simulated)
+        return {
+            "serial_number": serial,
+            "calibration_date": date,  # in the vendor's format
+            "driver": driver,
+            "hardware": str(unit[0].hardware),
+            "variant": str(unit[0].variant),
+            "is_simulated": self.is_simulated,
+        }
 
     def set_channels(self, kinds: Mapping[int, str]) -> None:
         """Set the type of each thermocouple, a letter of B E J K N R S T by its channel, 1 to 8.
@@ -274,8 +261,7 @@ class TC08(Closing):
     def single(self) -> Scan:
         """Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
 
-        TC08Error or RuntimeError if the library fails, the unit is not open, or no channels are
-        set.
+        TC08Error or RuntimeError if the library fails, the unit is closed, or no channels are set.
         """
         handle = self._open_handle()
         if not self._has_channels:
@@ -311,9 +297,8 @@ def flagged(
 def load(path: str | None = None, environment: Mapping[str, str] = os.environ) -> Library:
     """Load the vendor's library and declare the types of its functions.
 
-    Without its `path` the variable `ENVIRONMENT` names the file, and without that the system's own
-    search must find ``usbtc08``: else FileNotFoundError. OSError if the file cannot be loaded, or
-    lacks a function.
+    Its `path`, else the variable `ENVIRONMENT`, names the file; else the system's own search must
+    find ``usbtc08`` (FileNotFoundError). OSError if it cannot be loaded, or lacks a function.
     """
     name = path or environment.get(ENVIRONMENT) or ctypes.util.find_library("usbtc08")
     if name is None:

@@ -6,9 +6,7 @@ certain**: it is where public decoders that do not depend on one another agree (
 ``flir_ros_sync.cpp``), and none of them is the vendor's. So are the orders: each 16-bit word is
 little-endian, and of a longer number the high word comes first; the latter is an option of
 `decode`. Therefore a recording keeps the rows as they came. The meaning of the status bits is not
-public: the state of the shutter follows from `last_ffc_frame` and from the serial line, see
-`camera.next_shutter`.
-
+public: the shutter follows from `last_ffc_frame` and the serial line, see `camera.next_shutter`.
 Tested against computed vectors and emulators, not against a camera.
 """
 
@@ -80,9 +78,9 @@ FIELDS: Final = MappingProxyType(
 def decode(rows: Counts, *, high_word_first: bool = True) -> dict[str, float]:
     """Read the value of each of `FIELDS` from telemetry rows, uint16 (row, x) or (word,).
 
-    The rows are as they came, and `high_word_first` is the order of the words of a longer number:
-    likely, not certain. Any content is read as if it were telemetry: there is no checksum.
-    TypeError or ValueError if the rows are not of uint16, or hold fewer than `WORDS` words.
+    `high_word_first` is the order of the words of a longer number: likely, not certain. Any content
+    is read as if it were telemetry: there is no checksum. TypeError or ValueError if the rows are
+    not of uint16, or hold fewer than `WORDS` words.
     """
     words = _checked(rows)
     values: dict[str, float] = {}

@@ -1,9 +1,9 @@
-"""Byte streams to devices, each opened by one name like an address.
+"""Byte streams to devices, each opened by its address.
 
 ``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``pty:///dev/pts/3`` a
-pseudo-terminal of an emulated device, and ``sim://boson?sn=7`` an emulator that is
-started for the caller and ends with the transport. Nothing is sent when one is opened. Tested on
-pseudo-terminals, not on hardware.
+pseudo-terminal of an emulated device, and ``sim://boson?sn=7`` an emulator that is started for the
+caller and ends with the transport. Nothing is sent when one is opened. Tested on pseudo-terminals,
+not on hardware.
 """
 
 import errno
@@ -75,10 +75,9 @@ class Transport(Protocol):
         """Send all bytes; `TransportError` if the device is gone."""
 
     def read(self, size: int, timeout: float) -> bytes:
-        """Wait until bytes came, or `timeout` [s] went by.
+        """Wait until bytes came, or `timeout` [s] went by; `TransportError` if the device is gone.
 
         Return at most `size` bytes and often fewer; none only if `timeout` went by.
-        `TransportError` if the device is gone.
         """
 
     def close(self) -> None:
@@ -86,10 +85,9 @@ class Transport(Protocol):
 
 
 class SerialTransport(Closing):
-    """A serial port, or a pseudo-terminal, that is open already; see `open_serial`.
+    """An open serial port of pyserial, or pseudo-terminal; see `open_serial`.
 
-    `port` is open, of pyserial; `url` is its name in messages; `after` is called once the port is
-    closed, to end an emulator.
+    `url` is its name in messages; `after` is called once it is closed, to end an emulator.
     """
 
     def __init__(
@@ -152,20 +150,13 @@ class SerialTransport(Closing):
 def open_serial(
     url: str, *, baudrate: int, rtscts: bool = False, world: object | None = None
 ) -> SerialTransport:
-    """Open the line to a device by its name, for this program alone; nothing is sent.
+    """Open the line to a device by its address, for this program alone; nothing is sent.
 
-    The name is ``serial:///dev/ttyACM0``, ``pty:///dev/pts/3`` or ``sim://boson?sn=7``, with the
-    options of the emulator; ``sim://boson/wide`` is ``sim://boson?name=wide``. `baudrate` [bit/s]
-    is the speed of the line, `rtscts` its flow control by RTS and CTS, and `world` the emulated
-    bench that a ``sim://`` device is part of; by default one of its own.
-
-    Raises
-    ------
-    ValueError
-        If the name is not one of these, has options that are not understood, or gives a
-        pseudo-terminal as a serial port, which would let an emulator pass for hardware.
-    TransportError
-        If the port cannot be opened.
+    ``sim://boson/wide`` is ``sim://boson?name=wide``. `baudrate` [bit/s] is the speed of the line,
+    `rtscts` its flow control by RTS and CTS, and `world` the emulated bench that a ``sim://``
+    device is part of; by default one of its own. ValueError for another address, unknown options,
+    or a pseudo-terminal as a serial port, which would let an emulator pass for hardware;
+    TransportError if the port cannot be opened.
     """
     address = addresses.parse(url, _SCHEMES)
     if address.scheme == "sim":

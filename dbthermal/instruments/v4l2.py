@@ -1,6 +1,6 @@
 """Raw 16-bit frames of a camera on Linux, with the kernel's stamps, numbers and flags.
 
-A thin use of Video4Linux2, in ten calls. Their numbers, sizes and layouts are those of 64-bit Linux
+A thin use of Video4Linux2, in ten calls; numbers, sizes and layouts are those of 64-bit Linux
 (``linux/videodev2.h``, https://docs.kernel.org/userspace-api/media/v4l). The kernel's stamp of a
 frame is on CLOCK_MONOTONIC. That of uvcvideo claims to be of the start of the exposure; likely,
 unless that module is told to use the camera's clock, it is of the frame's first packet. Tested with
@@ -99,10 +99,7 @@ class Kernel:
     platform: str = sys.platform
 
     def ask(self, file: int, number: int, argument: bytearray) -> None:
-        """Call `ioctl`, again where a signal came between: unlike other calls, Python's does not.
-
-        The kernel changes the argument; OSError if it refuses.
-        """
+        """Call `ioctl`, again where a signal came between; OSError if the kernel refuses."""
         while True:
             try:
                 self.ioctl(file, number, argument)
@@ -121,8 +118,8 @@ class Kernel:
 class Capture(Closing):
     """A camera's node that streams Y16 frames, a `camera.FrameSource`; see `Capture.open`.
 
-    Its identity is the node, the driver's name of the camera, the bus it is plugged in, and the
-    driver with its version, on which a stamp's meaning depends.
+    Its identity is the node, name and bus of the camera, and the driver with its version, on which
+    a stamp's meaning depends.
     """
 
     is_simulated: Final = False
@@ -150,8 +147,7 @@ class Capture(Closing):
         """Open a node, agree on format and rate, and start the stream; nothing is reset.
 
         `decode` reads the metadata of a frame from its telemetry rows. OSError if the node cannot
-        be opened, is busy, or this is not Linux; ValueError if it gives no Y16, or the driver
-        agrees to another format or rate.
+        be opened or is busy; ValueError if it gives no Y16, or another format or rate.
         """
         capture = cls(path, stream or Stream(), kernel, decode)
         capture._start()

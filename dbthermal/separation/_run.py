@@ -211,7 +211,7 @@ def _separate_part(
     # What is dask's is computed here: its own threads, or the cluster's, would hold more blocks.
     part = part.load(scheduler="synchronous")
     result = solve(part, response, method, workers=1, **options)
-    store.save_part(result, path, provenance, height)
+    store.save_rows([result], path, provenance, height)
 
 
 def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:

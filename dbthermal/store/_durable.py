@@ -1,8 +1,8 @@
 """Files and folders that survive a power loss: written, then synced, then renamed.
 
 A file system may write names and contents in any order: after a power loss a renamed file may have
-its new name and no content. So the new content is synced to the disk first, then it is renamed,
-then the folder that holds the name is synced.
+its new name and no content. So the new content is synced first, then it is renamed, then the folder
+that holds the name is synced.
 """
 
 import errno
@@ -27,17 +27,13 @@ class HeldFolder:
 
     Parameters
     ----------
-    folder : Path
-        That exists (OSError otherwise).
-    path : Path, optional
-        Where it will be moved next, if that is another place.
+    folder, path : Path
+        That exists (OSError otherwise); where it will be moved next, if that is another place.
 
     Attributes
     ----------
-    root : Path
-        Leads into it, wherever it is; without a /proc, as on macOS, its path.
-    close : callable
-        Lets it go.
+    root, close : Path, callable
+        Leads into it, wherever it is; without a /proc, as on macOS, its path. Lets it go.
     """
 
     def __init__(self, folder: Path, path: Path | None = None) -> None:
@@ -62,8 +58,7 @@ class HeldFolder:
 class DurableStore(SummedStore):
     """Zarr store in a folder in which an existing file is replaced in one step.
 
-    New files are written as `SummedStore` does, and are brought to the disk by `tree_to_disk`, for
-    many at once take the time of one.
+    New files are brought to the disk by `tree_to_disk`, for many at once take the time of one.
     """
 
     def __init__(self, root: Path, *, read_only: bool = False) -> None:
@@ -104,11 +99,7 @@ def replace(path: Path, content: bytes, part: Path, before: Iterable[Path] = ())
 
 @contextmanager
 def made_beside(path: Path) -> Iterator[Path]:
-    """
-    Yield the path of a folder to make, and move it to `path` when it is complete and on the disk.
-
-    It is made beside it; what a kill leaves there is hidden.
-    """
+    """Yield a folder to make beside `path`; move it there when it is complete and on the disk."""
     # Interrupted, zarr's threads may still write there: what then stays hides no interrupt.
     with TemporaryDirectory(
         prefix=f".{path.name}-", dir=path.parent, ignore_cleanup_errors=True
@@ -128,12 +119,7 @@ def to_disk(paths: Iterable[Path]) -> None:
     Parameters
     ----------
     paths : iterable of Path
-        Files and folders; what is in a folder is not synced with it.
-
-    Raises
-    ------
-    OSError
-        If one cannot be synced; FileNotFoundError if it does not exist.
+        Files and folders (OSError if one cannot be synced); not what is in these.
     """
     with ThreadPoolExecutor(_THREADS) as pool:
         list(pool.map(_to_disk, paths))

@@ -3,9 +3,8 @@
 ``checksums.sfv`` in the folder has a line for each file: its name and its CRC-32, as programs for
 "simple file verification" read them. A line is appended before its file is written: a recording
 that is cut short at any moment has the lines of all that is valid. A file that was replaced has a
-line for each state until the recording is closed. A bit that flips, a file that is cut, missing,
-foreign or in another's place is then seen: metadata and file names when the store is opened, values
-when they are read.
+line for each state until the recording is closed. A file that is damaged, cut, missing, foreign or
+in another's place is then seen: metadata and names when the store is opened, values when read.
 """
 
 import asyncio
@@ -57,8 +56,8 @@ class SummedStore(LocalStore):
 class CheckedStore(SummedStore):
     """Zarr store in a folder, to be read: all that differs from what was written is a ValueError.
 
-    `attrs` are the attributes of the store; a recording that is not `closed` has to have its valid
-    part alone, without `time`. A store without checksums, of dbthermal 0.1.0, opens with a warning.
+    `attrs` are those of the store; of a recording that is not `closed` only the valid part counts,
+    without `time`. A store without checksums, of dbthermal 0.1.0, opens with a warning.
     """
 
     def __init__(self, root: Path | str, *, read_only: bool = True) -> None:  # noqa: ARG002 - zarr's

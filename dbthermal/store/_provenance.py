@@ -1,7 +1,6 @@
 """Provenance of a result: parameters, versions, commit, and checksums of the input.
 
-It goes into every saved result (see `dbthermal.store`). It holds no date, no host and no folder, so
-that the same input, parameters and code give the same record, and the same bytes.
+It holds no date, no host and no folder: the same input, parameters and code give the same record.
 """
 
 import hashlib
@@ -9,7 +8,7 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,7 @@ def provenance(
         Name to value, as in the notebook's parameters cell: finite numbers, strings, booleans,
         None, and lists and mappings of these; TypeError or ValueError for any other.
     inputs : mapping, optional
-        Name to path of each file, or folder such as a zarr store, that was read. Only its checksum
-        is kept.
+        Name to path of each file, or folder such as a zarr store, that was read, for its checksum.
 
     Returns
     -------
@@ -64,19 +62,14 @@ def checksum(path: str | Path) -> str:
     Parameters
     ----------
     path : str or Path
-        File or folder.
-
-    Raises
-    ------
-    FileNotFoundError
-        If it does not exist.
+        File or folder; FileNotFoundError if it does not exist.
     """
     path = Path(path)
     if not path.is_dir():
-        return _file_checksum(path)
-    lines = (
-        f"{_file_checksum(file)}  {file.relative_to(path).as_posix()}\n" for file in _files(path)
-    )
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    files = {file.relative_to(path).as_posix(): file for file in path.rglob("*") if file.is_file()}
+    lines = (f"{checksum(files[name])}  {name}\n" for name in sorted(files))
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
@@ -104,20 +97,5 @@ def _plain(name: str, value: object) -> Any:
     try:
         return json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as error:
-        message = (
-            f"Invalid parameter {name!r} = {value!r}. Must be JSON with finite numbers: {error}."
-        )
-        raise type(error)(message) from error
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    """Files below `folder`, ordered by their relative names."""
-    yield from sorted(
-        (path for path in folder.rglob("*") if path.is_file()),
-        key=lambda path: path.relative_to(folder).as_posix(),
-    )
-
-
-def _file_checksum(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+        rule = f"Must be JSON with finite numbers: {error}."
+        raise type(error)(f"Invalid parameter {name!r} = {value!r}. {rule}") from error

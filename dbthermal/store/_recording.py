@@ -3,9 +3,8 @@
 The folder is a zarr store (format 3) from the first moment on. Chunks are written and synced to the
 disk first; then ``zarr.json``, which says how many frames are valid, is replaced in one step. Valid
 chunks are never written over in place. A kill or a power loss thus leaves a store without the chunk
-that was being written: ``complete`` is False and ``frames_written`` is where each band ends.
-`dbthermal.store.open_dataset` opens that much of it. The folder is held by its descriptor: renamed
-or moved, the recording goes on in it, and nothing is written to what now has its path.
+that was being written: ``complete`` is False and ``frames_written`` is where each band ends. The
+folder is held by its descriptor: renamed or moved, the recording goes on in it.
 """
 
 import json
@@ -53,18 +52,15 @@ class Recording:
     ----------
     path : str or Path
         Folder ``*.zarr`` to make.
-    variables : mapping of str to Variable
-        Of dims (band, time, ...), frame by frame, or (log,), row by row.
-    sizes : mapping of str to int
-        Sizes of their other dims.
+    variables, sizes : mapping
+        Name to `schema.Variable`, of dims (band, time, ...), frame by frame, or (log,), row by row;
+        and sizes of their other dims.
     bands : sequence of str
         Names of the bands.
     chunk : int
         Number of frames that a kill costs at most.
-    attrs : mapping
-        Attributes, as JSON.
-    fills : mapping of str to float, optional
-        Values behind a band's last frame, instead of NaN or 0.
+    attrs, fills : mapping
+        Attributes, as JSON; values behind a band's last frame, instead of NaN or 0.
     """
 
     def __init__(
@@ -175,10 +171,9 @@ class Recording:
             self._store.replace(GROUP, text.encode(), self._part(GROUP))
 
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
-        """Bring all bands to one number of frames, with `time` [s] as coordinate; set attributes.
+        """Bring all bands to one number of frames, once, with `time` [s] as coordinate.
 
-        A band with fewer frames than another gets copies of its last one, without stamps, as from
-        a driver that lost frames. A second call does nothing.
+        A band with fewer frames than another gets copies of its last one, without stamps.
         """
         if self._closed:
             return

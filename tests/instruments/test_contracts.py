@@ -55,9 +55,10 @@ def opened(request: pytest.FixtureRequest) -> Iterator[Opened]:
 
 def identity(device: Any) -> Mapping[str, object]:
     """Identity of a device, by name."""
-    if isinstance(device, Boson):
+    if isinstance(device, Boson | FilterWheel | TC08):
         return device.identity()
-    return vars(device.identity()) if isinstance(device, FilterWheel | TC08) else device.identity
+    told: Mapping[str, object] = device.identity
+    return told
 
 
 def ask(device: Any) -> object:

@@ -16,7 +16,7 @@ import xarray as xr
 
 from dbthermal import correction, separation, simulation, store
 from dbthermal.separation import _run
-from dbthermal.store import _parts
+from dbthermal.store import _datasets
 from reproduction.experiments import whole
 
 RIG = simulation.Rig()
@@ -183,7 +183,7 @@ def test_a_join_that_is_cut_short_loses_nothing(
     options: dict[str, Any] = {"memory": MEMORY, "provenance": {"run of": "a test"}}
     separation.run(path, tmp_path / "rest.zarr", RIG.response(), **options)
     links = iter(range(20))
-    link = _parts._link
+    link = _datasets._link
 
     def cut_short(source: Any, target: Any) -> None:
         """Link twenty files, then fail as on a full disk."""
@@ -192,7 +192,7 @@ def test_a_join_that_is_cut_short_loses_nothing(
         link(source, target)
 
     with monkeypatch.context() as patch:
-        patch.setattr(_parts, "_link", cut_short)
+        patch.setattr(_datasets, "_link", cut_short)
         with pytest.raises(OSError, match="No space"):
             separation.run(path, tmp_path / "cut.zarr", RIG.response(), **options)
     assert not (tmp_path / "cut.zarr").exists()

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from dbthermal import store
-from dbthermal.store import _provenance, _results
+from dbthermal.store import _datasets, _provenance
 
 RECORD: dict[str, Any] = {"parameters": {"frames": 3}, "commit": "unknown", "inputs": {}}
 DTYPES = st.sampled_from(["uint16", "float32", "float64", "int64", "bool"])
@@ -140,12 +140,15 @@ def test_missing_dataset_is_named(tmp_path: Path) -> None:
 def test_chunks(shape: tuple[int, ...], dtype: str, expected: tuple[int, ...]) -> None:
     """Tiles hold all frames and just over 1 MiB, or the whole frame where that is smaller."""
     variable = xr.Variable(("band", "time", "y", "x")[-len(shape) :], np.empty(shape, dtype))
-    assert _results._chunks(variable) == expected
+    assert _datasets._chunks(variable) == expected
 
 
 def test_chunks_without_pixels() -> None:
     """A table is one chunk."""
-    assert _results._chunks(xr.Variable(("material", "wavelength"), np.empty((7, 900)))) == (7, 900)
+    assert _datasets._chunks(xr.Variable(("material", "wavelength"), np.empty((7, 900)))) == (
+        7,
+        900,
+    )
 
 
 def test_numbers_come_back_sorted(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import operator
 import struct
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from enum import IntEnum
 from types import MappingProxyType
 from typing import Final
@@ -20,9 +20,7 @@ ADDRESSES: Final = CONTROLLERS | {HOST}
 YES: Final = 1
 NO: Final = 2
 
-HEADER: Final = 6  # [byte]
-MAXIMUM_DATA: Final = 255  # as documented [byte]
-
+_HEADER: Final = 6  # [byte]
 _SHORT = struct.Struct("<HBBBB")
 _LONG = struct.Struct("<HHBB")
 _HAS_DATA = 0x80
@@ -57,22 +55,21 @@ class Id(IntEnum):
     MOT_GET_DCSTATUSUPDATE = 0x0491
 
 
-_DATA = {
-    Id.HW_GET_INFO: (84,),
-    Id.HW_RICHRESPONSE: (68,),
-    Id.MOT_SET_VELPARAMS: (14,),
-    Id.MOT_GET_VELPARAMS: (14,),
-    Id.MOT_SET_HOMEPARAMS: (14,),
-    Id.MOT_GET_HOMEPARAMS: (14,),
-    Id.MOT_MOVE_ABSOLUTE: (0, 6),
-    Id.MOT_MOVE_COMPLETED: (0, 14),
-    Id.MOT_MOVE_STOPPED: (0, 14),
-    Id.MOT_GET_STATUSUPDATE: (14, 28),
-    Id.MOT_GET_DCSTATUSUPDATE: (14,),
-}
-
 LENGTHS: Final[Mapping[int, tuple[int, ...]]] = MappingProxyType(
-    {int(known): _DATA.get(known, (0,)) for known in Id}
+    {
+        **dict.fromkeys(Id, (0,)),
+        Id.HW_GET_INFO: (84,),
+        Id.HW_RICHRESPONSE: (68,),
+        Id.MOT_SET_VELPARAMS: (14,),
+        Id.MOT_GET_VELPARAMS: (14,),
+        Id.MOT_SET_HOMEPARAMS: (14,),
+        Id.MOT_GET_HOMEPARAMS: (14,),
+        Id.MOT_MOVE_ABSOLUTE: (0, 6),
+        Id.MOT_MOVE_COMPLETED: (0, 14),
+        Id.MOT_MOVE_STOPPED: (0, 14),
+        Id.MOT_GET_STATUSUPDATE: (14, 28),
+        Id.MOT_GET_DCSTATUSUPDATE: (14,),
+    }
 )
 """Lengths of data that each message can have [byte]; 0 is the form without data."""
 
@@ -90,7 +87,7 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """Bytes of a message, ready to send: the header, and the data; with data in the long form.
+    """Bytes of a message, ready to send; with data in the long form.
 
     TypeError or ValueError if a number is not whole, or does not fit its field, the data are too
     long, or there are both data and parameters, which the long form does not have.
@@ -106,13 +103,12 @@ def encode(message: Message) -> bytes:
         ("param2", message.param2, 0xFF),
         ("destination", message.destination, 0x7F),
         ("source", message.source, 0xFF),
-        ("number of data", len(message.data), MAXIMUM_DATA),
+        ("number of data", len(message.data), 0xFF),  # as documented
     ):
         if not 0 <= operator.index(value) <= most:
             raise ValueError(f"Invalid {name} {value} of a message. Must lie in 0 to {most}.")
     if not message.data:
-        fields = (message.id, message.param1, message.param2, message.destination, message.source)
-        return _SHORT.pack(*fields)
+        return _SHORT.pack(*astuple(message)[:-1])
     if message.param1 or message.param2:
         parameters = (message.param1, message.param2)
         raise ValueError(f"Invalid parameters {parameters} of a message with data. Must be 0.")
@@ -165,8 +161,7 @@ class Decoder:
         self, destinations: Collection[int] = ADDRESSES, sources: Collection[int] = ADDRESSES
     ) -> None:
         self.dropped = 0
-        self._destinations = frozenset(destinations)
-        self._sources = frozenset(sources)
+        self._destinations, self._sources = frozenset(destinations), frozenset(sources)
         self._buffer = bytearray()
 
     @property
@@ -180,17 +175,16 @@ class Decoder:
         An unknown identifier, or one of `Id` with a length that it never has, is not a message.
         """
         self._buffer += received
-        messages = []
-        start = 0
-        while len(self._buffer) - start >= HEADER:
+        messages, start = [], 0
+        while len(self._buffer) - start >= _HEADER:
             length = self._data_length(start)
             if length is None:
                 start, self.dropped = start + 1, self.dropped + 1
-            elif len(self._buffer) - start < HEADER + length:
+            elif len(self._buffer) - start < _HEADER + length:
                 break
             else:
                 messages.append(self._message(start, length))
-                start += HEADER + length
+                start += _HEADER + length
         del self._buffer[:start]
         return messages
 
@@ -214,5 +208,5 @@ class Decoder:
     def _message(self, start: int, length: int) -> Message:
         identifier, *params, destination, source = _SHORT.unpack_from(self._buffer, start)
         first, second = (0, 0) if length else params
-        data = bytes(self._buffer[start + HEADER : start + HEADER + length])
+        data = bytes(self._buffer[start + _HEADER : start + _HEADER + length])
         return Message(identifier, first, second, destination & ~_HAS_DATA, source, data)

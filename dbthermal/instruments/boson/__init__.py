@@ -3,10 +3,8 @@
 A camera that is busy answers late, after its driver gave up; read naively, every later command then
 gets the reply of the one before (openmv/openmv, pull request 3265). Here each request has a
 sequence number of its own, and frames that do not carry it are discarded and counted. Connecting
-sends nothing and resets nothing, and nothing is ever written to the camera's flash memory.
-
-Written from public descriptions and tested against public byte vectors and an emulator, not against
-hardware.
+sends and resets nothing, and nothing is ever written to the camera's flash memory. Written from
+public descriptions, tested against public byte vectors and an emulator, not against hardware.
 """
 
 import threading
@@ -99,8 +97,7 @@ class Boson(Closing):
 
     Each method raises `BosonTimeoutError` if no reply comes, `BosonReplyError` if a wrong one does,
     `BosonStatusError` if the camera refuses, and `TransportError` if it is gone. A reading is
-    requested again if no reply comes; a command that changes the camera never is. Open it by
-    `from_url`; tests hand in a line, the number of the first request, clock and sleep [s].
+    requested again if no reply comes; a command that changes the camera never is.
 
     Examples
     --------
@@ -203,9 +200,9 @@ class Boson(Closing):
     def run_ffc(self, *, timeout: float = FFC_TIMEOUT) -> int:
         """Run a flat-field correction, wait until it is complete, return its frame number.
 
-        When it starts the camera still says "complete" of the one before. So another status has to
-        be seen, or the frame number of the last correction has to change. While the shutter is
-        closed the camera may not answer; `BosonTimeoutError` after `timeout` [s].
+        At its start the camera still says "complete" of the one before: another status has to be
+        seen, or another frame number of the last correction. While the shutter is closed the camera
+        may not answer; `BosonTimeoutError` after `timeout` [s].
         """
         before = self.read(commands.LAST_FFC_FRAME)
         changed = self.ffc_status() != FfcStatus.COMPLETE

@@ -1,12 +1,9 @@
-"""Commands of a FLIR Boson: identifiers, layouts and meanings of the answers.
-
-A `Reading` is read, a `Setting` is set and read; only those that the driver sends are here, as
-facts, none of the vendor's text or code.
+"""Commands of a FLIR Boson that the driver sends: identifiers, layouts and meanings of the answers.
 
 References
 ----------
 Identifiers, enumerations and status codes: openmv/openmv, ``drivers/boson/include`` (commit
-cbbb877).
+cbbb877). Facts alone, none of the vendor's text or code.
 """
 
 import struct

@@ -3,6 +3,5 @@
 Begin with `world`, the one bench that all of them share: `boson`, `apt` and `tc08` answer as the
 devices do, byte for byte where the protocol is public, on the line of a `port`; `camera` gives the
 frames, of pictures that a program hands it, such as those of `blackbody`. All say that they are
-emulated: `is_simulated` is True, and so do names and identities. They were built from public
-descriptions and checked against public byte vectors; real devices may do more than these say.
+emulated. They were built from public descriptions; real devices may do more than these say.
 """

@@ -2,13 +2,10 @@
 
 It answers below the real driver, byte for byte, with the quirks that users report of real ones:
 speeds near 0 and a motor without current after power-up, silence if it is addressed wrongly,
-reports of moves at any time, another model than on the label. As in a wheel without an encoder, its
-counter of commanded steps agrees with the wheel only once the home switch was found.
-
-References
-----------
-As in `dbthermal.instruments.apt`; quirks from issues 6, 14, 17, 74 and 83 of
-AlexShkarin/pyLabLib and from the documentation of thorlabs_apt_device.
+reports of moves at any time, another model than on the label. Its counter of commanded steps agrees
+with the wheel only once the home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of
+AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in
+`dbthermal.instruments.apt`.
 """
 
 import math
@@ -79,11 +76,11 @@ class Drive:
 
 
 class EmulatedApt:
-    """A controller and a wheel; a `Device` of `dbthermal.instruments.emulated.port`.
+    """A controller and a wheel, on the world's clock; a `Device` of `emulated.port`.
 
-    It uses the world's clock and turns the world's wheel, whose slot 1 is `slot_offset` [deg] from
-    the home switch. `position` counts the commanded steps, `wheel` is the place of the wheel from
-    its home switch [count]; `plugged` is set to False to pull out the cable.
+    It turns the world's wheel, whose slot 1 is `slot_offset` [deg] from the home switch. `position`
+    counts the commanded steps, `wheel` is the place of the wheel from its home switch [count];
+    `plugged` is set to False to pull out the cable.
     """
 
     is_simulated: Final = True
@@ -240,8 +237,8 @@ class EmulatedApt:
 def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     """Start an emulated wheel for ``sim://apt``, on a pseudo-terminal of its own.
 
-    Its options are ``model``, ``sn`` (serial number), ``offset`` (of slot 1 from the home switch
-    [deg]) and ``name``, without effect; ValueError if one is unknown or invalid.
+    Options: ``model``, ``sn`` (serial number), ``offset`` (of slot 1 from the home switch [deg])
+    and ``name``, without effect; ValueError if one is unknown or invalid.
     """
     require_known(options, ("model", "sn", "offset", "name"))
     device = EmulatedApt(

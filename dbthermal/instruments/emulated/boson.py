@@ -1,8 +1,8 @@
 """An emulated FLIR Boson: the command port, after the public descriptions.
 
 It knows every command of `boson.commands`, refuses as a camera would, and runs a shutter on the
-clock of its world, on command only. It is no camera: the duration of a correction and the settings
-at power-on, which the public descriptions leave open, are choices made here.
+clock of its world, on command only. The duration of a correction and the settings at power-on,
+which the public descriptions leave open, are choices made here.
 """
 
 import math
@@ -151,9 +151,9 @@ def _packed(layout: str, values: Callable[[], tuple[int | bytes, ...]]) -> Calla
 def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
     """Start an emulated camera for ``sim://boson``, on a pseudo-terminal of its own.
 
-    Options are ``name``, its name in the world (``"boson"`` by default), and without a world also
-    ``sn``, its serial number, and ``fpa``, the temperature of its focal-plane array [K]. ValueError
-    if an option is not known or disagrees with the world, KeyError if it has no such camera.
+    Options: ``name``, in the world (``"boson"`` by default), and without a world ``sn``, its serial
+    number, and ``fpa``, the temperature of its focal-plane array [K]. ValueError if one is not
+    known or disagrees with the world, KeyError if it has no such camera.
     """
     require_known(options, ("name", "sn", "fpa"))
     name = options.get("name", "boson")

@@ -1,10 +1,9 @@
-"""Emulated cameras: frames of a `World`.
+"""Emulated cameras: frames of a `World`, of pictures that are handed in, for each band one.
 
-The look of the scene is handed in: for each band a picture, a function of the scene's time that
-gives counts. The emulated camera adds a frame rate, a clock, buffers that overflow if no program
-reads, a shutter that freezes the image, and telemetry. It is no model of a detector: noise and
-response are in the counts that are handed in. It never flags its shutter: as with a real camera,
-that follows from telemetry, serial line and frozen image, see `camera.next_shutter`.
+A picture is a function of the scene's time that gives counts, noise and response included. The
+camera adds a frame rate, a clock, buffers that overflow if no program reads, a shutter that freezes
+the image, and telemetry. It never flags its shutter: as with a real camera, that follows from
+telemetry, serial line and frozen image, see `camera.next_shutter`.
 """
 
 import math
@@ -52,8 +51,7 @@ FFC_PERIODS: Final = (1.0, math.inf)
 class EmulatedCamera(Closing):
     """A `camera.FrameSource` without a camera; its frames begin with the first `read`.
 
-    It shows a camera of the world by its name: through a filter of its own, or, where `band` is
-    None, through the one in the beam of the wheel.
+    Through a filter of its own, or, where `band` is None, the one in the beam of the wheel.
     """
 
     world: World

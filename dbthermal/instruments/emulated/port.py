@@ -1,7 +1,4 @@
-"""The line between an emulated device and its driver: a raw pseudo-terminal in real time.
-
-Its path can be opened by any program.
-"""
+"""The line between an emulated device and its driver: a raw pseudo-terminal in real time."""
 
 import os
 import pty
@@ -42,9 +39,9 @@ class Device(Protocol):
 class EmulatedPort(Closing):
     """A raw pseudo-terminal on which a thread lets an emulated device answer.
 
-    `path` is of the end for the driver, as in ``/dev/pts/3``. If the device is pulled out, or an
-    error in it ends the thread, the terminal hangs up, as a real one does. Bytes that a driver does
-    not read are kept, without blocking the device, which only the thread calls once it is started.
+    `path` is the driver's end, as in ``/dev/pts/3``. If the device is pulled out, or an error in it
+    ends the thread, the terminal hangs up, as a real one does. Bytes that a driver does not read
+    are kept, without blocking the device, which only the thread calls once it is started.
     """
 
     is_simulated: Final = True
@@ -98,9 +95,9 @@ def require_known(options: Mapping[str, str], names: Sequence[str]) -> None:
 def number(
     options: Mapping[str, str], name: str, default: Number, limits: tuple[Number, Number]
 ) -> Number:
-    """Number that an option gives, as in ``sim://boson?sn=7``, within lowest and highest limit.
+    """Number that an option gives, as in ``sim://boson?sn=7``, of the type of `default`.
 
-    It is of the type of `default`; ValueError if it is no such number.
+    ValueError if it is no such number, or outside the limits.
     """
     if name not in options:
         return default

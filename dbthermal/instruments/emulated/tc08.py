@@ -1,9 +1,8 @@
 """Emulated TC-08: an object with the functions of the vendor's library, and none of its code.
 
 It writes into the caller's ctypes buffers as the library does, so that the real driver runs above
-it. The USB protocol below the library is not public and is not emulated. Signatures, error numbers
-and NaN for channels that are off are those of the header ``usbtc08.h``. The conversion time (0.1 s
-for each channel and the cold junction) is from datalogd's documentation, and likely, not certain.
+it. Signatures, error numbers and NaN for channels that are off are those of the header
+``usbtc08.h``. The conversion time is from datalogd's documentation, and likely, not certain.
 """
 
 import math
@@ -23,8 +22,8 @@ _HANDLE = 1
 class EmulatedTC08:
     """The library and one unit, with type-T thermocouples whatever letter they are set to.
 
-    `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open;
-    `junction_temperature` is that of the terminals [K]; `sleep` waits while a reading is converted.
+    `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open; `sleep` waits
+    while a reading is converted.
     """
 
     is_simulated: Final = True

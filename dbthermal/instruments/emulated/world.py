@@ -2,10 +2,9 @@
 
 The wheel's emulator turns `World.wheel_position`, and the view of the camera behind it changes; the
 camera's emulator starts a flat-field correction, and the frame source freezes; a program sets
-`World.blackbody_temperature`, and thermocouples and frames follow. There is no physics here, only
-positions and temperatures. All temperatures are in kelvin, all times in seconds since the world
-began, on the clock that was injected; events in the scene have a time of their own,
-`World.scene_time`, so that a recording can begin with it.
+`World.blackbody_temperature`, and thermocouples and frames follow. There is no physics here.
+Temperatures are in kelvin, times in seconds since the world began, on the clock that was injected;
+events in the scene have a time of their own, so that a recording can begin with it.
 """
 
 import math
@@ -44,15 +43,13 @@ class CameraState:
 
 
 class World:
-    """
-    One emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch` on.
+    """One emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch`.
 
-    `filters` has the band in each slot of the wheel, 1 to 6; slots left out have none. `scene` has
-    temperatures [K] by name at a time of the scene [s]; if it `waits` it stands at its beginning
-    until `begin` sets `scene_began`. `thermocouples` has the place of each channel, 1 to 8: a name
-    in the scene, ``"blackbody"``, ``"room"`` or ``"open"``; `cameras` the `CameraState` of each
-    camera by its name. Single attributes may be read and set from any thread. To change several
-    together, hold `lock`, which is re-entrant, or call a method, which does.
+    `filters` has the band in each slot of the wheel, 1 to 6. `scene` has temperatures [K] by name
+    at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.
+    `thermocouples` has the place of each channel, 1 to 8: a name in the scene, ``"blackbody"``,
+    ``"room"`` or ``"open"``. Single attributes may be read and set from any thread. To change
+    several together, hold `lock`.
     """
 
     is_simulated: Final = True
@@ -164,10 +161,9 @@ class World:
 
 
 def emulated_world(session: Session, **settings: Any) -> World:
-    """Bench with the cameras, filters and thermocouples of an emulated session.
+    """Bench of an emulated session, at room temperature unless the settings say otherwise.
 
-    The thermocouples are at the places that they are named after, all at room temperature but the
-    blackbody, unless the settings of the `World` say otherwise.
+    The thermocouples are at the places that they are named after.
     """
     room = dict.fromkeys(session.thermocouples.values(), ROOM)
     world = World(filters=session.filters, **{"scene": lambda _: room, **settings})

@@ -57,8 +57,9 @@ class NotHomedError(WheelError):
 class Controller:
     """One motor of a controller at the other end of a line, for one thread at a time.
 
-    `unit` and `motor` are its addresses, `info` and `scale` its identity and its units: valid
-    after `find`. The line stays the caller's to close.
+    `unit` and `motor` are its addresses, `info` and `scale` its identity and its units: valid after
+    `find`. The line stays the caller's to close. All raise TransportError if the device is gone,
+    and NoReplyError if it is silent.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class Controller:
         self._transport = transport
         self._settings = settings
         self._clock = clock
-        self._identity: tuple[apt.Info, Scale] | None = None
+        self._info: apt.Info | None = None
         # A recorder asks for the position in a thread of its own, while others turn the wheel.
         self._line = threading.Lock()
         self._events: list[apt.Message] = []
@@ -82,31 +83,33 @@ class Controller:
     @property
     def info(self) -> apt.Info:
         """Identity of the controller; `WheelError` before `find`."""
-        return self._identified()[0]
+        if self._info is None:
+            raise WheelError(
+                "The wheel is not connected. Must be opened by `FilterWheel.from_url`."
+            )
+        return self._info
 
     @property
     def scale(self) -> Scale:
         """Units of the controller; `WheelError` before `find`."""
-        return self._identified()[1]
+        return self._scale_of(self.info)
 
     def find(self) -> apt.Info:
         """Search for a controller at each address, and check its model and serial number.
 
-        NoReplyError if nothing replies, WrongDeviceError if the device is another one,
-        TransportError if it is gone.
+        WrongDeviceError if the device is another one.
         """
         for unit, motor in self._settings.addresses:
             try:
                 info = self._greet(unit)
             except NoReplyError:
                 continue
-            self._identity = info, self._scale_of(info)
-            self.unit, self.motor = unit, motor
+            self._scale_of(info)
+            self._info, self.unit, self.motor = info, unit, motor
             self._collect()
             self._notices.clear()  # it need not know all messages of the greeting
             return info
-        dropped = self._decoder.dropped
-        if dropped:
+        if dropped := self._decoder.dropped:
             raise WrongDeviceError(
                 f"{dropped} bytes came that are no APT messages. Must be an APT controller."
             )
@@ -114,11 +117,7 @@ class Controller:
         raise NoReplyError(f"No APT controller answered at {tried}. It must be on.")
 
     def prepare(self) -> None:
-        """Set the speeds, read them back, and enable the motor.
-
-        WheelError if the controller does not take the speeds, does not enable the motor, or
-        reports an error; NoReplyError, TransportError if it is silent or gone.
-        """
+        """Set the speeds, read them back, and enable the motor; WheelError if it takes not all."""
         self._set_velocity()
         self._set_home()
         self._send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
@@ -132,7 +131,7 @@ class Controller:
         self.raise_notice()
 
     def status(self) -> apt.Status:
-        """Position and state of the motor; NoReplyError or TransportError if it is silent."""
+        """Position and state of the motor."""
         return apt.Status.parse(self._request(Id.MOT_REQ_STATUSUPDATE, Id.MOT_GET_STATUSUPDATE))
 
     def start_home(self) -> None:
@@ -141,15 +140,12 @@ class Controller:
         self._send(Id.MOT_MOVE_HOME, CHANNEL)
 
     def start_move(self, target: int) -> None:
-        """Begin a move to an absolute place [count].
-
-        WheelError if the controller has reported an error, and then nothing is sent.
-        """
+        """Begin a move to an absolute place [count]; WheelError if an error was reported before."""
         self._forget_events()
         self._send(Id.MOT_MOVE_ABSOLUTE, data=apt.Position(CHANNEL, target).pack())
 
     def stop(self) -> None:
-        """Stop by a ramp; TransportError if the device is gone."""
+        """Stop by a ramp."""
         self._send(Id.MOT_MOVE_STOP, CHANNEL, apt.NO)
 
     def has_reported(self, identifier: Id) -> bool:
@@ -162,13 +158,6 @@ class Controller:
             reported = self._reported()
             self._notices.clear()
             raise WheelError(f"The controller is not well.{reported}")
-
-    def _identified(self) -> tuple[apt.Info, Scale]:
-        if self._identity is None:
-            raise WheelError(
-                "The wheel is not connected. Must be opened by `FilterWheel.from_url`."
-            )
-        return self._identity
 
     def _greet(self, unit: int) -> apt.Info:
         """Begin as the maker's example does, and ask for the identity."""
@@ -191,13 +180,9 @@ class Controller:
         )
 
     def _set_velocity(self) -> None:
-        settings, scale = self._settings, self.scale
-        speeds = apt.VelocityParameters(
-            channel=CHANNEL,
-            minimum=0,
-            acceleration=scale.device_acceleration(settings.acceleration),
-            maximum=scale.device_velocity(settings.velocity),
-        )
+        acceleration = self.scale.device_acceleration(self._settings.acceleration)
+        velocity = self.scale.device_velocity(self._settings.velocity)
+        speeds = apt.VelocityParameters(CHANNEL, 0, acceleration, velocity)
         self._send(Id.MOT_SET_VELPARAMS, data=speeds.pack())
         reply = self._request(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
         actual = apt.VelocityParameters.parse(reply)

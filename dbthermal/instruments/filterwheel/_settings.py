@@ -40,10 +40,10 @@ class Scale:
     acceleration: float  # device units of one count/s^2
 
     def target(self, position: int, offset: float = 0.0) -> int:
-        """Absolute place [count] of a slot, `offset` [deg] being that of slot 1 after homing.
+        """Absolute place [count] of a slot, 1 to 6; `offset` [deg] is that of slot 1 after homing.
 
         A sixth of a turn is not a whole number of counts. Each place is rounded by itself, so that
-        errors of up to half a count never add up. ValueError if the slot is not 1 to 6.
+        errors never add up. ValueError if the slot is another.
         """
         if position not in range(1, POSITIONS + 1):
             raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
@@ -87,59 +87,29 @@ FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
 
 @dataclass(frozen=True)
 class Settings:
-    """Properties of one wheel.
+    """Properties of one wheel; ValueError if one is out of its range, or two filters share a name.
 
-    Attributes
-    ----------
-    filters : mapping
-        Band in each slot, by its number 1 to 6. Slots left out hold no filter.
-    serial_number : int, optional
-        Serial number of the controller; another one is then refused.
-    addresses : tuple of tuple
-        Where the controller is looked for, in this order: address of its identity, and of its
-        motor. A BSC20x is a rack and silently ignores messages to a unit.
-    home_offset : float
-        From the position after homing to slot 1 [deg]. Differs from wheel to wheel: look.
-    home_direction, home_limit_switch : int, optional
-        1 forward, 2 reverse; 1 the reverse switch, 4 the forward one. Which a wheel needs is
-        uncertain: None keeps what the controller has.
-    velocity, home_velocity : float
-        [turn/s].
-    acceleration : float
-        [turn/s^2].
-    tolerance : float
-        Largest distance of the wheel from a slot [deg], below half the way to the next, 30.
-    reply_timeout, home_timeout, move_timeout : float
-        Longest wait for a reply, for the home switch, for a move [s].
-    start_timeout : float
-        Longest wait until a move is seen to start [s].
-    stall_timeout : float
-        Longest time for which the position may not change in a move [s].
-    poll_interval : float
-        Time between two status requests [s].
-
-    Raises
-    ------
-    ValueError
-        If a slot is not 1 to 6, two filters have one name, or a number is out of its range.
+    Which direction and switch a wheel needs for homing is uncertain: None keeps what the controller
+    has. A BSC20x is a rack and silently ignores messages to a unit, so that both are tried.
     """
 
-    filters: Mapping[int, str] = field(default_factory=dict)
-    serial_number: int | None = None
+    filters: Mapping[int, str] = field(default_factory=dict)  # band in each slot, 1 to 6
+    serial_number: int | None = None  # of the controller; another one is then refused
+    # Where the controller is looked for, in order: address of its identity, and of its motor.
     addresses: tuple[tuple[int, int], ...] = ((apt.UNIT, apt.UNIT), (apt.RACK, apt.BAY_1))
-    home_offset: float = 0.0
-    home_direction: int | None = None
-    home_limit_switch: int | None = None
-    velocity: float = 1.0
-    home_velocity: float = 0.2
-    acceleration: float = 1.0
-    tolerance: float = 0.1
-    reply_timeout: float = 1.0
-    home_timeout: float = 60.0
-    move_timeout: float = 20.0
-    start_timeout: float = 1.0
-    stall_timeout: float = 2.0
-    poll_interval: float = 0.05
+    home_offset: float = 0.0  # from the home position to slot 1 [deg]; differs by wheel: look
+    home_direction: int | None = None  # 1 forward, 2 reverse
+    home_limit_switch: int | None = None  # 1 the reverse switch, 4 the forward one
+    velocity: float = 1.0  # [turn/s]
+    home_velocity: float = 0.2  # [turn/s]
+    acceleration: float = 1.0  # [turn/s^2]
+    tolerance: float = 0.1  # largest distance from a slot [deg], below half the way to the next
+    reply_timeout: float = 1.0  # [s]
+    home_timeout: float = 60.0  # [s]
+    move_timeout: float = 20.0  # [s]
+    start_timeout: float = 1.0  # until a move is seen to start [s]
+    stall_timeout: float = 2.0  # for which the position may not change in a move [s]
+    poll_interval: float = 0.05  # between two status requests [s]
 
     def __post_init__(self) -> None:
         for position in self.filters:

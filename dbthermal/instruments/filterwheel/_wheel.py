@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 from dbthermal.instruments import apt
+from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.filterwheel._controller import (
     Controller,
     NotHomedError,
@@ -20,7 +21,7 @@ from dbthermal.instruments.filterwheel._controller import (
     WheelTimeoutError,
 )
 from dbthermal.instruments.filterwheel._settings import FAULTS, Settings
-from dbthermal.instruments.transport import Closing, SerialTransport, Transport, open_serial
+from dbthermal.instruments.transport import Closing, Transport, open_serial
 
 BAUDRATE: Final = 115_200  # [bit/s]
 SETTLING: Final = 0.05  # [s] between taking RTS down and up, as in the maker's example
@@ -35,22 +36,8 @@ CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is ov
 _LOGGER = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Identity:
-    """Identity of the controller; the model it gives is not always the one on its label."""
-
-    model: str
-    serial_number: int
-    firmware: str
-    addresses: str
-    is_simulated: bool
-
-
 class FilterWheel(Closing):
-    """A filter wheel whose line is open, for one thread at a time; see `from_url`.
-
-    The line is closed with the wheel; clock [s] and sleep [s] are replaced in tests.
-    """
+    """A filter wheel whose line is open, for one thread at a time; see `from_url`."""
 
     def __init__(
         self,
@@ -68,17 +55,15 @@ class FilterWheel(Closing):
 
     @classmethod
     def from_url(cls, url: str, settings: Settings, *, world: object | None = None) -> Self:
-        """Open the line and `connect`; the wheel does not move.
-
-        The address is ``serial:///dev/ttyUSB0``, ``pty:///dev/pts/3`` or ``sim://apt``, of an
-        emulated bench, the `world`. Errors are those of
-        `dbthermal.instruments.transport.open_serial`, and of `connect`, after which the line is
-        closed again.
-        """
+        """Open the line as `transport.open_serial`, and `connect`; the wheel does not move."""
         transport = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
         wheel = cls(transport, settings)
         try:
-            _toggle_rts(transport)
+            # Take RTS down and up again, where the line has one; a pseudo-terminal has none.
+            transport.set_rts(level=False)
+            system_time.sleep(SETTLING)
+            if not transport.set_rts(level=True):
+                _LOGGER.info("The line %s has no RTS.", url)
             wheel.connect()
         except BaseException:
             wheel.close()
@@ -88,8 +73,8 @@ class FilterWheel(Closing):
     def connect(self) -> apt.Info:
         """Find the controller, check its identity, set the speeds and enable the motor.
 
-        NoReplyError or WrongDeviceError if nothing replies, or the device is another one;
-        WheelError or TransportError if it does not take the speeds or enable the motor, or is gone.
+        `WheelError` or a kind of it if nothing replies, the device is another one, or does not take
+        the speeds or enable the motor; TransportError if it is gone.
         """
         info = self._controller.find()
         self._controller.prepare()
@@ -101,10 +86,18 @@ class FilterWheel(Closing):
         return self._transport.is_simulated
 
     def identity(self) -> Identity:
-        """Identity of the controller; `WheelError` if the wheel is not connected."""
+        """Model (not always that on the label), numbers and addresses of the controller.
+
+        `WheelError` if the wheel is not connected.
+        """
         controller, info = self._controller, self._controller.info
-        addresses = f"0x{controller.unit:02X}, 0x{controller.motor:02X}"
-        return Identity(info.model, info.serial_number, info.firmware, addresses, self.is_simulated)
+        return {
+            "model": info.model,
+            "serial_number": str(info.serial_number),
+            "firmware": info.firmware,
+            "addresses": f"0x{controller.unit:02X}, 0x{controller.motor:02X}",
+            "is_simulated": self.is_simulated,
+        }
 
     def status(self) -> apt.Status:
         """Position [count] and state; NoReplyError or TransportError if the motor is silent."""
@@ -115,10 +108,8 @@ class FilterWheel(Closing):
 
         The speeds are set before: where they are near 0, as in some controllers that were just
         switched on, homing does nothing and says nothing. StalledWheelError or WheelTimeoutError if
-        the wheel does not start or stops before the switch, the controller reports a fault, or it
-        takes longer than the settings' `home_timeout`; the wheel was stopped. WheelError if it is
-        still moving, or the controller reports an error or does not take the speeds; NoReplyError
-        or TransportError if that falls silent, or the device is gone.
+        the wheel does not start, stops before the switch, or takes too long, and was stopped; else
+        the errors of `connect`, and WheelError if it is still moving.
         """
         self._controller.prepare()
         self._require_rest()
@@ -132,12 +123,11 @@ class FilterWheel(Closing):
     def move_to(self, position: int) -> None:
         """Turn a slot, 1 to 6, into the beam, and confirm that it is there.
 
-        ValueError if the slot is not 1 to 6; NotHomedError if the controller was not homed since it
+        ValueError if the slot is another; NotHomedError if the controller was not homed since it
         was switched on, or steps may be lost since; StalledWheelError if the wheel does not move,
-        stops elsewhere, or the controller reports a fault: steps may be lost, and it must be homed
-        before the next move; WheelTimeoutError if it takes longer than the settings'
-        `move_timeout`, and was stopped; WheelError if it is still moving, or the controller reports
-        an error; NoReplyError or TransportError if that falls silent, or the device is gone.
+        stops elsewhere, or the controller reports a fault: it must be homed before the next move;
+        WheelTimeoutError if it takes too long, and was stopped; WheelError if it is still moving,
+        or the controller reports an error or falls silent; TransportError if the device is gone.
         """
         scale, settings = self._controller.scale, self.settings
         target = scale.target(position, settings.home_offset)
@@ -224,8 +214,7 @@ class FilterWheel(Closing):
         controller = self._controller
         status = controller.status()
         controller.raise_notice()
-        faults = status.bits & FAULTS
-        if faults:
+        if faults := status.bits & FAULTS:
             controller.stop()
             raise StalledWheelError(
                 f"The controller reports {faults.name}, and the wheel was stopped. Must be none."
@@ -285,11 +274,3 @@ def _is_home(motion: _Motion, status: apt.Status) -> bool:
     homed = status.bits & (apt.StatusBits.HOMED | apt.StatusBits.HOMING)
     done = motion.reported or (motion.moved and motion.rests > 0)
     return done and homed == apt.StatusBits.HOMED
-
-
-def _toggle_rts(transport: SerialTransport) -> None:
-    """Take RTS down and up again, where the line has one; a pseudo-terminal has none."""
-    transport.set_rts(level=False)
-    system_time.sleep(SETTLING)
-    if not transport.set_rts(level=True):
-        _LOGGER.info("The line %s has no RTS.", transport.url)

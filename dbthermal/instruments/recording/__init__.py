@@ -6,7 +6,8 @@ and `bench_series` those of a blackbody. See `dbthermal.instruments.protocols` f
 """
 
 from dbthermal.instruments.recording._capture import notes, open_capture, overview
-from dbthermal.instruments.recording._recorder import Limits, Preview, Reading, Summary, record
+from dbthermal.instruments.recording._recorder import record
+from dbthermal.instruments.recording._records import Limits, Preview, Reading, Summary
 from dbthermal.instruments.recording._sweep import bench_series, open_sweep
 
 __all__ = [

@@ -1,13 +1,10 @@
 """The recorder: the frames of all cameras and the readings beside them, into one capture file.
 
 A thread for each camera fetches its frames, one more reads the other instruments, so that none
-waits for another: a command that a camera answers late, because it corrects its offsets just then,
-costs no frame. A queue of bounded length leads to the thread that writes. If the disk is too slow
-the queue fills, frames are refused, and the log has their number and time.
-
-The caller's thread shows the preview. A preview that is slow or raises, an interrupt by the
-keyboard, twice maybe, or a signal stops no chunk half-way: the frames that came before are written
-before the writer ends.
+waits for another: a camera that corrects its offsets answers late, and that costs no frame. A queue
+of bounded length leads to the thread that writes. If the disk is too slow the queue fills, frames
+are refused, and the log has their number and time. The caller's thread shows the preview; whatever
+ends that, the frames that came before are written.
 """
 
 import errno
@@ -17,7 +14,7 @@ import queue
 import shutil
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
@@ -31,7 +28,8 @@ from dbthermal.instruments.camera import (
     NoFrameError,
     SourceLostError,
 )
-from dbthermal.instruments.recording._capture_file import CHUNK, CaptureFile, Note
+from dbthermal.instruments.recording._capture_file import CaptureFile, Note
+from dbthermal.instruments.recording._records import Limits, Preview, Reading, Summary
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.signals import SignalExit, raised_signals
 
@@ -41,99 +39,6 @@ _SHOW_POLL: Final = 0.01  # least wait between two looks for a preview [s]
 _WRITE_POLL: Final = 0.05  # how long the writer waits for a frame [s]
 _HELD: Final = 2.0  # how long after the start a frame may still come that a driver held [s]
 _BYTES: Final = 2  # of a pixel
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Another instrument that is read beside the frames.
-
-    Attributes
-    ----------
-    read : callable
-        Reads a value, and may take its time. Its OSError, RuntimeError and ValueError are noted as
-        a failed reading; any other error ends the recording.
-    units : str
-        Unit of the value.
-    """
-
-    read: Callable[[], float]
-    units: str = "K"
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Sizes and waiting times of a recording.
-
-    Attributes
-    ----------
-    chunk : int
-        Frames of a chunk: the most that a kill may cost.
-    queue : int
-        Frames of each band held until they are written.
-    reserve : int
-        Space that must stay free [byte].
-    silence : float
-        Wait for a frame before it is noted that none came [s].
-    reading_period : float
-        Time from reading to reading [s].
-    patience : float
-        Wait, at the end, for a device that hangs [s].
-    preview_period : float
-        Least time from preview to preview [s].
-    """
-
-    chunk: int = CHUNK
-    queue: int = 120
-    reserve: int = 10**9
-    silence: float = 1.0
-    reading_period: float = 1.0
-    patience: float = 10.0
-    preview_period: float = 0.2
-
-
-@dataclass(frozen=True)
-class Preview:
-    """State of a recording while it goes on.
-
-    Attributes
-    ----------
-    time : float
-        Time since the start [s].
-    frames : mapping of str to Frame
-        Last frame of each band that had one.
-    totals : mapping
-        Numbers of frames of each band: ``frames``, ``lost``, ``refused``, ``damaged``.
-    readings : mapping of str to float
-        Last value of each reading, NaN if it failed.
-    units : mapping of str to str
-        Units of the readings, else kelvin.
-    """
-
-    time: float
-    frames: Mapping[str, Frame]
-    totals: Mapping[str, Mapping[str, int]]
-    readings: Mapping[str, float]
-    units: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Result of a recording.
-
-    Attributes
-    ----------
-    path : Path
-        Folder of the recording, wherever it lies now.
-    ended : str
-        ``"duration"``, ``"stopped"``, ``"source lost"`` (it goes on until the last source is lost),
-        or ``"no frames"`` if a band had none.
-    totals : mapping
-        As in `Preview`.
-    """
-
-    path: Path
-    ended: str
-    totals: Mapping[str, Mapping[str, int]]
 
 
 def record(
@@ -150,10 +55,8 @@ def record(
     """Record until the end of the session's duration, a stop, or the loss of the last camera.
 
     Frames that a driver buffered before the start, by their stamps, are not recorded: they show
-    another filter, or another scene. Two seconds after the start such a stamp counts as wrong.
-
-    The recorder holds its folder: renamed or moved on its disk, it or one above it, the recording
-    goes on in it without losing a frame, with a note in the log, and the result has its new path.
+    another filter, or another scene. Two seconds after the start such a stamp counts as wrong. If
+    the folder, or one above it, is renamed or moved on its disk, the recording goes on in it.
 
     Parameters
     ----------
@@ -163,16 +66,11 @@ def record(
         Band to an open source, in the session's order; they stay open.
     path : str or Path
         Folder ``*.zarr`` to make; see `open_capture`.
-    readings : mapping, optional
-        Name to another instrument: thermocouples, the cameras' temperatures, the blackbody.
-    identities : mapping, optional
-        Band, or name of another device, to model and numbers, beside those of the sources.
-    limits : Limits, optional
-        Sizes and waiting times.
-    preview : callable, optional
-        Called now and then with a `Preview`, in the caller's thread; it may take its time.
-    stop : Event, optional
-        Ends the recording when it is set.
+    readings, identities : mapping, optional
+        Name to another instrument; name or band to model and numbers, beside those of the sources.
+    limits, preview, stop : optional
+        `Limits`; a function called now and then with a `Preview` in the caller's thread, which may
+        take its time; and an event whose setting ends the recording.
 
     Returns
     -------
@@ -181,19 +79,14 @@ def record(
 
     Raises
     ------
-    FileExistsError
-        If `path` exists.
+    FileExistsError, ValueError
+        If `path` exists; or the sources are not those of the session, or emulated and it is not.
     OSError
-        If there is too little space, before or on the way; or the folder, or one of an array in
-        it, was deleted, replaced or taken to another disk, or that of an array moved.
-    ValueError
-        If the sources are not those of the session, or are emulated and the session is not.
-    Exception
-        Error of a source, a reading or the preview, or an interrupt by the keyboard. In all cases
-        what was recorded is kept. A second interrupt ends the wait, not the writing.
-    SignalExit
-        In the main thread, after SIGTERM or SIGHUP, with the exit status of a shell; also kept. A
-        signal that the program handles or ignores is left alone.
+        If there is too little space, or the folder or one in it was deleted or replaced.
+    Exception, SignalExit
+        Error of a source, a reading or the preview, an interrupt by the keyboard, or SIGTERM or
+        SIGHUP in the main thread. In all cases what was recorded is kept; a second interrupt ends
+        the wait, not the writing.
     """
     limits, readings = limits or Limits(), readings or {}
     _check(session, sources)
@@ -226,15 +119,15 @@ def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
             f"Invalid sources {list(sources)}. Must be the bands {list(session.bands)}."
         )
     for band, source in sources.items():
-        if source.is_simulated != session.simulated:
-            raise ValueError(
-                f"Invalid source of band '{band}': is_simulated is {source.is_simulated}. "
-                f"Must be {session.simulated}, as the session says."
-            )
-        if source.shape != session.shape:
-            raise ValueError(
-                f"Invalid shape {source.shape} of band '{band}'. Must be {session.shape}."
-            )
+        for name, value, expected in (
+            ("is_simulated", source.is_simulated, session.simulated),
+            ("shape", source.shape, session.shape),
+        ):
+            if value != expected:
+                raise ValueError(
+                    f"Invalid source of band '{band}': {name} is {value}. Must be {expected}, as "
+                    "the session says."
+                )
 
 
 def _new_file(
@@ -248,10 +141,9 @@ def _new_file(
     """Create the capture file, if the disk has room for all of it, uncompressed."""
     folder = path.absolute().parent
     folder.mkdir(parents=True, exist_ok=True)
-    rows, columns = session.shape
     frames = sum(session.duration * source.frame_rate for source in sources.values())
-    _check_space(folder, limits.reserve + int(_BYTES * rows * columns * frames))
-    known = {band: dict(source.identity) for band, source in sources.items()}
+    _check_space(folder, limits.reserve + int(_BYTES * math.prod(session.shape) * frames))
+    known = {band: source.identity for band, source in sources.items()}
     attrs = {
         "is_simulated": session.simulated,
         "origin": "simulated, emulated rig" if session.simulated else "measured",
@@ -263,9 +155,13 @@ def _new_file(
         "started": _utc(),
         "provenance": store.provenance(asdict(session)),
     }
-    units = {name: reading.units for name, reading in readings.items()}
     return CaptureFile(
-        path, sources, readings=units, origin=monotonic(), attrs=attrs, chunk=limits.chunk
+        path,
+        sources,
+        readings={name: reading.units for name, reading in readings.items()},
+        origin=monotonic(),
+        attrs=attrs,
+        chunk=limits.chunk,
     )
 
 
@@ -273,21 +169,19 @@ def _utc() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
+@dataclass(eq=False)
 class _Run:
     """One recording: the threads that fetch, read and write, and their shared state."""
 
-    def __init__(
-        self,
-        file: CaptureFile,
-        sources: Mapping[str, FrameSource],
-        readings: Mapping[str, Reading],
-        limits: Limits,
-        start: float,
-        end: float,
-        stop: threading.Event,
-    ) -> None:
-        self.file, self.readings, self.limits = file, readings, limits
-        self.start, self.end, self.stop = start, end, stop
+    file: CaptureFile
+    sources: Mapping[str, FrameSource]
+    readings: Mapping[str, Reading]
+    limits: Limits
+    start: float
+    end: float
+    stop: threading.Event
+
+    def __post_init__(self) -> None:
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = "", ""
@@ -297,13 +191,13 @@ class _Run:
         self.last_readings: dict[str, float] = {}
         # (band, frame, number refused before it); at most `limits.queue` frames of each band.
         self._frames: queue.SimpleQueue[tuple[str, Frame, int]] = queue.SimpleQueue()
-        self._room = {band: threading.Semaphore(limits.queue) for band in sources}
+        self._room = {band: threading.Semaphore(self.limits.queue) for band in self.sources}
         self._notes: queue.SimpleQueue[tuple[Note, str, float, float]] = queue.SimpleQueue()
         self._lost_sources: list[str] = []
         self._refused_last: dict[str, int] = {}
         self._fetching = [
             threading.Thread(target=self.fetch, args=item, name=item[0], daemon=True)
-            for item in sources.items()
+            for item in self.sources.items()
         ]
         self._reading = threading.Thread(target=self.read, name="readings", daemon=True)
 
@@ -314,8 +208,7 @@ class _Run:
     def fetch(self, band: str, source: FrameSource) -> None:
         """Put the frames of one source into the queue, until the end.
 
-        If the queue has no room for the band a frame is refused; the next one that is accepted
-        carries the number of refused ones.
+        Without room a frame is refused; the next accepted one carries the number of refused ones.
         """
         refused = 0
         try:
@@ -334,8 +227,7 @@ class _Run:
             self._lost_sources.append(band)
             self._notes.put((Note.SOURCE_LOST, band, monotonic(), math.nan))
         except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-            self.errors.append(error)
-            self.over.set()
+            self._fail(error)
         finally:
             self._refused_last[band] = refused
 
@@ -350,9 +242,12 @@ class _Run:
                         value, kind = math.nan, Note.READING_FAILED
                     self._notes.put((kind, name, monotonic(), value))
                 self.over.wait(min(self.limits.reading_period, max(0.0, self.end - monotonic())))
-        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-            self.errors.append(error)
-            self.over.set()
+        except BaseException as error:  # noqa: BLE001 - as above
+            self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        self.errors.append(error)
+        self.over.set()
 
     def show(self, preview: Callable[[Preview], None] | None) -> None:
         """Call the preview at its period, until the last frame is written."""
@@ -376,19 +271,23 @@ class _Run:
             for thread in threads:
                 thread.start()
             self._write_frames()
-        except BaseException as error:  # noqa: BLE001 - raised again in the caller's thread
-            self.errors.append(error)
+        except BaseException as error:  # noqa: BLE001 - as above
+            self._fail(error)
         self.over.set()
         for thread in threads:
             self._join(thread)
         try:
             if not self.file.broken:
-                self._write_rest()
+                while not self._frames.empty():
+                    self._take(*self._frames.get_nowait())
+                self._take_notes()
+                for band, number in self._refused_last.items():
+                    self.file.refused(band, number, monotonic())
                 self.ended = self._reason()
                 is_complete = self.ended in {"duration", "stopped"}
                 self.file.close(complete=is_complete, ended=self.ended)
         except BaseException as error:  # noqa: BLE001 - as above
-            self.errors.append(error)
+            self._fail(error)
         finally:
             self.done.set()
 
@@ -405,14 +304,6 @@ class _Run:
             number += 1
             if number % self.limits.chunk == 0:
                 _check_space(self.file.recording.root, self.limits.reserve)
-
-    def _write_rest(self) -> None:
-        """Write the rest of the queues, when the threads have ended."""
-        while not self._frames.empty():
-            self._take(*self._frames.get_nowait())
-        self._take_notes()
-        for band, number in self._refused_last.items():
-            self.file.refused(band, number, monotonic())
 
     def _take(self, band: str, frame: Frame, refused: int) -> None:
         """Write a frame, unless the driver held it from before the start."""
@@ -449,17 +340,12 @@ class _Run:
             return
         thread.join(self.limits.patience)
         if thread.is_alive():
-            self.errors.append(
-                TimeoutError(
-                    f"No answer of the device of '{thread.name}' within {self.limits.patience} s "
-                    "after the end. Must keep its time limits."
-                )
-            )
+            late = f"within {self.limits.patience} s after the end. Must keep its time limits."
+            self.errors.append(TimeoutError(f"No answer of the device of '{thread.name}' {late}"))
 
 
 def _check_space(path: Path, least: int) -> None:
-    available = _free(path)
-    if available < least:
+    if (available := _free(path)) < least:
         message = f"Too little space: {available} bytes are free. Must be {least}"
         raise OSError(errno.ENOSPC, message, os.path.realpath(path))
 

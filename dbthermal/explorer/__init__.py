@@ -1,0 +1,76 @@
+"""Look around in a result, a capture or a store, in JupyterLab: pictures, regions and curves.
+
+Begin with `explore(result)`. `View` is what it shows, without the browser: the same frames, curves
+of a `Region` and files from Python alone, which "copy as code" writes.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import xarray as xr
+
+from dbthermal.explorer._regions import Region
+from dbthermal.explorer._view import View
+
+try:
+    from dbthermal.explorer._widget import Explorer
+except ImportError as error:
+    raise ImportError(
+        f"Missing library '{error.name}'. Must be installed: pip install dbthermal[explorer]."
+    ) from error
+
+__all__ = ["Explorer", "Region", "View", "explore"]
+__dir__ = __all__.copy
+
+
+def explore(
+    data: xr.Dataset | str | Path,
+    capture: xr.Dataset | str | Path | None = None,
+    response: xr.Dataset | str | Path | None = None,
+    *,
+    events: Mapping[str, float] = MappingProxyType({}),
+    celsius: bool = True,
+) -> Explorer:
+    """Look around in a separated scene or a capture, with regions and their curves.
+
+    Slider, arrow keys or space for the time; wheel and drag for a zoom that all pictures share;
+    rectangle, ellipse and polygon for regions, whose mean, least and greatest values are drawn with
+    the standard deviation of the mean (`View.curve`). What a pixel's status says is hatched. Where
+    no browser is, as in papermill or HTML, a picture stands in its place.
+
+    Parameters
+    ----------
+    data : Dataset, str or Path
+        Result of `separation`, or a capture; or the store of one. A store, and what is read lazily,
+        is copied film by film into a temporary file, frame after frame, when it is first shown
+        (see `View`).
+    capture : Dataset, str or Path, optional
+        Capture that the result was made of: its bands are shown beside it.
+    response : Dataset, str or Path, optional
+        Response of the cameras: the bands are shown as apparent temperatures instead of counts.
+    events : mapping of str to float, optional
+        Name to time [s] of what is marked on the time axis, beside the flags of the capture.
+    celsius : bool
+        Degrees Celsius instead of kelvin; the explorer has a button for it.
+
+    Returns
+    -------
+    Explorer
+        Shown by the notebook as the last value of a cell.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `View`.
+
+    Examples
+    --------
+    >>> import numpy as np, xarray as xr, dbthermal
+    >>> dims = ("time", "y", "x")
+    >>> film = xr.DataArray(np.full((3, 4, 6), 300.0), {"time": [0.0, 0.1, 0.2]}, dims)
+    >>> explorer = dbthermal.explore(film.to_dataset(name="object_temperature"))
+    >>> list(explorer.view.panes)
+    ['object_temperature']
+    """
+    return Explorer(View(data, capture, response, events=events), celsius=celsius)

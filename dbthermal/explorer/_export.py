@@ -1,0 +1,182 @@
+"""Figure and files of explored frames and curves."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from PIL import Image
+from scipy.constants import zero_Celsius
+
+from dbthermal import figures, store
+from dbthermal._arrays import Array
+from dbthermal.explorer._films import Pane
+from dbthermal.explorer._regions import Region
+from dbthermal.explorer._view import Pixels, View
+from dbthermal.figures import drawing
+
+SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc")
+_MOST_COLUMNS: Final = 3
+
+
+def unit(pane: Pane, *, celsius: bool) -> tuple[str, float]:
+    """Unit in which a pane is shown, and what is taken from its values for it."""
+    if pane.absolute and celsius:
+        return "\N{DEGREE SIGN}C", zero_Celsius
+    return pane.units, 0.0
+
+
+def figure(
+    view: View,
+    names: Sequence[str],
+    index: int,
+    regions: Mapping[str, Region],
+    *,
+    celsius: bool,
+    palette: str = "inferno",
+    limits: Mapping[str, tuple[float, float]],
+) -> Figure:
+    """Figure of some panes at a frame, side by side, with the outlines of regions."""
+    columns = 2 if len(names) == 4 else min(len(names), _MOST_COLUMNS)
+    rows = -(-len(names) // columns)
+    height = 3.6 * view.shape[0] / view.shape[1] + 0.5
+    result, axes = drawing.canvas(rows, columns, (4.4 * columns, height * rows + 0.4))
+    places: list[Axes] = axes.ravel().tolist()
+    for axis in places[len(names) :]:
+        axis.set_axis_off()
+    for axis, name in zip(places, names, strict=False):
+        pane = view.pane(name)
+        if pane.kind == "status":
+            _draw_status(axis, view)
+        else:
+            units, offset = unit(pane, celsius=celsius)
+            low, high = limits.get(name) or view.limits(name)
+            image = xr.DataArray(view.frame(name, index) - offset, dims=("y", "x"))
+            label = units if units != "1" else ""
+            scale = (low - offset, high - offset)
+            title = pane.label[0].upper() + pane.label[1:]
+            drawing.draw_image(result, axis, image, title, label, cmap=palette, limits=scale)
+        for place, region in enumerate(regions.values()):
+            color = drawing.COLORS[place % len(drawing.COLORS)]
+            outline = _outline(region) - 0.5
+            axis.add_patch(Polygon(outline[:, ::-1], fill=False, edgecolor=color, linewidth=1.5))
+    note = drawing.provenance_note(view.data)
+    result.suptitle(f"{view.time[index]:.2f} s{note}", fontsize=10)
+    return result
+
+
+def _draw_status(axis: Axes, view: View) -> None:
+    """Draw the most decisive flag of each pixel in its colour."""
+    codes, legend = status_legend(view)
+    colors = np.array([[int(color[at : at + 2], 16) for at in (1, 3, 5)] for _, color, _ in legend])
+    axis.imshow(colors[codes].astype(np.uint8), interpolation="nearest")
+    axis.set(xticks=[], yticks=[])
+    axis.set_title("Status: green is without a flag", fontsize=9)
+
+
+def status_legend(view: View) -> tuple[npt.NDArray[np.uint8], list[tuple[str, str, float]]]:
+    """Place in the legend of each pixel (y, x), and the legend: words, colour, share."""
+    first = figures.first_reason(xr.DataArray(view.status))
+    texts = {"": ("no flag", "#a8d5b0"), **figures.REASONS}
+    names = [name for name in texts if np.any(first == name)]
+    codes = np.select([first == name for name in names], range(len(names))).astype(np.uint8)
+    return codes, [(*texts[name], float(np.mean(first == name))) for name in names]
+
+
+def _outline(region: Region) -> Array:
+    """Corners (n, 2) of an outline, rows and columns."""
+    if region.kind == "polygon":
+        return np.array(region.points)
+    (top, left), (bottom, right) = region.points
+    if region.kind == "rectangle":
+        return np.array([(top, left), (top, right), (bottom, right), (bottom, left)])
+    angle = np.linspace(0.0, 2.0 * np.pi, 90)
+    middle, half = (
+        np.array([top + bottom, left + right]) / 2,
+        np.array([bottom - top, right - left]),
+    )
+    return np.asarray(middle + np.column_stack([np.sin(angle), np.cos(angle)]) * half / 2)
+
+
+def curves(
+    view: View, name: str, regions: Mapping[str, Region], pixels: Pixels = "unflagged"
+) -> xr.Dataset:
+    """Curves of some regions, `View.curve`, over (region, time)."""
+    if not regions:
+        raise ValueError("Invalid export without a region. Must have one: draw it first.")
+    parts = [view.curve(name, region, pixels=pixels) for region in regions.values()]
+    names = xr.DataArray(list(regions), dims="region", name="region")
+    result = xr.concat([part.drop_attrs(deep=False) for part in parts], dim=names)
+    outlines = [part.attrs["region"] for part in parts]
+    return result.assign(outline=("region", outlines)).assign_attrs(pane=name, selection=pixels)
+
+
+def save(  # noqa: PLR0913 - what the page shows, by name
+    view: View,
+    path: str | Path,
+    names: Sequence[str],
+    index: int,
+    regions: Mapping[str, Region],
+    *,
+    celsius: bool,
+    pixels: Pixels = "unflagged",
+    palette: str = "inferno",
+    limits: Mapping[str, tuple[float, float]],
+) -> None:
+    """Save what is seen, by suffix.
+
+    ``.csv``: curves of the regions in the first pane; ``.tiff``: its frame, 32-bit float in its own
+    units; ``.png``: all panes; ``.nc``: all panes' frames, and the curves.
+    """
+    path, (name, *_) = Path(path), names
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"Invalid path '{path}'. Must end in one of {list(SUFFIXES)}.")
+    what = {"pane": name, "frame": index, "sources": view.sources}
+    if path.suffix == ".csv":
+        path.write_text(_table(view, curves(view, name, regions, pixels), celsius=celsius))
+    elif path.suffix == ".png":
+        shown = figure(view, names, index, regions, celsius=celsius, palette=palette, limits=limits)
+        store.save_figure(shown, path, store.provenance(what))
+    elif path.suffix == ".tiff":
+        pane = view.pane(name)
+        text = f"{pane.label} [{pane.units}] at {view.time[index]:.3f} s"
+        Image.fromarray(view.frame(name, index)).save(
+            path, tiffinfo={270: text.encode("ascii", "ignore")}
+        )
+    else:
+        frames = {
+            one.replace(" ", "_"): (
+                ("y", "x"),
+                view.frame(one, index),
+                {"units": view.panes[one].units},
+            )
+            for one in names
+        }
+        result = xr.Dataset(frames, attrs={"time": float(view.time[index])})
+        if regions and view.panes[name].kind != "status":
+            result = result.merge(curves(view, name, regions, pixels), combine_attrs="no_conflicts")
+        result.to_netcdf(path, engine="scipy")
+
+
+def _table(view: View, found: xr.Dataset, *, celsius: bool) -> str:
+    """Curves as comma-separated values, a row a time, with names and units in the first."""
+    units, offset = unit(view.panes[found.attrs["pane"]], celsius=celsius)
+    names = [("mean", offset), ("minimum", offset), ("maximum", offset), ("std", 0.0)]
+    columns = {}
+    for region in map(str, found["region"].values):
+        one = found.sel(region=region)
+        for name, zero in names:
+            of = "K" if name == "std" and zero != offset else units
+            columns[f"{region} {name} [{of}]"] = np.atleast_1d(one[name].values - zero)
+        columns[f"{region} pixels"] = np.atleast_1d(one["pixels"].values)
+    rows = np.column_stack(list(columns.values()))
+    head = [f'"{name}"' for name in columns]
+    if "time" in found.coords:
+        rows, head = np.column_stack([found["time"].values, rows]), ["time [s]", *head]
+    lines = [",".join(f"{value:.6g}" for value in row) for row in rows]
+    return "\n".join([",".join(head), *lines]) + "\n"

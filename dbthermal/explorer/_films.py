@@ -1,0 +1,111 @@
+"""Films and maps that are shown: one frame at a time, from memory, from a store, or computed."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import xarray as xr
+
+from dbthermal import _rows, store
+from dbthermal.response import Curve
+
+Values = npt.NDArray[np.float32]
+Progress = Callable[[str, float], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Pane:
+    """Picture of one quantity.
+
+    Attributes
+    ----------
+    name, label : str
+        Name in `View.panes`, and words for the title.
+    units : str
+        Unit of the values; those in kelvin of an `absolute` temperature are also shown in degrees
+        Celsius.
+    array : DataArray
+        Values (time, y, x) or (y, x), in memory or lazy.
+    absolute : bool
+        A temperature, not a difference of some.
+    std : str
+        Name of the pane of its standard deviation; empty without one.
+    curve : Curve, optional
+        Response by which counts are shown as apparent temperatures.
+    """
+
+    name: str
+    label: str
+    units: str
+    array: xr.DataArray
+    absolute: bool = False
+    std: str = ""
+    curve: Curve | None = None
+
+    @property
+    def kind(self) -> Literal["film", "map", "status"]:
+        """Film (time, y, x), map (y, x), or the map of the status."""
+        if self.name == "status":
+            return "status"
+        return "film" if self.array.ndim == 3 else "map"
+
+    @cached_property
+    def _source(self) -> npt.NDArray[Any]:
+        """Values that are indexed: those in memory, not copied, or those of `stage`."""
+        return self.array.values if self.array.ndim == 3 else self.array.values[None]
+
+    def stage(self, progress: Progress | None = None) -> None:
+        """Copy a film that is not in memory into a temporary file without a name, frame by frame.
+
+        A store keeps all of time of a tile of pixels together, so that a frame of its own would be
+        as dear as all of them. Rows are read one block of chunks after the other.
+        """
+        array = self.array
+        if "_source" in vars(self) or array.ndim < 3 or array.variable._in_memory:
+            return
+        size = array.size * array.dtype.itemsize
+        with TemporaryFile() as file:
+            try:
+                if hasattr(os, "posix_fallocate"):  # or a full disk would end the process later
+                    os.posix_fallocate(file.fileno(), 0, size)
+            except OSError as error:
+                raise OSError(
+                    error.errno,
+                    f"No room for {size / 1e6:.0f} MB of '{self.name}' in the folder of temporary "
+                    "files. Must be free, or TMPDIR name another folder",
+                ) from error
+            copy = np.memmap(file, array.dtype, "r+", shape=array.shape)
+        height = array.encoding.get("preferred_chunks", {}).get("y", 1)
+        for block in _rows.blocks(array.shape, max(1, height * array.size // array.shape[1])):
+            copy[:, block] = array.isel(y=block).values
+            if progress is not None:
+                progress(f"reading {self.label}", block.stop / array.shape[1])
+        vars(self)["_source"] = copy
+
+    def read(
+        self, frames: slice, rows: slice = slice(None), columns: slice = slice(None)
+    ) -> Values:
+        """Values (time, y, x) of some frames, of a map its one; float32."""
+        self.stage()
+        part = self._source[frames if self.array.ndim == 3 else slice(None), rows, columns]
+        if self.curve is not None:
+            return np.asarray(self.curve.inverse(part), dtype=np.float32)
+        return np.asarray(part, dtype=np.float32)
+
+
+def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
+    """Dataset as it is, or the one in a store."""
+    if isinstance(data, str | Path):
+        return store.open_dataset(data)
+    if not isinstance(data, xr.Dataset):
+        raise TypeError(
+            f"Invalid {label} of type {type(data).__name__}. Must be a Dataset or the path of a "
+            "store, as from separation.separate."
+        )
+    return data

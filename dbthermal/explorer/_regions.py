@@ -1,0 +1,139 @@
+"""Regions of the image, and the standard deviation of a mean over their pixels."""
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from dbthermal._arrays import Array, Mask
+
+Kind = Literal["rectangle", "ellipse", "polygon"]
+
+_LEAST: Final = {"rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
+
+
+@dataclass(frozen=True)
+class Region:
+    """Part of the image: the pixels whose centres lie inside an outline.
+
+    Attributes
+    ----------
+    kind : {"rectangle", "ellipse", "polygon"}
+        Form of the outline.
+    points : tuple of (float, float)
+        (row, column) of two opposite corners, of an ellipse those of the rectangle around it, or of
+        the corners of a polygon in order [pixel]. Pixel (i, j) covers i to i + 1 and j to j + 1.
+
+    Raises
+    ------
+    ValueError
+        If the kind is another one, or the points are too few or not finite.
+
+    Examples
+    --------
+    >>> Region("rectangle", ((1, 2), (3, 5))).mask((4, 6)).sum()
+    np.int64(6)
+    """
+
+    kind: Kind
+    points: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        """Check the outline."""
+        if self.kind not in get_args(Kind):
+            raise ValueError(
+                f"Unknown kind of region {self.kind!r}. Must be one of {list(_LEAST)}."
+            )
+        try:
+            points = tuple((float(row), float(column)) for row, column in self.points)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"Invalid points {self.points!r} of a {self.kind}. Must be pairs (row, column)."
+            ) from error
+        least, most = _LEAST[self.kind]
+        if not least <= len(points) <= max(least, most):
+            count = least if self.kind != "polygon" else f"{least} to {most}"
+            raise ValueError(f"Invalid {len(points)} points of a {self.kind}. Must be {count}.")
+        if not all(math.isfinite(one) for point in points for one in point):
+            raise ValueError(f"Invalid points {points} of a {self.kind}. Must be finite.")
+        object.__setattr__(self, "points", points)
+
+    def mask(self, shape: tuple[int, int]) -> Mask:
+        """Mask (y, x) of the pixels of an image of so many rows and columns."""
+        rows, columns = np.ogrid[0.5 : shape[0], 0.5 : shape[1]]
+        outline = np.array(self.points)
+        if self.kind == "polygon":
+            return _inside(outline, rows, columns)
+        (top, left), (bottom, right) = outline.min(axis=0), outline.max(axis=0)
+        if self.kind == "rectangle":
+            inside = (top <= rows) & (rows < bottom) & (left <= columns) & (columns < right)
+        elif top == bottom or left == right:
+            inside = np.zeros(shape, dtype=bool)
+        else:
+            down = (2.0 * rows - top - bottom) / (bottom - top)
+            inside = down**2 + ((2.0 * columns - left - right) / (right - left)) ** 2 <= 1.0
+        return np.asarray(inside)
+
+
+def _inside(corners: Array, rows: Array, columns: Array) -> Mask:
+    """Even-odd rule: a ray along the row from a point inside crosses the outline an odd number."""
+    odd = np.zeros((rows.size, columns.size), dtype=bool)
+    for (row, column), (next_row, next_column) in zip(
+        corners, np.roll(corners, -1, 0), strict=True
+    ):
+        if row != next_row:
+            spans = (row <= rows) != (next_row <= rows)
+            crossing = column + (rows - row) / (next_row - row) * (next_column - column)
+            odd ^= spans & (columns < crossing)
+    return odd
+
+
+def common_gain(emissivity: Array, covariance: Array) -> tuple[Array, Array]:
+    r"""Deviation of object and background (pixel) by the emissivities, for a contrast of 1 K [1].
+
+    The image formation :math:`e_b x + (1 - e_b) y`, in linearised kelvin, is kept by errors
+    :math:`\delta e` of the emissivities (band, pixel), of a covariance (band, band, pixel), if
+
+    .. math:: e_b\,\delta x + (1 - e_b)\,\delta y = -(x - y)\,\delta e_b
+
+    which two bands solve exactly and more by least squares. NaN where the emissivities are.
+    """
+    known = np.isfinite(emissivity).all(axis=0) & np.isfinite(covariance).all(axis=(0, 1))
+    system = np.stack([emissivity, 1.0 - emissivity], axis=-1)[:, known]  # (band, pixel, 2)
+    gain = np.linalg.pinv(np.moveaxis(system, 1, 0))  # (pixel, 2, band)
+    variance = np.einsum("pib,bcp,pic->ip", gain, covariance[..., known], gain)
+    result = np.full((2, emissivity.shape[1]), np.nan)
+    result[:, known] = np.sqrt(np.maximum(variance, 0.0))
+    return result[0], result[1]
+
+
+def mean_std(std: Array, common: Array) -> Array:
+    r"""Standard deviation (time) of a mean over pixels, from theirs (time, pixel).
+
+    .. math:: s^2 = \Big(\frac1n \sum_i c_i\Big)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
+
+    Of each pixel's deviation :math:`s_i` the part :math:`c_i` is the same error in all pixels, so
+    that no number of them lessens it; at most all of it, and all of it where it is NaN. A pixel
+    whose deviation is NaN does not count.
+    """
+    part = np.where(np.isfinite(common), np.minimum(common, std), std)
+    number = np.maximum(np.isfinite(std).sum(axis=-1), 1)
+    own = np.nansum(std**2 - part**2, axis=-1) / number**2
+    result = np.sqrt((np.nansum(part, axis=-1) / number) ** 2 + own)
+    return np.asarray(np.where(np.isfinite(std).any(axis=-1), result, np.nan))
+
+
+def statistics(values: npt.NDArray[np.floating]) -> dict[str, Array]:
+    """Mean, least and greatest value (time), and number of pixels with one, of (time, pixel)."""
+    finite = np.isfinite(values)
+    number = finite.sum(axis=-1)
+    total = np.sum(values, axis=-1, where=finite, dtype=np.float64)
+    some = number > 0
+    return {
+        "mean": np.divide(total, number, out=np.full(len(values), np.nan), where=some),
+        "minimum": np.where(some, values.min(axis=-1, initial=np.inf, where=finite), np.nan),
+        "maximum": np.where(some, values.max(axis=-1, initial=-np.inf, where=finite), np.nan),
+        "pixels": number,
+    }

@@ -1,0 +1,415 @@
+"""View of a result or a capture: its panes, frames, ranges of colour, curves, and code for them."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import response as responses
+from dbthermal import schema
+from dbthermal._arrays import Array, Mask
+from dbthermal._coordinates import laid_on
+from dbthermal.explorer._films import Pane, Progress, Values, opened
+from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
+from dbthermal.schema import Status
+
+Pixels = Literal["unflagged", "measured", "all"]
+
+COMPLETED: Final = int(
+    Status.COMPLETED_FROM_MATERIAL
+    | Status.COMPLETED_FROM_PRIOR
+    | Status.COMPLETED_FROM_SURROUNDINGS
+    | Status.COMPLETED_FRAMES
+)
+FILMS: Final = {
+    "object_temperature": "object temperature",
+    "background_temperature": "reflected temperature",
+}
+_ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
+_SAMPLES: Final = 2**22  # of a region's film that are read at once
+_LOOKED_AT: Final = (12, 40_000)  # frames, and pixels of a frame, of which the range is taken
+
+
+class View:
+    """Frames, ranges of colour and curves of a result or a capture, as the explorer shows them.
+
+    Films that are not in memory are copied into a temporary file, where the environment variable
+    ``TMPDIR`` says, frame after frame, when they are first read: 4 bytes a pixel and frame on disk,
+    and in memory no more than a row of a store's chunks.
+
+    Parameters
+    ----------
+    data : Dataset, str or Path
+        Result of `separation` with `object_temperature` (time, y, x) [K] and what else it has, or a
+        capture with `counts` (band, time, y, x) [count]; or the store of one.
+    capture, response : Dataset, str or Path, optional
+        As in `explore`.
+    events : mapping of str to float, optional
+        Name to time [s].
+
+    Attributes
+    ----------
+    panes : dict of str to Pane
+        What can be shown: ``input 9.5`` for each band, ``object_temperature``,
+        ``background_temperature``, ``emissivity 9.5``, each with ``_std``, and ``status``. What a
+        method does not estimate is left out.
+    time : ndarray
+        Time of each frame [s].
+    shape : tuple of int
+        Rows and columns.
+    events : dict of str to float
+        Name to time [s], with what segments and frame flags of the capture say.
+
+    Raises
+    ------
+    TypeError
+        If the data are neither a Dataset nor a path.
+    ValueError
+        If there is no temperature and no counts, a variable is not as `schema` says, the capture
+        has other frames, pixels or bands, or an event is not at a finite time.
+
+    Examples
+    --------
+    >>> import numpy as np, xarray as xr
+    >>> dims = ("time", "y", "x")
+    >>> film = xr.DataArray(np.full((3, 4, 6), 300.0), {"time": [0.0, 0.1, 0.2]}, dims)
+    >>> view = View(film.to_dataset(name="object_temperature"))
+    >>> curve = view.curve("object_temperature", Region("rectangle", ((0, 0), (2, 2))))
+    >>> curve["mean"].values, int(curve["pixels"][0])
+    (array([300., 300., 300.]), 4)
+    """
+
+    def __init__(
+        self,
+        data: xr.Dataset | str | Path,
+        capture: xr.Dataset | str | Path | None = None,
+        response: xr.Dataset | str | Path | None = None,
+        *,
+        events: Mapping[str, float] = MappingProxyType({}),
+    ) -> None:
+        self.progress: Progress | None = None
+        self.data = opened(data, "data")
+        alone = "object_temperature" not in self.data and "counts" in self.data
+        self.capture = None if capture is None else opened(capture, "capture")
+        self._response = None if response is None else opened(response, "response")
+        given = {"result": data, "capture": capture, "response": response}
+        if alone:
+            if capture is not None:
+                raise ValueError(
+                    "Invalid second capture. The data are a capture: must be a result."
+                )
+            self.capture, given = self.data, {"capture": data, "response": response}
+        self.sources = {
+            name: repr(str(one)) if isinstance(one, str | Path) else name
+            for name, one in given.items()
+            if one is not None
+        }
+        self.panes = {pane.name: pane for pane in self._panes(alone=alone)}
+        film = next(iter(self.panes.values())).array
+        self.time = film["time"].values.astype(np.float64)
+        self.shape: tuple[int, int] = film.shape[1], film.shape[2]
+        self.events = {**self._marks(), **{name: float(one) for name, one in events.items()}}
+        for name, moment in self.events.items():
+            if not np.isfinite(moment):
+                raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
+
+    def _panes(self, *, alone: bool) -> Iterator[Pane]:
+        """Yield what can be shown, in the order in which it is."""
+        if self.capture is not None:
+            reference = self.data if alone else self.data.get("object_temperature")
+            yield from self._inputs(self.capture, reference)
+        if alone:
+            return
+        data = self.data
+        if "object_temperature" not in data:
+            raise ValueError(
+                f"Missing variable 'object_temperature'. Has {sorted(map(str, data))}. Must be a "
+                "result of separation, or a capture with 'counts'."
+            )
+        known = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
+        for name in (name for name in known if name in data):
+            schema.check_variable(data[name], known[name], f"'{name}' of the result")
+            laid_on(data[name], data["object_temperature"], f"'{name}'", "the object temperature")
+        missing = str(data.attrs.get("not_estimated", "")).split()
+        shown = [name for name in (*FILMS, "emissivity") if name in data and name not in missing]
+        for name in [*shown, *(f"{name}_std" for name in shown if f"{name}_std" in data)]:
+            yield from self._of(name, missing)
+        if "status" in data:
+            yield Pane("status", "status", "1", data["status"])
+
+    def _of(self, name: str, missing: Sequence[str]) -> Iterator[Pane]:
+        """Yield the panes of a variable of a result: one, or one a band."""
+        if name in missing:
+            return
+        array, base = self.data[name], name.removesuffix("_std")
+        words = FILMS.get(base, base) + (", std. deviation" if name != base else "")
+        std = f"{name}_std" if name == base and f"{name}_std" in self.data else ""
+        std = "" if std in missing else std
+        if base in FILMS:
+            yield Pane(name, words, "K", array, absolute=name == base, std=std)
+            return
+        for place, band in enumerate(map(str, array["band"].values)):
+            own = f"{std} {band}" if std else ""
+            title = f"{band} \N{MICRO SIGN}m {words}"
+            yield Pane(f"{name} {band}", title, "1", array.isel(band=place), std=own)
+
+    def _inputs(
+        self, capture: xr.Dataset, reference: xr.Dataset | xr.DataArray | None
+    ) -> Iterator[Pane]:
+        """Yield the bands of a capture, as apparent temperatures if there is a response."""
+        if "counts" in capture and "band" not in capture["counts"].dims:  # of one camera
+            schema.check_variable(capture["counts"], _ONE_BAND, "'counts' of the capture")
+            yield Pane("input", "input", "count", capture["counts"])
+            return
+        counts = schema.check(capture, "capture")["counts"]
+        if reference is not None and reference is not capture:
+            counts = laid_on(counts, reference, "the capture", "the result")
+        for place, band in enumerate(map(str, counts["band"].values)):
+            one, label = counts.isel(band=place), f"{band} \N{MICRO SIGN}m input"
+            if self._response is None:
+                yield Pane(f"input {band}", label, "count", one)
+            else:
+                curve = responses.curve(self._response, band)
+                yield Pane(f"input {band}", label, "K", one, absolute=True, curve=curve)
+
+    def _marks(self) -> dict[str, float]:
+        """Events of the capture: shutter events, and where a run of flagged frames begins."""
+        marks: dict[str, Mask] = {}
+        capture = self.capture if self.capture is not None else self.data
+        if "segment" in capture:
+            events = np.diff(capture["segment"].values, prepend=0)
+            marks["shutter event"] = np.asarray(events > 0)
+        if "frame_flags" in capture:
+            flags = capture["frame_flags"]
+            for name in str(flags.attrs.get("flag_meanings", "")).split():
+                marks[name.replace("_", " ")] = np.asarray(
+                    schema.has_flag(flags, name).any([dim for dim in flags.dims if dim != "time"])
+                )
+        found = {}
+        for name, where in marks.items():
+            begins = np.flatnonzero(where & ~np.roll(np.append(where, False), 1)[:-1])
+            found.update({f"{name} {i}": float(self.time[at]) for i, at in enumerate(begins, 1)})
+        return found
+
+    def pane(self, name: str) -> Pane:
+        """Pane of a name, read so far that a frame of it is quick; ValueError if there is none."""
+        if name not in self.panes:
+            raise ValueError(f"Unknown pane {name!r}. Must be one of {list(self.panes)}.")
+        self.panes[name].stage(self.progress)
+        return self.panes[name]
+
+    def frame(self, name: str, index: int) -> Values:
+        """Values (y, x) of a pane at a frame, in its units.
+
+        Parameters
+        ----------
+        name : str
+            One of `panes`.
+        index : int
+            Number of the frame, from 0; of no meaning for a map.
+
+        Raises
+        ------
+        ValueError
+            If there is no such pane or frame.
+        """
+        if not 0 <= index < self.time.size:
+            raise ValueError(f"Invalid frame {index}. Must be from 0 to {self.time.size - 1}.")
+        return np.asarray(self.pane(name).read(slice(index, index + 1))[0])
+
+    @cached_property
+    def status(self) -> Any:
+        """Status (y, x), uint32; zeros where the data have none."""
+        source = self.data if "status" in self.data else self.capture
+        if source is None or "status" not in source:
+            return np.zeros(self.shape, dtype=np.uint32)
+        return source["status"].values.astype(np.uint32)
+
+    def counted(self, pixels: Pixels = "unflagged") -> Mask:
+        """Mask (y, x) of the pixels that count.
+
+        Parameters
+        ----------
+        pixels : {"unflagged", "measured", "all"}
+            Those without a flag and those that were completed; those without a flag; every one.
+        """
+        if pixels not in get_args(Pixels):
+            raise ValueError(f"Unknown pixels {pixels!r}. Must be one of {list(get_args(Pixels))}.")
+        if pixels == "all":
+            return np.ones(self.shape, dtype=bool)
+        good: Mask = self.status == 0
+        return good | ((self.status & COMPLETED) != 0) if pixels == "unflagged" else good
+
+    def limits(self, name: str) -> tuple[float, float]:
+        """Range of colour of a pane: all but one in a hundred of its values at either end.
+
+        Of some frames and pixels, those that are measured if there are any; a deviation begins
+        at 0.
+        """
+        pane, (frames, pixels) = self.pane(name), _LOOKED_AT
+        times = slice(0, None, -(-self.time.size // frames))
+        step = max(1, int(np.sqrt(np.prod(self.shape) / pixels)))
+        some = slice(0, None, step)
+        values, good = pane.read(times, some, some), self.counted("measured")[some, some]
+        for part in (values[:, good], values):
+            finite = part[np.isfinite(part)]
+            if finite.size:
+                low, high = np.percentile(finite, [1, 99])
+                low = 0.0 if "_std" in name else low
+                return float(low), float(high) if high > low else float(low) + 1.0
+        return 0.0, 1.0
+
+    def curve(self, name: str, region: Region, *, pixels: Pixels = "unflagged") -> xr.Dataset:
+        r"""Mean, least and greatest value of a region over time, with the deviation of the mean.
+
+        An error that all pixels share is not lessened by their number (`std`): of object and
+        reflected temperature what the emissivities' deviations give through the image formation; of
+        emissivities, completed pixels and pixels of cameras that stand apart, all of it. What
+        remains is the noise of each pixel and frame,
+
+        .. math:: s^2 = \Big(\frac1n \sum_i c_i\Big)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
+
+        Parameters
+        ----------
+        name : str
+            One of `panes`, but "status".
+        region : Region
+            Where.
+        pixels : {"unflagged", "measured", "all"}
+            Which pixels count; see `counted`.
+
+        Returns
+        -------
+        Dataset
+            `mean`, `minimum`, `maximum`, `std` in the pane's units and `pixels`, the number that
+            counts, over (time); without it for a map. NaN where no pixel counts. `std` is NaN where
+            the result states no deviation.
+
+        Raises
+        ------
+        ValueError
+            If there is no such pane, or no pixel in the region.
+
+        Notes
+        -----
+        In no deviation are the calibration of the cameras, and what interpolation between pixels
+        makes neighbours share.
+        """
+        pane, inside = self.pane(name), region.mask(self.shape)
+        if pane.kind == "status":
+            raise ValueError("Invalid pane 'status'. Must be one with numbers.")
+        if not inside.any():
+            raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
+        box = tuple(slice(one.min(), one.max() + 1) for one in np.nonzero(inside))
+        where = (inside & self.counted(pixels))[box]
+        gain = self._common(pane, box, where)
+        count = max(1, _SAMPLES // max(1, where.size)) if pane.kind == "film" else 1
+        starts = range(0, self.time.size if pane.kind == "film" else 1, count)
+        parts = [self._part(pane, slice(at, at + count), box, where, gain) for at in starts]
+        values = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+        units = {"units": pane.units}
+        result = xr.Dataset(
+            {key: ("time", one, {} if key == "pixels" else units) for key, one in values.items()},
+            attrs={"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels},
+        )
+        if pane.kind == "map":
+            return result.isel(time=0)
+        return result.assign_coords(time=("time", self.time, schema.COORDINATES["time"].attrs))
+
+    def _common(self, pane: Pane, box: tuple[slice, ...], where: Mask) -> Array | None:
+        """Deviation (pixel) by the emissivities for a contrast of 1 K; NaN: all is shared."""
+        data, (rows, columns) = self.data, box
+        apart = data.attrs.get("reflection_shift", "none") != "none"
+        apart |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())
+        needed = {*FILMS, "emissivity", "emissivity_std"}
+        if pane.name not in FILMS or apart or not needed <= set(data):
+            return None
+        cut = data[["emissivity", "emissivity_std"]].isel(y=rows, x=columns)
+        if "emissivity_covariance" in data:
+            covariance = data["emissivity_covariance"].isel(y=rows, x=columns).values[..., where]
+        else:
+            variance = cut["emissivity_std"].values[:, where] ** 2
+            covariance = np.eye(len(variance))[..., None] * variance
+        gains = common_gain(cut["emissivity"].values[:, where], covariance)
+        completed = ((self.status[box] & COMPLETED) != 0)[where]
+        return np.where(completed, np.nan, gains[list(FILMS).index(pane.name)])
+
+    def _part(
+        self, pane: Pane, frames: slice, box: tuple[slice, ...], where: Mask, gain: Array | None
+    ) -> dict[str, Array]:
+        """Statistics of some frames of a region, at the pixels of its box that count."""
+        values = pane.read(frames, *box)[:, where]
+        result = statistics(values)
+        std = common = np.full(values.shape, np.nan)
+        if pane.name.startswith("input "):
+            std, common = self._noise(pane, values), np.zeros(values.shape)
+        elif pane.std:
+            std = self.pane(pane.std).read(frames, *box)[:, where].astype(np.float64)
+        if gain is not None:
+            warm, cold = (self.pane(name).read(frames, *box)[:, where] for name in FILMS)
+            common = gain * np.abs(warm - cold)
+        return {**result, "std": mean_std(np.where(np.isfinite(values), std, np.nan), common)}
+
+    def _noise(self, pane: Pane, values: Values) -> Array:
+        """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""
+        assert self.capture is not None
+        holders = (self._response, self.data)
+        noise = next((one["noise"] for one in holders if one is not None and "noise" in one), None)
+        if noise is None:
+            return np.full(values.shape, np.nan)
+        band = pane.name.removeprefix("input ")
+
+        def of(array: xr.DataArray) -> float:
+            return float(array[schema.band_positions(array, [band], "the noise")[0]])
+
+        factor = of(self.capture["noise_factor"]) if "noise_factor" in self.capture else 1.0
+        pattern = of(self.capture["pattern_std"]) if "pattern_std" in self.capture else 0.0
+        std = np.hypot(of(noise) * factor, pattern)
+        if pane.curve is None:
+            return np.full(values.shape, std)
+        return np.asarray(std / pane.curve.count_slope(values))
+
+    def probe(self, names: Sequence[str], index: int, row: int, column: int) -> dict[str, Any]:
+        """Values of some panes at a pixel and frame, with deviations, and its flags by name."""
+        at = (slice(index, index + 1), slice(row, row + 1), slice(column, column + 1))
+
+        def number(pane: str) -> float | None:
+            value = float(self.pane(pane).read(*at)[0, 0, 0]) if pane else np.nan
+            return value if np.isfinite(value) else None
+
+        shown = [name for name in names if name != "status"]
+        values = {name: (number(name), number(self.panes[name].std)) for name in shown}
+        bits = int(self.status[row, column])
+        return {"values": values, "flags": [bit.label for bit in Status if bits & bit]}
+
+    def code(
+        self, name: str, index: int, regions: Mapping[str, Region], pixels: Pixels = "unflagged"
+    ) -> str:
+        """Python that gives the same frame and curves again, with the names `View` and `Region`."""
+        (_, first), *rest = self.sources.items()
+        arguments = ", ".join([first, *(f"{key}={one}" for key, one in rest)])
+        free = [key for key, one in self.sources.items() if key == one]
+        lines = [f"# {', '.join(free)}: the data that were explored"] if free else []
+        lines += [
+            "from dbthermal.explorer import Region, View",
+            "",
+            f"view = View({arguments})",
+            f"frame = view.frame({name!r}, {index})  # (y, x) at {self.time[index]:.3f} s",
+        ]
+        if name != "status" and regions:
+            lines.append("regions = {")
+            lines += [
+                f"    {key!r}: Region({one.kind!r}, {one.points})," for key, one in regions.items()
+            ]
+            lines += [
+                "}",
+                "curves = {",
+                f"    key: view.curve({name!r}, region, pixels={pixels!r})",
+                "    for key, region in regions.items()",
+                "}",
+            ]
+        return "\n".join(lines) + "\n"

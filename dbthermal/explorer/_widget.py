@@ -1,0 +1,225 @@
+"""Explorer in JupyterLab: answers its page, pixels as binary messages and never in traits."""
+
+import base64
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import anywidget
+import numpy as np
+import numpy.typing as npt
+import traitlets
+import xarray as xr
+from matplotlib import colormaps
+
+from dbthermal import schema
+from dbthermal.explorer import _export
+from dbthermal.explorer._films import Values
+from dbthermal.explorer._regions import Region
+from dbthermal.explorer._view import COMPLETED, FILMS, View
+from dbthermal.figures import drawing
+
+PALETTES: Final = ("inferno", "cividis", "gray")
+_LEVELS: Final = 65534.0
+_DPI: Final = 80
+_HERE: Final = Path(__file__).parent
+_REFUSED: Final = (ArithmeticError, LookupError, MemoryError, OSError, TypeError, ValueError)
+
+
+def quantised(values: Values) -> tuple[npt.NDArray[np.uint16], float, float]:
+    """Values as 1 to 65535 from the least to the greatest, 0 without one; and these two."""
+    known = schema.measured(values)
+    if not known.any():
+        return np.zeros(values.shape, np.uint16), 0.0, 1.0
+    low = float(values.min(where=known, initial=np.inf))
+    high = float(values.max(where=known, initial=-np.inf))
+    high = high if high > low else low + 1.0
+    with np.errstate(invalid="ignore", over="ignore"):
+        codes = (values - np.float32(low)) * np.float32(_LEVELS / (high - low)) + np.float32(1.5)
+        codes = np.clip(codes, 1.0, 65535.0)
+    return np.where(known, codes, 0.0).astype(np.uint16), low, high
+
+
+class Explorer(anywidget.AnyWidget):
+    """Explorer of a `View` in a notebook; see `dbthermal.explore`.
+
+    Parameters
+    ----------
+    view : View
+        What is shown.
+    celsius : bool
+        Degrees Celsius instead of kelvin.
+
+    Attributes
+    ----------
+    view : View
+        What is shown.
+    regions : dict of str to Region
+        Regions by name, as they are drawn.
+    """
+
+    _esm = _HERE / "explorer.js"
+    _css = _HERE / "explorer.css"
+    _preview = traitlets.Unicode("").tag(sync=True)  # where no kernel answers, as in HTML
+
+    def __init__(self, view: View, *, celsius: bool = True) -> None:
+        self.view = view
+        self.regions: dict[str, Region] = {}
+        self._celsius, self._limits = celsius, dict[str, tuple[float, float]]()
+        self._state: dict[str, Any] = {"index": view.time.size // 2, "pixels": "unflagged"}
+        super().__init__()
+        self.on_msg(self._on_message)
+
+    def curves(self, name: str = "") -> xr.Dataset:
+        """Curves over (region, time) of the regions drawn, `View.curve`.
+
+        Parameters
+        ----------
+        name : str
+            One of `view.panes`; the one that is plotted if not given.
+
+        Raises
+        ------
+        ValueError
+            If there is no such pane, or no region.
+        """
+        name = name or self._state.get("pane") or next(iter(self.view.panes))
+        return _export.curves(self.view, name, self.regions, self._state["pixels"])
+
+    def _repr_mimebundle_(self, **options: Any) -> Any:
+        """Widget for who has one, and a picture for who has none."""
+        bundle = super()._repr_mimebundle_(**options)
+        data = bundle[0] if isinstance(bundle, tuple) else bundle
+        if data is not None:
+            data["image/png"] = self._picture()
+        return bundle
+
+    def _picture(self) -> str:
+        """Object temperature or the inputs at a frame, and the maps, as PNG in base64."""
+        view, panes = self.view, self.view.panes
+        films = [name for name in panes if name.startswith("input ")]
+        names = ["object_temperature"] if "object_temperature" in panes else films
+        names += [name for name in panes if name == "status" or name.startswith("emissivity ")]
+        limits = {name: self._range(name) for name in names if name != "status"}
+        shown = _export.figure(
+            view, names, self._state["index"], {}, celsius=self._celsius, limits=limits
+        )
+        buffer = io.BytesIO()
+        shown.savefig(buffer, dpi=_DPI)
+        return base64.b64encode(buffer.getvalue()).decode()
+
+    def _range(self, name: str) -> tuple[float, float]:
+        """Range of colour of a pane, once found."""
+        if name not in self._limits:
+            self._limits[name] = self.view.limits(name)
+        return self._limits[name]
+
+    def _on_message(self, _: object, content: dict[str, Any], __: Sequence[object]) -> None:
+        """Answer a question of a page, which waits for it; an error is an answer, too."""
+        key = {name: content.get(name) for name in ("page", "kind")}
+        self.view.progress = lambda text, share: self.send(
+            {**key, "progress": f"{text}: {100 * share:.0f} %"}
+        )
+        try:
+            answer, buffers = getattr(self, f"_answer_{content.get('kind')}")(content)
+        except _REFUSED as error:
+            answer, buffers = {"error": f"{error}"}, []
+        finally:
+            self.view.progress = None
+        self.send(
+            {**answer, **key},
+            [np.asarray(one).tobytes() for one in buffers],
+        )
+
+    def _answer_start(self, _: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+        """Answer panes, times, events and legend; palettes and classes of pixels."""
+        view = self.view
+        codes, legend = _export.status_legend(view)
+        panes = [
+            {
+                "name": pane.name,
+                "label": pane.label,
+                "units": pane.units if pane.units != "1" else "",
+                "kind": pane.kind,
+                "absolute": pane.absolute,
+                "shown": "_std" not in pane.name or pane.name == f"{next(iter(FILMS))}_std",
+            }
+            for pane in view.panes.values()
+        ]
+        classes = np.where(view.status == 0, 0, np.where((view.status & COMPLETED) != 0, 1, 2))
+        palettes = [colormaps[name](range(256), bytes=True) for name in PALETTES]
+        return {
+            "panes": panes,
+            "shape": view.shape,
+            "time": [round(float(one), 6) for one in view.time],
+            "events": view.events,
+            "legend": legend,
+            "palettes": PALETTES,
+            "colors": drawing.COLORS,
+            "celsius": self._celsius,
+            "index": self._state["index"],
+            "regions": [[name, one.kind, one.points] for name, one in self.regions.items()],
+            "note": drawing.provenance_note(view.data).strip(" ()"),
+        }, [classes.astype(np.uint8), codes, *palettes]
+
+    def _answer_frames(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+        """Answer panes at a frame."""
+        names = asked["panes"]
+        parts = [quantised(self.view.frame(name, asked["index"])) for name in names]
+        scales = [
+            (low, high, *self._range(name))
+            for name, (_, low, high) in zip(names, parts, strict=True)
+        ]
+        self._state["index"] = asked["index"]
+        return {"index": asked["index"], "panes": names, "scales": scales}, [
+            one[0] for one in parts
+        ]
+
+    def _answer_probe(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+        """Answer values and flags of a pixel."""
+        place = [asked[name] for name in ("index", "row", "column")]
+        return {**self.view.probe(asked["panes"], *place), "at": place}, []
+
+    def _answer_curves(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+        """Answer the curves of all regions in a pane."""
+        points = {name: (kind, points) for name, kind, points in asked["regions"]}
+        self.regions = {
+            name: Region(kind, tuple(map(tuple, one))) for name, (kind, one) in points.items()
+        }
+        self._state |= {"pixels": asked["pixels"], "pane": asked["pane"]}
+        buffers, counts = [], []
+        for region in self.regions.values():
+            found = self.view.curve(asked["pane"], region, pixels=asked["pixels"])
+            values = [np.atleast_1d(found[name]) for name in ("mean", "minimum", "maximum", "std")]
+            buffers.append(np.array(values, dtype=np.float32))
+            counts.append((int(region.mask(self.view.shape).sum()), int(found["pixels"].max())))
+        return {"pane": asked["pane"], "names": list(self.regions), "counts": counts}, buffers
+
+    def _answer_event(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+        """Answer the events, with a new one."""
+        self.view.events[str(asked["name"])] = float(asked["time"])
+        return {"events": self.view.events}, []
+
+    def _answer_code(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+        """Answer Python that gives the frame and the curves again."""
+        place = asked["panes"][0], asked["index"]
+        return {"text": self.view.code(*place, self.regions, asked["pixels"])}, []
+
+    def _answer_export(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
+        """Answer a file of what is seen."""
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / f"explored{asked['suffix']}"
+            _export.save(
+                self.view,
+                path,
+                asked["panes"],
+                asked["index"],
+                self.regions,
+                celsius=asked["celsius"],
+                pixels=asked["pixels"],
+                palette=asked["palette"],
+                limits={name: tuple(pair) for name, pair in asked["limits"].items()},
+            )
+            return {"name": path.name}, [np.frombuffer(path.read_bytes(), dtype=np.uint8)]

@@ -1,0 +1,665 @@
+// Explorer of thermal videos in a notebook: pictures on canvas, linked in time, zoom and cursor.
+// Frames and curves come from Python as binary messages. One question is in flight at a time; of
+// those that wait, the latest of each kind is asked next. Nothing is loaded from a network.
+
+const ZERO_CELSIUS = 273.15;
+const DIGITS = { "": 3, count: 0 };
+const TOOLS = { move: "Move", rectangle: "Rectangle", ellipse: "Ellipse", polygon: "Polygon" };
+const PIXELS = { unflagged: "flagged: hatched", hidden: "flagged: hidden", measured: "measured only", all: "all pixels count" };
+const HIDDEN = { unflagged: [0, 0, 0], all: [0, 0, 0], hidden: [0, 0, 1], measured: [0, 1, 1] }; // good, completed, flagged
+const FILES = { ".csv": "curves of the regions", ".png": "these pictures", ".tiff": "frame of the chosen picture, 32-bit float", ".nc": "frames and curves" };
+const HELP = "Arrow keys: frame, with shift ten. Space: play. M: mark this time. Title: choose what is plotted. Wheel on a clicked "
+  + "picture: zoom; double click: all of it, or the end of a polygon. Hatched: flagged; dotted: completed, not measured.";
+
+function make(parent, tag, className = "", properties = {}) {
+  const element = Object.assign(document.createElement(tag), properties);
+  element.className = className;
+  parent?.appendChild(element);
+  return element;
+}
+const surface = (width, height) => make(null, "canvas", "", { width, height }).getContext("2d");
+const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+const capital = (text) => text[0].toUpperCase() + text.slice(1);
+
+class Link {
+  constructor(model, take) {
+    Object.assign(this, { model, take, page: Math.random().toString(36).slice(2), wanted: new Map(), busy: false });
+    this.listener = (message, buffers) => this.receive(message, buffers);
+    model.on("msg:custom", this.listener);
+  }
+  ask(kind, content = {}) {
+    this.wanted.set(kind, content);
+    this.pump();
+  }
+  pump() {
+    if (this.busy || !this.wanted.size) return;
+    const [kind, content] = this.wanted.entries().next().value;
+    this.wanted.delete(kind);
+    this.busy = true;
+    this.model.send({ kind, page: this.page, ...content });
+  }
+  receive(message, buffers) {
+    if (message.page !== this.page) return;
+    if (message.progress) return this.take("progress", message);
+    this.busy = false;
+    this.take(message.error ? "error" : message.kind, message, buffers);
+    this.pump();
+  }
+}
+
+function marchingSquares(codes, width, height, level, line) {
+  // Where a line between the centres of four pixels crosses the level.
+  for (let row = 0; row + 1 < height; row++) {
+    for (let column = 0; column + 1 < width; column++) {
+      const at = row * width + column;
+      const [a, b, c, d] = [codes[at], codes[at + 1], codes[at + width + 1], codes[at + width]];
+      const above = (a > level) + (b > level) + (c > level) + (d > level);
+      if (above === 0 || above === 4 || !(a && b && c && d)) continue;
+      const ends = [];
+      if (a > level !== b > level) ends.push([column + (level - a) / (b - a), row]);
+      if (b > level !== c > level) ends.push([column + 1, row + (level - b) / (c - b)]);
+      if (d > level !== c > level) ends.push([column + (level - d) / (c - d), row + 1]);
+      if (a > level !== d > level) ends.push([column, row + (level - a) / (d - a)]);
+      if (ends.length === 4 && (a + b + c + d) / 4 > level === a > level) ends.push(ends.shift());
+      for (let i = 0; i + 1 < ends.length; i += 2) line(ends[i], ends[i + 1]);
+    }
+  }
+}
+
+function ticks(low, high, count) {
+  if (!(high > low)) return [[low, low.toFixed(2)]];
+  const power = 10 ** Math.floor(Math.log10((high - low) / count));
+  const step = [1, 2, 5, 10].map((factor) => factor * power).find((one) => one >= (high - low) / count);
+  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  const first = Math.ceil(low / step - 1e-9);
+  return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, i) => [(first + i) * step, ((first + i) * step).toFixed(digits)]);
+}
+
+function stroke(context, ...lines) {
+  const ratio = window.devicePixelRatio || 1;
+  for (const [strokeStyle, width] of lines) {
+    Object.assign(context, { strokeStyle, lineWidth: width * ratio });
+    context.stroke();
+  }
+}
+
+function outline(context, { kind, points }, place) {
+  const [[left, top], [right, bottom], ...more] = [...points, points.at(-1)].map(([row, column]) => place(column, row));
+  if (kind === "rectangle") context.rect(left, top, right - left, bottom - top);
+  else if (kind === "ellipse") context.ellipse((left + right) / 2, (top + bottom) / 2, Math.abs(right - left) / 2, Math.abs(bottom - top) / 2, 0, 0, 2 * Math.PI);
+  else {
+    context.moveTo(left, top);
+    for (const corner of [[right, bottom], ...more]) context.lineTo(...corner);
+    context.closePath();
+  }
+}
+
+function hatch(kind, size) {
+  const context = surface(size, size);
+  for (const [style, line] of [["#000000a0", size / 4], ["#ffffffd0", size / 8]]) {
+    Object.assign(context, { strokeStyle: style, fillStyle: style, lineWidth: line });
+    context.beginPath();
+    for (const shift of kind === 2 ? [-size, 0, size] : []) {
+      context.moveTo(shift - 1, size + 1);
+      context.lineTo(shift + size + 1, -1);
+    }
+    context.stroke();
+    if (kind === 1) context.arc(size / 2, size / 2, line / 1.6, 0, 2 * Math.PI);
+    context.fill();
+  }
+  return context.canvas;
+}
+
+class Picture {
+  constructor(explorer, pane) {
+    Object.assign(this, { explorer, pane, codes: null, limits: null, own: null, table: new Uint32Array(65536) });
+    this.box = make(null, "div", "dbt-picture");
+    this.title = make(this.box, "button", "dbt-title", { type: "button", textContent: capital(pane.label), title: "plot the curves of this" });
+    this.title.onclick = () => explorer.choose(pane);
+    this.readout = make(this.box, "div", "dbt-readout");
+    this.canvas = make(this.box, "canvas", "dbt-canvas", { tabIndex: 0 });
+    this.canvas.dataset.pane = pane.name;
+    this.foot = make(this.box, "div", "dbt-foot");
+    if (pane.kind === "status") this.addLegend();
+    else this.addScale();
+    this.image = surface(explorer.shape[1], explorer.shape[0]);
+    this.pixels = this.image.getImageData(0, 0, explorer.shape[1], explorer.shape[0]);
+    this.colors = new Uint32Array(this.pixels.data.buffer);
+    explorer.listen(this.canvas);
+  }
+  addLegend() {
+    for (const [words, color, share] of this.explorer.legend) {
+      const entry = make(this.foot, "span", "dbt-entry");
+      make(entry, "i", "dbt-swatch").style.background = color;
+      entry.append(`${words}, ${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`);
+    }
+  }
+  addScale() {
+    const number = (place, title) => make(this.foot, "input", "dbt-number", {
+      type: "number", step: "any", title, ariaLabel: `${this.pane.label}: ${title}`,
+      onchange: (event) => {
+        const limits = [...this.limits];
+        limits[place] = parseFloat(event.target.value) + this.explorer.offset(this.pane);
+        if (limits[0] < limits[1]) this.limits = limits;
+        event.target.blur();
+        this.paint();
+      },
+    });
+    this.low = number(0, "colour range begins");
+    this.bar = make(this.foot, "canvas", "dbt-bar", { width: 256, height: 1 });
+    this.high = number(1, "colour range ends");
+    this.unit = make(this.foot, "span");
+    const auto = () => { this.limits = this.own; this.paint(); };
+    make(this.foot, "button", "dbt-button", { type: "button", textContent: "auto", title: "range of the whole film", onclick: auto });
+  }
+  take(codes, [low, high, from, to]) {
+    Object.assign(this, { codes, scale: [low, high], own: [from, to] });
+    this.limits ??= this.own;
+    this.paint();
+  }
+  paint() {
+    if (!this.codes) return;
+    const { explorer, colors, codes, table } = this;
+    const hidden = HIDDEN[explorer.selection];
+    if (this.pane.kind === "status") table.set(explorer.statusColors);
+    else this.paintScale(explorer.palettes[explorer.palette]);
+    for (let at = 0; at < colors.length; at++) colors[at] = hidden[explorer.classes[at]] ? 0 : table[codes[at]];
+    this.image.putImageData(this.pixels, 0, 0);
+    explorer.redraw();
+  }
+  paintScale(palette) {
+    const { explorer, pane, table, limits: [from, to], scale: [low, high] } = this;
+    for (let code = 1; code < 65536; code++) {
+      const value = low + ((code - 1) / 65534) * (high - low);
+      table[code] = palette[clamp(Math.floor((256 * (value - from)) / (to - from)), 0, 255)];
+    }
+    const bar = new ImageData(256, 1);
+    new Uint32Array(bar.data.buffer).set(palette);
+    this.bar.getContext("2d").putImageData(bar, 0, 0);
+    for (const [input, value] of [[this.low, from], [this.high, to]]) {
+      if (document.activeElement !== input) input.value = explorer.text(value, pane);
+    }
+    this.unit.textContent = explorer.unit(pane);
+  }
+  draw() {
+    const { explorer, canvas, pane, explorer: { zoom: { x, y, factor }, cursor, shape } } = this;
+    const width = Math.max(1, Math.round(canvas.clientWidth * (window.devicePixelRatio || 1)));
+    const height = Math.max(1, Math.round((width * shape[0]) / shape[1]));
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    const context = canvas.getContext("2d");
+    const size = (width / shape[1]) * factor;
+    const place = (column, row) => [(column - x) * size, (row - y) * size];
+    context.imageSmoothingEnabled = false;
+    context.fillStyle = "#b8b8b8";
+    context.fillRect(0, 0, width, height);
+    context.drawImage(this.image.canvas, ...place(0, 0), shape[1] * size, shape[0] * size);
+    if (pane.kind !== "status") context.drawImage(explorer.hatching(width, height, size), 0, 0);
+    if (explorer.isotherm !== null && pane.absolute && this.codes) this.drawIsotherm(context, place);
+    for (const [, region, color] of explorer.shownRegions()) {
+      context.beginPath();
+      outline(context, region, place);
+      stroke(context, ["white", 4], [color, 2]);
+    }
+    if (cursor) {
+      const [across, down] = place(cursor[1] + 0.5, cursor[0] + 0.5);
+      context.beginPath();
+      for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+        context.moveTo(across + 5 * dx, down + 5 * dy);
+        context.lineTo(across + 15 * dx, down + 15 * dy);
+      }
+      stroke(context, ["black", 3], ["white", 1]);
+    }
+    this.title.classList.toggle("dbt-chosen", explorer.chosen === pane.name);
+    this.readout.textContent = cursor ? this.words(cursor) : "";
+  }
+  drawIsotherm(context, place) {
+    const { explorer, scale: [low, high], codes } = this;
+    const value = explorer.isotherm + explorer.offset(this.pane);
+    context.beginPath();
+    marchingSquares(codes, explorer.shape[1], explorer.shape[0], 1 + ((value - low) / (high - low)) * 65534, (from, to) => {
+      context.moveTo(...place(from[0] + 0.5, from[1] + 0.5));
+      context.lineTo(...place(to[0] + 0.5, to[1] + 0.5));
+    });
+    stroke(context, ["black", 3], ["#7fffd4", 1.5]);
+  }
+  words([row, column]) {
+    const { explorer, pane } = this;
+    if (pane.kind === "status") return explorer.legend[this.codes[row * explorer.shape[1] + column]][0];
+    const [value, std] = explorer.probed?.[pane.name] ?? [];
+    if (value === undefined) return "\u2026";
+    if (value === null) return "no value";
+    return `${explorer.text(value, pane)}${std === null ? "" : ` \u00b1 ${std.toFixed(DIGITS[pane.units] ?? 2)}`} ${explorer.unit(pane)}`;
+  }
+}
+
+class Explorer {
+  constructor(model, el) {
+    Object.assign(this, { pictures: new Map(), shown: [], curves: new Map(), regions: new Map(), events: {}, drawn: -1, number: 1 });
+    Object.assign(this, { zoom: { x: 0, y: 0, factor: 1 }, cursor: null, probed: null, selection: "unflagged", palette: 0, isotherm: null });
+    this.root = make(el, "div", "dbt-explorer");
+    Object.assign(this.root.dataset, { testid: "explorer", lmSuppressShortcuts: "true" }); // or JupyterLab takes the arrow keys
+    this.root.explorer = this;
+    this.message = make(this.root, "div", "dbt-faint", { textContent: "waiting for the kernel \u2026" });
+    this.link = new Link(model, (...answer) => this.take(...answer));
+    this.link.ask("start");
+  }
+  close() {
+    clearInterval(this.player);
+    this.observer?.disconnect();
+    this.link.model.off("msg:custom", this.link.listener);
+  }
+  take(kind, message, buffers = []) {
+    const bytes = (i) => new Uint8Array(buffers[i].buffer, buffers[i].byteOffset, buffers[i].byteLength);
+    const copy = (i, Type) => new Type(bytes(i).slice().buffer);
+    this.say(message.error ?? message.progress ?? "", kind === "error");
+    ({
+      progress: () => {},
+      error: () => {},
+      start: () => this.panes || this.build(message, copy),
+      frames: () => {
+        message.panes.forEach((name, i) => this.pictures.get(name).take(copy(i, Uint16Array), message.scales[i]));
+        this.shownIndex = message.index;
+      },
+      probe: () => { this.probed = message.values; },
+      curves: () => {
+        this.curves = new Map(message.names.map((name, i) => [name, { values: copy(i, Float32Array), counts: message.counts[i] }]));
+        this.plotted = this.panes.find((pane) => pane.name === message.pane);
+      },
+      event: () => this.placeMarks(message.events),
+      code: () => this.showText(message.text),
+      export: () => {
+        const href = URL.createObjectURL(new Blob([bytes(0)]));
+        make(null, "a", "", { href, download: message.name }).click();
+        setTimeout(() => URL.revokeObjectURL(href), 1000);
+      },
+    })[kind]();
+    this.redraw();
+  }
+  say(text, wrong = false) {
+    this.message.textContent = text || HELP;
+    this.message.classList.toggle("dbt-wrong", wrong);
+  }
+
+  // The page
+  build({ regions, palettes, ...setup }, copy) {
+    Object.assign(this, setup, { paletteNames: palettes, classes: copy(0, Uint8Array) });
+    this.palettes = palettes.map((_, i) => copy(2 + i, Uint32Array));
+    this.statusColors = setup.legend.map(([, color]) => parseInt(`ff${color.slice(5)}${color.slice(3, 5)}${color.slice(1, 3)}`, 16));
+    for (const [name, kind, points] of regions) this.regions.set(name, { kind, points });
+    this.number = regions.length + 1;
+    this.shown = setup.panes.filter((pane) => pane.shown).map((pane) => pane.name);
+    this.chosen = (setup.panes.find((pane) => pane.name === "object_temperature") ?? setup.panes[0]).name;
+    this.buildTools();
+    this.grid = make(this.root, "div", "dbt-grid");
+    this.buildTime();
+    this.buildPlot();
+    this.root.appendChild(this.message);
+    this.root.addEventListener("keydown", (event) => this.key(event));
+    this.observer = new ResizeObserver(() => this.redraw());
+    this.observer.observe(this.root);
+    this.arrange(copy(1, Uint8Array));
+    this.askCurves();
+  }
+  button(parent, textContent, title, onclick) {
+    return make(parent, "button", "dbt-button", { type: "button", textContent, title, onclick });
+  }
+  select(parent, label, options, action) {
+    const list = make(make(parent, "label", "dbt-label", { textContent: label }), "select", "", { ariaLabel: label, onchange: () => action(list.value) });
+    for (const [value, textContent] of Object.entries(options)) make(list, "option", "", { value, textContent });
+  }
+  buildTools() {
+    const bar = make(this.root, "div", "dbt-row");
+    const tools = make(bar, "span", "dbt-group");
+    this.tools = Object.entries(TOOLS).map(([tool, text]) => {
+      const button = this.button(tools, text, tool === "move" ? "drag a picture, or a region in it" : `draw a region: ${tool}`, () => this.useTool(tool));
+      button.dataset.tool = tool;
+      return button;
+    });
+    this.useTool("move");
+    this.select(bar, "colours", { ...this.paletteNames }, (value) => { this.palette = +value; this.repaint(); });
+    this.select(bar, "pixels", PIXELS, (value) => { this.selection = value; this.repaint(); this.askCurves(); });
+    const name = () => (this.celsius ? "\u00b0C" : "K");
+    const unit = this.button(bar, name(), "kelvin or degrees Celsius", () => {
+      if (this.isotherm !== null) this.setIsotherm(this.isotherm + (this.celsius ? ZERO_CELSIUS : -ZERO_CELSIUS));
+      this.celsius = !this.celsius;
+      unit.textContent = name();
+      this.repaint();
+    });
+    const line = make(bar, "label", "dbt-label", { textContent: "isotherm" });
+    const set = () => this.setIsotherm(this.level.value === "" ? null : parseFloat(this.level.value));
+    this.level = make(line, "input", "dbt-number", { type: "number", step: "any", placeholder: "none", ariaLabel: "isotherm", onchange: set });
+    const out = make(bar, "span", "dbt-group");
+    this.button(out, "Copy as code", "Python that gives this frame and these curves", () => this.askFor("code"));
+    for (const [suffix, what] of Object.entries(FILES)) {
+      this.button(out, suffix === ".nc" ? "NetCDF" : suffix.slice(1).toUpperCase(), `save ${what}`, () => this.askFor("export", { suffix }));
+    }
+    const list = make(bar, "details", "dbt-panes");
+    make(list, "summary", "", { textContent: "Pictures" });
+    const entries = make(list, "div", "dbt-list");
+    for (const pane of this.panes) {
+      const entry = make(entries, "label", "dbt-label");
+      const box = make(entry, "input", "", { type: "checkbox", checked: pane.shown, onchange: () => {
+        const wanted = (one) => (one.name === pane.name ? box.checked : this.shown.includes(one.name));
+        this.shown = this.panes.filter(wanted).map((one) => one.name);
+        this.arrange();
+      } });
+      entry.append(capital(pane.label));
+    }
+    make(bar, "span", "dbt-note", { textContent: this.note });
+  }
+  buildTime() {
+    const row = make(this.root, "div", "dbt-row");
+    this.playButton = this.button(row, "\u25b6", "play or stop (space)", () => this.play());
+    const track = make(row, "div", "dbt-track");
+    this.slider = make(track, "input", "dbt-slider", { type: "range", min: 0, max: this.time.length - 1, value: this.index, ariaLabel: "frame" });
+    this.slider.dataset.testid = "time";
+    this.slider.oninput = () => this.goTo(+this.slider.value);
+    this.marks = make(track, "div", "dbt-marks");
+    this.clock = make(row, "span", "dbt-clock");
+    this.placeMarks(this.events);
+  }
+  placeMarks(events) {
+    this.events = events;
+    const [first, last] = [this.time[0], this.time.at(-1)];
+    this.marks.replaceChildren(...Object.entries(events).filter(([, at]) => first <= at && at <= last).map(([name, at]) => {
+      const mark = make(null, "i", "dbt-mark", { title: `${name}, ${at.toFixed(2)} s` });
+      mark.style.left = `calc(8px + (100% - 16px) * ${(at - first) / (last - first || 1)})`; // as the slider's thumb
+      return mark;
+    }));
+  }
+  buildPlot() {
+    const row = make(this.root, "div", "dbt-curves");
+    this.plot = make(row, "canvas", "dbt-plot");
+    this.plot.onclick = ({ offsetX }) => {
+      if (!this.axes) return;
+      const moment = this.time[0] + ((offsetX - this.axes[0]) / (this.axes[1] - this.axes[0])) * (this.time.at(-1) - this.time[0]);
+      const distances = this.time.map((one) => Math.abs(one - moment));
+      this.goTo(distances.indexOf(Math.min(...distances)));
+    };
+    this.list = make(row, "div", "dbt-regions");
+  }
+  arrange(statusCodes) {
+    this.grid.replaceChildren(...this.shown.map((name) => {
+      if (!this.pictures.has(name)) this.pictures.set(name, new Picture(this, this.panes.find((pane) => pane.name === name)));
+      return this.pictures.get(name).box;
+    }));
+    if (statusCodes) this.pictures.get("status")?.take(statusCodes, [0, 1, 0, 1]);
+    this.goTo(this.index);
+  }
+  showText(value) {
+    const dialog = make(this.root, "div", "dbt-dialog");
+    make(dialog, "textarea", "", { value, readOnly: true, rows: value.split("\n").length }).select();
+    navigator.clipboard?.writeText(value).then(() => this.say("copied"), () => this.say("select and copy"));
+    this.button(dialog, "Close", "", () => dialog.remove());
+  }
+
+  // What is asked of Python
+  goTo(index) {
+    this.index = this.slider.value = clamp(index, 0, this.time.length - 1);
+    const panes = this.shown.filter((name) => this.pictures.get(name).pane.kind === "film" || !this.pictures.get(name).codes);
+    this.link.ask("frames", { index: this.index, panes });
+    this.askProbe();
+  }
+  askProbe() {
+    if (this.cursor) this.link.ask("probe", { index: this.index, row: this.cursor[0], column: this.cursor[1], panes: this.shown });
+  }
+  counted() { return this.selection === "hidden" ? "unflagged" : this.selection; }
+  askCurves() {
+    const regions = [...this.regions].map(([name, { kind, points }]) => [name, kind, points]);
+    this.link.ask("curves", { pane: this.chosen, pixels: this.counted(), regions });
+  }
+  askFor(kind, more = {}) {
+    const limits = Object.fromEntries([...this.pictures].filter(([name, one]) => one.limits && name !== "status").map(([name, one]) => [name, one.limits]));
+    const panes = [this.chosen, ...this.shown.filter((name) => name !== this.chosen)];
+    this.link.ask(kind, { panes, index: this.index, pixels: this.counted(), celsius: this.celsius, palette: this.paletteNames[this.palette], limits, ...more });
+  }
+
+  // What the user does
+  useTool(tool) {
+    Object.assign(this, { tool, draft: null });
+    for (const button of this.tools) button.classList.toggle("dbt-chosen", button.dataset.tool === tool);
+  }
+  choose(pane) {
+    if (pane.kind === "status") return;
+    this.chosen = pane.name;
+    this.askCurves();
+    this.redraw();
+  }
+  setIsotherm(value) {
+    this.isotherm = value;
+    this.level.value = value === null ? "" : +value.toFixed(2);
+    this.redraw();
+  }
+  play() {
+    const starts = !this.player;
+    clearInterval(this.player);
+    const next = () => this.link.busy || this.goTo((this.index + 1) % this.time.length);
+    this.player = starts ? setInterval(next, 60) : null;
+    this.playButton.textContent = starts ? "\u25a0" : "\u25b6";
+  }
+  key(event) {
+    if (event.target.matches("input[type=number], textarea, select")) return event.stopPropagation();
+    const step = event.shiftKey ? 10 : 1;
+    const actions = {
+      ArrowRight: () => this.goTo(this.index + step),
+      ArrowLeft: () => this.goTo(this.index - step),
+      Home: () => this.goTo(0),
+      End: () => this.goTo(this.time.length - 1),
+      " ": () => this.play(),
+      m: () => this.link.ask("event", { name: `mark ${Object.keys(this.events).length + 1}`, time: this.time[this.index] }),
+      Escape: () => { this.draft = null; this.redraw(); },
+      Enter: () => this.finish(),
+    };
+    const pressed = [" ", "Enter"].includes(event.key) && event.target.tagName !== "CANVAS" && event.target !== this.slider;
+    if (!actions[event.key] || event.ctrlKey || event.metaKey || pressed) return;
+    actions[event.key]();
+    event.preventDefault();
+    event.stopPropagation();
+  }
+  listen(canvas) {
+    const place = (event) => {
+      const size = (canvas.clientWidth / this.shape[1]) * this.zoom.factor;
+      return [event.offsetY / size + this.zoom.y, event.offsetX / size + this.zoom.x];
+    };
+    canvas.onpointerdown = (event) => {
+      if (event.button) return;
+      canvas.focus();
+      canvas.setPointerCapture(event.pointerId);
+      this.press(place(event));
+    };
+    canvas.onpointermove = (event) => this.drag(place(event), event.buttons);
+    canvas.onpointerup = () => { this.grip = null; if (this.draft?.kind !== "polygon") this.finish(); };
+    canvas.onpointerleave = () => { this.cursor = null; this.redraw(); };
+    canvas.ondblclick = () => (this.tool === "polygon" ? this.finish() : this.moveZoom(0, 0, 1));
+    canvas.onwheel = (event) => {
+      if (document.activeElement !== canvas) return; // the page scrolls until a picture is clicked
+      event.preventDefault();
+      const [row, column] = place(event);
+      const factor = clamp(this.zoom.factor * 2 ** (-event.deltaY / 400), 1, 64);
+      const ratio = this.zoom.factor / factor;
+      this.moveZoom(column - (column - this.zoom.x) * ratio, row - (row - this.zoom.y) * ratio, factor);
+    };
+  }
+  moveZoom(x, y, factor) {
+    const [height, width] = this.shape;
+    this.zoom = { x: clamp(x, 0, width - width / factor), y: clamp(y, 0, height - height / factor), factor };
+    this.redraw();
+  }
+  press(at) {
+    if (this.tool === "polygon") this.draft = { kind: "polygon", points: [...(this.draft?.points ?? []), at] };
+    else if (this.tool !== "move") this.draft = { kind: this.tool, points: [at, at] };
+    else {
+      const found = [...this.regions].reverse().find(([, region]) => {
+        const path = new Path2D();
+        outline(path, region, (column, row) => [column, row]);
+        return surface(1, 1).isPointInPath(path, at[1], at[0]);
+      });
+      this.grip = { at, region: found?.[1], points: found?.[1].points, zoom: this.zoom };
+    }
+    this.redraw();
+  }
+  drag(at, pressed) {
+    const [row, column] = at.map(Math.floor);
+    const within = row >= 0 && column >= 0 && row < this.shape[0] && column < this.shape[1];
+    const moved = within && String(this.cursor) !== String([row, column]);
+    this.cursor = within ? [row, column] : null;
+    if (this.draft && this.draft.kind !== "polygon") this.draft.points = [this.draft.points[0], at.map((one, i) => clamp(one, 0, this.shape[i]))];
+    else if (this.grip?.region) {
+      this.grip.region.points = this.grip.points.map((point) => point.map((one, i) => one + at[i] - this.grip.at[i]));
+      this.askCurves();
+    } else if (this.grip) this.moveZoom(this.zoom.x + this.grip.at[1] - at[1], this.zoom.y + this.grip.at[0] - at[0], this.zoom.factor);
+    if (moved && !pressed) this.askProbe();
+    this.redraw();
+  }
+  finish() {
+    const points = this.draft?.points.filter((one, i, all) => !i || Math.hypot(one[0] - all[i - 1][0], one[1] - all[i - 1][1]) > 0.1) ?? [];
+    const wide = [0, 1].every((i) => Math.max(...points.map((one) => one[i])) - Math.min(...points.map((one) => one[i])) > 0.5);
+    if (wide && points.length >= (this.tool === "polygon" ? 3 : 2)) {
+      this.regions.set(`region ${this.number++}`, { kind: this.draft.kind, points });
+      this.askCurves();
+    }
+    this.draft = null;
+    this.redraw();
+  }
+
+  // What is drawn
+  offset(pane) { return pane.absolute && this.celsius ? ZERO_CELSIUS : 0; }
+  unit(pane) { return pane.absolute && this.celsius ? "\u00b0C" : pane.units; }
+  text(value, pane) { return (value - this.offset(pane)).toFixed(DIGITS[pane.units] ?? 2); }
+  repaint() { for (const picture of this.pictures.values()) picture.paint(); }
+  shownRegions() {
+    const all = [...this.regions].map(([name, region], i) => [name, region, this.colors[i % this.colors.length]]);
+    return this.draft ? [...all, ["", this.draft, "#000000"]] : all;
+  }
+  hatching(width, height, size) {
+    const key = [width, height, size, this.zoom.x, this.zoom.y, this.selection].join();
+    if (this.hatched?.key === key) return this.hatched.canvas;
+    const whole = surface(width, height);
+    for (const kind of [1, 2]) {
+      if (HIDDEN[this.selection][kind] || !this.classes.includes(kind)) continue;
+      const mask = surface(this.shape[1], this.shape[0]);
+      const pixels = new ImageData(this.shape[1], this.shape[0]);
+      this.classes.forEach((one, at) => { pixels.data[4 * at + 3] = one === kind ? 255 : 0; });
+      mask.putImageData(pixels, 0, 0);
+      const layer = surface(width, height);
+      layer.imageSmoothingEnabled = false;
+      layer.drawImage(mask.canvas, -this.zoom.x * size, -this.zoom.y * size, this.shape[1] * size, this.shape[0] * size);
+      layer.globalCompositeOperation = "source-in";
+      layer.fillStyle = layer.createPattern(hatch(kind, Math.round(8 * (window.devicePixelRatio || 1))), "repeat");
+      layer.fillRect(0, 0, width, height);
+      whole.drawImage(layer.canvas, 0, 0);
+    }
+    this.hatched = { key, canvas: whole.canvas };
+    return whole.canvas;
+  }
+  redraw() {
+    if (!this.panes) return;
+    this.pending ??= requestAnimationFrame(() => {
+      this.pending = null;
+      for (const name of this.shown) this.pictures.get(name)?.draw();
+      this.clock.textContent = `${this.time[this.index].toFixed(2)} s  (frame ${this.index}, last ${this.time.length - 1})`;
+      this.drawPlot();
+      this.drawn = this.shownIndex;
+    });
+  }
+  curve(name) {
+    // Mean, least, greatest value and deviation of the mean, each a function of the frame, in the unit shown.
+    const found = this.curves.get(name);
+    if (!found) return null;
+    const length = found.values.length / 4;
+    const part = (place, zero) => (i) => found.values[place * length + (length === 1 ? 0 : i)] - zero;
+    const zero = this.offset(this.plotted);
+    return { mean: part(0, zero), low: part(1, zero), high: part(2, zero), std: part(3, 0), counts: found.counts };
+  }
+  drawPlot() {
+    const regions = this.shownRegions().map(([name, , color]) => [name, color, this.curve(name)]).filter(([, , curve]) => curve);
+    this.listRegions(regions);
+    const ratio = window.devicePixelRatio || 1;
+    const [width, height] = [this.plot.clientWidth, this.plot.clientHeight];
+    Object.assign(this.plot, { width: width * ratio, height: height * ratio });
+    const context = this.plot.getContext("2d");
+    context.scale(ratio, ratio);
+    const ink = getComputedStyle(this.root).color;
+    Object.assign(context, { font: "12px sans-serif", fillStyle: ink });
+    this.axes = regions.length ? [64, width - 12] : null;
+    if (!this.axes) return context.fillText("Rectangle, Ellipse or Polygon: draw a region in a picture to see its curve here.", 12, 24);
+    const ends = regions.flatMap(([, , { low, high }]) => this.time.flatMap((_, i) => [low(i), high(i)])).filter(Number.isFinite);
+    const range = ends.length ? [ends.reduce((a, b) => Math.min(a, b)), ends.reduce((a, b) => Math.max(a, b))] : [0, 1];
+    const margin = Math.max(0.06 * (range[1] - range[0]), 1e-3);
+    const [low, high] = [range[0] - margin, range[1] + margin];
+    const [left, right, top, bottom] = [...this.axes, 12, height - 36];
+    const [begin, end] = [this.time[0], this.time.at(-1)];
+    const across = (moment) => left + ((moment - begin) / (end - begin || 1)) * (right - left);
+    const down = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
+    const line = (from, to, strokeStyle, dashes = []) => {
+      Object.assign(context, { strokeStyle, lineWidth: 1 });
+      context.setLineDash(dashes);
+      context.beginPath();
+      context.moveTo(...from);
+      context.lineTo(...to);
+      context.stroke();
+    };
+    context.textAlign = "right";
+    for (const [at, text] of ticks(low, high, (bottom - top) / 40)) {
+      context.fillText(text, left - 6, down(at) + 4);
+      line([left, down(at)], [right, down(at)], "#8884");
+    }
+    context.textAlign = "center";
+    for (const [at, text] of ticks(begin, end, (right - left) / 90)) {
+      context.fillText(text, across(at), bottom + 15);
+      line([across(at), top], [across(at), bottom], "#8884");
+    }
+    context.fillText("time [s]", (left + right) / 2, height - 5);
+    context.save();
+    context.translate(13, (top + bottom) / 2);
+    context.rotate(-Math.PI / 2);
+    const unit = this.unit(this.plotted);
+    context.fillText(this.plotted.label + (unit && ` [${unit}]`), 0, 0, bottom - top + 40);
+    context.restore();
+    for (const moment of Object.values(this.events)) line([across(moment), top], [across(moment), bottom], "#d1495b", [3, 3]);
+    line([across(this.time[this.index]), top], [across(this.time[this.index]), bottom], ink);
+    for (const [, color, curve] of regions) this.drawCurve(context, color, curve, (i) => across(this.time[i]), down);
+  }
+  drawCurve(context, color, { mean, low, high, std }, across, down) {
+    const corner = (i, sign) => [across(i), down(mean(i) + sign * 1.96 * std(i))];
+    context.fillStyle = `${color}44`;
+    for (let i = 0; i + 1 < this.time.length; i++) {
+      const corners = [corner(i, 1), corner(i + 1, 1), corner(i + 1, -1), corner(i, -1)];
+      if (!corners.flat().every(Number.isFinite)) continue;
+      context.beginPath();
+      for (const one of corners) context.lineTo(...one);
+      context.fill();
+    }
+    for (const [value, lineWidth, dashes] of [[low, 1, [2, 3]], [high, 1, [2, 3]], [mean, 2, []]]) {
+      Object.assign(context, { strokeStyle: color, lineWidth });
+      context.setLineDash(dashes);
+      context.beginPath();
+      this.time.forEach((_, i) => Number.isFinite(value(i)) && context[i && Number.isFinite(value(i - 1)) ? "lineTo" : "moveTo"](across(i), down(value(i))));
+      context.stroke();
+    }
+  }
+  listRegions(regions) {
+    const digits = DIGITS[this.plotted?.units] ?? 2;
+    const lines = regions.map(([name, color, { mean, low, high, std, counts }]) => {
+      const [i, line] = [this.index, make(null, "div", "dbt-region")];
+      make(line, "i", "dbt-swatch").style.background = color;
+      make(line, "b", "", { textContent: name });
+      this.button(line, "\u00d7", `remove ${name}`, () => { this.regions.delete(name); this.askCurves(); });
+      const bar = Number.isNaN(std(i)) ? "" : ` \u00b1 ${std(i).toFixed(digits + (std(i) < 0.05 ? 1 : 0))}`;
+      make(line, "div", "", { textContent: `mean ${mean(i).toFixed(digits)}${bar} ${this.unit(this.plotted)}` });
+      make(line, "div", "dbt-faint", { textContent: `${low(i).toFixed(digits)} to ${high(i).toFixed(digits)}; ${counts[1]} of ${counts[0]} pixels` });
+      return line;
+    });
+    if (lines.length) lines.push(make(null, "div", "dbt-faint", { textContent: "line: mean, with its 95 % interval; dotted: least and greatest pixel" }));
+    const text = lines.map((line) => line.textContent).join();
+    if (text !== this.listed) this.list.replaceChildren(...lines);
+    this.listed = text;
+  }
+}
+
+export default {
+  render({ model, el }) {
+    const explorer = new Explorer(model, el);
+    return () => explorer.close();
+  },
+};

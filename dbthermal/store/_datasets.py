@@ -1,0 +1,299 @@
+"""Datasets on disk as zarr: saved whole, or by rows, and opened; recordings opened too.
+
+No other package opens or writes zarr.
+"""
+
+import json
+import math
+import os
+import shutil
+import zlib
+from collections.abc import Iterable, Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from zarr.codecs import Crc32cCodec, ZstdCodec
+
+from dbthermal.store._integrity import (
+    MARK,
+    SUMS,
+    CheckedStore,
+    SummedStore,
+    last_sums,
+    sums_file,
+    valid_part,
+)
+from dbthermal.store._results import as_json, whole
+
+_COMPRESSORS = (ZstdCodec(), Crc32cCodec())
+_CHUNK_BYTES: Final = 2**20
+"""Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
+
+
+def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> tuple[int, ...]:
+    """Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
+
+    Every stage works pixel by pixel on all frames and bands, so a chunk holds all of a nearly
+    square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression. Tiles divide a
+    `height` of rows, if there is one, so that rows that follow begin with a tile.
+    """
+    sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
+    if not {"y", "x"} <= sizes.keys():
+        return tuple((sizes | ({"y": height} if height and "y" in sizes else {})).values())
+    pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
+    pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
+    rows = min(height or sizes["y"], math.ceil(math.sqrt(pixels)))
+    if height:
+        rows = next(count for count in range(rows, 0, -1) if height % count == 0)
+    width = min(sizes["x"], math.ceil(pixels / rows))
+    sizes |= {"y": rows if height else min(sizes["y"], math.ceil(pixels / width)), "x": width}
+    return tuple(sizes.values())
+
+
+def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:
+    """Save a dataset as zarr (format 3, not consolidated), in place of an earlier one.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Of any stage; it is not changed.
+    path : str or Path
+        Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
+    provenance : mapping
+        From `dbthermal.store.provenance`; becomes ``attrs["provenance"]``.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> counts = xr.Dataset({"counts": ("band", [20310, 20750])})  # [count]
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save(counts, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
+    ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
+    [20310, 20750]
+    """
+    _save([dataset], path, provenance, None)
+
+
+def save_rows(
+    parts: Iterable[xr.Dataset],
+    path: str | Path,
+    provenance: Mapping[str, Any],
+    height: int | None = None,
+) -> None:
+    """Save a dataset as `save` does, of parts that follow one another along y, each as it comes.
+
+    Parameters
+    ----------
+    parts : iterable of Dataset
+        Rows from the first to the last, made when they are asked for: no more than one is held.
+        What has no y, and the attributes, are those of the first.
+    path, provenance : str or Path, mapping
+        See `save`.
+    height : int, optional
+        Rows of each part but the last, which has no more; of the first by default. For
+        `join_parts` it is that of the other folders too.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> rows = (xr.Dataset({"status": (("y", "x"), [[row, 0]])}) for row in range(3))
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save_rows(rows, f"{folder}/wall.zarr", store.provenance({}))
+    ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
+    [[0, 0], [1, 0], [2, 0]]
+    """
+    rest = iter(parts)
+    first = next(rest)
+    _save(chain([first], rest), path, provenance, height or first.sizes.get("y"))
+
+
+def _save(
+    parts: Iterable[xr.Dataset],
+    path: str | Path,
+    provenance: Mapping[str, Any],
+    height: int | None,
+) -> None:
+    """Save parts that follow one another along y, each of a height that chunks then divide."""
+    options: dict[str, Any] = {"mode": "a", "append_dim": "y"}
+    with whole(path, ".zarr") as folder:
+        folder.mkdir()
+        for number, part in enumerate(parts):
+            # Of all kinds of text zarr's format 3 specifies the one of variable length alone.
+            plain = _with_text_as(part.drop_encoding(), "U", np.dtypes.StringDType())
+            encoding = {
+                name: {"chunks": _chunks(variable, height), "compressors": _COMPRESSORS}
+                for name, variable in plain.variables.items()
+            }
+            if number == 0:
+                plain.attrs = {**MARK, **part.attrs, "provenance": json.loads(as_json(provenance))}
+            else:
+                rest = [name for name, one in plain.variables.items() if "y" not in one.dims]
+                plain = plain.drop_vars(rest).drop_attrs(deep=False)
+            plain.to_zarr(
+                SummedStore(folder),
+                zarr_format=3,
+                consolidated=False,
+                write_empty_chunks=True,
+                **(options if number else {"mode": "w-", "encoding": encoding}),
+            )
+        (folder / SUMS).write_bytes(sums_file(last_sums(folder)))
+
+
+def open_dataset(path: str | Path) -> xr.Dataset:
+    """Open a saved dataset or a recording; values are read when they are used.
+
+    A recording that was cut short, or is being written, opens as far as all bands are valid; its
+    attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder ``*.zarr``.
+
+    Returns
+    -------
+    Dataset
+        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
+        fixed-length kind.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        With file, array and store, if a file of it, or of the valid part of a recording that was
+        cut short, is not as it was written, missing, or foreign; of a chunk, when it is read.
+
+    Warns
+    -----
+    UserWarning
+        If the store has no checksums, as of dbthermal 0.1.0, so that damage cannot be seen.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> wall = xr.Dataset({"object_temperature": ("time", [295.2, 295.3], {"units": "K"})})
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save(wall, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
+    ...     saved = store.open_dataset(f"{folder}/wall.zarr").load()
+    >>> saved.equals(wall), saved.attrs["provenance"]["parameters"]
+    (True, {'frames': 2})
+    """
+    if not Path(path).is_dir():
+        raise FileNotFoundError(
+            f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
+        )
+    checked = CheckedStore(path)
+    dataset = _open(checked) if checked.closed else _open_valid_part(checked)
+    dataset.attrs = {name: value for name, value in dataset.attrs.items() if name not in MARK}
+    return _with_text_as(dataset, "T", np.dtype(str))
+
+
+def _open(checked: CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
+    dataset: xr.Dataset = xr.open_zarr(
+        checked, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
+    )
+    return dataset
+
+
+def _open_valid_part(checked: CheckedStore) -> xr.Dataset:
+    """Open the variables of a recording one by one, for their room differs while it grows."""
+    ends, parts = valid_part(checked.attrs), []
+    names = {array.parent.name for array in checked.root.glob("*/zarr.json")}
+    for name in sorted(names):
+        part = _open(checked, leave=names - {name})
+        parts.append(part.isel({d: slice(end) for d, end in ends.items() if d in part.dims}))
+    # The attributes as checked, for they may have gone on since.
+    return xr.merge(parts, combine_attrs="override").assign_attrs(checked.attrs)
+
+
+def join_parts(parts: Iterable[str | Path], path: str | Path) -> None:
+    """Join datasets of rows that follow one another; their chunks are linked, and not read.
+
+    Parameters
+    ----------
+    parts : iterable of str or Path
+        Folders from `save_rows`, each a part of its own, of one `height` but the last. They stay as
+        they are; on a disk without hard links their chunks are copied.
+    path : str or Path
+        Folder ``*.zarr`` of the whole, with the attributes of the first.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> rows = [xr.Dataset({"status": (("y", "x"), [[row, 0]])}) for row in range(3)]
+    >>> with TemporaryDirectory() as folder:
+    ...     parts = [f"{folder}/{number}.zarr" for number in range(3)]
+    ...     for row, part in zip(rows, parts):
+    ...         store.save_rows([row], part, store.provenance({}))
+    ...     store.join_parts(parts, f"{folder}/wall.zarr")
+    ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
+    [[0, 0], [1, 0], [2, 0]]
+    """
+    first, *rest = [Path(part) for part in parts]
+    with whole(path, ".zarr") as folder:
+        shutil.copytree(first, folder, copy_function=_link)
+        metadata = {one: json.loads(one.read_text()) for one in folder.glob("*/zarr.json")}
+        along = {one: array for one, array in metadata.items() if "y" in array["dimension_names"]}
+        sums = last_sums(folder)
+        for part in rest:
+            for one, array in along.items():
+                sums |= _added(part / one.parent.name, one.parent, array)
+        for one, array in along.items():
+            one.unlink()
+            one.write_text(json.dumps(array, indent=2))
+            sums[one.relative_to(folder).as_posix()] = f"{zlib.crc32(one.read_bytes()):08x}"
+        (folder / SUMS).unlink()
+        (folder / SUMS).write_bytes(sums_file(sums))
+
+
+def _link(source: str | Path, target: str | Path) -> None:
+    """Link a file at a second place; a kill then leaves the parts whole."""
+    try:
+        os.link(source, target)
+    except OSError:  # a disk that knows no links
+        shutil.copyfile(source, target)
+
+
+def _added(part: Path, whole: Path, array: dict[str, Any]) -> dict[str, str]:
+    """Add the chunks of a part of an array behind those of the whole; their checksums by name."""
+    place = array["dimension_names"].index("y")
+    end, rows = array["shape"][place], array["chunk_grid"]["configuration"]["chunk_shape"][place]
+    own, sums = last_sums(part.parent), {}
+    if end % rows:
+        raise ValueError(
+            f"Invalid part '{part.parent}' after {end} rows in chunks of {rows}. Must follow whole "
+            "chunks."
+        )
+    for chunk in [one for one in (part / "c").rglob("*") if one.is_file()]:
+        numbers = list(chunk.relative_to(part / "c").parts)
+        numbers[place] = str(int(numbers[place]) + end // rows)
+        added = whole.joinpath("c", *numbers)
+        sums[added.relative_to(whole.parent).as_posix()] = own[
+            chunk.relative_to(part.parent).as_posix()
+        ]
+        added.parent.mkdir(parents=True, exist_ok=True)
+        _link(chunk, added)
+    array["shape"][place] += json.loads((part / "zarr.json").read_text())["shape"][place]
+    return sums
+
+
+def _with_text_as(dataset: xr.Dataset, kind: str, dtype: np.dtype[Any]) -> xr.Dataset:
+    """Convert text of one of NumPy's kinds to another one."""
+    texts = {
+        name: (variable.dims, variable.to_numpy().astype(object).astype(dtype), variable.attrs)
+        for name, variable in dataset.variables.items()
+        if variable.dtype.kind == kind
+    }
+    return dataset.assign(texts)

@@ -1,0 +1,210 @@
+"""The explorer in a real JupyterLab and browser: keys, pointer and pixels, the network refused.
+
+Skipped where there is no chromium.
+"""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.error import URLError
+from urllib.request import urlopen
+
+import nbformat
+import numpy as np
+import pytest
+import xarray as xr
+
+from dbthermal import separation, simulation, store
+from dbthermal.explorer import Region, View
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+sync_api = pytest.importorskip("playwright.sync_api", reason="no Playwright (extra 'test')")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no chromium in PATH: the explorer is not tried in a browser"
+)
+ROOT = Path(__file__).parents[2]
+CELL = """import dbthermal, resource
+explorer = dbthermal.explore({arguments})
+explorer"""
+
+
+class Lab:
+    """JupyterLab on a free port in a folder, and a page of a browser that reaches nothing else."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.outside, self.errors = folder, list[str](), list[str]()
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.address = f"http://127.0.0.1:{free.getsockname()[1]}"
+        settings = {
+            "ServerApp.ip": "127.0.0.1",
+            "ServerApp.port": self.address.rpartition(":")[2],
+            "ServerApp.root_dir": str(folder),
+            "IdentityProvider.token": "",
+            "LabApp.expose_app_in_browser": "True",
+            "LabApp.news_url": "",
+            "LabApp.check_for_updates_class": "jupyterlab.NeverCheckForUpdate",
+        }
+        options = [f"--{name}={value}" for name, value in settings.items()]
+        command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", *options]
+        own = {"JUPYTER_CONFIG_DIR": str(folder / "config"), "JUPYTER_RUNTIME_DIR": str(folder)}
+        environment = {**os.environ, **own, "PYTHONPATH": str(ROOT), "HOME": str(folder)}
+        environment.pop("PYTHONWARNINGS", None)
+        with (folder / "lab.log").open("w") as log:
+            self.server = subprocess.Popen(
+                command, env=environment, stdout=log, stderr=log, cwd=folder
+            )
+
+    def await_answer(self) -> None:
+        """Return when the server answers."""
+        for _ in range(240):
+            assert self.server.poll() is None, (self.folder / "lab.log").read_text()
+            try:
+                with urlopen(f"{self.address}/api/status", timeout=2):
+                    return
+            except (URLError, TimeoutError):
+                time.sleep(0.25)
+        raise TimeoutError((self.folder / "lab.log").read_text())
+
+    def admit(self, route: Any) -> None:
+        """Let requests to the server through, and refuse and note all others."""
+        if route.request.url.startswith((self.address, "data:", "blob:")):
+            route.continue_()
+        else:
+            self.outside.append(route.request.url)
+            route.abort()
+
+    def run(self, page: Any, *cells: str) -> None:
+        """Open a notebook of some cells and run it until the explorer has drawn a frame."""
+        notebook = nbformat.v4.new_notebook(
+            cells=[nbformat.v4.new_code_cell(cell) for cell in cells],
+            metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}},
+        )
+        nbformat.write(notebook, self.folder / "explore.ipynb")
+        page.goto(f"{self.address}/lab/tree/explore.ipynb?reset")
+        page.wait_for_selector(".jp-Notebook .cm-content")
+        page.wait_for_function(
+            "jupyterapp.shell.currentWidget?.sessionContext?.session?.kernel?.status === 'idle'"
+        )
+        page.evaluate("jupyterapp.commands.execute('notebook:run-all-cells')")
+        page.wait_for_function(
+            "document.querySelector('[data-testid=explorer]')?.explorer?.drawn >= 0", timeout=60_000
+        )
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    """Server that ends with the module."""
+    lab = Lab(tmp_path_factory.mktemp("lab"))
+    try:
+        lab.await_answer()
+        yield lab
+    finally:
+        lab.server.terminate()
+        lab.server.wait(30)
+
+
+@pytest.fixture
+def page(lab: Lab) -> Iterator[Any]:
+    """Page of a browser, of which requests and errors are noted."""
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1500, "height": 1300})
+        page.set_default_timeout(120_000)
+        page.route("**/*", lab.admit)
+        page.on("pageerror", lambda error: lab.errors.append(str(error)))
+        yield page
+        browser.close()
+
+
+def drag(page: Any, canvas: Any, start: tuple[float, float], stop: tuple[float, float]) -> None:
+    """Drag the pointer from one place of a picture to another one, as shares of its size."""
+    box = canvas.bounding_box()
+    (x0, y0), (x1, y1) = (
+        (box["x"] + across * box["width"], box["y"] + down * box["height"])
+        for across, down in (start, stop)
+    )
+    page.mouse.move(x0, y0)
+    page.mouse.down()
+    page.mouse.move((x0 + x1) / 2, (y0 + y1) / 2)
+    page.mouse.move(x1, y1)
+    page.mouse.up()
+
+
+def read_curve(page: Any, name: str) -> np.ndarray:
+    """Mean, least, greatest value and deviation (4, time) of a region, as the page has them."""
+    page.wait_for_function(
+        "name => { const e = document.querySelector('[data-testid=explorer]').explorer;"
+        " return e.curves.has(name) && !e.link.busy && !e.link.wanted.size }",
+        arg=name,
+    )
+    values = page.evaluate(
+        "name => Array.from(document.querySelector('[data-testid=explorer]').explorer"
+        ".curves.get(name).values, (one) => (Number.isFinite(one) ? one : null))",
+        name,
+    )
+    return np.array(values, dtype=np.float64).reshape(4, -1)
+
+
+def region_of(page: Any, name: str) -> Region:
+    """Region as the page has it."""
+    kind, points = page.evaluate(
+        "name => { const r = document.querySelector('[data-testid=explorer]').explorer"
+        ".regions.get(name); return [r.kind, r.points] }",
+        name,
+    )
+    return Region(kind, tuple(map(tuple, points)))
+
+
+def check_curve(page: Any, view: View, name: str) -> Region:
+    """The curve in the page is that of the view, rounded to float32."""
+    region = region_of(page, name)
+    curve = view.curve("object_temperature", region)
+    expected = [curve[part].values for part in ("mean", "minimum", "maximum", "std")]
+    np.testing.assert_allclose(read_curve(page, name), expected, rtol=0, atol=5e-5)  # [K]
+    return region
+
+
+def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
+    """Curves of a drawn and a moved region are the view's; keys step; no request goes outside."""
+    rig, rng = simulation.Rig(), np.random.default_rng(4)
+    table = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    scene = simulation.walkers(np.arange(120) / 10, (24, 32), table, rng)
+    capture = simulation.observe(scene, rig.response(), rng)
+    result = separation.solve(capture, rig.response())
+    parts = {"result": result, "capture": capture, "response": rig.response()}
+    for name, part in parts.items():
+        store.save(part, lab.folder / f"{name}.zarr", {})
+    names = [f"{name}.zarr" for name in parts]
+    lab.run(page, CELL.format(arguments=", ".join(map(repr, names))))
+    view = View(result, capture, rig.response())
+
+    canvas = page.locator("canvas[data-pane=object_temperature]")
+    page.locator("[data-tool=ellipse]").click()
+    drag(page, canvas, (0.2, 0.2), (0.5, 0.6))
+    before = check_curve(page, view, "region 1")
+    assert before.mask(view.shape).sum() > 50
+    page.locator("[data-tool=move]").click()
+    drag(page, canvas, (0.35, 0.4), (0.6, 0.5))
+    after = check_curve(page, view, "region 1")
+    np.testing.assert_allclose(np.subtract(after.points, before.points)[:, 1], 8.0, atol=0.3)
+
+    slider = page.locator("[data-testid=time]")
+    start = int(slider.input_value())
+    slider.focus()
+    for key in ("ArrowRight", "ArrowRight", "ArrowLeft", "Shift+ArrowRight"):
+        page.keyboard.press(key)
+    page.wait_for_function(
+        "index => document.querySelector('[data-testid=explorer]').explorer.drawn === index",
+        arg=start + 11,
+    )
+    assert int(slider.input_value()) == start + 11
+    if folder := os.environ.get("DBTHERMAL_SCREENSHOTS"):
+        page.locator("[data-testid=explorer]").screenshot(path=f"{folder}/explorer.png")
+    assert (lab.outside, lab.errors) == ([], [])

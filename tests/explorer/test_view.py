@@ -1,0 +1,282 @@
+"""What the explorer shows, curves and files, without the browser."""
+
+import csv
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+
+import dbthermal
+from dbthermal import schema, store
+from dbthermal.explorer import Region, View, _export
+from dbthermal.explorer._widget import quantised
+from dbthermal.response import apparent_temperature
+from dbthermal.schema import Status
+
+WHOLE = Region("rectangle", ((0, 0), (4, 5)))
+Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
+
+
+def separated(**changes: Any) -> xr.Dataset:
+    """Three frames of 4 by 5 pixels: object 310 to 312 K, background 300 K, both known by 0.1 K."""
+    film = np.broadcast_to(np.array([310.0, 311.0, 312.0])[:, None, None], (3, 4, 5)).copy()
+    flat = np.broadcast_to(np.array([0.9, 0.7])[:, None, None], (2, 4, 5))
+    variables = schema.STAGES["separated"]
+    values = {
+        "object_temperature": film,
+        "background_temperature": np.full((3, 4, 5), 300.0),
+        "object_temperature_std": np.full((3, 4, 5), 0.1),
+        "background_temperature_std": np.full((3, 4, 5), 0.1),
+        "emissivity": flat,
+        "emissivity_std": np.full((2, 4, 5), 1e-3),
+        "status": np.zeros((4, 5), np.uint32),
+    } | changes
+    arrays = {
+        name: (variables[name].dims, one, variables[name].attrs) for name, one in values.items()
+    }
+    return xr.Dataset(arrays, {"time": [0.0, 0.5, 1.0], "band": ["8-14", "9.5"]})
+
+
+def test_panes_of_a_result_with_its_capture(glass: Glass) -> None:
+    """Inputs are apparent temperatures; what is not estimated is left out."""
+    _, capture, response = glass
+    result = dbthermal.separation.solve(capture, response, "apparent")
+    view = View(result, capture, response)
+    missing = result.attrs["not_estimated"].split()
+    assert "emissivity" in missing
+    expected = {"input 8-14", "input 9.5", "object_temperature", "status"}
+    assert expected <= set(view.panes)
+    assert not [name for name in view.panes if name.startswith("emissivity")]
+    apparent = apparent_temperature(response, capture["counts"].isel(time=[7]))
+    np.testing.assert_allclose(view.frame("input 9.5", 7), apparent[1, 0], rtol=0, atol=5e-5)  # [K]
+
+
+def test_frames_of_a_store_are_those_in_memory(glass: Glass, tmp_path: Path) -> None:
+    """A film that is copied frame by frame from a store has the same frames, ranges and curves."""
+    _, capture, response = glass
+    result = dbthermal.separation.solve(capture, response)
+    for name, part in {"result": result, "capture": capture, "response": response}.items():
+        store.save(part, tmp_path / f"{name}.zarr", {})
+    paths = [tmp_path / f"{name}.zarr" for name in ("result", "capture", "response")]
+    stored, held = View(*paths), View(result, capture, response)
+    told: list[float] = []
+    stored.progress = lambda _, share: told.append(share)
+    assert list(stored.panes) == list(held.panes)
+    for name in held.panes:
+        np.testing.assert_array_equal(stored.frame(name, 200), held.frame(name, 200))
+        assert stored.limits(name) == held.limits(name)
+    xr.testing.assert_identical(
+        stored.curve("object_temperature", WHOLE), held.curve("object_temperature", WHOLE)
+    )
+    assert told[-1] == 1.0
+
+
+def test_curve_and_its_deviation() -> None:
+    """Mean and extremes; the emissivities' share of the deviation is not lessened by 20 pixels."""
+    data = separated()
+    data["object_temperature"][:, 0, 0] += 2.0
+    curve = View(data).curve("object_temperature", WHOLE)
+    np.testing.assert_allclose(curve["mean"], [310.1, 311.1, 312.1], rtol=0, atol=1e-4)  # [K]
+    np.testing.assert_allclose(curve["maximum"] - curve["minimum"], 2.0, rtol=0, atol=1e-4)
+    # dx = (x - y) (k de_1 - de_2) / (1 - k), k = 0.3 / 0.1
+    shared = np.array([10.0, 11.0, 12.0]) * 1e-3 * np.hypot(3.0, 1.0) / 2.0
+    shared = shared * 19 / 20 + (shared * np.array([12, 13, 14]) / np.array([10, 11, 12])) / 20
+    own = np.sqrt((0.01 - shared**2) / 20)
+    np.testing.assert_allclose(curve["std"], np.hypot(shared, own), rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("emissivity 9.5", {}),
+        ("object_temperature", {"status": np.full((4, 5), int(Status.COMPLETED_FROM_PRIOR))}),
+        ("object_temperature", {"emissivity": np.full((2, 4, 5), np.nan)}),
+    ],
+)
+def test_deviation_that_is_shared_does_not_shrink(name: str, changes: dict[str, Any]) -> None:
+    """Emissivities, completed pixels and unknown shares keep the deviation of one pixel."""
+    data = separated(**changes)
+    curve = View(data).curve(name, WHOLE)
+    one = 1e-3 if name.startswith("emissivity") else 0.1
+    np.testing.assert_allclose(curve["std"], one, rtol=1e-6)
+
+
+def test_mean_of_a_region_is_as_certain_as_stated(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of pooled materials, errors of a region's mean are neither far above nor below the band."""
+    rig, scores = dbthermal.simulation.Rig(), []
+    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        scene = dbthermal.simulation.walkers(np.arange(150) / 10, (12, 16), glass, rng)
+        capture = dbthermal.simulation.observe(scene, rig.response(), rng)
+        view = View(dbthermal.separation.separate(capture, rig.response()))
+        curve = view.curve("object_temperature", Region("rectangle", ((1, 1), (11, 15))))
+        inside = np.zeros((12, 16), dtype=bool)
+        inside[1:11, 1:15] = True
+        truth = scene["object_temperature"].values[:, inside & view.counted()].mean(axis=1)
+        scores.append((curve["mean"].values - truth) / curve["std"].values)
+    rms = float(np.sqrt(np.mean(np.square(scores))))
+    with capsys.disabled():
+        print(f"\nerror of a region's mean over its deviation, RMS: {rms:.2f}")
+    assert 0.2 < rms < 1.5
+
+
+def test_noise_of_an_input_falls_with_the_number(glass: Glass) -> None:
+    """Counts of n pixels have the response's noise, over the root of n."""
+    _, capture, response = glass
+    curve = View(capture).curve("input 9.5", WHOLE)
+    assert np.isnan(curve["std"]).all()  # no response: nothing is known of the noise
+    curve = View(capture, response=response).curve("input 9.5", WHOLE)
+    slope = dbthermal.response.curve(response, "9.5").count_slope(curve["mean"].values)
+    expected = float(response["noise"][1]) / slope / np.sqrt(20)
+    np.testing.assert_allclose(curve["std"], expected, rtol=0.02)
+
+
+def test_flagged_pixels_do_not_count() -> None:
+    """Completed pixels count unless only measured ones are wanted; flagged ones if all are."""
+    status = np.zeros((4, 5), np.uint32)
+    status[0], status[1] = int(Status.GRAY), int(Status.GRAY | Status.COMPLETED_FROM_MATERIAL)
+    view = View(separated(status=status))
+    numbers = {"unflagged": 15, "measured": 10, "all": 20}
+    for pixels, number in numbers.items():
+        curve = view.curve("object_temperature", WHOLE, pixels=pixels)  # type: ignore[arg-type]
+        assert (curve["pixels"] == number).all()
+    empty = view.curve("object_temperature", Region("rectangle", ((0, 0), (1, 5))))
+    assert np.isnan(empty["mean"]).all()
+    assert (empty["pixels"] == 0).all()
+
+
+def test_events_of_a_capture(glass: Glass) -> None:
+    """Segments, runs of flagged frames and what the user names are marked."""
+    _, capture, _ = glass
+    segment = np.repeat([0, 1, 2], [100, 150, 100])
+    flags = np.zeros((2, 350), np.uint16)
+    flags[1, [20, 21, 40]] = 2
+    attrs = {"flag_masks": [1, 2], "flag_meanings": "late shutter_closed"}
+    marked = capture.assign(segment=("time", segment), frame_flags=(("band", "time"), flags, attrs))
+    events = View(marked, events={"heater on": 3.0}).events
+    assert events == {
+        "shutter event 1": 10.0,
+        "shutter event 2": 25.0,
+        "shutter closed 1": 2.0,
+        "shutter closed 2": 4.0,
+        "heater on": 3.0,
+    }
+
+
+def test_copied_code_gives_the_same(glass: Glass, tmp_path: Path) -> None:
+    """Code of a view of stores runs alone, that of data in memory with their names."""
+    _, capture, response = glass
+    regions = {"region 1": Region("ellipse", ((0.5, 0.5), (4, 5)))}
+    store.save(capture, tmp_path / "capture.zarr", {})
+    store.save(response, tmp_path / "response.zarr", {})
+    held = View(capture, response=response)
+    views = [View(tmp_path / "capture.zarr", response=tmp_path / "response.zarr"), held]
+    for view, names in zip(views, ({}, {"capture": capture, "response": response}), strict=True):
+        done: dict[str, Any] = dict(names)
+        exec(view.code("input 9.5", 11, regions), done)
+        np.testing.assert_array_equal(done["frame"], held.frame("input 9.5", 11))
+        xr.testing.assert_identical(
+            done["curves"]["region 1"], held.curve("input 9.5", regions["region 1"])
+        )
+
+
+def test_exported_files(tmp_path: Path) -> None:
+    """CSV and NetCDF have the curves, TIFF and NetCDF the frame, PNG a picture; by suffix alone."""
+    view, names = View(separated()), ["object_temperature", "emissivity 9.5", "status"]
+    regions = {"region 1": WHOLE, "door": Region("rectangle", ((0, 0), (2, 2)))}
+    for suffix in _export.SUFFIXES:
+        _export.save(view, tmp_path / f"a{suffix}", names, 1, regions, celsius=True, limits={})
+    with (tmp_path / "a.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["time [s]"] for row in rows] == ["0", "0.5", "1"]
+    assert float(rows[1]["door mean [\N{DEGREE SIGN}C]"]) == pytest.approx(311.0 - 273.15, abs=1e-3)
+    assert {row["region 1 pixels"] for row in rows} == {"20"}
+    with Image.open(tmp_path / "a.tiff") as image, Image.open(tmp_path / "a.png") as figure:
+        np.testing.assert_array_equal(np.asarray(image), np.float32(311.0))
+        assert image.tag_v2[270] == "object temperature [K] at 0.500 s"  # type: ignore[attr-defined]
+        assert figure.size[0] > 500
+    with xr.open_dataset(tmp_path / "a.nc", engine="scipy") as saved:
+        assert saved["mean"].sel(region="door").values.tolist() == [310.0, 311.0, 312.0]
+        assert saved["object_temperature"].attrs["units"] == "K"
+    with pytest.raises(ValueError, match="Must end in one of"):
+        _export.save(view, tmp_path / "a.txt", names, 1, regions, celsius=True, limits={})
+    with pytest.raises(ValueError, match="without a region"):
+        _export.save(view, tmp_path / "a.csv", names, 1, {}, celsius=True, limits={})
+
+
+def test_codes_keep_the_values() -> None:
+    """Codes of 16 bits give a frame back within half a step, and 0 for what is no number."""
+    frame = np.array([[280.0, 300.5, np.nan], [np.inf, 320.0, 1e30]], dtype=np.float32)
+    codes, low, high = quantised(frame)
+    assert (low, high) == (280.0, 320.0)
+    assert codes[~schema.measured(frame)].tolist() == [0, 0, 0]
+    back = low + (codes - 1.0) / 65534 * (high - low)
+    known = schema.measured(frame)
+    np.testing.assert_allclose(back[known], frame[known], rtol=0, atol=4e-4)  # [K]
+
+
+@pytest.mark.parametrize(
+    ("data", "error", "message"),
+    [
+        (3, TypeError, "Invalid data of type int. Must be a Dataset or the path of a store"),
+        (xr.Dataset({"a": ("x", [1.0])}), ValueError, "Missing variable 'object_temperature'"),
+        (separated().drop_vars("time"), ValueError, "Missing coordinate 'time'"),
+        (separated().isel(time=0), ValueError, "Invalid dims"),
+        (separated().isel(time=[]), ValueError, "Empty 'object_temperature'"),
+        (separated().assign_coords(time=[0.0, 0.0, 1.0]), ValueError, "Unordered 'time'"),
+        ("nowhere.zarr", FileNotFoundError, "nowhere.zarr"),
+    ],
+)
+def test_bad_data_are_refused(data: Any, error: type[Exception], message: str) -> None:
+    """What is no result and no capture is an error that names what is wrong."""
+    with pytest.raises(error, match=message):
+        View(data)
+
+
+def test_bad_questions_are_refused(glass: Glass) -> None:
+    """Names, frames, pixels, captures and events that do not fit are named."""
+    view = View(separated())
+    with pytest.raises(ValueError, match="Unknown pane 'object'"):
+        view.frame("object", 0)
+    with pytest.raises(ValueError, match="Invalid frame 3"):
+        view.frame("object_temperature", 3)
+    with pytest.raises(ValueError, match="no pixel of the"):
+        view.curve("object_temperature", Region("rectangle", ((0, 0), (0.2, 0.2))))
+    with pytest.raises(ValueError, match="Invalid pane 'status'"):
+        view.curve("status", WHOLE)
+    with pytest.raises(ValueError, match="Unknown pixels 'some'"):
+        view.counted("some")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="Invalid size 350 of 'time' of the capture"):
+        View(separated(), glass[1])
+    with pytest.raises(ValueError, match="of the event 'lamp'"):
+        View(separated(), events={"lamp": np.nan})
+
+
+def test_explorer_has_a_picture_for_who_has_no_browser() -> None:
+    """Beside the widget the output holds a PNG; the traits hold no pixels."""
+    explorer = dbthermal.explore(separated())
+    bundle = explorer._repr_mimebundle_()
+    data = bundle[0] if isinstance(bundle, tuple) else bundle
+    assert {"image/png", "application/vnd.jupyter.widget-view+json"} <= set(data)
+    state = explorer.get_state()
+    assert all(len(str(one)) < 100 for key, one in state.items() if key not in {"_esm", "_css"})
+    explorer.close()
+
+
+def test_no_room_for_a_film_is_an_error(
+    glass: Glass, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A film that finds no room on disk is named before the disk is full."""
+    store.save(glass[1], tmp_path / "capture.zarr", {})
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
+    with pytest.raises(OSError, match="No room for 0 MB of 'input 8-14'"):
+        View(tmp_path / "capture.zarr").frame("input 8-14", 0)
