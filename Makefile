@@ -8,7 +8,8 @@ export PYTHON JOBS
 unexport PYTHONHOME
 
 # One make at a time in a checkout: the first one takes its lock and calls another, which has the tasks.
-ifneq ($(filter-out help,$(MAKECMDGOALS)),)
+# But JupyterLab, which is open for as long as somebody works in it.
+ifneq ($(filter-out help lab,$(MAKECMDGOALS)),)
 ifneq ($(value DBTHERMAL_LOCKED),$(CURDIR))
 unlocked := yes
 endif
@@ -56,7 +57,7 @@ export PYTHONPATH := $(CURDIR)/notebooks
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install format check types pytest smoke chain interop test test-slow reproduce full verify record data bench attack lock clean FORCE
+.PHONY: help install format check types pytest smoke chain interop test test-slow reproduce full verify record report data docs lab bench attack lock clean FORCE
 
 help: ## list the tasks
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
@@ -93,7 +94,7 @@ test: .venv/installed ## check lint, types, the quick tests, and every notebook 
 	$(MAKE) --no-print-directory pytest
 	$(parallel) smoke
 
-test-slow: .venv/installed ## run the long tests, and the notebooks on the recordings of the emulated rig
+test-slow: .venv/documenting ## run the long tests, and the notebooks on the recordings of the emulated rig
 	$(python) -m pytest --numprocesses="$$JOBS" -m slow
 	$(parallel) chain
 
@@ -112,6 +113,17 @@ record: .venv/installed ## keep the numbers of results/full as the reference, an
 data: .venv/installed ## fetch the outside files that data_manifest.yaml lists
 	$(python) -m reproduction.manifest
 
+report: .venv/installed ## one page on everything in results/full: results/report.html
+	$(python) -m reproduction.report
+
+docs: .venv/documenting ## build the documentation site into results/docs/html, with the notebooks that are in results/full
+	$(python) -m sphinx --fail-on-warning --keep-going --fresh-env --quiet docs results/docs/html
+
+lab: ## open JupyterLab on a copy of the five-minute tour, in results/lab
+	@$(MAKE) --no-print-directory install
+	@test -e results/lab/tour.ipynb || { mkdir -p results/lab && cp notebooks/00_quickstart.ipynb results/lab/tour.ipynb; }
+	$(python) -m jupyterlab results/lab/tour.ipynb
+
 bench: .venv/installed ## measure every method's time, and a run from disk to disk, into results/bench
 	$(python) -m reproduction.benchmark
 
@@ -124,7 +136,7 @@ lock: .venv/installed ## write both locks anew from pyproject.toml, keeping the 
 	$(compile) --no-config --generate-hashes --constraint requirements.lock --output-file requirements-hashes.lock pyproject.toml
 
 clean: ## remove all that make made: results, environment, caches
-	rm -rf results .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf results docs/api docs/notebooks .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find dbthermal tests notebooks -name __pycache__ -prune -exec rm -rf {} +
 
 # The lock constrains the package's own build too; pip renamed the variable for that. What an install that was interrupted left may look
@@ -137,6 +149,13 @@ clean: ## remove all that make made: results, environment, caches
 	PIP_CONSTRAINT=requirements.lock PIP_BUILD_CONSTRAINT=requirements.lock \
 	    $(python) -m pip install --quiet --editable '.[notebooks,test]'
 	@sync && touch $@ && rm -f .venv/installing
+
+# What the site needs; an environment in which this is interrupted counts as interrupted, and one in which it fails is as it was.
+.venv/documenting: .venv/installed
+	@mv .venv/installed .venv/installing
+	PIP_CONSTRAINT=requirements.lock PIP_BUILD_CONSTRAINT=requirements.lock \
+	    $(python) -m pip install --quiet --editable '.[docs]' || { mv .venv/installing .venv/installed; exit 1; }
+	@sync && mv .venv/installing .venv/installed && touch $@
 
 # Which outside files there are changes the results, so a change of theirs counts as a change of a source.
 listed := { printf 'DBTHERMAL_DATA=%s\n' "$$DBTHERMAL_DATA"; find -L data -type f 2>/dev/null | LC_ALL=C sort; }

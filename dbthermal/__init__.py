@@ -27,6 +27,8 @@ __all__ = [
     "noise",
     "planck",
     "readers",
+    "report",
+    "reporting",
     "response",
     "scene",
     "schema",
@@ -36,7 +38,7 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-_FUNCTIONS: Final = {"explore": "explorer"}  # name to its module
+_FUNCTIONS: Final = {"explore": "explorer", "report": "reporting"}  # name to its module
 
 
 def __getattr__(name: str) -> Any:

@@ -33,6 +33,7 @@ from dbthermal._glossary import (
 )
 
 __all__ = [
+    "COMPLETED",
     "COORDINATES",
     "EMISSIVITY_LIMITS",
     "EXPOSURE_TIME",
@@ -126,6 +127,15 @@ class Status(Flags):
     COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background of surroundings"
     COMPLETED_FRAMES = 1 << 19, "completed, not measured: some frames of the temperatures"
     NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
+
+
+COMPLETED: Final = (
+    Status.COMPLETED_FROM_MATERIAL
+    | Status.COMPLETED_FROM_PRIOR
+    | Status.COMPLETED_FROM_SURROUNDINGS
+    | Status.COMPLETED_FRAMES
+)
+"""Bits of a pixel of which something is completed, not measured."""
 
 
 def status_attrs() -> dict[str, object]:

@@ -16,8 +16,9 @@ ARCHITECTURE = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding=
 LAYERS = BLOCK.splitlines()[::-1]
 LEVEL = {module: level for level, row in enumerate(LAYERS) for module in row.split()}
 PLACES = {
+    "zarr": {"readers", "store"},
+    "h5py": {"readers"},
     "anywidget": {"explorer"},
-    "zarr": {"store"},
     "av": {"readers", "store"},
     "torch": {"separation"},
     "robust_laplacian": {"simulation"},
@@ -65,7 +66,7 @@ def test_optional_packages_have_one_place() -> None:
 
 
 def test_only_store_opens_zarr() -> None:
-    """A folder in zarr's format is opened and written in one module."""
+    """Results in zarr's format are opened and written in one module; readers open others."""
     texts = {
         path.relative_to(PACKAGE): path.read_text(encoding="utf-8")
         for path in PACKAGE.rglob("*.py")

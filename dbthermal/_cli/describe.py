@@ -60,7 +60,7 @@ def _stage(dataset: xr.Dataset) -> str:
 
 
 def _shares(flags: xr.DataArray) -> dict[str, float]:
-    """Share of the values without a flag, and of each flag that there is."""
+    """Share of the values without a flag, and of each flag found."""
     values = flags.values
     shares = {"none": float((values == 0).mean())}
     for name in str(flags.attrs["flag_meanings"]).split():

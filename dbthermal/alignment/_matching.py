@@ -305,7 +305,7 @@ def delay(movies: Movies, shift: Array, times: Array) -> float:
     the moved movie :math:`h`, its change :math:`\dot h`, the residual r of the others over their
     ratio to it, and sums over time and a window,
 
-    .. math:: \delta = \sum (\dot h r - c^T A^{-1} \, g r) \Big/ \sum (\dot h^2 - c^T A^{-1} c),
+    .. math:: \delta = \sum (\dot h r - c^T A^{-1} \, g r) / \sum (\dot h^2 - c^T A^{-1} c),
               \quad A = g g^T, \; c = g \dot h
     """
     places, (_, width, count) = np.indices(movies.shape) + shift, movies.first.shape

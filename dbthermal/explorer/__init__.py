@@ -7,21 +7,31 @@ of a `Region` and files from Python alone, which "copy as code" writes.
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import xarray as xr
 
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import View
 
-try:
+if TYPE_CHECKING:
     from dbthermal.explorer._widget import Explorer
-except ImportError as error:
-    raise ImportError(
-        f"Missing library '{error.name}'. Must be installed: pip install dbthermal[explorer]."
-    ) from error
 
 __all__ = ["Explorer", "Region", "View", "explore"]
 __dir__ = __all__.copy
+
+
+def __getattr__(name: str) -> "type[Explorer]":
+    """Import the explorer's page when it is first used; `View` and `Region` do without."""
+    if name != "Explorer":
+        raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")
+    try:
+        from dbthermal.explorer._widget import Explorer  # noqa: PLC0415 - asks for the extra
+    except ImportError as error:
+        raise ImportError(
+            f"Missing library '{error.name}'. Must be installed: pip install dbthermal[explorer]."
+        ) from error
+    return Explorer
 
 
 def explore(
@@ -31,7 +41,7 @@ def explore(
     *,
     events: Mapping[str, float] = MappingProxyType({}),
     celsius: bool = True,
-) -> Explorer:
+) -> "Explorer":
     """Look around in a separated scene or a capture, with regions and their curves.
 
     Slider, arrow keys or space for the time; wheel and drag for a zoom that all pictures share;
@@ -73,4 +83,4 @@ def explore(
     >>> list(explorer.view.panes)
     ['object_temperature']
     """
-    return Explorer(View(data, capture, response, events=events), celsius=celsius)
+    return __getattr__("Explorer")(View(data, capture, response, events=events), celsius=celsius)

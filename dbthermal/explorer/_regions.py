@@ -112,7 +112,7 @@ def common_gain(emissivity: Array, covariance: Array) -> tuple[Array, Array]:
 def mean_std(std: Array, common: Array) -> Array:
     r"""Standard deviation (time) of a mean over pixels, from theirs (time, pixel).
 
-    .. math:: s^2 = \Big(\frac1n \sum_i c_i\Big)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
+    .. math:: s^2 = \left(\frac1n \sum_i c_i\right)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
 
     Of each pixel's deviation :math:`s_i` the part :math:`c_i` is the same error in all pixels, so
     that no number of them lessens it; at most all of it, and all of it where it is NaN. A pixel

@@ -19,12 +19,7 @@ from dbthermal.schema import Status
 
 Pixels = Literal["unflagged", "measured", "all"]
 
-COMPLETED: Final = int(
-    Status.COMPLETED_FROM_MATERIAL
-    | Status.COMPLETED_FROM_PRIOR
-    | Status.COMPLETED_FROM_SURROUNDINGS
-    | Status.COMPLETED_FRAMES
-)
+COMPLETED: Final = int(schema.COMPLETED)
 FILMS: Final = {
     "object_temperature": "object temperature",
     "background_temperature": "reflected temperature",
@@ -196,7 +191,7 @@ class View:
         return found
 
     def pane(self, name: str) -> Pane:
-        """Pane of a name, read so far that a frame of it is quick; ValueError if there is none."""
+        """Pane of a name, read so far that a frame of it is quick; ValueError for another name."""
         if name not in self.panes:
             raise ValueError(f"Unknown pane {name!r}. Must be one of {list(self.panes)}.")
         self.panes[name].stage(self.progress)
@@ -271,7 +266,7 @@ class View:
         emissivities, completed pixels and pixels of cameras that stand apart, all of it. What
         remains is the noise of each pixel and frame,
 
-        .. math:: s^2 = \Big(\frac1n \sum_i c_i\Big)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
+        .. math:: s^2 = \left(\frac1n \sum_i c_i\right)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
 
         Parameters
         ----------

@@ -16,6 +16,8 @@ from dbthermal.figures._calibration import (
 from dbthermal.figures._limits import plan
 from dbthermal.figures._live import LiveFigure, Panel
 from dbthermal.figures._scenes import (
+    FilmPanel,
+    film,
     reflection_shift,
     separated_film,
     separated_frames,
@@ -26,12 +28,14 @@ from dbthermal.figures._status import REASONS, first_reason, status
 
 __all__ = [
     "REASONS",
+    "FilmPanel",
     "LiveFigure",
     "Panel",
     "condition_matrix",
     "drawing",
     "emissivity_bars",
     "emissivity_by_contact",
+    "film",
     "first_reason",
     "gain_offset_maps",
     "plan",

@@ -1,14 +1,15 @@
 """Figures and films of separated scenes, and of one pixel beside its truth."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.text import Text
 from scipy.constants import zero_Celsius
 
@@ -187,43 +188,82 @@ def separated_film(
     """
     emission = laid_on(emission, apparent, "the emission", "the inputs")
     change = laid_on(change, apparent, "the reflection", "the inputs")
-    parts = [apparent.sel(band=band) - zero_Celsius for band in apparent["band"].values]
-    titles = [f"input {band_label(band)}" for band in apparent["band"].values]
-    parts += [emission - zero_Celsius, change]
-    titles += ["emission", "reflection less its mean"]
-    aspect = apparent.sizes["y"] / apparent.sizes["x"]
-    size = (_WIDTH * len(parts), round((0.8 * _WIDTH * aspect + 1.0) * _DPI / 2) * 2 / _DPI)
-    figure, axes = canvas(1, len(parts), size)
+    names = apparent["band"].values
+    panels = [
+        FilmPanel(apparent.sel(band=band) - zero_Celsius, f"input {band_label(band)}")
+        for band in names
+    ]
+    panels.append(FilmPanel(emission - zero_Celsius, "emission"))
+    panels.append(FilmPanel(change, "reflection less its mean", "[K]", symmetric=True))
+    yield from film(panels, title=title + drawing.provenance_note(apparent))
+
+
+@dataclass(frozen=True)
+class FilmPanel:
+    """Picture of a film.
+
+    Attributes
+    ----------
+    values : DataArray
+        (time, y, x); pixels without a value are gray.
+    title, unit : str
+        Title, and unit of the colour bar.
+    symmetric : bool
+        Zero in the middle of the range of colour.
+    """
+
+    values: xr.DataArray
+    title: str
+    unit: str = "[\N{DEGREE SIGN}C]"
+    symmetric: bool = False
+
+
+def film(panels: Sequence[FilmPanel], *, title: str) -> Iterator[npt.NDArray[np.uint8]]:
+    """Frames of a film: pictures side by side, each with one range of colour for all times.
+
+    Parameters
+    ----------
+    panels : sequence of FilmPanel
+        Of the same times and pixels.
+    title : str
+        Heading, which the time follows.
+
+    Yields
+    ------
+    ndarray of uint8, shape (rows, columns, 3)
+        Colours; both sizes even, as video codecs want them.
+    """
+    first = panels[0].values
+    aspect = first.sizes["y"] / first.sizes["x"]
+    size = (_WIDTH * len(panels), round((0.8 * _WIDTH * aspect + 1.0) * _DPI / 2) * 2 / _DPI)
+    figure, axes = canvas(1, len(panels), size)
     figure.set_dpi(_DPI)
-    for axis, part, name in zip(axes[0], parts, titles, strict=True):
-        last = part is parts[-1]
-        unit = "[K]" if last else "[\N{DEGREE SIGN}C]"
-        scale = limits_of(part, symmetric=last)
-        cmap = "RdBu_r" if last else "inferno"
-        draw_image(figure, axis, part.isel(time=0), name, unit, cmap=cmap, limits=scale)
-    heading = figure.suptitle(f"{title}, {' ' * 7}" + drawing.provenance_note(apparent))
-    images = [axis.images[0] for axis in axes[0]]
-    yield from _frames(FigureCanvasAgg(figure), images, parts, (heading, title, apparent))
+    for axis, panel in zip(axes[0], panels, strict=True):
+        scale = limits_of(panel.values, symmetric=panel.symmetric)
+        cmap = "RdBu_r" if panel.symmetric else "inferno"
+        image = panel.values.isel(time=0)
+        draw_image(figure, axis, image, panel.title, panel.unit, cmap=cmap, limits=scale)
+    heading = figure.suptitle(f"{title}, {' ' * 7}")
+    yield from _frames(FigureCanvasAgg(figure), axes[0], panels, heading)
 
 
 def _frames(
-    agg: Any,  # FigureCanvasAgg, whose methods have no types
-    images: list[AxesImage],
-    parts: list[xr.DataArray],
-    heading: tuple[Text, str, xr.DataArray],
+    drawing: Any,  # FigureCanvasAgg, whose methods have no types
+    axes: Iterable[Axes],
+    panels: Sequence[FilmPanel],
+    heading: Text,
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """Draw the axes and labels once, and over them the images of each time."""
-    text, title, data = heading
-    for artist in (*images, text):
+    images, title = [axis.images[0] for axis in axes], heading.get_text().rstrip(" ,")
+    for artist in (*images, heading):
         artist.set_animated(True)
-    agg.draw()
-    still = agg.copy_from_bbox(agg.figure.bbox)
-    note = drawing.provenance_note(data)
-    for index, moment in enumerate(data["time"].values):
-        agg.restore_region(still)
-        text.set_text(f"{title}{note}, {moment:.1f} s")
-        for image, part in zip(images, parts, strict=True):
-            image.set_data(part.values[index])
+    drawing.draw()
+    still = drawing.copy_from_bbox(drawing.figure.bbox)
+    for index, moment in enumerate(panels[0].values["time"].values):
+        drawing.restore_region(still)
+        heading.set_text(f"{title}, {moment:.1f} s")
+        for image, panel in zip(images, panels, strict=True):
+            image.set_data(panel.values.values[index])
             image.axes.draw_artist(image)
-        agg.figure.draw_artist(text)
-        yield np.asarray(agg.buffer_rgba())[..., :3].copy()
+        drawing.figure.draw_artist(heading)
+        yield np.asarray(drawing.buffer_rgba())[..., :3].copy()

@@ -86,8 +86,12 @@ def status(result: xr.Dataset) -> Figure:
         for words, color in [REASONS.get(name, _GOOD)]
     ]
     right.legend(handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9)
-    completed = sum(share for name, share in shares.items() if name.startswith("completed"))
+    frames = shares["completed_frames"]
+    completed = (
+        sum(share for name, share in shares.items() if name.startswith("completed")) - frames
+    )
     good = f"{percent(shares[''])} of the pixels have no flag"
+    good += f", {percent(frames)} but for some frames" if frames else ""
     good += f", {percent(completed)} are completed" if completed else ""
     figure.suptitle(f"Status: {good}" + provenance_note(result))
     return figure

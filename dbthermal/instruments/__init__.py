@@ -6,8 +6,9 @@ opens it again. `inventory` lists what is on the USB bus. Below are the drivers:
 `fslp`, `filterwheel` over `apt`, and `tc08`; `camera` is the interface of any camera, and
 `thermocouple` converts type T. Imported by name are ``v4l2`` (frames), ``telemetry``, ``transport``
 (serial lines), ``signals`` and ``emulated``: devices behind ``sim://`` addresses, below the same
-drivers. The drivers were written from public descriptions and tested against public byte vectors
-and emulators, never against hardware. They need the packages of ``dbthermal[instruments]``.
+drivers; `_addresses` has the rules of all addresses. The drivers were written from public
+descriptions and tested against public byte vectors and emulators, never against hardware. They need
+the packages of ``dbthermal[instruments]``.
 """
 
 import importlib

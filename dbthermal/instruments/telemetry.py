@@ -85,12 +85,8 @@ def decode(rows: Counts, *, high_word_first: bool = True) -> dict[str, float]:
     words = _checked(rows)
     values: dict[str, float] = {}
     for name, field in FIELDS.items():
-        part = [int(word) for word in words[field.span]]
-        number = 0
-        for word in part if high_word_first else reversed(part):
-            number = number << _WORD_BITS | word
-        if field.signed and number >= -field.lowest:
-            number += 2 * field.lowest
+        part = words[field.span][:: 1 if high_word_first else -1].astype(">u2")
+        number = int.from_bytes(part.tobytes(), "big", signed=field.signed)
         values[name] = number / field.steps + field.zero if field.steps else number
     return values
 
@@ -117,8 +113,8 @@ def encode(values: Mapping[str, float], columns: int, rows: int = ROWS) -> Count
             raise ValueError(
                 f"Invalid {name} of {number} steps. Must lie in {field.lowest} to {highest}."
             )
-        parts = [number >> _WORD_BITS * place & 0xFFFF for place in range(field.words)]
-        words[field.span] = parts[::-1]
+        data = number.to_bytes(2 * field.words, "big", signed=field.signed)
+        words[field.span] = np.frombuffer(data, ">u2")
     return words.reshape(rows, columns)
 
 

@@ -158,43 +158,28 @@ def open_serial(
     or a pseudo-terminal as a serial port, which would let an emulator pass for hardware;
     TransportError if the port cannot be opened.
     """
-    address = addresses.parse(url, _SCHEMES)
-    if address.scheme == "sim":
-        return _open_emulated(address, url, world, baudrate=baudrate, rtscts=rtscts)
-    path = address.target
-    if address.scheme == "serial" and Path(path).resolve().is_relative_to("/dev/pts"):
-        raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must begin with pty://.")
-    port = _open_port(path, baudrate=baudrate, rtscts=rtscts)
-    return SerialTransport(port, url, is_simulated=address.scheme == "pty")
-
-
-def _open_emulated(
-    address: addresses.Address, url: str, world: object | None, *, baudrate: int, rtscts: bool
-) -> SerialTransport:
-    """Start the emulator that an address names, and open its end of the line."""
-    if address.target not in EMULATORS:
-        rule = f"Must be one of {sorted(EMULATORS)} after sim://"
-        raise ValueError(f"Invalid address '{url}'. {rule}.")
-    options = {**address.options, **({"name": address.name} if address.name else {})}
-    emulated = importlib.import_module(EMULATORS[address.target]).start(options, world)
-    try:
-        port = _open_port(emulated.path, baudrate=baudrate, rtscts=rtscts)
-    except TransportError:
-        emulated.close()
-        raise
-    return SerialTransport(port, url, is_simulated=True, after=emulated.close)
-
-
-def _open_port(path: str, *, baudrate: int, rtscts: bool) -> "serial.Serial":
-    """Open a port for this program alone."""
     import serial  # noqa: PLC0415 - an optional package, which drivers of other devices do without
 
+    address = addresses.parse(url, _SCHEMES)
+    path, after = address.target, None
+    if address.scheme == "sim":
+        if path not in EMULATORS:
+            rule = f"Must be one of {sorted(EMULATORS)} after sim://"
+            raise ValueError(f"Invalid address '{url}'. {rule}.")
+        options = {**address.options, **({"name": address.name} if address.name else {})}
+        emulated = importlib.import_module(EMULATORS[path]).start(options, world)
+        path, after = emulated.path, emulated.close
+    elif address.scheme == "serial" and Path(path).resolve().is_relative_to("/dev/pts"):
+        raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must begin with pty://.")
     try:
-        return serial.Serial(
+        port = serial.Serial(
             path, baudrate, rtscts=rtscts, exclusive=True, write_timeout=WRITE_TIMEOUT
         )
     except OSError as error:
+        if after is not None:
+            after()
         raise TransportError(
             f"Could not open '{path}': {error}. It must exist, be yours to use, and in no "
             "other program's use."
         ) from error
+    return SerialTransport(port, url, is_simulated=address.scheme != "serial", after=after)

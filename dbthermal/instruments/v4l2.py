@@ -44,7 +44,7 @@ __all__ = ["BUFFERS", "Y16", "Capture", "Kernel", "open_url"]
 __dir__ = __all__.copy
 
 Y16: Final = 0x20363159
-"""Pixel format ``Y16 ``: 16 bits a pixel, little-endian, before any gain control."""
+"""Pixel format ``Y16`` and a space: 16 bits a pixel, little-endian, before any gain control."""
 
 BUFFERS: Final = 32
 """Frames that the kernel holds while no program reads, the most it can; beyond, it drops: half a
@@ -150,20 +150,29 @@ class Capture(Closing):
         be opened or is busy; ValueError if it gives no Y16, or another format or rate.
         """
         capture = cls(path, stream or Stream(), kernel, decode)
-        capture._start()
+        capture._file = file = capture._kernel.open_node(path)
+        try:
+            capture.identity = {"device": path, **capture._agree(file)}
+            capture._map_buffers(file)
+            capture._kernel.ask(file, STREAMON, bytearray(_TYPE))
+        except BaseException:
+            capture.close()
+            raise
         return capture
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """Wait for the next frame, a copy; see `camera.FrameSource.read`."""
-        file, buffer = self._opened(), _buffer(0)
-        deadline = self._kernel.clock() + timeout
-        while self._announced(file, deadline):
+        if self._file is None:
+            raise SourceLostError(f"No frames from '{self.path}': it is closed.")
+        file, buffer, clock = self._file, _buffer(0), self._kernel.clock
+        deadline = clock() + timeout
+        while self._kernel.select([file], [], [], max(0.0, deadline - clock()))[0]:
             if self._taken(file, buffer):
                 break
         else:
             raise NoFrameError(f"No frame from '{self.path}' in {timeout} s.")
         try:
-            return self._frame(buffer, self._kernel.clock())
+            return self._frame(buffer, clock())
         finally:
             self._give_back(file, buffer)
 
@@ -183,16 +192,6 @@ class Capture(Closing):
             self._maps.clear()
             self._kernel.close(file)
 
-    def _start(self) -> None:
-        self._file = file = self._kernel.open_node(self.path)
-        try:
-            self.identity = {"device": self.path, **self._agree(file)}
-            self._map_buffers(file)
-            self._kernel.ask(file, STREAMON, bytearray(_TYPE))
-        except BaseException:
-            self.close()
-            raise
-
     def _agree(self, file: int) -> dict[str, str]:
         """Set format and rate; a driver sets the nearest that it can, which is an error here."""
         captures, identity = _capability(file, self._kernel)
@@ -202,11 +201,6 @@ class Capture(Closing):
                 code.to_bytes(4, "little").decode("ascii", "backslashreplace") for code in offered
             ]
             raise ValueError(f"Invalid video node '{self.path}' with {names}. Must offer 'Y16 '.")
-        self._agree_on_format(file)
-        self._agree_on_rate(file)
-        return identity
-
-    def _agree_on_format(self, file: int) -> None:
         rows, columns = self.stream.rows, self.shape[1]
         line = _BYTES * columns
         wanted = columns, rows, Y16, _PROGRESSIVE, line, rows * line
@@ -218,8 +212,6 @@ class Capture(Closing):
                 f"Invalid format of '{self.path}': {agreed} (columns, rows, code, field, bytes of "
                 f"a row, bytes of a frame). Must be {wanted}: is the telemetry set as requested?"
             )
-
-    def _agree_on_rate(self, file: int) -> None:
         rate = self.frame_rate
         argument = bytearray(PARAMETERS.pack(CAPTURE, 0, 0, 1000, round(1000 * rate), 0, 0))
         self._kernel.ask(file, S_PARM, argument)
@@ -229,6 +221,7 @@ class Capture(Closing):
                 f"Invalid frame period {numerator}/{denominator} s of '{self.path}'. "
                 f"Must be 1/{rate} s."
             )
+        return identity
 
     def _map_buffers(self, file: int) -> None:
         request = bytearray(REQUEST.pack(BUFFERS, CAPTURE, MMAP))
@@ -240,15 +233,6 @@ class Capture(Closing):
             self._maps.append(self._kernel.map(file, length, offset))
             self._kernel.ask(file, QBUF, buffer)
 
-    def _opened(self) -> int:
-        if self._file is None:
-            raise SourceLostError(f"No frames from '{self.path}': it is closed.")
-        return self._file
-
-    def _announced(self, file: int, deadline: float) -> bool:
-        wait = max(0.0, deadline - self._kernel.clock())
-        return bool(self._kernel.select([file], [], [], wait)[0])
-
     def _taken(self, file: int, buffer: bytearray) -> bool:
         """Take the buffer of a frame; False if it was announced but is missing."""
         try:
@@ -256,10 +240,10 @@ class Capture(Closing):
         except BlockingIOError:
             return False
         except OSError as error:
-            if error.errno not in _GONE:
-                raise
-            message = f"No more frames from '{self.path}': {error.strerror}."
-            raise SourceLostError(message) from error
+            if error.errno in _GONE:
+                text = f"No more frames from '{self.path}': {error.strerror}."
+                raise SourceLostError(text) from error
+            raise
         return True
 
     def _give_back(self, file: int, buffer: bytearray) -> None:

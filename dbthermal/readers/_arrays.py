@@ -1,4 +1,4 @@
-"""Counts in files of NumPy, or in an array that another library has opened."""
+"""Counts in files of NumPy, HDF5, NetCDF and zarr, or in an array that is opened already."""
 
 import lzma
 import struct
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal.readers import _containers as containers
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._decoding import MEMORY
 from dbthermal.readers._recording import Clock
@@ -36,26 +37,35 @@ def array(
     clock: Clock,
     memory: float = MEMORY,
 ) -> xr.Dataset:
-    """Counts of a .npy or .npz file, or of an array from HDF5, NetCDF, zarr or elsewhere.
+    """Counts of a NumPy, HDF5, NetCDF or zarr file, or of an array that is opened already.
 
-    Pickled objects are never loaded. Arrays in other formats are opened by their own libraries,
-    ``xarray.open_dataset("a.nc")["frames"]`` or ``h5py.File("a.h5")["frames"]``, and may be lazy.
-    Errors as `tiff`; ValueError if a file is neither .npy nor .npz, or damaged, or the array is not
-    one of three dimensions and uint16.
+    The format is that of the first bytes. Pickled objects are never loaded, and nothing is taken
+    from another file. HDF5 and zarr may be without checksums; damage of their values is then not
+    seen, as in any copy. An array that another library has opened may be lazy.
 
     Parameters
     ----------
     source : str, Path, array or DataArray
-        Regular file, or an array with `shape` and `dtype`: (time, y, x), uint16.
+        Regular file, folder of zarr, or an array with `shape` and `dtype`: (time, y, x), uint16.
     name : str, optional
-        Name of the array in a .npz of several.
+        Name of the array in a file of several, such as ``"entry/frames"``.
     unit, clock, memory
-        As for `tiff`; a DataArray's own ``units`` must agree.
+        As for `tiff`; an array's own ``units`` must agree.
 
     Returns
     -------
     Dataset
         As from `tiff`.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file does not exist.
+    ImportError
+        If h5py, the extra ``recordings``, is not installed for HDF5, which NetCDF 4 is too.
+    ValueError
+        If a file is of another format, or damaged; the array is not one of three dimensions and
+        uint16, is scaled, or is not in the file; as `tiff` for unit, clock, memory and 8 bits.
 
     Examples
     --------
@@ -66,14 +76,21 @@ def array(
     """
     label = Path(source).name if isinstance(source, str | Path) else "array"
     recordings.check_unit(unit, label)
+
+    def check(values: Any) -> None:
+        _check(values.shape, values.dtype, memory, label)
+        own = getattr(values, "attrs", {}).get("units", unit)
+        recordings.check_unit(own.decode() if isinstance(own, bytes) else str(own), label)
+
     with ExitStack() as stack:
-        if isinstance(source, str | Path):
+        values = source
+        if not isinstance(source, str | Path):
+            check(source)
+        elif containers.kind_of(Path(source)):
+            values = containers.read(Path(source), name, check, stack)
+        else:
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
-        else:
-            values = source
-            _check(values.shape, values.dtype, memory, label)
-            recordings.check_unit(str(getattr(values, "attrs", {}).get("units", unit)), label)
         counts = np.asarray(values).astype(np.uint16)
     return recordings.clocked(counts, clock, label, format="array")
 
@@ -120,7 +137,9 @@ def _numpy_array(stream: IO[bytes], name: str, memory: float) -> npt.NDArray[Any
             shape, by_columns, dtype = headers[version](stream)
     except _NO_HEADER as error:
         message = " ".join(str(error).split())[:100]
-        raise ValueError(f"Invalid '{name}': {message}. Must be .npy or .npz.") from error
+        raise ValueError(
+            f"Invalid '{name}': {message}. Must be .npy, .npz, HDF5, NetCDF or zarr."
+        ) from error
     _check(shape, dtype, memory, name)
     size = 2 * int(np.prod(shape, dtype=object))
     if len(content := stream.read(size + 1)) != size:

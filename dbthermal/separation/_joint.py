@@ -9,7 +9,7 @@ reference band and p of the second camera. The combination without background (e
 A method solves it as if x(p) were x(r), which gives q. Then the equations of all pixels are solved
 together, frame by frame, each for the term of the larger coefficient:
 
-.. math:: u_1(x(r)) \leftarrow \Big[q(r) - \sum_{m > 1} c_m u_m(x(p))\Big] / c_1
+.. math:: u_1(x(r)) \leftarrow \left[q(r) - \sum_{m > 1} c_m u_m(x(p))\right] / c_1
 
 contracts by :math:`g = |\sum_{m > 1} c_m / c_1|` a step, for two bands
 :math:`(e_2 / e_1) / \kappa`; where that is above 1 the equation solved for x(p) contracts by 1/g.

@@ -102,15 +102,18 @@ def _digest(content: Mapping[str, Any]) -> str:
 
 
 def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> None:
-    """Save a text in Markdown, with its provenance in a comment at its end.
+    """Save a text in Markdown or HTML, with its provenance in a comment at its end.
 
     Parameters
     ----------
     text, path, provenance : str, str or Path, mapping
-        Text, file ``*.md``; see `save`.
+        Text, file ``*.md`` or ``*.html``; see `save`.
     """
-    with whole(path, ".md") as part:
-        part.write_text(f"{text}\n<!-- {as_json(provenance)} -->\n", encoding="utf-8")
+    suffix = ".html" if Path(path).suffix == ".html" else ".md"
+    # A string in it can neither end the comment nor begin a tag.
+    content = as_json(provenance).replace("--", "-\\u002d").replace("<", "\\u003c")
+    with whole(path, suffix) as part:
+        part.write_text(f"{text}\n<!-- {content} -->\n", encoding="utf-8")
 
 
 def save_figure(

@@ -8,7 +8,6 @@ import pytest
 from loopback import Loop
 from test_transport import Echo
 
-from dbthermal.instruments import transport
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated import boson as emulated_boson
 from dbthermal.instruments.emulated.port import EmulatedPort
@@ -36,11 +35,11 @@ def test_an_emulator_ends_if_its_port_cannot_be_opened(monkeypatch: pytest.Monke
         started.append(start(options, world))
         return started[0]
 
-    def refuse(path: str, **_: object) -> None:
-        raise TransportError(f"Could not open '{path}'.")
+    def refuse(path: str, *_: object, **__: object) -> None:
+        raise OSError(f"no '{path}'")
 
     monkeypatch.setattr(emulated_boson, "start", note)
-    monkeypatch.setattr(transport, "_open_port", refuse)
+    monkeypatch.setattr("serial.Serial", refuse)
     with pytest.raises(TransportError, match="Could not open"):
         open_serial("sim://boson", baudrate=921600)
     assert not started[0]._thread.is_alive()

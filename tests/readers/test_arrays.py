@@ -1,5 +1,6 @@
 """Arrays of counts: files of NumPy without objects, and what other libraries have opened."""
 
+import json
 import resource
 import time
 from collections import Counter
@@ -51,15 +52,68 @@ def test_arrays_of_other_libraries() -> None:
         read(scene()[0])
 
 
-def test_arrays_on_disk(tmp_path: Path) -> None:
-    """Arrays that zarr and xarray open and leave on disk are read when they are taken."""
-    path = tmp_path / "a.zarr"
-    zarr.create_array(store=path, name="frames", data=scene())
-    assert_array_equal(read(zarr.open_group(path, mode="r")["frames"]).counts, scene())
-    frames = xr.DataArray(scene(), dims=("t", "y", "x"), name="frames")
-    frames.astype("i4").to_netcdf(tmp_path / "a.nc", engine="scipy")
-    with xr.open_dataset(tmp_path / "a.nc") as opened:
-        assert_array_equal(read(opened["frames"].astype("uint16")).counts, scene())
+def written(path: Path, form: str) -> Path:
+    """Three frames in a file of a container, named "frames"."""
+    frames = xr.DataArray(scene(), dims=("t", "y", "x"), name="frames", attrs={"units": "count"})
+    if form == "h5":
+        with pytest.importorskip("h5py").File(path, "w") as file:
+            file.create_dataset("entry/frames", data=scene())
+    elif form == "nc":
+        signed = frames.astype("i2").assign_attrs(_Unsigned="true")
+        signed.to_netcdf(path, engine="scipy")
+    else:
+        group = zarr.open_group(path, mode="w", zarr_format=2 if form == "zarr2" else 3)
+        group.create_array("frames", data=scene(), chunks=(1, 24, 32)).attrs["units"] = "count"
+    return path
+
+
+@pytest.mark.parametrize("form", ["h5", "nc", "zarr2", "zarr3"])
+def test_containers_by_path(tmp_path: Path, form: str) -> None:
+    """HDF5, NetCDF and zarr by path: the counts as they are, the array named if it is missing."""
+    path = written(tmp_path / f"a.{form}", form)
+    assert_array_equal(read(path).counts, scene())
+    with pytest.raises(ValueError, match=r"Missing array 'film' .* one of \['(entry/)?frames'\]"):
+        read(path, "film")
+    with pytest.raises(ValueError, match="Must be at most memory=100"):
+        read(path, memory=100)
+
+
+def test_other_units_dims_and_files_are_refused(tmp_path: Path) -> None:
+    """Temperatures, time that is not first, scaled numbers, other formats have a sentence each."""
+    frames = xr.DataArray(scene().astype("i2"), dims=("t", "y", "x"), name="frames")
+    frames.attrs["_Unsigned"] = "true"
+    for changed, message in (
+        (frames.assign_attrs(units="K"), "Invalid unit 'K'"),
+        (frames.rename(t="y", y="time"), r"Invalid dims \['y', 'time', 'x'\] .* Must be \(time, y"),
+        (frames.assign_attrs(scale_factor=0.1), "Invalid dtype float"),
+    ):
+        changed.to_netcdf(tmp_path / "a.nc", engine="scipy")
+        with pytest.raises(ValueError, match=message):
+            read(tmp_path / "a.nc")
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frames"] = h5py.ExternalLink("b.h5", "frames")
+        form = h5py.VirtualLayout((3, 24, 32), "u2")
+        file.create_virtual_dataset("virtual", form)
+    with pytest.raises(ValueError, match=r"Invalid 'virtual' in other files"):
+        read(tmp_path / "a.h5")
+
+
+def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
+    """A store of pickled objects is not read, and a chunk that is missing is no image of zeros."""
+    path = written(tmp_path / "a.zarr", "zarr3")
+    (path / "frames" / "c" / "1" / "0" / "0").unlink()
+    with pytest.raises(ValueError, match="Missing 1 chunks of 'frames'"):
+        read(path)
+    path = written(tmp_path / "b.zarr", "zarr2")
+    about = json.loads((path / "frames" / ".zarray").read_text())
+    about["compressor"] = {"id": "pickle", "protocol": 5}
+    (path / "frames" / ".zarray").write_text(json.dumps(about))
+    with pytest.raises(ValueError, match=r"Damaged 'b\.zarr': .*pickle"):
+        read(path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"Damaged 'empty': .*Must be a whole zarr"):
+        read(tmp_path / "empty")
 
 
 def test_objects_are_not_loaded(tmp_path: Path) -> None:
@@ -75,19 +129,21 @@ def test_objects_are_not_loaded(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Invalid|Truncated"):
         read(path)
     path.write_bytes(b"nothing at all")
-    with pytest.raises(ValueError, match=r"Invalid 'a\.npy': .*Must be \.npy or \.npz"):
+    with pytest.raises(ValueError, match=r"Invalid 'a\.npy': .*Must be \.npy, \.npz, HDF5"):
         read(path)
 
 
 @pytest.mark.parametrize(
     "number", [pytest.param(300, id="300"), pytest.param(10_000, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("form", ["npy", "npz", "raw"])
+@pytest.mark.parametrize("form", ["npy", "npz", "raw", "nc", "h5"])
 def test_damage(tmp_path: Path, form: str, number: int) -> None:
     """Damaged files are refused, or read as they are; a .npz has checksums."""
     path, counts, found = tmp_path / f"a.{form}", scene(), Counter[str]()
     if form == "raw":
         counts.tofile(path)
+    elif form in {"nc", "h5"}:
+        written(path, form)
     else:
         (np.save if form == "npy" else np.savez_compressed)(path, counts)
     whole = path.read_bytes()
@@ -105,7 +161,11 @@ def test_damage(tmp_path: Path, form: str, number: int) -> None:
         except ValueError as refusal:
             found["refused" if "Must " in str(refusal) else f"unclear: {refusal}"] += 1
         else:
-            pixels = changed[-counts.nbytes :] if form != "npz" else counts.tobytes()
+            order = ">u2" if form == "nc" else "<u2"
+            start, pixels = whole.find(counts.astype(order).tobytes()), counts.tobytes()
+            if start >= 0:  # but in a .npz, which is compressed
+                there = np.frombuffer(changed[start : start + counts.nbytes], order)
+                pixels = there.astype("<u2").tobytes()
             found[f"{'same' if taken.tobytes() == pixels else 'other'}, {kind}"] += 1
         assert time.perf_counter() - begun < 5  # [s]
     taken_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before

@@ -242,3 +242,15 @@ def test_an_interrupted_install_is_done_anew(checkout: Path, started: Start) -> 
     assert (checkout / ".venv/installed").exists()
     assert not (checkout / ".venv/installing").exists()
     assert len((checkout / "calls").read_text().splitlines()) == 2  # pip itself, then the packages
+
+
+@pytest.mark.parametrize(("pip", "installed"), [("exit 0", 1), ("exit 1", 1), ("kill $PPID", 0)])
+def test_the_site_s_packages_come_beside(checkout: Path, pip: str, installed: int) -> None:
+    """Added to the environment, they make nothing out of date; a failure leaves it as it was."""
+    script(checkout / ".venv/bin/python", pip)
+    os.utime(checkout / ".venv/installed", (2e9, 2e9))
+    done = make(".venv/documenting")
+    assert (done.returncode == 0) == (pip == "exit 0")
+    assert (checkout / ".venv/documenting").exists() == (pip == "exit 0")
+    assert [path.stat().st_mtime for path in checkout.glob(".venv/installed")] == [2e9] * installed
+    assert (checkout / ".venv/installing").exists() == (not installed)

@@ -259,8 +259,7 @@ class Boson(Closing):
         deadline = self._clock() + self.timeout
         received = 0
         while (remaining := deadline - self._clock()) > 0:
-            piece = self._transport.read(_READ_SIZE, remaining)
-            if not piece:
+            if not (piece := self._transport.read(_READ_SIZE, remaining)):
                 break
             received += len(piece)
             if received > MAXIMUM_RECEIVED:
@@ -268,26 +267,22 @@ class Boson(Closing):
                     f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. "
                     "Must be a Boson's command port that no other program uses."
                 )
-            reply = self._matching(self._decoder.feed(piece))
-            if reply is not None:
-                return reply
+            key = (fslp.COMMAND_CHANNEL, self._sequence)
+            frames = self._decoder.feed(piece)
+            replies = [
+                frame
+                for frame in frames
+                if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
+            ]
+            self.statistics.discarded += len(frames) - len(replies[:1])
+            self.statistics.damaged = self._decoder.damaged
+            if replies:
+                return replies[0]
         self.statistics.timeouts += 1
         raise BosonTimeoutError(
             f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
             "and the camera through with booting."
         )
-
-    def _matching(self, frames: list[fslp.Frame]) -> fslp.Frame | None:
-        """Reply to the last request, if it is among the frames; the others are counted."""
-        key = (fslp.COMMAND_CHANNEL, self._sequence)
-        replies = [
-            frame
-            for frame in frames
-            if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
-        ]
-        self.statistics.discarded += len(frames) - len(replies[:1])
-        self.statistics.damaged = self._decoder.damaged
-        return replies[0] if replies else None
 
 
 def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:

@@ -83,8 +83,6 @@ class EmulatedApt:
     `plugged` is set to False to pull out the cable.
     """
 
-    is_simulated: Final = True
-
     def __init__(
         self,
         world: World,

@@ -7,7 +7,7 @@ which the public descriptions leave open, are choices made here.
 
 import math
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -33,7 +33,8 @@ _SERIAL_NUMBER_LIMITS = (0, (1 << 32) - 1)
 _FPA_LIMITS = (0.0, 655.0)  # [K] which tenths in 16 bits hold
 _STATUS, _RANGE, _FEW, _MANY, _UNKNOWN = 0x162, 0x203, 0x17D, 0x17E, 0x161
 
-Handler = tuple[int, Callable[[bytes], bytes | None]]
+# Number of the states of each setting, which are numbered from 0.
+_CHOICES = {setting.set_command: len(setting.kind.__members__) for setting in commands.SETTINGS}
 
 
 class EmulatedBoson:
@@ -42,8 +43,6 @@ class EmulatedBoson:
     Its clock is the world's; KeyError if the world has no camera of this name.
     """
 
-    is_simulated: Final = True
-
     def __init__(self, world: World, name: str) -> None:
         self.camera = world.camera(name)
         self.settings = dict(DEFAULTS)
@@ -51,7 +50,6 @@ class EmulatedBoson:
         self._name = name
         self._decoder = fslp.Decoder()
         self._replies: list[bytes] = []
-        self._handlers = self._all_handlers()
 
     @property
     def plugged(self) -> bool:
@@ -87,65 +85,43 @@ class EmulatedBoson:
 
     def answer(self, request: fslp.Frame) -> tuple[int, bytes]:
         """Status and data of the reply to a request."""
+        command, data, readings = request.command, request.data, self._readings()
         if request.status != fslp.REQUEST:
             return _STATUS, b""
-        if request.command not in self._handlers:
+        if command not in {commands.RUN_FFC, *self.settings, *readings}:
             return _UNKNOWN, b""
-        size, handle = self._handlers[request.command]
-        if len(request.data) != size:
-            return (_FEW if len(request.data) < size else _MANY), b""
-        data = handle(request.data)
-        return (_RANGE, b"") if data is None else (0, data)
-
-    def _all_handlers(self) -> dict[int, Handler]:
-        """Size of the data, and function, of each command; a value out of range gives None."""
-        camera = self.camera
-        values: dict[commands.Reading[Any], Callable[[], tuple[int | bytes, ...]]] = {
-            commands.SERIAL_NUMBER: lambda: (camera.serial_number,),
-            commands.PART_NUMBER: lambda: (b"EMULATED-BOSON-640",),
-            commands.SENSOR_SERIAL_NUMBER: lambda: (camera.serial_number,),
-            commands.SOFTWARE_REVISION: lambda: (0, 0, 0),
-            commands.FPA_TEMPERATURE: lambda: (
-                round(10 * (camera.fpa_temperature - zero_Celsius)),
-            ),
-            commands.FFC_IN_PROGRESS: lambda: (self._ffc_status() == FfcStatus.IN_PROGRESS,),
-            commands.FFC_STATUS: lambda: (self._ffc_status(),),
-            commands.LAST_FFC_FRAME: lambda: (camera.last_ffc_frame,),
-        }
-        handlers: dict[int, Handler] = {commands.RUN_FFC: (0, self._run_ffc)}
-        for reading, read in values.items():
-            handlers[reading.command] = 0, _packed(reading.layout, read)
-        for setting in commands.SETTINGS:
-            kind: Any = setting.kind  # an enumeration, whose members are numbered from 0
-            handlers[setting.set_command] = 4, self._setter(setting.set_command, len(kind))
-            handlers[setting.reading.command] = 0, self._getter(setting.set_command)
-        return handlers
-
-    def _ffc_status(self) -> FfcStatus:
-        if self._world.ffc_in_progress(self._name):
-            return FfcStatus.IN_PROGRESS
-        return FfcStatus.COMPLETE if self.camera.ffc_count else FfcStatus.NONE_PERFORMED
-
-    def _run_ffc(self, _: bytes) -> bytes:
-        self._world.start_ffc(self._name)
-        return b""
-
-    def _getter(self, command: int) -> Callable[[bytes], bytes]:
-        return lambda _: struct.pack(">i", self.settings[command])
-
-    def _setter(self, command: int, values: int) -> Callable[[bytes], bytes | None]:
-        def handle(data: bytes) -> bytes | None:
+        size = 4 if command in self.settings else 0
+        if len(data) != size:
+            return (_FEW if len(data) < size else _MANY), b""
+        if command == commands.RUN_FFC:
+            self._world.start_ffc(self._name)
+        elif command in self.settings:
             (value,) = struct.unpack(">i", data)
-            if value not in range(values):
-                return None
+            if value not in range(_CHOICES[command]):
+                return _RANGE, b""
             self.settings[command] = value
-            return b""
+        return 0, readings.get(command, b"")
 
-        return handle
-
-
-def _packed(layout: str, values: Callable[[], tuple[int | bytes, ...]]) -> Callable[[bytes], bytes]:
-    return lambda _: struct.pack(layout, *values())
+    def _readings(self) -> dict[int, bytes]:
+        """Data of every reading and setting, by the identifier that reads it."""
+        camera, status = self.camera, FfcStatus.NONE_PERFORMED
+        if self._world.ffc_in_progress(self._name):
+            status = FfcStatus.IN_PROGRESS
+        elif camera.ffc_count:
+            status = FfcStatus.COMPLETE
+        values: dict[commands.Reading[Any], tuple[int | bytes, ...]] = {
+            commands.SERIAL_NUMBER: (camera.serial_number,),
+            commands.PART_NUMBER: (b"EMULATED-BOSON-640",),
+            commands.SENSOR_SERIAL_NUMBER: (camera.serial_number,),
+            commands.SOFTWARE_REVISION: (0, 0, 0),
+            commands.FPA_TEMPERATURE: (round(10 * (camera.fpa_temperature - zero_Celsius)),),
+            commands.FFC_IN_PROGRESS: (status == FfcStatus.IN_PROGRESS,),
+            commands.FFC_STATUS: (status,),
+            commands.LAST_FFC_FRAME: (camera.last_ffc_frame,),
+        }
+        for setting in commands.SETTINGS:
+            values[setting.reading] = (self.settings[setting.set_command],)
+        return {one.command: struct.pack(one.layout, *value) for one, value in values.items()}
 
 
 def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:

@@ -52,8 +52,6 @@ class World:
     several together, hold `lock`.
     """
 
-    is_simulated: Final = True
-
     def __init__(
         self,
         *,

@@ -29,16 +29,14 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         `counts` (band, time, y, x) [count], read when used; `exposure_time` (band, time) [s], NaN
         for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
         ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
-        any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates``
-        has b of each band.
+        any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates`` has
+        b of each band.
 
     Raises
     ------
-    FileNotFoundError
-        If the folder does not exist.
-    ValueError
-        If a band has fewer than two frames with a time, or a file of the recording is not as it
-        was written; see `dbthermal.store.open_dataset`.
+    FileNotFoundError, ValueError
+        If the folder does not exist; if a band has fewer than two frames with a time, or a file is
+        not as it was written, see `dbthermal.store.open_dataset`.
 
     Examples
     --------
@@ -72,12 +70,7 @@ def notes(path: str | Path) -> list[tuple[float, str, str, float]]:
     Parameters
     ----------
     path : str or Path
-        Folder ``*.zarr`` of the recording.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
+        Folder ``*.zarr`` of the recording; FileNotFoundError if it does not exist.
     """
     recording = store.open_dataset(path)
     kinds = {number: name for name, number in recording.attrs["log_kinds"].items()}

@@ -3,9 +3,8 @@
 Each frame is compared with the one before: a number that leaps is a loss, one that does not rise a
 repetition, a stamp that does not rise, or cannot be, is no time, and an image without a changed
 pixel was not taken anew. Nothing is left out: a damaged frame is written with its flags, and only
-its exposure time is NaN, so that `dbthermal.alignment` passes over it. Losses, shutter events and
-readings of other instruments go into the log. The store explains its contents in words, for a
-reader may have no more than the store.
+its exposure time is NaN. Losses, shutter events and readings of other instruments go into the log.
+The store explains its contents in words, for a reader may have no more than the store.
 """
 
 import math
@@ -174,10 +173,9 @@ class CaptureFile:
     """A new recording at `path` that takes frames and notes in the order in which they come.
 
     `readings` has the unit of each further instrument, `origin` is the host's clock at time 0 [s],
-    `attrs` are attributes of the recording (JSON), and `chunk` is the number of frames that are
-    written together. FileExistsError if `path` exists; ValueError if the sources differ in shape or
-    telemetry. After a failed write `broken` is True: what was written before is valid, and nothing
-    more may be handed over. Renamed or moved, the recording goes on in its folder, with a note.
+    and `chunk` is the number of frames that are written together. FileExistsError if `path` exists;
+    ValueError if the sources differ in shape or telemetry. After a failed write `broken` is True:
+    what was written before is valid, and nothing more may be handed over.
     """
 
     def __init__(

@@ -1,7 +1,6 @@
 """Reader of a blackbody sweep: one recording for each temperature and filter.
 
-Only the folder is read: the recordings say which session they are of. Temperatures are the readings
-during the recordings, not the set points.
+The recordings say which session they are of; temperatures are the readings during them.
 """
 
 from collections.abc import Iterator, Mapping
@@ -79,10 +78,8 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
 
     Parameters
     ----------
-    folder : str or Path
-        Of `dbthermal.instruments.protocols.record_sweep`.
-    name : str
-        Of the session.
+    folder, name : str or Path, str
+        Of `dbthermal.instruments.protocols.record_sweep`, and of the session.
     frames : int
         Frames to take of each: the first ones of each band that are whole and show the blackbody.
 
@@ -107,18 +104,12 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
     for paths in sweep.steps():
         temperatures.append(_agreed(paths, BLACKBODY, sweep.stability))
         movies.append(_movie(paths, frames))
-    order = np.argsort(temperatures)
-    axis = xr.DataArray(
-        np.array(temperatures)[order],
-        dims="temperature",
-        name="temperature",
-        attrs=schema.COORDINATES["temperature"].attrs,
-    )
-    counts = xr.concat([movies[place] for place in order], dim=axis)
+    order, attrs = np.argsort(temperatures), schema.COORDINATES["temperature"].attrs
+    axis = xr.Variable("temperature", np.array(temperatures)[order], attrs)
+    counts = xr.concat([movies[place] for place in order], "temperature")
     counts = counts.transpose("band", "temperature", "frame", "y", "x")
-    return schema.check(
-        counts.to_dataset(name="counts").assign_attrs(sweep.attrs), "blackbody_movies"
-    )
+    joined = counts.to_dataset(name="counts").assign_coords(temperature=axis)
+    return schema.check(joined.assign_attrs(sweep.attrs), "blackbody_movies")
 
 
 def bench_series(
@@ -131,10 +122,8 @@ def bench_series(
 
     Parameters
     ----------
-    folder : str or Path
-        Of `dbthermal.instruments.protocols.record_sweep`.
-    name : str
-        Of the session.
+    folder, name : str or Path, str
+        Of `dbthermal.instruments.protocols.record_sweep`, and of the session.
     region : mapping
         Material to its rows and columns. The thermocouple named like it is the object's.
     correction : Dataset, optional
@@ -166,10 +155,14 @@ def bench_series(
             counts = [_mean(captures[band], band, place, correction) for band in captures]
             one = xr.Dataset({"counts": ("band", counts), **measured}, {"band": list(captures)})
             series[material].append(one)
-    return {
-        material: _contact(measurements).assign_attrs(sweep.attrs, material=material)
-        for material, measurements in series.items()
-    }
+    joined = {}
+    for material, measurements in series.items():
+        one = xr.concat(measurements, "measurement").transpose("band", "measurement")
+        for variable, described in schema.STAGES["contact"].items():
+            one[variable].attrs = described.attrs
+        one.attrs = {**sweep.attrs, "material": material}
+        joined[material] = schema.check(one, "contact")
+    return joined
 
 
 def _find(folder: str | Path, name: str) -> _Sweep:
@@ -246,11 +239,3 @@ def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset
     if not np.isfinite(mean):
         raise ValueError(f"No good pixel {source}. Must have one.")
     return mean
-
-
-def _contact(measurements: list[xr.Dataset]) -> xr.Dataset:
-    """Series of one material, stage `contact`, from its measurements."""
-    series = xr.concat(measurements, "measurement").transpose("band", "measurement")
-    for name, variable in schema.STAGES["contact"].items():
-        series[name].attrs = variable.attrs
-    return schema.check(series, "contact")

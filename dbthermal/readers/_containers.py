@@ -1,0 +1,100 @@
+"""Arrays in files of HDF5, NetCDF and zarr, which are left on disk."""
+
+import math
+import warnings
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import xarray as xr
+import zarr
+
+from dbthermal.readers import _recording as recordings
+
+_DAMAGE: Final = (
+    *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError),
+    *(OSError, EOFError, RuntimeError, MemoryError, SystemError, RuntimeWarning, UserWarning),
+)
+
+
+def kind_of(path: Path) -> str:
+    """Format of a container, by its first bytes; empty if it is none."""
+    if path.is_dir():
+        return "zarr"
+    with recordings.files([path])[0].open("rb") as stream:
+        start = stream.read(8)
+    return "HDF5" if start == b"\x89HDF\r\n\x1a\n" else "NetCDF" if start[:3] == b"CDF" else ""
+
+
+def read(path: Path, name: str | None, check: Callable[[Any], None], stack: ExitStack) -> Any:
+    """Numbers of an array of three dimensions, by its name if there are several, once checked."""
+    kind = kind_of(path)
+    try:
+        stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
+        warnings.simplefilter("error", UserWarning)  # as of one dimension twice
+        found = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
+        wanted = next(iter(found)) if name is None and len(found) == 1 else name
+        if wanted not in found:
+            rule = f"Must be one of {sorted(found)}, which have three dimensions"
+            raise ValueError(f"Missing array '{wanted}' in '{path.name}'. {rule}.")
+        values, dims = found[wanted]
+        if "time" in dims[1:]:
+            raise ValueError(f"Invalid dims {dims} of '{path.name}'. Must be (time, y, x).")
+        for scale in {"scale_factor", "add_offset"} & set(values.attrs):
+            raise ValueError(f"Invalid '{scale}' of '{path.name}'. Must be counts as measured.")
+        check(values)
+        return values[...]
+    except _DAMAGE as error:
+        if isinstance(error, ValueError) and "Must " in str(error):
+            raise
+        message = " ".join(str(error).split())[:200]
+        raise ValueError(f"Damaged '{path.name}': {message}. Must be a whole {kind}.") from error
+
+
+def _hdf5(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
+    h5py = recordings.optional("h5py", "recordings")
+    file = stack.enter_context(h5py.File(path, "r"))
+    found, headers = dict[str, tuple[Any, list[str]]](), [8]
+
+    def visit(name: str, one: Any) -> None:
+        headers.append(h5py.h5o.get_info(one.id).addr)
+        if isinstance(one, h5py.Dataset) and one.ndim == 3:
+            found[name] = (one, [dim.label or next(iter(dim.keys()), "") for dim in one.dims])
+
+    file.visititems(visit)  # follows no link to another file
+    for name, (one, _) in found.items():
+        if one.is_virtual or one.external:
+            raise ValueError(f"Invalid '{name}' in other files. Must be in '{path.name}' itself.")
+        start = one.id.get_offset() if one.chunks is None else None
+        if start is not None and any(start <= place < start + one.nbytes for place in headers):
+            raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
+        pieces = zip(one.shape, one.chunks or one.shape, strict=True)
+        wanted = math.prod(-(-size // part) for size, part in pieces) if one.chunks else 0
+        chunks = [one.id.get_chunk_info(n) for n in range(one.id.get_num_chunks() if wanted else 0)]
+        if len(chunks) != wanted or any(chunk.filter_mask for chunk in chunks):
+            raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
+    return found
+
+
+def _netcdf(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
+    opened = xr.open_dataset(
+        path, engine="scipy", decode_times=False, decode_coords=False, create_default_indexes=False
+    )
+    variables = stack.enter_context(opened).variables.items()
+    return {str(name): (one, [*map(str, one.dims)]) for name, one in variables if one.ndim == 3}
+
+
+def _foreign_store(path: Path, _: ExitStack) -> dict[str, tuple[Any, list[str]]]:
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
+        root = zarr.open(str(path), mode="r")
+        found: dict[str, Any] = {path.stem: root}
+        if isinstance(root, zarr.Group):
+            found = dict(root.members(max_depth=None))
+    arrays = {n: one for n, one in found.items() if isinstance(one, zarr.Array) and one.ndim == 3}
+    for name, one in arrays.items():
+        recordings.check_memory(one.shards or one.chunks, 2.0**30, f"a chunk of '{name}'")
+        if missing := one.nchunks - one.nchunks_initialized:
+            raise ValueError(f"Missing {missing} chunks of '{name}'. Must be a whole copy.")
+    names = {name: getattr(one.metadata, "dimension_names", None) for name, one in arrays.items()}
+    return {n: (one, [str(dim) for dim in names[n] or ()]) for n, one in arrays.items()}

@@ -1,0 +1,171 @@
+"""Page of a report: sections of text, tables, figures and films in one file of HTML."""
+
+import base64
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from dbthermal import store
+
+try:
+    from jinja2 import Environment, select_autoescape
+    from markupsafe import Markup
+except ImportError as error:
+    raise ImportError("A report needs Jinja2: pip install dbthermal[report]") from error
+
+
+@dataclass(frozen=True)
+class Section:
+    """Part of a page under one heading.
+
+    Attributes
+    ----------
+    title : str
+        Heading.
+    body : sequence of str or Markup
+        Paragraphs; a plain string is text, and is shown as it is written. `table`, `image_tag` and
+        `film_tag` make Markup.
+    """
+
+    title: str
+    body: Sequence[str]
+
+
+def save_page(
+    path: str | Path,
+    title: str,
+    sections: Iterable[Section],
+    *,
+    origin: str,
+    numbers: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+) -> None:
+    """Save sections as one HTML file that asks for nothing else.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ``*.html``. Its parents are made.
+    title, origin : str
+        Title, and beside it what the data are: "measured", "simulated", "emulated".
+    sections : iterable of Section
+        In their order.
+    numbers : mapping
+        Numbers of the page, kept in it as JSON in the element ``numbers``.
+    provenance : mapping
+        From `store.provenance`, shown at the end.
+    """
+    environment = Environment(autoescape=select_autoescape(default=True), trim_blocks=True)
+    text = resources.files("dbthermal.reporting").joinpath("page.html").read_text("utf-8")
+    page = environment.from_string(text).render(
+        title=title,
+        origin=origin,
+        sections=list(sections),
+        numbers=embedded_json(numbers),
+        provenance=json.dumps(provenance, indent=2, sort_keys=True),
+    )
+    if Path(path).suffix != ".html":
+        raise ValueError(f"Invalid path '{path}'. Must end in '.html'.")
+    store.save_text(page, path, provenance)
+
+
+def embedded_json(content: Mapping[str, Any]) -> Markup:
+    """JSON that stays inside its ``<script>`` element, whatever the strings in it are."""
+    plain = json.dumps(content, allow_nan=False, sort_keys=True)
+    return Markup(plain.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], *, names: int = 1) -> Markup:
+    """Table of text and numbers.
+
+    Parameters
+    ----------
+    head : sequence of str
+        Headings of the columns.
+    rows : iterable of sequence
+        Cells, each shown as its text.
+    names : int
+        Columns of names, to the left; the others are numbers, to the right.
+    """
+
+    def cells(row: Sequence[object], tag: str) -> Markup:
+        kinds = ("name" if index < names else "number" for index in range(len(row)))
+        pairs = zip(row, kinds, strict=True)
+        return Markup("").join(
+            Markup("<{0} class={1}>{2}</{0}>").format(Markup(tag), kind, cell)
+            for cell, kind in pairs
+        )
+
+    body = Markup("").join(Markup("<tr>{}</tr>").format(cells(row, "td")) for row in rows)
+    return Markup("<table><thead><tr>{}</tr></thead><tbody>{}</tbody></table>").format(
+        cells(head, "th"), body
+    )
+
+
+def image_tag(image: Figure | str | Path, text: str) -> Markup:
+    """Figure as a picture within the page: a matplotlib figure as vectors, a PNG file as it is.
+
+    Parameters
+    ----------
+    image : Figure, str or Path
+        A figure, or a file ``*.png``.
+    text : str
+        What it shows, for whoever cannot see it; the caption.
+    """
+    if isinstance(image, Figure):
+        buffer = io.BytesIO()
+        with mpl.rc_context({"svg.hashsalt": "dbthermal", "svg.fonttype": "path"}):
+            image.savefig(buffer, format="svg", metadata={"Date": None}, dpi=150)
+        kind, content = "svg+xml", buffer.getvalue()
+    else:
+        kind, content = "png", Path(image).read_bytes()
+    source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    return Markup('<figure><img src="{}" alt="{}"><figcaption>{}</figcaption></figure>').format(
+        source, text, text
+    )
+
+
+def film_tag(path: str | Path, text: str) -> Markup:
+    """Film within the page.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ``*.mp4``, as from `store.save_video`.
+    text : str
+        Caption.
+    """
+    content = base64.b64encode(Path(path).read_bytes()).decode()
+    return Markup(
+        '<figure><video controls loop muted playsinline src="data:video/mp4;base64,{}"></video>'
+        "<figcaption>{}</figcaption></figure>"
+    ).format(content, text)
+
+
+def viewer_tag(film: Mapping[str, Any], text: str) -> Markup:
+    """Viewer of films: a picture, a slider for the time, and the curve of a pixel.
+
+    Parameters
+    ----------
+    film : mapping
+        `height`, `width`, `step` between pixels, `times` [s], `palette` (256 colours) and
+        `quantities`, as viewer.js reads them.
+    text : str
+        What to do with it.
+    """
+    script = resources.files("dbthermal.reporting").joinpath("viewer.js").read_text("utf-8")
+    return Markup(
+        '<div class="viewer"><div class="controls"><select data-part="quantity"></select>'
+        '<button type="button" data-part="play">Play</button>'
+        '<input type="range" min="0" value="0" step="1" data-part="time" aria-label="frame"></div>'
+        '<div class="readout" data-part="readout"></div><canvas data-part="picture"></canvas>'
+        '<canvas data-part="curve"></canvas><p>{}</p>'
+        '<script type="application/json">{}</script><script>{}</script></div>'
+    ).format(text, embedded_json(film), Markup(script))

@@ -1,0 +1,348 @@
+"""Report of a separated scene: films, curves of regions, validity, emissivities, assumptions."""
+
+from collections.abc import Iterator, Mapping
+from itertools import cycle
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final, Literal
+
+import numpy as np
+import xarray as xr
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from dbthermal import emissivity, figures, schema
+from dbthermal._arrays import Array
+from dbthermal.explorer import Region, View
+from dbthermal.figures import drawing
+from dbthermal.reporting._films import FILMS, VIEWED, Unit, sampled, video, viewer
+from dbthermal.reporting._page import (
+    Section,
+    image_tag,
+    save_page,
+    table,
+)
+from dbthermal.schema import Status
+
+Curves = Mapping[str, Mapping[str, xr.Dataset]]
+
+_FILMED: Final = 240  # frames of the film, at most
+_FASTEST: Final = 30.0  # Hz
+_SPREAD: Final = 0.02  # of emissivities of samples of one material
+_WORDS: Final = {
+    "method": "method",
+    "settings": "its options",
+    "response_kind": "response of the cameras",
+    "calibration": "calibration",
+    "noise_source": "noise taken from",
+    "emissivity_source": "emissivities taken from",
+    "not_estimated": "not estimated",
+    "reference_band": "band on whose grid the result is",
+    "reflection_shift": "shift between the cameras' reflections",
+    "time_offset": "clock of the second camera behind the first [s]",
+    "frames_lost": "frames lost",
+}
+_NEAREST: Final = 3  # materials that are named
+
+
+def report(  # noqa: PLR0913 - what is shown beside the result, by name
+    data: xr.Dataset | str | Path,
+    path: str | Path,
+    capture: xr.Dataset | str | Path | None = None,
+    response: xr.Dataset | str | Path | None = None,
+    *,
+    regions: Mapping[str, Region] = MappingProxyType({}),
+    materials: xr.Dataset | None = None,
+    title: str = "Separated thermal scene",
+    provenance: Mapping[str, Any] | None = None,
+    celsius: bool = True,
+    codec: Literal["vp9", "h264"] = "h264",
+) -> None:
+    """Write one HTML file on a separated scene, to hand to someone else; it needs no network.
+
+    It shows the scene as a film, a viewer of frames and of each pixel's curve, the curves of
+    regions with their error bars, what can be trusted and why the rest cannot, emissivities beside
+    those of a table, what was assumed, parameters and provenance. Its numbers are in it as JSON.
+
+    Parameters
+    ----------
+    data : Dataset, str or Path
+        Result of `separation` with `object_temperature` (time, y, x) [K], or its store.
+    path : str or Path
+        File ``*.html``. Its parents are made.
+    capture, response : Dataset, str or Path, optional
+        Corrected capture (band, time, y, x) [count] and the cameras' response: the inputs are shown
+        beside the result, as apparent temperatures if both are given.
+    regions : mapping of str to explorer.Region, optional
+        Name to region; the whole image if there is none.
+    materials : Dataset, optional
+        Stage `emissivity_table`, whose nearest materials are named; `emissivity.embedded_table` if
+        not given.
+    title : str
+        Heading.
+    provenance : mapping, optional
+        From `store.provenance`; that of the result if not given.
+    celsius : bool
+        Temperatures in degrees Celsius instead of kelvin.
+    codec : {"h264", "vp9"}
+        Compression of the film. H.264 plays in every browser; see `store.save_video`.
+
+    Raises
+    ------
+    ImportError
+        If a library of the extra `report` is not installed.
+    TypeError, ValueError
+        As `explorer.View`; if there is no object temperature, or the path has another ending.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import dbthermal
+    >>> film = xr.DataArray(np.full((2, 4, 6), 300.0), {"time": [0.0, 0.1]}, ("time", "y", "x"))
+    >>> with TemporaryDirectory() as folder:
+    ...     page = Path(folder, "scene.html")
+    ...     dbthermal.report(film.to_dataset(name="object_temperature"), page, title="Wall")
+    ...     "<h1>Wall</h1>" in page.read_text("utf-8")
+    True
+    """
+    view = View(data, capture, response)
+    if "object_temperature" not in view.panes:
+        raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
+    result, unit = view.data, Unit(celsius=celsius)
+    chosen = dict(regions) or {
+        "whole image": Region("rectangle", ((0, 0), (view.shape[0], view.shape[1])))
+    }
+    curves = {
+        name: {pane: view.curve(pane, region) for pane in view.panes if _is_averaged(pane)}
+        for name, region in chosen.items()
+    }
+    table_ = emissivity.embedded_table() if materials is None else materials
+    numbers = {
+        "scene": _scene(view),
+        "validity": _validity(view),
+        "regions": {name: _summary(of, table_) for name, of in curves.items()},
+    }
+    sections = [
+        Section(
+            "Scene", [_scene_sentence(view), video(view, unit, title, codec), viewer(view, unit)]
+        ),
+        Section("Regions", list(_regions(view, unit, chosen, curves))),
+        Section("What can be trusted", list(_trust(view, numbers["validity"]))),
+        Section("Emissivities", list(_emissivities(numbers["regions"]))),
+        Section("What was assumed", [_assumed(view)]),
+    ]
+    save_page(
+        path,
+        title,
+        [section for section in sections if section.body],
+        origin=_origin(view),
+        numbers=numbers,
+        provenance=result.attrs.get("provenance", {}) if provenance is None else provenance,
+    )
+
+
+def _is_averaged(name: str) -> bool:
+    """A pane of which the regions' means are wanted."""
+    return name in FILMS or name.startswith("emissivity ")
+
+
+def _scene(view: View) -> dict[str, Any]:
+    """Size and duration."""
+    rows, columns = view.shape
+    seconds = float(view.time[-1] - view.time[0])
+    return {"rows": rows, "columns": columns, "frames": int(view.time.size), "duration_s": seconds}
+
+
+def _scene_sentence(view: View) -> str:
+    """Size, duration and method in a sentence."""
+    scene, attrs = _scene(view), view.data.attrs
+    text = f"{scene['rows']} rows of {scene['columns']} pixels, {scene['frames']} frames in "
+    text += f"{scene['duration_s']:.1f} s"
+    return text + (f"; separated by the method '{attrs['method']}'." if "method" in attrs else ".")
+
+
+def _origin(view: View) -> str:
+    """Origin of the data: measured, simulated, emulated, or not stated."""
+    holders = [one for one in (view.data, view.capture) if one is not None]
+    return next(
+        (str(one.attrs["origin"]) for one in holders if "origin" in one.attrs), "origin not stated"
+    )
+
+
+def _regions(
+    view: View, unit: Unit, chosen: Mapping[str, Region], curves: Curves
+) -> Iterator[Markup | str]:
+    """Yield where the regions are, and their curves with two standard deviations."""
+    yield image_tag(_outlines(view, unit, chosen), "Object temperature, mean over time; regions.")
+    names = [name for name in FILMS if name in view.panes]
+    figure, axes = drawing.canvas(len(names), 1, (9.0, 2.9 * len(names)))
+    for axis, name in zip(axes[:, 0], names, strict=True):
+        pane = view.panes[name]
+        for region, color in zip(chosen, cycle(drawing.COLORS), strict=False):
+            curve = curves[region][name]
+            mean, two = unit.of(curve["mean"].values, pane), 2 * curve["std"].values
+            axis.plot(view.time, mean, color=color, label=region, linewidth=1.2)
+            axis.fill_between(
+                view.time, mean - two, mean + two, color=color, alpha=0.25, linewidth=0
+            )
+        axis.set(title=pane.label, ylabel=f"[{unit.label(pane)}]")
+        axis.legend(frameon=False, fontsize=8)
+    axes[-1, 0].set_xlabel("time [s]")
+    yield image_tag(figure, "Means of the regions, and two standard deviations of these means.")
+    head = ["region", "pixels that count", f"object temperature [{unit.name}]", "its std [K]"]
+    rows = []
+    for region in chosen:
+        curve = curves[region]["object_temperature"]
+        mean = unit.of(curve["mean"].values, view.panes["object_temperature"])
+        rows.append(
+            [
+                region,
+                int(curve["pixels"].max()),
+                _range(mean),
+                _text(_plain(curve["std"].mean()), 3),
+            ]
+        )
+    yield table(head, rows)
+    yield (
+        "Pixels with a flag do not count, but those that were completed do. Errors that the pixels "
+        "of a region share are not lessened by their number."
+    )
+
+
+def _outlines(view: View, unit: Unit, chosen: Mapping[str, Region]) -> Figure:
+    """Mean picture of the object with the regions on it."""
+    pane = view.panes["object_temperature"]
+    film, step = sampled(view, pane.name, VIEWED, VIEWED * 200_000)
+    with np.errstate(invalid="ignore"):
+        count = film.notnull().sum("time")
+        image = unit.of(film.sum("time") / count.where(count > 0), pane)
+    aspect = view.shape[0] / view.shape[1]
+    figure, axes = drawing.canvas(1, 1, (5.6, 4.6 * aspect + 0.5))
+    label = f"[{unit.label(pane)}]"
+    drawing.draw_image(
+        figure, axes[0, 0], image, pane.label, label, limits=drawing.limits_of(image)
+    )
+    for (name, region), color in zip(chosen.items(), cycle(drawing.COLORS), strict=False):
+        mask = region.mask((view.shape[0], view.shape[1]))[::step, ::step]
+        if mask.all():
+            continue
+        axes[0, 0].contour(mask, [0.5], colors=[color], linewidths=1.5)
+        row, column = (float(one.mean()) for one in np.nonzero(mask))
+        axes[0, 0].text(column, row, name, color="white", ha="center", va="center", fontsize=9)
+    return figure
+
+
+def _validity(view: View) -> dict[str, float]:
+    """Share of the pixels that are measured, completed, without a value, and with each flag."""
+    frames = int(Status.COMPLETED_FRAMES)
+    completed = (view.status & int(schema.COMPLETED) & ~np.uint32(frames)) != 0
+    film, _ = sampled(view, "object_temperature", VIEWED, VIEWED * 200_000)
+    shares = {
+        "no_flag": float(np.mean(view.status == 0)),
+        "no_flag_but_for_some_frames": float(np.mean(view.status == frames)),
+        "completed": float(completed.mean()),
+        "without_value": float(film.isnull().all("time").mean()),
+    }
+    return shares | {
+        bit.label: float(np.mean((view.status & bit) != 0))
+        for bit in Status
+        if (view.status & bit).any()
+    }
+
+
+def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
+    """Yield the map of the status, and a table of the flags with what they mean."""
+    if "status" not in view.panes:
+        yield "The result has no status: nothing is said of what can be trusted."
+        return
+    yield image_tag(figures.status(view.data), "Pixels to trust, and the reason of the others.")
+    meaning = {bit.label: bit.meaning for bit in Status}
+    words = {
+        "no_flag": "measured, and nothing speaks against it",
+        "no_flag_but_for_some_frames": "measured, and gaps of some frames are bridged",
+        "completed": "not measured here, but completed from what else is known",
+        "without_value": "no object temperature at any time",
+    }
+    rows = [
+        [name.replace("_", " "), words.get(name) or meaning[name], drawing.percent(share)]
+        for name, share in shares.items()
+    ]
+    yield table(["flag", "meaning", "share of the pixels"], rows, names=2)
+
+
+def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[str, Any]:
+    """Numbers of a region: temperatures, emissivities, and the nearest materials."""
+    summary: dict[str, Any] = {}
+    for name in (name for name in FILMS if name in curves):
+        curve = curves[name]
+        summary[name] = {key: _plain(curve[key].mean()) for key in ("mean", "std")}
+        summary[name]["minimum"] = _plain(curve["mean"].min())
+        summary[name]["maximum"] = _plain(curve["mean"].max())
+    bands = [name.removeprefix("emissivity ") for name in curves if name.startswith("emissivity ")]
+    if bands:
+        values, stds = (
+            np.array([float(curves[f"emissivity {band}"][key]) for band in bands])
+            for key in ("mean", "std")
+        )
+        summary["emissivity"] = dict(zip(bands, map(_plain, values), strict=True))
+        summary["emissivity_std"] = dict(zip(bands, map(_plain, stds), strict=True))
+        summary["nearest"] = _nearest(bands, values, stds, materials)
+    return summary
+
+
+def _nearest(
+    bands: list[str], values: Array, stds: Array, materials: xr.Dataset
+) -> list[dict[str, Any]]:
+    """Materials of a table by their distance from measured emissivities, in standard deviations."""
+    if not set(bands) <= set(materials["band"].values) or not np.isfinite(values + stds).all():
+        return []
+    known = materials["emissivity"].sel(band=bands)
+    spread = np.hypot(stds, _SPREAD)
+    distance = np.sqrt(np.mean(((known.values - values) / spread) ** 2, axis=1))
+    order = np.argsort(distance)[:_NEAREST]
+    names = materials["material"].values
+    return [{"material": str(names[at]), "distance": float(distance[at])} for at in order]
+
+
+def _emissivities(regions: Mapping[str, Mapping[str, Any]]) -> Iterator[Markup | str]:
+    """Yield the emissivities of the regions beside the nearest materials of the table."""
+    known = {name: of for name, of in regions.items() if of.get("emissivity")}
+    if not known:
+        return
+    bands = list(next(iter(known.values()))["emissivity"])
+    rows = []
+    for name, of in known.items():
+        pairs = [(of["emissivity"][band], of["emissivity_std"][band]) for band in bands]
+        cells = [f"{_text(one, 3)} \N{PLUS-MINUS SIGN} {_text(std, 3)}" for one, std in pairs]
+        near = ", ".join(f"{one['material']} ({one['distance']:.1f})" for one in of["nearest"])
+        rows.append([name, near or "-", *cells])
+    head = ["region", "nearest materials of the table (distance)"]
+    yield table([*head, *(drawing.band_label(band) for band in bands)], rows, names=2)
+    yield (
+        "Means of the pixels that count. The distance is the root mean square over the bands, in "
+        f"standard deviations, to which {_SPREAD} is added for what samples of a material differ. "
+        "A near material is no identification: many share two emissivities."
+    )
+
+
+def _assumed(view: View) -> Markup:
+    """Assumptions of the separation, by the attributes of the result."""
+    attrs = view.data.attrs
+    rows = [[words, str(attrs[name])] for name, words in _WORDS.items() if str(attrs.get(name, ""))]
+    events = ", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items())
+    return table(["what", "as"], [*rows, ["events", events or "none known"]], names=2)
+
+
+def _plain(value: Any) -> float | None:
+    """Number for JSON; None if it is not finite."""
+    return float(value) if np.isfinite(value) else None
+
+
+def _text(value: float | None, digits: int) -> str:
+    return "no value" if value is None else f"{value:.{digits}f}"
+
+
+def _range(values: Array) -> str:
+    """Least and greatest of some values."""
+    finite = values[np.isfinite(values)]
+    return f"{finite.min():.2f} to {finite.max():.2f}" if finite.size else "no value"

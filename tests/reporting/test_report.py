@@ -1,0 +1,147 @@
+"""The report: its numbers against closed forms, hostile words, and the page in a browser."""
+
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import dbthermal
+from dbthermal import store
+from dbthermal.explorer import Region
+from dbthermal.schema import Status, status_attrs
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+HOSTILE = "</script><script>document.title = 'taken'</script><img src=x onerror=alert(1)>"
+
+
+def scene(**attrs: str) -> xr.Dataset:
+    """Simulated result: glass that warms by 1 K/s from 300 K; a dead pixel, some of a material."""
+    time, shape = np.arange(20) / 4.0, (12, 16)
+    film = np.broadcast_to(300.0 + time[:, None, None], (20, *shape)).astype(np.float32).copy()
+    film[:, 0, 0] = np.nan
+    status = np.zeros(shape, np.uint32)
+    status[0, 0] = Status.DEAD_PIXEL
+    status[1, :8] = Status.COMPLETED_FROM_MATERIAL
+    pair = np.array([0.861, 0.718])[:, None, None]
+    return xr.Dataset(
+        {
+            "object_temperature": (("time", "y", "x"), film),
+            "object_temperature_std": (("time", "y", "x"), np.full_like(film, 0.03)),
+            "background_temperature": (("time", "y", "x"), np.full_like(film, 295.0)),
+            "emissivity": (("band", "y", "x"), np.broadcast_to(pair, (2, *shape)).copy()),
+            "emissivity_std": (("band", "y", "x"), np.full((2, *shape), 0.004)),
+            "status": (("y", "x"), status, status_attrs()),
+        },
+        {"time": time, "band": ["8-14", "9.5"]},
+        {"origin": "simulated", "method": "subspace", **attrs},
+    )
+
+
+def numbers(page: str) -> dict[str, Any]:
+    """Numbers that a page holds."""
+    (text,) = re.findall(r'<script type="application/json" id="numbers">(.*?)</script>', page)
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def test_numbers_are_those_of_the_scene(tmp_path: Path) -> None:
+    """Shares, the mean over time of a warming of 1 K/s, and the material that was put in."""
+    regions = {"corner": Region("rectangle", ((0, 0), (2, 4)))}
+    dbthermal.report(scene(), tmp_path / "a" / "scene.html", regions=regions)
+    page = (tmp_path / "a" / "scene.html").read_text("utf-8")
+    found = numbers(page)
+    assert found["scene"] == {"rows": 12, "columns": 16, "frames": 20, "duration_s": 4.75}
+    assert found["validity"]["no_flag"] == pytest.approx(1 - 9 / 192)
+    assert found["validity"]["completed"] == pytest.approx(8 / 192)
+    assert found["validity"]["without_value"] == found["validity"]["dead_pixel"]
+    corner = found["regions"]["corner"]
+    assert corner["object_temperature"]["mean"] == pytest.approx(300 + 4.75 / 2, abs=1e-4)
+    assert corner["emissivity"]["9.5"] == pytest.approx(0.718)
+    assert corner["nearest"][0]["material"] == "plate window glass"
+    assert "plate window glass" in page
+    assert ">simulated<" in page
+
+
+def test_same_result_gives_same_bytes(tmp_path: Path) -> None:
+    """A result in memory and its store give the same page, twice."""
+    store.save(scene(), tmp_path / "scene.zarr", {"commit": "unknown"})
+    for name in ("first", "second"):
+        dbthermal.report(tmp_path / "scene.zarr", tmp_path / f"{name}.html")
+    assert (tmp_path / "first.html").read_bytes() == (tmp_path / "second.html").read_bytes()
+
+
+def test_words_stay_words(tmp_path: Path) -> None:
+    """Title, regions, attributes and provenance that hold a program are shown, not run."""
+    regions = {HOSTILE: Region("rectangle", ((2, 2), (6, 6)))}
+    data = scene(origin=HOSTILE, calibration=HOSTILE, settings="-->" + HOSTILE)
+    provenance = {"parameters": {"-->": HOSTILE}}
+    path = tmp_path / "scene.html"
+    dbthermal.report(data, path, regions=regions, title=HOSTILE, provenance=provenance)
+    page = path.read_text("utf-8")
+    assert "<script>document.title" not in page
+    assert "<img src=x" not in page
+    assert "--><" not in page
+    assert HOSTILE in numbers(page)["regions"]
+
+
+def test_nothing_outside_is_asked_for(tmp_path: Path) -> None:
+    """Every source of the page is in it."""
+    dbthermal.report(scene(), tmp_path / "scene.html")
+    page = (tmp_path / "scene.html").read_text("utf-8")
+    sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
+    assert sources
+    assert all(one.startswith(("data:", "#")) for one in sources)
+
+
+@pytest.mark.parametrize(
+    ("data", "name", "message"),
+    [
+        (scene(), "scene.pdf", "scene.pdf'. Must end in '.html'"),
+        (scene().drop_vars("object_temperature"), "scene.html", "'object_temperature'"),
+    ],
+)
+def test_bad_input_is_named(data: xr.Dataset, name: str, message: str, tmp_path: Path) -> None:
+    """Another ending, and data without a temperature, are refused before anything is written."""
+    with pytest.raises(ValueError, match=re.escape(message)):
+        dbthermal.report(data, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without Jinja2 the error names the extra."""
+    for name in [name for name in sys.modules if name.startswith("dbthermal.reporting")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    with pytest.raises(ImportError, match=r"dbthermal\[report\]"):
+        dbthermal.report(scene(), "scene.html")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium: the report is not tried in a browser")
+def test_page_works_without_a_network(tmp_path: Path) -> None:
+    """In a browser that reaches nothing: the film is there, a click and a key answer."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="no Playwright (extra 'test')")
+    path = tmp_path / "scene.html"
+    dbthermal.report(scene(), path, celsius=False)
+    errors: list[str] = []
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1100, "height": 900})
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("requestfailed", lambda request: errors.append(request.url[:80]))
+        page.context.set_offline(True)
+        page.goto(path.as_uri())
+        page.wait_for_function("document.querySelector('video').readyState >= 1")
+        readout = page.locator("[data-part=readout]")
+        assert "302.50 \N{PLUS-MINUS SIGN} 0.03 K" in readout.inner_text()
+        page.locator("[data-part=time]").press("End")
+        assert "4.75 s" in readout.inner_text()
+        page.locator("[data-part=picture]").click(position={"x": 3, "y": 3})
+        assert "row 0, column 0: no value" in readout.inner_text()
+        browser.close()
+    assert errors == []
