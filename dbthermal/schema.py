@@ -1,9 +1,7 @@
 """Glossary: dimensions, type, unit and meaning of every variable at each stage of the data stream.
 
 A name is agreed here first, then used. `check` holds a dataset against its stage and raises with
-the value that offends. The stages follow the stream: capture, corrected, separated; calibration
-data, a response and an emissivity table stand beside it. ``python -m dbthermal.schema`` prints the
-glossary as text, which is docs/nomenclature.md.
+the value that offends. ``python -m dbthermal.schema`` prints the glossary as docs/nomenclature.md.
 """
 
 import sys
@@ -129,12 +127,7 @@ class Status(Flags):
     NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
 
 
-COMPLETED: Final = (
-    Status.COMPLETED_FROM_MATERIAL
-    | Status.COMPLETED_FROM_PRIOR
-    | Status.COMPLETED_FROM_SURROUNDINGS
-    | Status.COMPLETED_FRAMES
-)
+COMPLETED: Final = Status(sum(bit for bit in Status if bit.label.startswith("completed")))
 """Bits of a pixel of which something is completed, not measured."""
 
 
@@ -199,11 +192,10 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
 
     Raises
     ------
-    TypeError
-        If it is not a Dataset, or a variable's dtype is not a real number.
-    ValueError
-        If a variable, dimension or coordinate is missing, misnamed or out of order, a unit is
-        another one, a coordinate does not increase strictly, or bands repeat.
+    TypeError, ValueError
+        If it is not a Dataset of real numbers, a variable, dimension or coordinate is missing,
+        misnamed or out of order, a unit is another one, a coordinate does not increase strictly, or
+        bands repeat.
 
     Examples
     --------
