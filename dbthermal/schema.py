@@ -150,8 +150,7 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     Examples
     --------
     >>> import numpy as np, xarray as xr
-    >>> bits = np.array([0, 1024, 128], dtype=np.uint32)
-    >>> status = xr.DataArray(bits, dims="x", attrs=status_attrs())
+    >>> status = xr.DataArray(np.uint32([0, 1024, 128]), dims="x", attrs=status_attrs())
     >>> has_flag(status, "dead_pixel", "gray").values
     array([False,  True, False])
     """
