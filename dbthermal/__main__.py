@@ -232,14 +232,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if options.traceback:
             raise
-        status, reason = 1, _reason(error)
+        status, reason = 1, _reason(error, options.command)
     print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
     return status
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: Exception, command: str) -> str:
     """Message of an error in one line, with the extra that a missing library belongs to."""
-    if isinstance(error, ImportError) and (extra := _EXTRAS.get(str(error.name).split(".")[0])):
+    extra = _EXTRAS.get(str(error.name).split(".")[0]) if isinstance(error, ImportError) else None
+    if isinstance(error, ImportError) and extra:
+        extra = command if command == "report" else extra  # which has all that it needs
         rule = f"Must be installed: python -m pip install 'dbthermal[{extra}]'"
         return f"Missing library '{error.name}', of the extra '{extra}'. {rule}."
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())

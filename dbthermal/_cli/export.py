@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import explorer, reporting, store
+from dbthermal import explorer, store
 from dbthermal._cli.files import opened, provenance
 
 
@@ -92,6 +92,8 @@ def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, 
 
 def report(options: argparse.Namespace) -> dict[str, Any]:
     """Command `report`."""
+    from dbthermal import reporting  # noqa: PLC0415 - optional
+
     result, shown = opened(options.result), [opened(one) for one in options.shown]
     regions = {
         f"rows {top} to {bottom}, columns {left} to {right}": explorer.Region(
