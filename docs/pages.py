@@ -34,7 +34,8 @@ def of_module(name: str) -> str:
     """Page of a module: its own docstring, a table of its public names, and each of them."""
     module = importlib.import_module(name)
     names = [each for each in module.__all__ if not inspect.ismodule(getattr(module, each))]
-    lines = [name, "=" * len(name), "", f".. automodule:: {name}", "", ".. autosummary::"]
+    title = name.removeprefix("dbthermal.")
+    lines = [title, "=" * len(title), "", f".. automodule:: {name}", "", ".. autosummary::"]
     lines += ["   :nosignatures:", "", *(f"   {each}" for each in names), ""]
     for each in names:
         value = getattr(module, each)

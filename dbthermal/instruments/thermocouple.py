@@ -5,10 +5,9 @@ connected, the cold junction. Both follow the same reference function E(t), so t
 
     E(tip) = voltage at the terminals + E(cold junction).
 
-NIST defines E(t), and gives an approximate inverse that is off by up to 0.04 K. Here this inverse
-starts a Newton iteration on the definition, so that the two functions are inverses of one another
-to within rounding. A real thermocouple follows the tables only to within its tolerance: 0.5 K for
-the better class of type T.
+NIST defines E(t), and gives an approximate inverse that is off by up to 0.04 K: it starts a Newton
+iteration on the definition, so that the two functions are inverses of one another to within
+rounding. A real thermocouple follows the tables to 0.5 K, if it is of the better class of type T.
 """
 
 from typing import Final
@@ -81,15 +80,13 @@ def temperature(emf_mV: npt.ArrayLike, junction_temperature: npt.ArrayLike) -> A
     """Temperature [K] of the tip from the voltage at the terminals: the exact inverse of `emf`.
 
     Of the voltage [mV] and the temperature of the terminals, the cold junction [K], arrays that are
-    broadcast against one another; to within rounding (1e-9 K). The range ends at 20.872 mV, as
-    NIST's does, which is 400 °C rounded up: there the result is 673.1505 K. ValueError if a cold
-    junction lies outside 3.15 to 673.15 K, or a voltage, referred to 0 °C, outside -5.603 to 20.872
-    mV, or one of them is NaN, as for an open thermocouple.
+    broadcast against one another. The range ends at 20.872 mV, as NIST's does, which is 400 °C
+    rounded up: there the result is 673.1505 K. ValueError if a cold junction lies outside 3.15 to
+    673.15 K, or a voltage, referred to 0 °C, outside -5.603 to 20.872 mV, or one of them is NaN.
 
     Examples
     --------
-    A meter reads 4.279 mV, and its terminals are at 25 °C; the tip is at 120.88 °C. Without the
-    cold junction it would be taken for 100 °C.
+    A meter reads 4.279 mV, and its terminals are at 25 °C; the tip is at 120.88 °C.
 
     >>> f"{float(temperature(4.279, 298.15)) - 273.15:.3f}"
     '120.882'

@@ -259,8 +259,7 @@ class Boson(Closing):
         deadline = self._clock() + self.timeout
         received = 0
         while (remaining := deadline - self._clock()) > 0:
-            piece = self._transport.read(_READ_SIZE, remaining)
-            if not piece:
+            if not (piece := self._transport.read(_READ_SIZE, remaining)):
                 break
             received += len(piece)
             if received > MAXIMUM_RECEIVED:

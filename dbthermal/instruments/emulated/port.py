@@ -60,27 +60,23 @@ class EmulatedPort(Closing):
         self._thread.join()
 
     def _serve(self) -> None:
+        """Carry bytes until the device is pulled out, or the port is closed."""
+        waiting: deque[bytes] = deque()
         try:
-            self._let_talk()
+            while self.device.plugged and not self._ending.is_set():
+                timeout = min(TICK, max(0.0, self.device.next_due()))
+                writers = [self._master] if waiting else []
+                ready, writable, _ = select.select([self._master], writers, [], timeout)
+                if ready:
+                    self.device.receive(os.read(self._master, _READ_SIZE))
+                waiting.extend(self.device.poll())
+                if writable:
+                    piece = waiting.popleft()
+                    if rest := piece[os.write(self._master, piece) :]:
+                        waiting.appendleft(rest)
         finally:
             os.close(self._master)
             os.close(self._slave)
-
-    def _let_talk(self) -> None:
-        """Carry bytes until the device is pulled out, or the port is closed."""
-        waiting: deque[bytes] = deque()
-        while self.device.plugged and not self._ending.is_set():
-            timeout = min(TICK, max(0.0, self.device.next_due()))
-            writers = [self._master] if waiting else []
-            ready, writable, _ = select.select([self._master], writers, [], timeout)
-            if ready:
-                self.device.receive(os.read(self._master, _READ_SIZE))
-            waiting.extend(self.device.poll())
-            if writable:
-                piece = waiting.popleft()
-                rest = piece[os.write(self._master, piece) :]
-                if rest:
-                    waiting.appendleft(rest)
 
 
 def require_known(options: Mapping[str, str], names: Sequence[str]) -> None:

@@ -252,8 +252,7 @@ class Controller:
         """Read until the reply comes; None if it does not in time."""
         deadline = self._clock() + self._settings.reply_timeout
         while (remaining := deadline - self._clock()) > 0:
-            received = self._transport.read(READ_SIZE, remaining)
-            if not received:
+            if not (received := self._transport.read(READ_SIZE, remaining)):
                 return None
             replies = [
                 message

@@ -155,10 +155,14 @@ def bench_series(
             counts = [_mean(captures[band], band, place, correction) for band in captures]
             one = xr.Dataset({"counts": ("band", counts), **measured}, {"band": list(captures)})
             series[material].append(one)
-    return {
-        material: _contact(measurements).assign_attrs(sweep.attrs, material=material)
-        for material, measurements in series.items()
-    }
+    joined = {}
+    for material, measurements in series.items():
+        one = xr.concat(measurements, "measurement").transpose("band", "measurement")
+        for variable, described in schema.STAGES["contact"].items():
+            one[variable].attrs = described.attrs
+        one.attrs = {**sweep.attrs, "material": material}
+        joined[material] = schema.check(one, "contact")
+    return joined
 
 
 def _find(folder: str | Path, name: str) -> _Sweep:
@@ -235,11 +239,3 @@ def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset
     if not np.isfinite(mean):
         raise ValueError(f"No good pixel {source}. Must have one.")
     return mean
-
-
-def _contact(measurements: list[xr.Dataset]) -> xr.Dataset:
-    """Series of one material, stage `contact`, from its measurements."""
-    series = xr.concat(measurements, "measurement").transpose("band", "measurement")
-    for name, variable in schema.STAGES["contact"].items():
-        series[name].attrs = variable.attrs
-    return schema.check(series, "contact")
