@@ -87,7 +87,7 @@ def array(
         if not isinstance(source, str | Path):
             check(source)
         elif containers.kind_of(Path(source)):
-            values = containers.read(Path(source), name, check, stack)
+            values = containers.read(Path(source), name, check, memory, stack)
         else:
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
