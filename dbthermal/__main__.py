@@ -24,6 +24,7 @@ __dir__ = __all__.copy
 
 _EXTRAS: Final = {
     **dict.fromkeys(("anywidget", "ipywidgets"), "explorer"),
+    "jinja2": "report",
     **dict.fromkeys(("pydantic", "serial", "usb", "yaml"), "instruments"),
     **dict.fromkeys(("h5netcdf", "h5py", "tifffile"), "recordings"),
     "av": "video",
@@ -64,8 +65,9 @@ capture path            store of a capture
 correction path?        store of gain and offset; none if the cameras correct them
 response path           store of the cameras' response
 result path             store of a result
+shown path*             its capture, and the cameras' response, to be shown beside it
 materials text*         as listed by 'data'; all by default
---output path!          store *.zarr that is made; of 'export' *.csv, *.tif, *.png or *.nc
+--output path!          what is made: store *.zarr, or of the kind that the examples below have
 --overwrite flag        replace the output
 --dry-run flag          only say what would be read and written
 --json flag             print the summary as JSON
@@ -164,6 +166,14 @@ result.zarr --variable background_temperature -o film.tif
 result.zarr -o object.png
 result.zarr -o result.nc
 
+explore export.explore result shown --output
+make a notebook to look around in a result or a capture, for JupyterLab
+result.zarr aligned.zarr response.zarr -o look.ipynb
+
+report export.report result shown --region --output
+write a report on a result, one HTML file that needs no network
+result.zarr aligned.zarr response.zarr --region 10 60 10 90 -o scene.html
+
 data steps.data
 list the filters and materials that come with the package
 --json
@@ -222,14 +232,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if options.traceback:
             raise
-        status, reason = 1, _reason(error)
+        status, reason = 1, _reason(error, options.command)
     print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
     return status
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: Exception, command: str) -> str:
     """Message of an error in one line, with the extra that a missing library belongs to."""
-    if isinstance(error, ImportError) and (extra := _EXTRAS.get(str(error.name).split(".")[0])):
+    extra = _EXTRAS.get(str(error.name).split(".")[0]) if isinstance(error, ImportError) else None
+    if isinstance(error, ImportError) and extra:
+        extra = command if command == "report" else extra  # which has all that it needs
         rule = f"Must be installed: python -m pip install 'dbthermal[{extra}]'"
         return f"Missing library '{error.name}', of the extra '{extra}'. {rule}."
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())

@@ -15,6 +15,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import nbformat
 import numpy as np
 import pytest
 import tifffile
@@ -201,6 +202,7 @@ def test_curves_films_pictures(results: Path) -> None:
     object_ = result["object_temperature"].values
     with (results / "curve.csv").open(encoding="utf-8", newline="") as stream:
         rows = [*csv.reader(stream)]
+    assert rows[0][:2] == ["time [s]", "pixel 12 16 mean [K]"]
     assert len(rows) == 201
     assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16], abs=1e-3)  # [K]
     for suffix in ("tif", "png", "nc"):
@@ -214,6 +216,19 @@ def test_curves_films_pictures(results: Path) -> None:
     assert "Must end in one of ['.csv', '.tif', '.png', '.nc']" in line
     line = refused(results, "export", "result.zarr", "--pixel", "24", "0", "-o", "no.csv")
     assert "Must lie in the image of 24 x 32" in line
+
+
+def test_report_and_explorer(results: Path) -> None:
+    """A report is a page with the region's name; the explorer's notebook has one valid cell."""
+    shown = ["result.zarr", "aligned.zarr", "response.zarr"]
+    found = run(results, "report", *shown, "--region", "2", "8", "2", "8", "-o", "out.html")
+    assert found.returncode == 0, found.stderr
+    assert "rows 2 to 8, columns 2 to 8" in (results / "out.html").read_text(encoding="utf-8")
+    done(results, "explore", *shown, "-o", "look.ipynb")
+    notebook = nbformat.read(results / "look.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    paths = ", ".join(repr(str(results / name)) for name in shown)
+    assert f"dbthermal.explore({paths})" in notebook.cells[0].source
 
 
 def test_plan_and_data(tmp_path: Path) -> None:

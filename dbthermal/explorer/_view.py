@@ -141,7 +141,7 @@ class View:
         if name in missing:
             return
         array, base = self.data[name], name.removesuffix("_std")
-        words = FILMS.get(base, base) + (", std. deviation" if name != base else "")
+        words = FILMS.get(base, base) + (", deviation" if name != base else "")
         std = f"{name}_std" if name == base and f"{name}_std" in self.data else ""
         std = "" if std in missing else std
         if base in FILMS:
@@ -255,7 +255,7 @@ class View:
             if finite.size:
                 low, high = np.percentile(finite, [1, 99])
                 low = 0.0 if "_std" in name else low
-                return float(low), float(high) if high > low else float(low) + 1.0
+                return float(low), float(high if high > low else low + (1e-3 * abs(low) or 1.0))
         return 0.0, 1.0
 
     def curve(self, name: str, region: Region, *, pixels: Pixels = "unflagged") -> xr.Dataset:

@@ -10,7 +10,6 @@ from typing import Any, Final
 import anywidget
 import numpy as np
 import numpy.typing as npt
-import traitlets
 import xarray as xr
 from matplotlib import colormaps
 
@@ -62,7 +61,6 @@ class Explorer(anywidget.AnyWidget):
 
     _esm = _HERE / "explorer.js"
     _css = _HERE / "explorer.css"
-    _preview = traitlets.Unicode("").tag(sync=True)  # where no kernel answers, as in HTML
 
     def __init__(self, view: View, *, celsius: bool = True) -> None:
         self.view = view

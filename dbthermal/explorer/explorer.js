@@ -27,10 +27,7 @@ class Link {
     this.listener = (message, buffers) => this.receive(message, buffers);
     model.on("msg:custom", this.listener);
   }
-  ask(kind, content = {}) {
-    this.wanted.set(kind, content);
-    this.pump();
-  }
+  ask(kind, content = {}) { this.wanted.set(kind, content); this.pump(); }
   pump() {
     if (this.busy || !this.wanted.size) return;
     const [kind, content] = this.wanted.entries().next().value;
@@ -40,30 +37,24 @@ class Link {
   }
   receive(message, buffers) {
     if (message.page !== this.page) return;
-    if (message.progress) return this.take("progress", message);
-    this.busy = false;
-    this.take(message.error ? "error" : message.kind, message, buffers);
+    this.busy = Boolean(message.progress);
+    this.take(message.error ? "error" : message.progress ? "progress" : message.kind, message, buffers);
     this.pump();
   }
 }
 
-function marchingSquares(codes, width, height, level, line) {
-  // Where a line between the centres of four pixels crosses the level.
-  for (let row = 0; row + 1 < height; row++) {
-    for (let column = 0; column + 1 < width; column++) {
-      const at = row * width + column;
-      const [a, b, c, d] = [codes[at], codes[at + 1], codes[at + width + 1], codes[at + width]];
-      const above = (a > level) + (b > level) + (c > level) + (d > level);
-      if (above === 0 || above === 4 || !(a && b && c && d)) continue;
-      const ends = [];
-      if (a > level !== b > level) ends.push([column + (level - a) / (b - a), row]);
-      if (b > level !== c > level) ends.push([column + 1, row + (level - b) / (c - b)]);
-      if (d > level !== c > level) ends.push([column + (level - d) / (c - d), row + 1]);
-      if (a > level !== d > level) ends.push([column, row + (level - a) / (d - a)]);
-      if (ends.length === 4 && (a + b + c + d) / 4 > level === a > level) ends.push(ends.shift());
-      for (let i = 0; i + 1 < ends.length; i += 2) line(ends[i], ends[i + 1]);
+function isotherm(codes, width, level, place) {
+  // Edges between pixels of which one is above the level and the other one is not.
+  const path = new Path2D();
+  codes.forEach((code, at) => {
+    const [row, column] = [Math.floor(at / width), at % width];
+    for (const [next, from] of [[at + 1, [column + 1, row]], [at + width, [column, row + 1]]]) {
+      if (!code || !codes[next] || code > level === codes[next] > level || (next === at + 1 && column + 1 === width)) continue;
+      path.moveTo(...place(...from));
+      path.lineTo(...place(column + 1, row + 1));
     }
-  }
+  });
+  return path;
 }
 
 function ticks(low, high, count) {
@@ -75,37 +66,31 @@ function ticks(low, high, count) {
   return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, i) => [(first + i) * step, ((first + i) * step).toFixed(digits)]);
 }
 
-function stroke(context, ...lines) {
-  const ratio = window.devicePixelRatio || 1;
+function stroke(context, path, ...lines) {
   for (const [strokeStyle, width] of lines) {
-    Object.assign(context, { strokeStyle, lineWidth: width * ratio });
-    context.stroke();
+    Object.assign(context, { strokeStyle, lineWidth: width * devicePixelRatio });
+    context.stroke(path);
   }
 }
 
-function outline(context, { kind, points }, place) {
-  const [[left, top], [right, bottom], ...more] = [...points, points.at(-1)].map(([row, column]) => place(column, row));
-  if (kind === "rectangle") context.rect(left, top, right - left, bottom - top);
-  else if (kind === "ellipse") context.ellipse((left + right) / 2, (top + bottom) / 2, Math.abs(right - left) / 2, Math.abs(bottom - top) / 2, 0, 0, 2 * Math.PI);
-  else {
-    context.moveTo(left, top);
-    for (const corner of [[right, bottom], ...more]) context.lineTo(...corner);
-    context.closePath();
-  }
+function outline({ kind, points }, place = (column, row) => [column, row]) {
+  const path = new Path2D();
+  const corners = points.map(([row, column]) => place(column, row));
+  const [[left, top], [right, bottom]] = [corners[0], corners[1] ?? corners[0]];
+  if (kind === "rectangle") path.rect(left, top, right - left, bottom - top);
+  else if (kind === "ellipse") path.ellipse((left + right) / 2, (top + bottom) / 2, Math.abs(right - left) / 2, Math.abs(bottom - top) / 2, 0, 0, 2 * Math.PI);
+  else path.addPath(new Path2D(`M${corners.map((corner) => corner.join(" ")).join("L")}Z`));
+  return path;
 }
 
 function hatch(kind, size) {
-  const context = surface(size, size);
-  for (const [style, line] of [["#000000a0", size / 4], ["#ffffffd0", size / 8]]) {
-    Object.assign(context, { strokeStyle: style, fillStyle: style, lineWidth: line });
-    context.beginPath();
-    for (const shift of kind === 2 ? [-size, 0, size] : []) {
-      context.moveTo(shift - 1, size + 1);
-      context.lineTo(shift + size + 1, -1);
-    }
-    context.stroke();
-    if (kind === 1) context.arc(size / 2, size / 2, line / 1.6, 0, 2 * Math.PI);
-    context.fill();
+  const context = surface(size, size); // 2: lines, dark beside light; 1: dots
+  for (let at = 0; at < 2 * size; at++) {
+    if (kind === 1 && at !== size >> 1) continue;
+    context.fillStyle = "#000000a0";
+    context.fillRect(at % size, size - 1 - (at % size), size / 4, size / 4);
+    context.fillStyle = "#ffffffd0";
+    context.fillRect(at % size, size - 1 - (at % size), size / 8, size / 8);
   }
   return context.canvas;
 }
@@ -129,19 +114,16 @@ class Picture {
   }
   addLegend() {
     for (const [words, color, share] of this.explorer.legend) {
-      const entry = make(this.foot, "span", "dbt-entry");
-      make(entry, "i", "dbt-swatch").style.background = color;
-      entry.append(`${words}, ${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %`);
+      make(this.foot, "i", "dbt-swatch").style.background = color;
+      make(this.foot, "span", "dbt-entry", { textContent: `${words}, ${(100 * share).toFixed(share < 0.1 ? 1 : 0)} %` });
     }
   }
   addScale() {
     const number = (place, title) => make(this.foot, "input", "dbt-number", {
       type: "number", step: "any", title, ariaLabel: `${this.pane.label}: ${title}`,
-      onchange: (event) => {
-        const limits = [...this.limits];
-        limits[place] = parseFloat(event.target.value) + this.explorer.offset(this.pane);
+      onchange: ({ target }) => {
+        const limits = this.limits.with(place, parseFloat(target.value) + this.explorer.offset(this.pane));
         if (limits[0] < limits[1]) this.limits = limits;
-        event.target.blur();
         this.paint();
       },
     });
@@ -160,12 +142,12 @@ class Picture {
   paint() {
     if (!this.codes) return;
     const { explorer, colors, codes, table } = this;
-    const hidden = HIDDEN[explorer.selection];
+    const hidden = explorer.hidden;
     if (this.pane.kind === "status") table.set(explorer.statusColors);
     else this.paintScale(explorer.palettes[explorer.palette]);
-    for (let at = 0; at < colors.length; at++) colors[at] = hidden[explorer.classes[at]] ? 0 : table[codes[at]];
+    for (let at = 0; at < colors.length; at++) colors[at] = hidden[at] ? 0 : table[codes[at]];
     this.image.putImageData(this.pixels, 0, 0);
-    explorer.redraw();
+    explorer.redraw([this]);
   }
   paintScale(palette) {
     const { explorer, pane, table, limits: [from, to], scale: [low, high] } = this;
@@ -176,14 +158,12 @@ class Picture {
     const bar = new ImageData(256, 1);
     new Uint32Array(bar.data.buffer).set(palette);
     this.bar.getContext("2d").putImageData(bar, 0, 0);
-    for (const [input, value] of [[this.low, from], [this.high, to]]) {
-      if (document.activeElement !== input) input.value = explorer.text(value, pane);
-    }
+    [this.low.value, this.high.value] = [explorer.text(from, pane), explorer.text(to, pane)];
     this.unit.textContent = explorer.unit(pane);
   }
   draw() {
     const { explorer, canvas, pane, explorer: { zoom: { x, y, factor }, cursor, shape } } = this;
-    const width = Math.max(1, Math.round(canvas.clientWidth * (window.devicePixelRatio || 1)));
+    const width = Math.max(1, Math.round(canvas.clientWidth * devicePixelRatio));
     const height = Math.max(1, Math.round((width * shape[0]) / shape[1]));
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     const context = canvas.getContext("2d");
@@ -194,33 +174,19 @@ class Picture {
     context.fillRect(0, 0, width, height);
     context.drawImage(this.image.canvas, ...place(0, 0), shape[1] * size, shape[0] * size);
     if (pane.kind !== "status") context.drawImage(explorer.hatching(width, height, size), 0, 0);
-    if (explorer.isotherm !== null && pane.absolute && this.codes) this.drawIsotherm(context, place);
-    for (const [, region, color] of explorer.shownRegions()) {
-      context.beginPath();
-      outline(context, region, place);
-      stroke(context, ["white", 4], [color, 2]);
+    if (explorer.isotherm !== null && pane.absolute && this.codes) {
+      const share = (explorer.isotherm + explorer.offset(pane) - this.scale[0]) / (this.scale[1] - this.scale[0]);
+      stroke(context, isotherm(this.codes, shape[1], 1 + 65534 * share, place), ["black", 3], ["#7fffd4", 1.5]);
     }
+    for (const [, region, color] of explorer.shownRegions()) stroke(context, outline(region, place), ["white", 4], [color, 2]);
     if (cursor) {
       const [across, down] = place(cursor[1] + 0.5, cursor[0] + 0.5);
-      context.beginPath();
-      for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
-        context.moveTo(across + 5 * dx, down + 5 * dy);
-        context.lineTo(across + 15 * dx, down + 15 * dy);
-      }
-      stroke(context, ["black", 3], ["white", 1]);
+      const cross = (near, far) => `M${across - far} ${down}h${far - near}M${across + near} ${down}h${far - near}`
+        + `M${across} ${down - far}v${far - near}M${across} ${down + near}v${far - near}`;
+      stroke(context, new Path2D(cross(5, 15)), ["black", 3], ["white", 1]);
     }
     this.title.classList.toggle("dbt-chosen", explorer.chosen === pane.name);
     this.readout.textContent = cursor ? this.words(cursor) : "";
-  }
-  drawIsotherm(context, place) {
-    const { explorer, scale: [low, high], codes } = this;
-    const value = explorer.isotherm + explorer.offset(this.pane);
-    context.beginPath();
-    marchingSquares(codes, explorer.shape[1], explorer.shape[0], 1 + ((value - low) / (high - low)) * 65534, (from, to) => {
-      context.moveTo(...place(from[0] + 0.5, from[1] + 0.5));
-      context.lineTo(...place(to[0] + 0.5, to[1] + 0.5));
-    });
-    stroke(context, ["black", 3], ["#7fffd4", 1.5]);
   }
   words([row, column]) {
     const { explorer, pane } = this;
@@ -234,7 +200,7 @@ class Picture {
 
 class Explorer {
   constructor(model, el) {
-    Object.assign(this, { pictures: new Map(), shown: [], curves: new Map(), regions: new Map(), events: {}, drawn: -1, number: 1 });
+    Object.assign(this, { pictures: new Map(), shown: [], changed: new Set(), curves: new Map(), regions: new Map(), events: {}, drawn: -1, number: 1 });
     Object.assign(this, { zoom: { x: 0, y: 0, factor: 1 }, cursor: null, probed: null, selection: "unflagged", palette: 0, isotherm: null });
     this.root = make(el, "div", "dbt-explorer");
     Object.assign(this.root.dataset, { testid: "explorer", lmSuppressShortcuts: "true" }); // or JupyterLab takes the arrow keys
@@ -253,8 +219,6 @@ class Explorer {
     const copy = (i, Type) => new Type(bytes(i).slice().buffer);
     this.say(message.error ?? message.progress ?? "", kind === "error");
     ({
-      progress: () => {},
-      error: () => {},
       start: () => this.panes || this.build(message, copy),
       frames: () => {
         message.panes.forEach((name, i) => this.pictures.get(name).take(copy(i, Uint16Array), message.scales[i]));
@@ -272,13 +236,10 @@ class Explorer {
         make(null, "a", "", { href, download: message.name }).click();
         setTimeout(() => URL.revokeObjectURL(href), 1000);
       },
-    })[kind]();
-    this.redraw();
+    })[kind]?.();
+    if (this.panes) this.redraw(kind === "frames" ? [] : undefined);
   }
-  say(text, wrong = false) {
-    this.message.textContent = text || HELP;
-    this.message.classList.toggle("dbt-wrong", wrong);
-  }
+  say(text, wrong = false) { this.message.textContent = text || HELP; this.message.classList.toggle("dbt-wrong", wrong); }
 
   // The page
   build({ regions, palettes, ...setup }, copy) {
@@ -297,6 +258,7 @@ class Explorer {
     this.root.addEventListener("keydown", (event) => this.key(event));
     this.observer = new ResizeObserver(() => this.redraw());
     this.observer.observe(this.root);
+    this.repaint();
     this.arrange(copy(1, Uint8Array));
     this.askCurves();
   }
@@ -316,7 +278,7 @@ class Explorer {
       return button;
     });
     this.useTool("move");
-    this.select(bar, "colours", { ...this.paletteNames }, (value) => { this.palette = +value; this.repaint(); });
+    this.select(bar, "colours", { ...this.paletteNames }, (value) => { this.palette = value; this.repaint(); });
     this.select(bar, "pixels", PIXELS, (value) => { this.selection = value; this.repaint(); this.askCurves(); });
     const name = () => (this.celsius ? "\u00b0C" : "K");
     const unit = this.button(bar, name(), "kelvin or degrees Celsius", () => {
@@ -338,11 +300,11 @@ class Explorer {
     const entries = make(list, "div", "dbt-list");
     for (const pane of this.panes) {
       const entry = make(entries, "label", "dbt-label");
-      const box = make(entry, "input", "", { type: "checkbox", checked: pane.shown, onchange: () => {
-        const wanted = (one) => (one.name === pane.name ? box.checked : this.shown.includes(one.name));
-        this.shown = this.panes.filter(wanted).map((one) => one.name);
+      const onchange = () => {
+        this.shown = this.panes.map((one) => one.name).filter((one) => (one === pane.name ? box.checked : this.shown.includes(one)));
         this.arrange();
-      } });
+      };
+      const box = make(entry, "input", "", { type: "checkbox", checked: pane.shown, onchange });
       entry.append(capital(pane.label));
     }
     make(bar, "span", "dbt-note", { textContent: this.note });
@@ -372,9 +334,9 @@ class Explorer {
     this.plot = make(row, "canvas", "dbt-plot");
     this.plot.onclick = ({ offsetX }) => {
       if (!this.axes) return;
-      const moment = this.time[0] + ((offsetX - this.axes[0]) / (this.axes[1] - this.axes[0])) * (this.time.at(-1) - this.time[0]);
-      const distances = this.time.map((one) => Math.abs(one - moment));
-      this.goTo(distances.indexOf(Math.min(...distances)));
+      const share = (offsetX - this.axes[0]) / (this.axes[1] - this.axes[0]);
+      const later = this.time.findIndex((one) => one >= this.time[0] + share * (this.time.at(-1) - this.time[0]));
+      this.goTo(later < 0 ? this.time.length - 1 : later);
     };
     this.list = make(row, "div", "dbt-regions");
   }
@@ -420,10 +382,8 @@ class Explorer {
     for (const button of this.tools) button.classList.toggle("dbt-chosen", button.dataset.tool === tool);
   }
   choose(pane) {
-    if (pane.kind === "status") return;
-    this.chosen = pane.name;
+    if (pane.kind !== "status") this.chosen = pane.name;
     this.askCurves();
-    this.redraw();
   }
   setIsotherm(value) {
     this.isotherm = value;
@@ -450,7 +410,7 @@ class Explorer {
       Escape: () => { this.draft = null; this.redraw(); },
       Enter: () => this.finish(),
     };
-    const pressed = [" ", "Enter"].includes(event.key) && event.target.tagName !== "CANVAS" && event.target !== this.slider;
+    const pressed = [" ", "Enter"].includes(event.key) && event.target.matches("button, summary");
     if (!actions[event.key] || event.ctrlKey || event.metaKey || pressed) return;
     actions[event.key]();
     event.preventDefault();
@@ -489,12 +449,8 @@ class Explorer {
     if (this.tool === "polygon") this.draft = { kind: "polygon", points: [...(this.draft?.points ?? []), at] };
     else if (this.tool !== "move") this.draft = { kind: this.tool, points: [at, at] };
     else {
-      const found = [...this.regions].reverse().find(([, region]) => {
-        const path = new Path2D();
-        outline(path, region, (column, row) => [column, row]);
-        return surface(1, 1).isPointInPath(path, at[1], at[0]);
-      });
-      this.grip = { at, region: found?.[1], points: found?.[1].points, zoom: this.zoom };
+      const region = [...this.regions.values()].reverse().find((one) => surface(1, 1).isPointInPath(outline(one), at[1], at[0]));
+      this.grip = { at, region, points: region?.points };
     }
     this.redraw();
   }
@@ -526,7 +482,10 @@ class Explorer {
   offset(pane) { return pane.absolute && this.celsius ? ZERO_CELSIUS : 0; }
   unit(pane) { return pane.absolute && this.celsius ? "\u00b0C" : pane.units; }
   text(value, pane) { return (value - this.offset(pane)).toFixed(DIGITS[pane.units] ?? 2); }
-  repaint() { for (const picture of this.pictures.values()) picture.paint(); }
+  repaint() {
+    this.hidden = this.classes.map((one) => HIDDEN[this.selection][one]);
+    for (const picture of this.pictures.values()) picture.paint();
+  }
   shownRegions() {
     const all = [...this.regions].map(([name, region], i) => [name, region, this.colors[i % this.colors.length]]);
     return this.draft ? [...all, ["", this.draft, "#000000"]] : all;
@@ -545,18 +504,19 @@ class Explorer {
       layer.imageSmoothingEnabled = false;
       layer.drawImage(mask.canvas, -this.zoom.x * size, -this.zoom.y * size, this.shape[1] * size, this.shape[0] * size);
       layer.globalCompositeOperation = "source-in";
-      layer.fillStyle = layer.createPattern(hatch(kind, Math.round(8 * (window.devicePixelRatio || 1))), "repeat");
+      layer.fillStyle = layer.createPattern(hatch(kind, Math.round(8 * devicePixelRatio)), "repeat");
       layer.fillRect(0, 0, width, height);
       whole.drawImage(layer.canvas, 0, 0);
     }
     this.hatched = { key, canvas: whole.canvas };
     return whole.canvas;
   }
-  redraw() {
-    if (!this.panes) return;
+  redraw(pictures = this.shown.map((name) => this.pictures.get(name))) {
+    for (const picture of pictures) this.changed.add(picture);
     this.pending ??= requestAnimationFrame(() => {
       this.pending = null;
-      for (const name of this.shown) this.pictures.get(name)?.draw();
+      for (const picture of this.changed) if (this.shown.includes(picture?.pane.name)) picture.draw();
+      this.changed.clear();
       this.clock.textContent = `${this.time[this.index].toFixed(2)} s  (frame ${this.index}, last ${this.time.length - 1})`;
       this.drawPlot();
       this.drawn = this.shownIndex;
@@ -574,11 +534,10 @@ class Explorer {
   drawPlot() {
     const regions = this.shownRegions().map(([name, , color]) => [name, color, this.curve(name)]).filter(([, , curve]) => curve);
     this.listRegions(regions);
-    const ratio = window.devicePixelRatio || 1;
     const [width, height] = [this.plot.clientWidth, this.plot.clientHeight];
-    Object.assign(this.plot, { width: width * ratio, height: height * ratio });
+    Object.assign(this.plot, { width: width * devicePixelRatio, height: height * devicePixelRatio });
     const context = this.plot.getContext("2d");
-    context.scale(ratio, ratio);
+    context.scale(devicePixelRatio, devicePixelRatio);
     const ink = getComputedStyle(this.root).color;
     Object.assign(context, { font: "12px sans-serif", fillStyle: ink });
     this.axes = regions.length ? [64, width - 12] : null;
@@ -591,23 +550,21 @@ class Explorer {
     const [begin, end] = [this.time[0], this.time.at(-1)];
     const across = (moment) => left + ((moment - begin) / (end - begin || 1)) * (right - left);
     const down = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
-    const line = (from, to, strokeStyle, dashes = []) => {
+    const line = (path, strokeStyle, dashes = []) => {
       Object.assign(context, { strokeStyle, lineWidth: 1 });
       context.setLineDash(dashes);
-      context.beginPath();
-      context.moveTo(...from);
-      context.lineTo(...to);
-      context.stroke();
+      context.stroke(new Path2D(path));
     };
+    const vertical = (moment) => `M${across(moment)} ${top}V${bottom}`;
     context.textAlign = "right";
     for (const [at, text] of ticks(low, high, (bottom - top) / 40)) {
       context.fillText(text, left - 6, down(at) + 4);
-      line([left, down(at)], [right, down(at)], "#8884");
+      line(`M${left} ${down(at)}H${right}`, "#8884");
     }
     context.textAlign = "center";
     for (const [at, text] of ticks(begin, end, (right - left) / 90)) {
       context.fillText(text, across(at), bottom + 15);
-      line([across(at), top], [across(at), bottom], "#8884");
+      line(vertical(at), "#8884");
     }
     context.fillText("time [s]", (left + right) / 2, height - 5);
     context.save();
@@ -616,26 +573,22 @@ class Explorer {
     const unit = this.unit(this.plotted);
     context.fillText(this.plotted.label + (unit && ` [${unit}]`), 0, 0, bottom - top + 40);
     context.restore();
-    for (const moment of Object.values(this.events)) line([across(moment), top], [across(moment), bottom], "#d1495b", [3, 3]);
-    line([across(this.time[this.index]), top], [across(this.time[this.index]), bottom], ink);
+    for (const moment of Object.values(this.events)) line(vertical(moment), "#d1495b", [3, 3]);
+    line(vertical(this.time[this.index]), ink);
     for (const [, color, curve] of regions) this.drawCurve(context, color, curve, (i) => across(this.time[i]), down);
   }
   drawCurve(context, color, { mean, low, high, std }, across, down) {
-    const corner = (i, sign) => [across(i), down(mean(i) + sign * 1.96 * std(i))];
+    const point = (i, value) => `${across(i)} ${down(value)}`;
+    const runs = this.time.map((_, i) => i).filter((i) => Number.isFinite(mean(i)));
     context.fillStyle = `${color}44`;
-    for (let i = 0; i + 1 < this.time.length; i++) {
-      const corners = [corner(i, 1), corner(i + 1, 1), corner(i + 1, -1), corner(i, -1)];
-      if (!corners.flat().every(Number.isFinite)) continue;
-      context.beginPath();
-      for (const one of corners) context.lineTo(...one);
-      context.fill();
+    for (const i of runs.filter((at) => at + 1 < this.time.length && Number.isFinite(std(at) + std(at + 1)))) {
+      const corners = [[i, 1], [i + 1, 1], [i + 1, -1], [i, -1]].map(([at, sign]) => point(at, mean(at) + sign * 1.96 * std(at)));
+      context.fill(new Path2D(`M${corners.join("L")}Z`));
     }
     for (const [value, lineWidth, dashes] of [[low, 1, [2, 3]], [high, 1, [2, 3]], [mean, 2, []]]) {
       Object.assign(context, { strokeStyle: color, lineWidth });
       context.setLineDash(dashes);
-      context.beginPath();
-      this.time.forEach((_, i) => Number.isFinite(value(i)) && context[i && Number.isFinite(value(i - 1)) ? "lineTo" : "moveTo"](across(i), down(value(i))));
-      context.stroke();
+      context.stroke(new Path2D(runs.map((i, at) => `${runs[at - 1] === i - 1 ? "L" : "M"}${point(i, value(i))}`).join("")));
     }
   }
   listRegions(regions) {
@@ -658,8 +611,5 @@ class Explorer {
 }
 
 export default {
-  render({ model, el }) {
-    const explorer = new Explorer(model, el);
-    return () => explorer.close();
-  },
+  render({ model, el }) { const explorer = new Explorer(model, el); return () => explorer.close(); },
 };

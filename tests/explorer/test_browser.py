@@ -4,6 +4,7 @@ Skipped where there is no chromium.
 """
 
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -22,6 +23,7 @@ import xarray as xr
 
 from dbthermal import separation, simulation, store
 from dbthermal.explorer import Region, View
+from dbthermal.response import counts as counts_of
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 sync_api = pytest.importorskip("playwright.sync_api", reason="no Playwright (extra 'test')")
@@ -29,9 +31,21 @@ pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="no chromium in PATH: the explorer is not tried in a browser"
 )
 ROOT = Path(__file__).parents[2]
-CELL = """import dbthermal, resource
+CELL = """import dbthermal
 explorer = dbthermal.explore({arguments})
 explorer"""
+
+
+STEPS = """async () => {
+    const explorer = document.querySelector('[data-testid=explorer]').explorer, times = [];
+    for (let i = 1; i <= 60; i++) {
+        const [begin, index] = [performance.now(), (i * 7) % 350];
+        explorer.goTo(index);
+        while (explorer.drawn !== index) await new Promise((done) => setTimeout(done, 1));
+        times.push(performance.now() - begin);
+    }
+    return [explorer.shown.length, times];
+}"""
 
 
 class Lab:
@@ -208,3 +222,65 @@ def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
     if folder := os.environ.get("DBTHERMAL_SCREENSHOTS"):
         page.locator("[data-testid=explorer]").screenshot(path=f"{folder}/explorer.png")
     assert (lab.outside, lab.errors) == ([], [])
+
+
+def large_store(folder: Path, shape: tuple[int, int, int]) -> None:
+    """Result and capture of a size (time, y, x), of smooth films with noise, row by row."""
+    frames, height, width = shape
+    rng, rig = np.random.default_rng(2), simulation.Rig()
+    time, columns = np.arange(frames) / 30, np.linspace(0, 20, width)
+    film = 295 + np.linspace(0, 10, frames)[:, None, None] + columns + np.zeros((1, 16, 1))
+    names = ("object_temperature", "background_temperature")
+    maps = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
+
+    def results() -> Iterator[xr.Dataset]:
+        for _ in range(0, height, 16):
+            noisy = (film + rng.normal(0, 0.1, film.shape)).astype(np.float32)
+            films = dict.fromkeys(names, noisy) | {f"{name}_std": noisy / 3000 for name in names}
+            arrays = {name: (("time", "y", "x"), one) for name, one in films.items()}
+            status = ("y", "x"), np.zeros((16, width), np.uint32)
+            yield xr.Dataset({**arrays, "status": status}, {"time": time}).assign(
+                emissivity=maps.expand_dims(y=16, x=width).transpose("band", "y", "x")
+            )
+
+    store.save_rows(results(), folder / "large.zarr", {})
+    counts = (
+        part[["object_temperature"]]
+        .rename(object_temperature="counts")
+        .map(lambda one: response_counts(rig.response(), one))
+        for part in results()
+    )
+    store.save_rows(counts, folder / "large_capture.zarr", {})
+    store.save(rig.response(), folder / "large_response.zarr", {})
+
+
+def response_counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
+    """Counts of both bands, float32."""
+    return counts_of(response, temperature).astype(np.float32)
+
+
+@pytest.mark.bench
+@pytest.mark.parametrize("inputs", [False, True], ids=["result", "result and capture"])
+def test_step_of_a_large_store(
+    lab: Lab, page: Any, inputs: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A step on 640 x 512 pixels and 350 frames from zarr takes 100 ms at most, in the median."""
+    if not (lab.folder / "large_response.zarr").exists():
+        large_store(lab.folder, (350, 512, 640))
+    names = ["large.zarr", "large_capture.zarr", "large_response.zarr"][: 3 if inputs else 1]
+    begin = time.perf_counter()
+    lab.run(page, CELL.format(arguments=", ".join(map(repr, names))))
+    opened = time.perf_counter() - begin
+    panes, times = page.evaluate(STEPS)
+    median, high = np.percentile(times, [50, 95])
+    (kernel,) = (
+        (Path("/proc") / f"{lab.server.pid}/task/{lab.server.pid}/children").read_text().split()
+    )
+    memory = re.findall(r"Rss(?:Anon|File):.*", Path(f"/proc/{kernel}/status").read_text())
+    load = os.getloadavg()[0]
+    with capsys.disabled():
+        print(f"\n{panes} pictures: median {median:.0f} ms, 95 % {high:.0f} ms, load {load:.1f}")
+        print(f"opened in {opened:.0f} s; kernel: {', '.join(memory)}")
+    if load > (os.cpu_count() or 1):
+        pytest.skip(f"the machine is loaded: {load:.1f}")
+    assert median < 100
