@@ -88,7 +88,8 @@ def shared(
     change of what is mirrored is no noise. To lean does not lessen them: neighbours share such
     errors. One that is not known has the neighbourhood's.
     """
-    value, variance, known = (one.reshape(shape) for one in (value, variance, known))
+    value, variance = (one.reshape(shape) for one in (value, variance))
+    known = known.reshape(shape)
     weight = np.divide(1.0, variance, out=np.zeros(shape), where=known)
     square = (value - _median(value, weight)) ** 2 * weight
     chi = np.maximum(_median(square, weight) / chdtri(1, 0.5), 1.0)
