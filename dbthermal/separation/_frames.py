@@ -126,8 +126,11 @@ def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Ar
     centred = np.where(valid, values - level, 0.0)
     position = (time - time[0]) / max(time[-1] - time[0], 1e-300)
     powers = position[:, np.newaxis] ** np.arange(5)
-    sums = [_cumulative(valid * powers[:, [i]]) for i in range(5)]
-    values_sums = [_cumulative(centred * powers[:, [i]]) for i in range(3)]
+    # Sums of the samples before each place (time + 1, pixel).
+    sums, values_sums = (
+        [np.pad(np.cumsum(part * powers[:, [i]], axis=0), ((1, 0), (0, 0))) for i in range(orders)]
+        for part, orders in ((valid, 5), (centred, 3))
+    )
     result, left = centred, variance
     lower, upper = np.full_like(result, -np.inf), np.full_like(result, np.inf)
     going = valid
@@ -148,11 +151,6 @@ def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Ar
         half = max(half + 1, int(half * _GROWTH))
     left = np.where(left < variance, np.minimum(_BENT * left, variance), variance)
     return np.where(valid, result + level, np.nan), left
-
-
-def _cumulative(values: Array) -> Array:
-    """Sums of the samples before each place (time + 1, pixel)."""
-    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
 
 
 def _fit(sums: list[Array], values: list[Array], position: Array, half: int) -> tuple[Array, Array]:

@@ -22,6 +22,9 @@ from dbthermal.separation._displaced import Displacement
 
 Labels = npt.NDArray[np.intp]
 
+BLOCK_ROWS: Final = 32
+"""Rows that are read at once: a lazy capture is then decoded about once."""
+
 # Pixels from which the noise is estimated where the response has none, and a clock is judged.
 _NOISE_PIXELS: Final = 4096
 _CLOCK_PIXELS: Final = 256
@@ -30,7 +33,6 @@ _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
 # Negative eigenvalue of a covariance that is rounding [1].
 _ROUNDED: Final = 1e-6
-_MASK_DIMS: Final = (("time",), ("y", "x"), ("time", "y", "x"))
 
 
 @dataclass(frozen=True)
@@ -69,10 +71,24 @@ class Inputs:
     displacement: Displacement | None  # of the second camera's reflections
     difference: Callable[[slice], npt.NDArray[Any]] | None = None  # of rows, see `_joint.Joint`
 
+    @property
+    def blocks(self) -> list[slice]:
+        """Rows that are read at once."""
+        height = self.capture.sizes["y"]
+        rows = height if self.method.whole_image else BLOCK_ROWS
+        return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
+
     def apply(self, function: Callable[..., Any] | None, tile: Any) -> Any:
         """Apply a function of the method to a tile, with the settings where it has any."""
         assert function is not None
         return function(tile) if self.settings is None else function(tile, self.settings)
+
+
+def require(settings: Any, method: str, name: str, holds: Any, rule: str) -> None:
+    """Refuse a setting of a method for which a rule does not hold."""
+    if not holds:
+        value = getattr(settings, name)
+        raise ValueError(f"Invalid {name} {value} of method '{method}'. Must {rule}.")
 
 
 def check(  # noqa: PLR0913 - all that the user gives, by name
@@ -81,22 +97,27 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     method: Method,
     name: str,
     *,
-    settings: Any,
-    seed: int,
-    emissivity: xr.DataArray | None,
-    emissivity_std: xr.DataArray | None,
-    mask: xr.DataArray | None,
-    pool: xr.DataArray | None,
-    response_kind: str,
+    settings: Any = None,
+    seed: int = 0,
+    emissivity: xr.DataArray | None = None,
+    emissivity_std: xr.DataArray | None = None,
     emissivity_covariance: xr.DataArray | None = None,
+    mask: xr.DataArray | None = None,
+    pool: xr.DataArray | None = None,
     reflection_shift: xr.Dataset | None = None,
+    response_kind: str = "exact",
 ) -> Inputs:
     """Check all that the user gives, see `solve`, against the capture and the method's demands."""
     settings = _checked_settings(method, name, settings)
     schema.check_corrected(corrected)
     _check_status(corrected)
     bands = [str(band) for band in corrected["band"].values]
-    _check_demands(method, name, bands, corrected.sizes["time"])
+    if len(bands) < 2 or (len(bands) > 2 and not method.any_bands):
+        rule = "two or more" if method.any_bands else "exactly two"
+        raise ValueError(f"Invalid bands {bands} for method '{name}'. Must be {rule}.")
+    if (frames := corrected.sizes["time"]) < method.minimum_frames:
+        rule = f"Must have at least {method.minimum_frames}."
+        raise ValueError(f"Invalid capture of {frames} frames for method '{name}'. {rule}")
     if emissivity is not None and not method.knows_emissivity:
         raise ValueError(f"Invalid emissivity for method '{name}', which estimates it. Omit it.")
     if emissivity is None and method.knows_emissivity:
@@ -107,7 +128,9 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     capture = corrected[[variable for variable in _READ if variable in corrected]]
     _check_segment(capture)
     if mask is not None:
-        capture = capture.assign(mask=_checked_mask(capture, mask))
+        dims = ("time",), ("y", "x"), ("time", "y", "x")
+        used = _selection(capture, mask, "mask", "b", *dims)
+        capture = capture.assign(mask=used.drop_vars(list(used.coords)))
     noise = _noise(capture, response, curves)
     _check_clock(capture, method, curves, noise)
     value, covariance = _known_emissivity(
@@ -166,17 +189,6 @@ def _check_status(corrected: xr.Dataset) -> None:
         )
 
 
-def _check_demands(method: Method, name: str, bands: list[str], frames: int) -> None:
-    if len(bands) < 2 or (len(bands) > 2 and not method.any_bands):
-        rule = "two or more" if method.any_bands else "exactly two"
-        raise ValueError(f"Invalid bands {bands} for method '{name}'. Must be {rule}.")
-    if frames < method.minimum_frames:
-        raise ValueError(
-            f"Invalid capture of {frames} frames for method '{name}'. "
-            f"Must have at least {method.minimum_frames}."
-        )
-
-
 def _check_segment(capture: xr.Dataset) -> None:
     """Check the number of shutter events before each frame, `segment` (time)."""
     if "segment" not in capture:
@@ -196,16 +208,19 @@ def _check_segment(capture: xr.Dataset) -> None:
         )
 
 
-def _checked_mask(capture: xr.Dataset, mask: xr.DataArray) -> xr.DataArray:
-    """Return the samples to use without coordinates: (time), (y, x) or (time, y, x), boolean."""
-    if not isinstance(mask, xr.DataArray):
-        raise TypeError(f"Invalid mask of type {type(mask).__name__}. Must be a DataArray.")
-    if mask.dtype != bool:
-        raise TypeError(f"Invalid dtype {mask.dtype} of the mask. Must be bool.")
-    if mask.dims not in _MASK_DIMS:
-        raise ValueError(f"Invalid dims {mask.dims} of the mask. Must be of {_MASK_DIMS}.")
-    mask = laid_on(mask, capture, "the mask", "the capture")
-    return mask.drop_vars(list(mask.coords))
+def _selection(
+    capture: xr.Dataset, array: xr.DataArray, name: str, kinds: str, *dims: tuple[str, ...]
+) -> xr.DataArray:
+    """Return a mask or labels of some dims, laid on the capture."""
+    if not isinstance(array, xr.DataArray):
+        raise TypeError(f"Invalid {name} of type {type(array).__name__}. Must be a DataArray.")
+    if array.dtype.kind not in kinds:
+        rule = "bool" if kinds == "b" else "whole numbers"
+        raise TypeError(f"Invalid dtype {array.dtype} of the {name}. Must be {rule}.")
+    if array.dims not in dims:
+        rule = " or ".join(map(str, dims))
+        raise ValueError(f"Invalid dims {array.dims} of the {name}. Must be {rule}.")
+    return laid_on(array, capture, f"the {name}", "the capture")
 
 
 def _noise(capture: xr.Dataset, response: xr.Dataset, curves: list[Curve]) -> Array:
@@ -336,12 +351,6 @@ def _labels(corrected: xr.Dataset, pool: xr.DataArray | None) -> Labels | None:
     """Labels (pixel) of materials, numbered from 0 without gaps, -1 for pixels of none."""
     if pool is None:
         return None
-    if not isinstance(pool, xr.DataArray):
-        raise TypeError(f"Invalid pool of type {type(pool).__name__}. Must be a DataArray.")
-    if pool.dtype.kind not in "iu":
-        raise TypeError(f"Invalid dtype {pool.dtype} of the pool. Must be whole numbers.")
-    if pool.dims != ("y", "x"):
-        raise ValueError(f"Invalid dims {pool.dims} of the pool. Must be ('y', 'x').")
-    flat = laid_on(pool, corrected, "the pool", "the capture").values.ravel()
+    flat = _selection(corrected, pool, "pool", "iu", ("y", "x")).values.ravel()
     names = np.unique(flat[flat >= 0])
     return np.where(flat >= 0, np.searchsorted(names, flat), -1).astype(np.intp)

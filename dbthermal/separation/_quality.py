@@ -55,9 +55,8 @@ def read(
     Returns the counts (band, time, pixel) [count], zero where they are invalid and in unusable
     pixels; the samples that are valid in all bands (time, pixel), by their values and by the
     variable `mask`, in frames that repeat none (`_samples.copies`); and the status (pixel). A pixel
-    with fewer valid frames than `fewest`, or that lacks more than `most_missing` of all, cannot be
-    solved; see `bridge` for pixels that lack a few. The `grains` of a larger part, if known, tell
-    what repeats by chance.
+    that has less than the `fewest` valid frames, or lacks more than `most_missing`, cannot be
+    solved. The `grains` of a larger part, if known, tell what repeats by chance.
     """
     raw = part["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1)  # judged in its own precision, which is cheaper
@@ -109,9 +108,8 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     """Bridge short gaps of single pixels by a line in all bands.
 
     A line between the same two frames in all bands holds the same mixture of object and
-    background, so nothing is biased, and all pixels of a tile keep the same frames. Bridged are
-    gaps of `LONGEST_GAP` frames that most other pixels have, in pixels that lack few. Returns the
-    counts, and the samples that are valid or bridged; a bridged one is no measurement.
+    background. Bridged are gaps of `LONGEST_GAP` frames that most other pixels have, in pixels that
+    lack few. Returns the counts, and the samples that are valid or bridged.
     """
     common = valid.mean(axis=1) > MOST_MISSING
     gap = ~valid & common[:, np.newaxis]
@@ -126,9 +124,8 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     first, last = before[frame, pixel], after[frame, pixel]
     share = (time[frame] - time[first]) / (time[last] - time[first])
     filled = counts.copy()
-    filled[:, frame, pixel] = (1.0 - share) * counts[:, first, pixel] + share * counts[
-        :, last, pixel
-    ]
+    line = (1.0 - share) * counts[:, first, pixel] + share * counts[:, last, pixel]
+    filled[:, frame, pixel] = line
     return filled, valid | gap
 
 
@@ -153,9 +150,8 @@ def common_frames(
 ) -> list[tuple[Mask, Mask]]:
     """Frames (time) that most pixels have, and the pixels (pixel) that have them all.
 
-    For methods that need the same frames of all pixels. A usable pixel that lacks one gets the bit
-    of invalid samples and counts of zero, in place; so do all where the frames are fewer than
-    `fewest`, and then the list is empty.
+    A usable pixel that lacks one gets the bit of invalid samples and counts of zero, in place; so
+    do all where the frames are fewer than `fewest`, and then the list is empty.
     """
     usable = ~unusable(status)
     if not np.any(usable):

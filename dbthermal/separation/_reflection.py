@@ -25,8 +25,7 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     .. math:: (1 - e_1) (y - \bar y)
 
     with the mean over time, in the linear response of small changes. Where the object is constant
-    its emissivity is undefined, but all that changes is reflected: the apparent temperature less
-    its mean.
+    all that changes is reflected: the apparent temperature less its mean.
 
     Parameters
     ----------
@@ -91,14 +90,14 @@ def uncalibrated_reflection(
 ) -> xr.Dataset:
     r"""Separate rapid, correlated changes from slow ones in two bands of any unit.
 
-    Without a response there are no temperatures, but the rapid changes are still the background's.
-    Smooth functions of time, which hold the object's change, are projected out of both bands. Frame
-    by frame, the gain and offset errors of the picture's own scaling are fitted to the uncorrelated
-    pixels (correlation below 0.1) and subtracted: small ones, and rapid. Large or slow ones are
-    undone before, by `unscaled`, whose `gain` then weights the frames by their noise. With
-    :math:`\lambda` the noise variance of the second band over that of the first there, the ratio k
-    of a pixel is that of Deming's regression [2]_, the pooled ratio is its median over the
-    correlated pixels, and the reflection in the first band's unit is the best linear estimate
+    Without a response there are no temperatures, but rapid changes are still the background's.
+    Smooth functions of time, which hold the object's change, are projected out of both bands. Gain
+    and offset errors of each frame, rapid and small, are fitted to the uncorrelated pixels
+    (correlation below 0.1) and subtracted; large or slow ones are undone before, by `unscaled`,
+    whose `gain` then weights the frames by their noise. With :math:`\lambda` the noise variance of
+    the second band over that of the first there, the ratio k of a pixel is that of Deming's
+    regression [2]_, the pooled ratio is its median over the correlated pixels, and the reflection
+    in the first band's unit is the best linear estimate
 
     .. math:: r(t) = \frac{r_1(t) + (k / \lambda) \, r_2(t)}{1 + k^2 / \lambda}
 
@@ -158,7 +157,9 @@ def uncalibrated_reflection(
     rapid -= [functions @ (functions.T @ part) for part in rapid]
     quiet = inside & (np.abs(_correlation(rapid)) < _UNCORRELATED)
     _require(quiet, f"correlation below {_UNCORRELATED} in magnitude")
-    rapid -= [_scaling(*parts, quiet) for parts in zip(rapid, values.mean(axis=1), strict=True)]
+    for band, mean in enumerate(values.mean(axis=1)):
+        offset, gain = _frame_errors(rapid[band], mean, quiet)
+        rapid[band] -= offset[:, np.newaxis] + gain[:, np.newaxis] * mean
     correlation = _correlation(rapid)
     quiet = inside & (np.abs(correlation) < _UNCORRELATED)
     moving = inside & (correlation > correlated)
@@ -166,38 +167,40 @@ def uncalibrated_reflection(
     # lambda = s_2^2 / s_1^2
     power = np.einsum("btp,btp->bp", rapid, rapid)
     noise_ratio = float(power[1, quiet].mean() / power[0, quiet].mean())
-    ratio = _deming(rapid, power, noise_ratio)
+    # Principal axis of the scatter S whitened by the noise: k = sqrt(lambda) tan(phi),
+    # tan(2 phi) = 2 sqrt(lambda) S_12 / (lambda S_11 - S_22).
+    cross = 2.0 * np.einsum("tp,tp->p", *rapid) * np.sqrt(noise_ratio)
+    angle = 0.5 * np.arctan2(cross, noise_ratio * power[0] - power[1])
+    ratio = np.sqrt(noise_ratio) * np.tan(angle)
     pooled = float(np.median(ratio[moving]))
     # r = (r_1 / s_1^2 + k r_2 / s_2^2) / (1 / s_1^2 + k^2 / s_2^2)
     reflection = rapid[0] + pooled / noise_ratio * rapid[1]
     reflection /= weight * (1.0 + pooled**2 / noise_ratio)
     units = {"units": signal.attrs["units"]} if "units" in signal.attrs else {}
-    variables = {
-        name: (("y", "x"), part.reshape(image), {"units": "1"})
-        for name, part in (("ratio", ratio), ("correlation", correlation))
-    } | {
-        name: (("time", "y", "x"), part.reshape(frames, *image).astype(np.float32), units)
-        for name, part in (("reflection", reflection), ("emission", values[0] - reflection))
-    }
-    attrs = {
-        **signal.attrs,
-        "pooled_ratio": pooled,
-        "noise_ratio": noise_ratio,
-        "correlated_pixels": int(moving.sum()),
-        "order": order,
-    }
-    coords = {name: signal[name] for name in ("time", "y", "x") if name in signal.coords}
-    return xr.Dataset(variables, coords=coords, attrs=attrs)
+    result = xr.Dataset(
+        coords={name: signal[name] for name in ("time", "y", "x") if name in signal.coords},
+        attrs={
+            **signal.attrs,
+            "pooled_ratio": pooled,
+            "noise_ratio": noise_ratio,
+            "correlated_pixels": int(moving.sum()),
+            "order": order,
+        },
+    )
+    for name, part in (("ratio", ratio), ("correlation", correlation)):
+        result[name] = ("y", "x"), part.reshape(image), {"units": "1"}
+    for name, part in (("reflection", reflection), ("emission", values[0] - reflection)):
+        result[name] = ("time", "y", "x"), part.reshape(frames, *image).astype(np.float32), units
+    return result
 
 
 def unscaled(signal: xr.DataArray, still: xr.DataArray) -> xr.DataArray:
     r"""Undo the scale of each frame of two pictures, from surroundings that do not change.
 
-    A picture that is scaled anew in each frame, as between its extremes, shows still surroundings
-    :math:`s(p)` as :math:`o(t) + g(t) s(p)`. Offset and gain are fitted robustly, with Cauchy's
-    weights [1]_ by each pixel's residual over time. A band is undone only where they explain 90 %
-    of the weighted variance over time; else its scale is nearly constant, or the surroundings
-    change themselves, and it stays as it is.
+    A picture that is scaled anew in each frame shows still surroundings :math:`s(p)` as
+    :math:`o(t) + g(t) s(p)`. Offset and gain are fitted robustly, with Cauchy's weights [1]_ by
+    each pixel's residual over time. A band where they explain less than 90 % of the weighted
+    variance over time stays as it is.
 
     Parameters
     ----------
@@ -278,7 +281,6 @@ def _frame_errors(change: Array, mean: Array, weight: Array | Mask) -> Array:
 
 
 def _check_signal(signal: xr.DataArray) -> None:
-    """Refuse all but two movies."""
     if signal.dims != ("band", "time", "y", "x") or signal.sizes["band"] != 2:
         raise ValueError(
             f"Invalid signal {dict(signal.sizes)}. Must be (band, time, y, x) of two bands."
@@ -319,20 +321,3 @@ def _correlation(rapid: Array) -> Array:
     cross = np.einsum("tp,tp->p", rapid[0], rapid[1])
     size = np.sqrt(np.prod(np.einsum("btp,btp->bp", rapid, rapid), axis=0))
     return np.asarray(np.divide(cross, size, out=np.zeros_like(cross), where=size > 0))
-
-
-def _scaling(rapid: Array, mean: Array, quiet: Mask) -> Array:
-    """Gain and offset errors (time, pixel) of each frame, fitted to the quiet pixels."""
-    offset, gain = _frame_errors(rapid, mean, quiet)
-    return np.asarray(offset[:, np.newaxis] + gain[:, np.newaxis] * mean)
-
-
-def _deming(rapid: Array, power: Array, noise_ratio: float) -> Array:
-    r"""Slope (pixel) of Deming's regression of the second band on the first.
-
-    The principal axis of the scatter S whitened by the noise, :math:`k = \sqrt\lambda \tan\phi`
-    with :math:`\tan 2\phi = 2 \sqrt\lambda S_{12} / (\lambda S_{11} - S_{22})`.
-    """
-    cross = np.einsum("tp,tp->p", rapid[0], rapid[1])
-    angle = 0.5 * np.arctan2(2.0 * cross * np.sqrt(noise_ratio), noise_ratio * power[0] - power[1])
-    return np.asarray(np.sqrt(noise_ratio) * np.tan(angle))

@@ -17,9 +17,9 @@ from tqdm import tqdm
 
 from dbthermal import store
 from dbthermal.separation import _inputs
-from dbthermal.separation._inputs import Method
+from dbthermal.separation._inputs import BLOCK_ROWS, Method
 from dbthermal.separation._solve import get_method, solve
-from dbthermal.separation._tiles import BLOCK_ROWS, PIXELS, SAMPLES
+from dbthermal.separation._tiles import PIXELS, SAMPLES
 
 if TYPE_CHECKING:
     from dbthermal.separation._solve import Settings

@@ -40,9 +40,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     """Separate emission and reflection in a capture, with an answer at every pixel.
 
     Each pixel alone (`solve`); where bands are apart in more than 2 % of the pixels whose
-    reflections move, once more with the shift between the two cameras' reflections
-    (`alignment.reflection_shift`), which is kept if fewer are apart with it; then with the pixels
-    of each material pooled (`materials`); last, what is still unknown is completed (`complete`).
+    reflections move, with the shift between the cameras' reflections (`alignment.reflection_shift`)
+    if fewer are apart with it; then with the pixels of each material pooled (`materials`); last,
+    what is still unknown is completed (`complete`).
 
     Parameters
     ----------
@@ -90,10 +90,12 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     source = "none" if reflection_shift is None else "given"
     alone = None
-    wide = min(corrected.sizes["y"], corrected.sizes["x"]) >= _WIDE
-    if reflection_shift is None and wide:
+    if reflection_shift is None and min(corrected.sizes["y"], corrected.sizes["x"]) >= _WIDE:
         # Pixels whose bands are apart take long: some tell whether the cameras are.
-        apart = _share_apart(solve(_thinned(corrected), response, workers=workers))
+        pixels = corrected.sizes["y"] * corrected.sizes["x"]
+        every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
+        some = corrected.isel(y=every, x=every)
+        apart = _share_apart(solve(some, response, workers=workers))
         if apart > _APART:
             shift = alignment.reflection_shift(corrected, response)
             if bool(shift["known"].any()):
@@ -123,13 +125,6 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if materials is not None:
         result["material"] = materials
     return result.assign_attrs(reflection_shift=source)
-
-
-def _thinned(corrected: xr.Dataset) -> xr.Dataset:
-    """Some thousand pixels of a capture, evenly spaced over the image."""
-    pixels = corrected.sizes["y"] * corrected.sizes["x"]
-    every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
-    return corrected.isel(y=every, x=every)
 
 
 def _share_apart(result: xr.Dataset) -> float:

@@ -1,7 +1,6 @@
 """The one entrance to all methods: the inputs are checked, and separated tile by tile."""
 
 import importlib
-import itertools
 import operator
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -10,7 +9,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
@@ -19,9 +17,9 @@ from dbthermal import schema
 from dbthermal.separation import _joint as joint
 from dbthermal.separation import _neighbours as neighbours
 from dbthermal.separation import _tiles as tiles
-from dbthermal.separation._inputs import Inputs, Labels, Method, check
+from dbthermal.separation._inputs import Inputs, Method, check
 from dbthermal.separation._pooling import pool as pooling
-from dbthermal.separation._tiles import Array, Estimate, Mask, Material, Survey
+from dbthermal.separation._tiles import Estimate, Mask, Material
 
 if TYPE_CHECKING:
     from dbthermal.separation._baselines.bcp import BcpSettings
@@ -49,8 +47,6 @@ _MODULES: Final = {
     "bcp": ("_baselines.bcp", "METHOD"),
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
-# Share of the pixels of the materials that have an emissivity alone, from which it is theirs [1].
-_MOST_TOLD: Final = 0.98
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -76,8 +72,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     r"""
     Separate emission and reflection in a capture of two bands or more.
 
-    Object temperature x, background temperature y and emissivities e are estimated of the image
-    formation (`mixing`), with the responses U of `response`:
+    Of the image formation (`mixing`) with the responses U of `response`, object temperature x,
+    background temperature y and emissivities e are estimated:
 
     .. math:: I_m(t) = e_m U_m(x(t)) + (1 - e_m) U_m(y(t)) + \mathrm{noise}
 
@@ -85,12 +81,11 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     ----------
     corrected : Dataset
         `counts` (band, time, y, x) [count], `time` [s], and optionally `status` (y, x) and
-        `segment` (time), as `correction.correct_capture` gives them: a camera's raw counts must be
-        corrected first. `pattern_std` (band) [count], an error of each pixel that is constant in
-        time, widens the bars of "subspace". Samples that are NaN are left out, and frames that
-        repeat the one before in a band. May be lazy, as from `store.open_dataset`: it is read a few
-        rows at a time, and never whole. "subspace" and "calibrated" take two bands or more, and the
-        former at least 32 frames; the other methods two bands.
+        `segment` (time), from `correction.correct_capture`. `pattern_std` (band) [count], an error
+        of each pixel that is constant in time, widens the bars of "subspace". Samples that are NaN
+        are left out, and frames that repeat the one before in a band. May be lazy: it is read a few
+        rows at a time. "subspace" and "calibrated" take two bands or more, and the former at least
+        32 frames; the other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used
         where present, times the `noise_factor` (band) that `alignment.align` leaves in the capture;
@@ -111,14 +106,13 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     mask : DataArray, optional
         Samples to use: (time), (y, x) or (time, y, x), boolean.
     pool : DataArray, optional
-        Materials (y, x), integer: the pixels of one label share their emissivities, which makes
-        all of them more certain; a negative one shares nothing. Known to the user, or found by
-        `materials`. For "subspace" only.
+        Materials (y, x), integer, as from `materials`: the pixels of one label share their
+        emissivities, which makes all of them more certain; a negative one shares nothing. For
+        "subspace" only.
     reflection_shift : Dataset, optional
-        Where two cameras side by side see what the object mirrors, from
-        `alignment.reflection_shift`: the reflection that all other bands, of the second camera,
-        show at a pixel p is the one that the quietest band shows at :math:`p + d(p)`, `shift`
-        (axis, y, x) [pixel] with `shift_std`, `known` (y, x). The result is on the quietest band's
+        From `alignment.reflection_shift`, for two cameras side by side: the reflection that all
+        other bands, of the second camera, show at a pixel p is the one that the quietest band shows
+        at :math:`p + d(p)`, `shift` (axis, y, x) [pixel]. The result is on the quietest band's
         grid. For "subspace", "calibrated", "naive" and "dbvt".
     response_kind : {"exact", "linear"}
         Sakuma-Hattori response, or the paper's linear one.
@@ -136,10 +130,9 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         (band, y, x) [1] and `reflection_ratio` (band, y, x) [1], the reflectivity over that of the
         quietest band (attribute `reference_band`), each with `_std`; of "subspace" also
         `emissivity_covariance` (band, other_band, y, x) [1]; `status` (y, x), bits of
-        `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says that they
-        are undefined, at samples that are invalid or masked, and where a method never estimates
-        them (attribute `not_estimated`); where the status is 0, all others are finite. A known
-        emissivity without a deviation has deviation 0.
+        `schema.Status`; `noise` (band) [count], as used. Values are NaN where a flag says why, at
+        samples that are invalid or masked, and where a method never estimates them (attribute
+        `not_estimated`); where the status is 0, all others are finite.
 
     Raises
     ------
@@ -160,9 +153,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     emissivity's deviation carries the drift that `SubspaceSettings.background_drift` states.
 
     A `segment` is used by "subspace" alone, and for the object alone: the step that a shutter
-    event leaves stays in the background, and makes the emissivity less certain, as its deviation
-    says; the object temperature is free of it. A step of the object during a shutter event is not
-    detected.
+    event leaves stays in the background, and in the emissivity's deviation. A step of the object
+    during a shutter event is not detected.
 
     With a `reflection_shift` d the other bands are resampled at the place p of each pixel r,
     p + d(p) = r, and the object of two places enters the bands,
@@ -170,13 +162,11 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. math:: I_1(r) = e_1 U_1(x(r)) + (1 - e_1) U_1(y), \quad
               I_m'(r) = e_m U_m(x(p)) + (1 - e_m) U_m(y)
 
-    The ratios are those of bands that are blurred alike, by a pixel, since no shift makes their
-    edges alike, and as certain as neighbours agree on them. With these the pixels are solved as if
-    x(p) were x(r), all of them are then solved together for the object,
-    and each once more with what follows for x(p) in the other bands. It costs 3 to 4 times as much
-    where the object is not the same in both places, and makes the object more certain: an error of
-    one pixel is averaged along the places p. A pixel of which the second camera does not see the
-    reflection has the bit `no_reflection_pair`.
+    The ratios are those of bands that are blurred alike, by a pixel, and as certain as neighbours
+    agree on them. With these the pixels are solved as if x(p) were x(r), then all together for the
+    object, and each once more with what follows for x(p) in the other bands: 3 to 4 times the cost
+    where the object is not the same in both places. A pixel of which the second camera does not see
+    the reflection has the bit `no_reflection_pair`.
 
     References
     ----------
@@ -233,7 +223,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         ) as bar,
     ):
         if inputs.displacement is None:
-            _separate_all(inputs, _materials(inputs, threads, bar), result, threads, bar)
+            pooled = None if pool is None else pooling.materials(inputs, threads, bar)
+            _separate_all(inputs, pooled, result, threads, bar)
         else:
             _solve_jointly(inputs, result, threads, bar)
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
@@ -305,38 +296,14 @@ def _solve_jointly(
     both = joint.solve(inputs, result, threads, blur=blur)
     if inputs.labels is not None:
         apart = inputs if both is None else replace(inputs, difference=both.difference)
-        material = _materials(apart, threads, bar, every=True)
+        material = pooling.materials(apart, threads, bar, every=True)
         _separate_all(inputs, material, result, threads, bar)
         both = joint.solve(inputs, result, threads, pooled=True)
     if both is not None:
         apart = replace(inputs, difference=both.difference)
-        material = material if inputs.labels is None else _materials(apart, threads, bar)
+        material = material if inputs.labels is None else pooling.materials(apart, threads, bar)
         _separate_all(apart, material, result, threads, bar)
         both.finish()
-
-
-def _materials(
-    inputs: Inputs, threads: ThreadPoolExecutor, bar: "tqdm[Any]", *, every: bool = False
-) -> Material | None:
-    """Ratios and emissivity of the material of each pixel of the image; None if none are told."""
-    if inputs.labels is None:
-        return None
-    selected = pooling.select(inputs.labels)
-    surveys = threads.map(lambda block: _survey(inputs, block, selected, bar), _blocks(inputs))
-    found = [part for survey in surveys for part in survey]
-    material = _pool(inputs, found)
-    told = sum(np.isfinite(part.emissivity).sum() for _, part in found)
-    every |= told > _MOST_TOLD * sum((part.frames > 0).sum() for _, part in found)
-    if material is None or every:
-        return material
-    # Pixels with a ratio or pieces of their own are those of a selection by them.
-    ratio = replace(material, emissivity=np.full_like(material.emissivity, np.nan))
-    surveys = threads.map(
-        lambda block: _survey(inputs, block, selected, bar, ratio), _blocks(inputs)
-    )
-    again = _pool(inputs, [part for survey in surveys for part in survey])
-    assert again is not None
-    return again
 
 
 def _separate_all(
@@ -347,20 +314,12 @@ def _separate_all(
     bar: "tqdm[Any]",
 ) -> None:
     """Separate all blocks of rows into the result."""
-    separate = partial(_separate, inputs, material=material, result=result, bar=bar)
-    for _ in threads.map(separate, _blocks(inputs)):
-        pass
-
-
-def _blocks(inputs: Inputs) -> list[slice]:
-    """Rows that are read at once."""
-    height = inputs.capture.sizes["y"]
-    rows = height if inputs.method.whole_image else tiles.BLOCK_ROWS
-    return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
+    separate = partial(_separate, inputs, material, result, bar)
+    list(threads.map(separate, inputs.blocks))
 
 
 def _separate(
-    inputs: Inputs, rows: slice, material: Material | None, result: xr.Dataset, bar: "tqdm[Any]"
+    inputs: Inputs, material: Material | None, result: xr.Dataset, bar: "tqdm[Any]", rows: slice
 ) -> None:
     """Separate a block of rows into its place in the result."""
     for cut in tiles.cut(inputs, rows, material):
@@ -372,44 +331,6 @@ def _separate(
             estimates.append((frames, pixels, estimate))
         _write(result, inputs.bands, cut, estimates)
         bar.update(cut.status.size)
-
-
-def _survey(
-    inputs: Inputs, rows: slice, selected: Mask, bar: "tqdm[Any]", material: Material | None = None
-) -> list[tuple[Labels, Survey]]:
-    """Survey the selected pixels of a block; with their numbers in the image."""
-    surveys = []
-    for cut in tiles.cut(inputs, rows, material):
-        numbers = tiles.numbers(cut.window, inputs.capture.sizes["x"])
-        for _, pixels, tile in cut.parts:
-            wanted = selected[numbers[pixels]]
-            if np.any(wanted):
-                part = tile if np.all(wanted) else tile.select_pixels(wanted)
-                survey: Survey = inputs.apply(inputs.method.survey, part)
-                # Whitened by one noise for all, not by that of the tile.
-                scale = np.array(part.noise) / inputs.noise[inputs.bands]
-                square = np.multiply.outer(scale, scale)[..., np.newaxis]
-                survey = replace(
-                    survey,
-                    scatter=survey.scatter * square,
-                    rapid_scatter=survey.rapid_scatter * square,
-                )
-                surveys.append((numbers[pixels][wanted], survey))
-        if material is None:
-            bar.update(cut.status.size)
-    return surveys
-
-
-def _pool(inputs: Inputs, surveys: list[tuple[Labels, Survey]]) -> Material | None:
-    """Ratios and emissivity of the material of each pixel of the image; None without a survey."""
-    labels = inputs.labels
-    if labels is None or not surveys:
-        return None
-    numbers = np.concatenate([number for number, _ in surveys])
-    survey = surveys[0][1].join([part for _, part in surveys[1:]])
-    noise = inputs.noise[inputs.bands]
-    materials = pooling.estimate(labels[numbers], int(labels.max()) + 1, survey, noise)
-    return pooling.expand(materials, labels)
 
 
 def _allocate(corrected: xr.Dataset, variables: Mapping[str, schema.Variable]) -> xr.Dataset:
@@ -435,13 +356,12 @@ def _write(
     cut: tiles.Cut,
     estimates: list[tuple[Mask, Mask, Estimate]],
 ) -> None:
-    """
-    Write the estimates of a window into the result, at frames (time) and pixels (pixel).
+    """Write the estimates of a window into the result, at frames (time) and pixels (pixel).
 
-    `bands` are the places of the tile's bands in the capture. A pixel of no estimate becomes NaN
-    and keeps its status; so do temperatures at frames of no estimate, and at invalid samples.
+    The tile's bands have these places in the capture. What has no estimate becomes NaN.
     """
     every = bool(np.all(cut.valid))
+    order = np.argsort(bands)
     complete = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
     for name in map(str, result.data_vars):
         target = result[name].values[..., cut.window[0], cut.window[1]]
@@ -458,19 +378,11 @@ def _write(
             if name == "status":
                 target[where] |= values
             elif "band" in dims:
-                each = itertools.product(range(len(bands)), repeat=target.ndim - 2)
-                for place in each:
-                    target[tuple(bands[index] for index in place)][where] = values[place]
+                target[..., where] = values[np.ix_(*[order] * (values.ndim - 1))]
+            elif np.all(frames) and np.all(where):
+                target[...] = values.reshape(target.shape)
             else:
-                _write_film(target, frames, where, values)
+                rows, columns = np.nonzero(where)
+                target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values
         if "time" in dims and not every:
             target[~cut.valid.reshape(-1, *shape)] = np.nan
-
-
-def _write_film(target: npt.NDArray[np.floating], frames: Mask, where: Mask, values: Array) -> None:
-    """Write values (time, pixel) at some frames and pixels of (time, y, x), in place."""
-    if np.all(frames) and np.all(where):
-        target[...] = values.reshape(target.shape)
-    else:
-        rows, columns = np.nonzero(where)
-        target[np.flatnonzero(frames)[:, np.newaxis], rows, columns] = values

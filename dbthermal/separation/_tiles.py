@@ -33,9 +33,6 @@ PIXELS: Final = 320
 SAMPLES: Final = 2**19
 """Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
 
-BLOCK_ROWS: Final = 32
-"""Rows that are read at once: a lazy capture is then decoded about once."""
-
 # Times as many pixels in a tile whose steps are compiled: these keep to the cache by themselves,
 # and the pixels that need more are then enough together.
 _COMPILED: Final = 8
@@ -192,16 +189,6 @@ class Estimate(Pixels):
                 for ending in ("", "_std")
             },
         )
-
-    def expand_frames(self, used: Mask) -> "Estimate":
-        """Return the estimate at all frames; the temperatures are NaN at those not used (time)."""
-        values = {}
-        for name in ("object_temperature", "background_temperature"):
-            for which in (name, f"{name}_std"):
-                part = getattr(self, which)
-                values[which] = np.full((used.size, part.shape[1]), np.nan)
-                values[which][used] = part
-        return replace(self, **values)
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
         """

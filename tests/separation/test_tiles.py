@@ -113,16 +113,14 @@ def selected(*places: int, size: int = 4) -> npt.NDArray[np.bool_]:
     return np.isin(np.arange(size), places)
 
 
-def test_pixels_and_frames_come_back_to_their_places() -> None:
-    """Selecting and replacing are inverse; unused frames are NaN."""
+def test_pixels_come_back_to_their_places() -> None:
+    """Selecting and replacing are inverse."""
     whole = estimate(4)
     part = whole.select_pixels(selected(1, 3))
     np.testing.assert_array_equal(part.object_temperature[0], [301.0, 303.0])
     back = estimate(4)
     back.replace_pixels(selected(1, 3), part)
     np.testing.assert_array_equal(back.object_temperature, whole.object_temperature)
-    wide = whole.expand_frames(selected(0, 1, 4, 5, 6, size=8))
-    assert np.isnan(wide.background_temperature).all(axis=1).sum() == 3
 
 
 def test_undefined_quantities_lose_their_deviation_too() -> None:

@@ -27,7 +27,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from dbthermal import planck
 from dbthermal.response import require_range
 from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
-from dbthermal.separation._inputs import Method
+from dbthermal.separation._inputs import Method, require
 from dbthermal.separation._tiles import Array, Estimate, Tile
 
 
@@ -65,28 +65,19 @@ class BcpSettings:
     def __post_init__(self) -> None:
         """Refuse windows without a centre, and numbers outside their range."""
         for name in ("patch", "window"):
-            if not (getattr(self, name) >= 1 and getattr(self, name) % 2 == 1):
-                raise ValueError(
-                    f"Invalid {name} {getattr(self, name)} of method 'bcp'. Must be odd."
-                )
+            side = getattr(self, name)
+            require(self, "bcp", name, side >= 1 and side % 2 == 1, "be odd")
         planck.require_positive("regularisation of method 'bcp'", self.regularisation)
-        if not 0 <= self.percentile <= 100:
-            raise ValueError(
-                f"Invalid percentile {self.percentile} of method 'bcp'. Must lie in [0, 100]."
-            )
-        if not 0 < self.least_transmission <= 1:
-            raise ValueError(
-                f"Invalid least_transmission {self.least_transmission} of method 'bcp'. "
-                "Must lie in (0, 1]."
-            )
+        require(self, "bcp", "percentile", 0 <= self.percentile <= 100, "lie in [0, 100]")
+        least = self.least_transmission
+        require(self, "bcp", "least_transmission", 0 < least <= 1, "lie in (0, 1]")
 
 
 def separate(tile: Tile, settings: BcpSettings) -> Estimate:
     """Remove the reflection from a whole image, each frame by itself.
 
-    Object temperature from the quieter band; the background's is that of A, the same in all pixels;
-    emissivity of each band is the mean over time of its own t. Pixels without a temperature, as
-    dead ones, are filled with the frame's median before the filters, and are NaN in the result.
+    The object temperature is that of the quieter band, the background's that of A; the emissivity
+    of a band is the mean of its t over time. Pixels without a temperature are NaN.
     """
     object_signal, reflected, transmission = _remove(tile, settings, 0)
     transmissions = np.stack([transmission, _remove(tile, settings, 1)[2]])
@@ -108,7 +99,9 @@ def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array,
         value = require_range(settings.reflected_temperature, curve, "reflected_temperature")
         known = float(tile.blackbody(band, value))
     for frame, signal in enumerate(tile.signals[band]):
-        image = _filled(tile, band, signal).reshape(tile.shape)
+        usable = np.isfinite(tile.temperature(band, signal))
+        filled = np.where(usable, signal, np.median(signal[usable])) if usable.any() else signal
+        image = filled.reshape(tile.shape)
         level = float(np.percentile(image, settings.percentile)) if known is None else known
         transmission = _transmission(image, level, settings)
         # I' = (I - A) / max(t, t0) + A
@@ -118,26 +111,16 @@ def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array,
     return cleaned, reflected, total / tile.time.size
 
 
-def _filled(tile: Tile, band: int, image: Array) -> Array:
-    """The frame with its median at pixels without a temperature."""
-    usable = np.isfinite(tile.temperature(band, image))
-    if not np.any(usable):
-        return image
-    return np.where(usable, image, np.median(image[usable]))
-
-
 def _transmission(image: Array, level: float, settings: BcpSettings) -> Array:
     """The smooth t of one frame; 1 where nothing in the patch is brighter than the reflection."""
     # t = (I - A) / (M - A)
     brightest = maximum_filter(image, settings.patch)
     coarse = np.ones_like(image)
     np.divide(image - level, brightest - level, out=coarse, where=brightest > level)
-    span = float(np.ptp(image))
-    if span == 0:  # one value: neither a guide, nor anything to smooth
-        return np.clip(coarse, 0.0, 1.0)
-    epsilon = settings.regularisation * span**2
-    fine = guided_filter(image, np.clip(coarse, 0.0, 1.0), settings.window, epsilon)
-    return np.clip(fine, 0.0, 1.0)
+    coarse, epsilon = np.clip(coarse, 0.0, 1.0), settings.regularisation * np.ptp(image) ** 2
+    if epsilon == 0:  # one value: neither a guide, nor anything to smooth
+        return coarse
+    return np.clip(guided_filter(image, coarse, settings.window, float(epsilon)), 0.0, 1.0)
 
 
 def guided_filter(guide: Array, image: Array, window: int, epsilon: float) -> Array:

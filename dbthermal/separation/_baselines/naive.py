@@ -14,18 +14,17 @@ through the Schur complement of the border (Triggs et al. 2000, doi:10.1007/3-54
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import expit, logit
 
 from dbthermal import mixing, planck
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
-from dbthermal.separation._inputs import Method
+from dbthermal.separation._inputs import Method, require
 from dbthermal.separation._quality import status_bits
-from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
+from dbthermal.separation._tiles import Array, Estimate, Mask, Pixels, Tile
 
 # Damping of the first step, relative to the diagonal of the normal equations, and its range; the
 # Schur complement is proportional to the damping, and is rounding below the least.
@@ -65,26 +64,20 @@ class NaiveSettings:
     def __post_init__(self) -> None:
         """Refuse numbers that are not positive."""
         for name in ("starts", "iterations"):
-            if not getattr(self, name) >= 1:
-                raise ValueError(
-                    f"Invalid {name} {getattr(self, name)} of method 'naive'. Must be at least 1."
-                )
+            require(self, "naive", name, getattr(self, name) >= 1, "be at least 1")
         planck.require_positive("shift_std [K] of method 'naive'", self.shift_std)
         planck.require_positive("tolerance of method 'naive'", self.tolerance)
 
 
 @dataclass(frozen=True)
-class _State:
-    """State of the search; columns are the starts of all pixels, start by start."""
+class _State(Pixels):
+    """State of the search; its "pixels" are the starts of all pixels, start by start."""
 
     logits: Array  # (2, column)
     logarithms: Array  # of object and background temperature / K, (2, time, column)
     damping: Array  # (column,)
     objective: Array  # (column,)
     active: Mask  # (column,)
-
-    def select(self, columns: npt.NDArray[Any]) -> "_State":
-        return _State(**{name: value[..., columns] for name, value in vars(self).items()})
 
 
 def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
@@ -94,7 +87,7 @@ def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
         cost = np.where(np.isfinite(state.objective), state.objective, np.inf)
         pixels = tile.signals.shape[-1]
         start = np.argmin(cost.reshape(settings.starts, pixels), axis=0)
-        kept = state.select(start * pixels + np.arange(pixels))
+        kept = state.select_pixels(start * pixels + np.arange(pixels))
         (temperature, background), emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
     status = status_bits({Status.NOT_CONVERGED: kept.active | lost})
@@ -105,28 +98,23 @@ def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
 
 
 def _search(tile: Tile, settings: NaiveSettings) -> _State:
-    """State of all starts at their end."""
+    """State at the end of all starts: random emissivities, and temperatures near the image's."""
     signals = np.tile(tile.signals, (1, 1, settings.starts))
-    state = _start(tile, signals, settings)
-    for _ in range(settings.iterations):
-        columns = state.active
-        if not np.any(columns):
-            break
-        moved = _step(tile, signals[..., columns], state.select(columns), settings.tolerance)
-        for name, value in vars(state).items():
-            value[..., columns] = getattr(moved, name)
-    return state
-
-
-def _start(tile: Tile, signals: Array, settings: NaiveSettings) -> _State:
-    """Random emissivities, and temperatures near the image's."""
     columns = signals.shape[-1]
     logits = logit(tile.rng.uniform(np.finfo(np.float64).tiny, 1.0, (2, columns)))
     shifts = settings.shift_std * tile.rng.standard_normal((2, 1, columns))
     logarithms = np.log(tile.temperature(0, signals[0]) + shifts)
     _, objective = _residual(tile, signals, logits, logarithms)
     damping = np.full(columns, _FIRST_DAMPING)
-    return _State(logits, logarithms, damping, objective, np.isfinite(objective))
+    state = _State(logits, logarithms, damping, objective, np.isfinite(objective))
+    for _ in range(settings.iterations):
+        active = state.active.copy()
+        if not np.any(active):
+            break
+        before = state.select_pixels(active)
+        after = _step(tile, signals[..., active], before, settings.tolerance)
+        state.replace_pixels(active, after)
+    return state
 
 
 def _residual(tile: Tile, signals: Array, logits: Array, logarithms: Array) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ from dbthermal import bands, planck
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation._baselines import WITHOUT_BACKGROUND, point_estimate
-from dbthermal.separation._inputs import Method
+from dbthermal.separation._inputs import Method, require
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._tiles import Array, Estimate, Tile
 
@@ -70,16 +70,14 @@ class RatioSettings:
             raise ValueError(
                 f"Unknown kind '{self.kind}' of method 'ratio'. Must be one of {KINDS}."
             )
-        if self.order is not None and not self.order >= 1:
-            raise ValueError(f"Invalid order {self.order} of method 'ratio'. Must be at least 1.")
+        require(self, "ratio", "order", self.order is None or self.order >= 1, "be at least 1")
 
 
 def ratio(tile: Tile, settings: RatioSettings) -> Estimate:
-    """
-    Temperature of a gray body before a background that emits nothing, for bands of `bands.FILTERS`.
+    """Temperature of a gray body before a background that emits nothing.
 
-    NaN where no temperature in the response's range has the ratio. The emissivity is the radiance
-    over that of a blackbody at this temperature, in the quieter band, mean over the valid frames.
+    NaN where no temperature in the response's range has the ratio. The emissivity is the mean over
+    time of the radiance over that of a blackbody at this temperature, in the quieter band.
     """
     first, second = tile.curves
     inverse = _inverse((first, second), settings.kind)
@@ -93,12 +91,9 @@ def ratio(tile: Tile, settings: RatioSettings) -> Estimate:
     frames = valid.sum(axis=0)
     mean = np.full(frames.shape, np.nan)
     np.divide(emissivity.sum(axis=0), frames, out=mean, where=frames > 0)
-    status = status_bits(
-        {
-            Status.OUTSIDE_RESPONSE: frames < temperature.shape[0],
-            Status.NONPHYSICAL_EMISSIVITY: (mean <= 0) | (mean >= 1),
-        }
-    )
+    odd = (mean <= 0) | (mean >= 1)
+    bits = {Status.OUTSIDE_RESPONSE: frames < len(valid), Status.NONPHYSICAL_EMISSIVITY: odd}
+    status = status_bits(bits)
     return point_estimate(tile, temperature, status, np.stack([mean, mean])).check_range(
         first, not_estimated=WITHOUT_BACKGROUND
     )
@@ -106,12 +101,9 @@ def ratio(tile: Tile, settings: RatioSettings) -> Estimate:
 
 def _radiances(tile: Tile, settings: RatioSettings) -> Array:
     """Radiance (2, time, pixel) of the bands, smoothed; NaN where the response has none."""
-    radiances = np.stack(
-        [
-            _radiance(curve, settings.kind, tile.temperature(band, tile.signals[band]))
-            for band, curve in enumerate(tile.curves)
-        ]
-    )
+    temperatures = (tile.temperature(band, signal) for band, signal in enumerate(tile.signals))
+    pairs = zip(tile.curves, temperatures, strict=True)
+    radiances = np.stack([_radiance(curve, settings.kind, part) for curve, part in pairs])
     if settings.order is None:
         return radiances
     functions = smooth.polynomial_basis(tile.time, settings.order)

@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -49,9 +50,7 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     .. math:: p(x, e, c, f \mid z) \propto p(z \mid x, e, c, f) \, p(e) \, p(c) \, p(f)
 
     The emissivities are those of the pixel, where measured; else those of its material elsewhere;
-    else of the `prior`. The pixel's own bands always add what they tell: how the bands' changes
-    compare, the ratio of their emissivities, and where they agree, the level of the background.
-    Near black, the result tends to the camera's own reading.
+    else of the `prior`. Near black, the result tends to the camera's own reading.
 
     Parameters
     ----------
@@ -62,9 +61,8 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     materials : DataArray, optional
         Labels (y, x), as from `materials`: pixels of one label have one material; -1 for none.
     surroundings : float or DataArray, optional
-        Temperature of what is reflected [K], stated or measured; a DataArray is () or (y, x).
-        If not given, it is estimated from the pixels that show it, beside a room of 295 K that is
-        uncertain by 8 K.
+        Temperature of what is reflected [K], () or (y, x). If not given, it is estimated from the
+        pixels that show it, beside a room of 295 K that is uncertain by 8 K.
     prior : str, DataArray or Dataset, optional
         Emissivities where no others are known: the name of a material of
         `emissivity.embedded_table`, or emissivities (band) [1] in (0, 1), both with a deviation of
@@ -83,9 +81,9 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         The variables of the result, and its values bit for bit where it has any; `status` has the
         bits ``completed_from_material`` or ``completed_from_prior``, and
         ``completed_from_surroundings``, where others were added, and ``completed_frames`` where
-        frames of a pixel were, beside the bits that say why there was none. Values stay NaN at bad
-        pixels and constant signals. A sample that is NaN in a band is bridged from those around it.
-        Attributes `surroundings`, `surroundings_std` [K] and `surroundings_source`.
+        frames of a pixel were. Values stay NaN at bad pixels and constant signals. A sample that is
+        NaN in a band is bridged from those around it. Attributes `surroundings`,
+        `surroundings_std` [K] and `surroundings_source`.
 
     Raises
     ------
@@ -129,11 +127,6 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         response,
         _METHOD,
         "complete",
-        settings=None,
-        seed=0,
-        emissivity=None,
-        emissivity_std=None,
-        mask=None,
         pool=materials,
         reflection_shift=reflection_shift,
         response_kind=str(result.attrs.get("response_kind", "exact")),
@@ -144,22 +137,20 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     scene = scenes.gather(inputs, result, told, prior)
     if not scene.apart:  # else the result's reflections are those of two places
         scenes.require_same_capture(scene, result)
-    if surroundings is not None:
-        scene = replace(scene, level=scenes.stated(scene, surroundings, surroundings_std))
-    level = scenes.find_level(scene)
-    if surroundings is not None:
-        level = replace(scene.level, fluctuation=level.fluctuation)
+    if surroundings is None:
+        level = scenes.find_level(scene)
+    else:
+        level = scenes.stated(scene, surroundings, surroundings_std)
+        fluctuation = scenes.find_level(replace(scene, level=level)).fluctuation
+        level = replace(level, fluctuation=fluctuation)
     scene = replace(scene, level=level)
     completed = result.copy(deep=True)
-    height = corrected.sizes["y"]
-    tops = range(0, height, tiles.BLOCK_ROWS)
-    blocks = [slice(top, min(top + tiles.BLOCK_ROWS, height)) for top in tops]
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
-        for _ in threads.map(lambda rows: _complete_rows(scene, rows, completed), blocks):
-            pass
+        list(threads.map(partial(_complete_rows, scene, completed), inputs.blocks))
     completed["status"].attrs.update(schema.status_attrs())
+    curve = inputs.curves[inputs.bands[0]]
     return completed.assign_attrs(
-        surroundings=float(np.mean(scene.kelvin(level.signal))),
+        surroundings=float(np.mean(curve.temperature(np.asarray(level.signal) + curve.reference))),
         surroundings_std=float(np.mean(level.std)),
         surroundings_source="capture" if surroundings is None else "stated",
     )
@@ -178,7 +169,7 @@ def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
     return laid_on(result, corrected, "the result", "the capture")
 
 
-def _complete_rows(scene: Scene, rows: slice, completed: xr.Dataset) -> None:
+def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
     """Complete the pixels of some rows, in place; what was measured is not touched."""
     lacking = np.zeros(completed["status"].values[rows].shape, dtype=bool)
     for name in (*FILMS, *MAPS):

@@ -114,11 +114,9 @@ def bins(tile: Tile, valid: Mask) -> Bins:
 
 
 def curve(tile: Tile, means: Bins, offset: Array) -> Curve:
-    """
-    Other bands over the first; offsets (band - 1) [K] of a pixel against the bands are not known.
+    """Other bands over the first; offsets (band - 1) [K] of a pixel against them are not known.
 
-    The variance is that of the noise, or what the bins show if it is more: what fluctuates there is
-    the background.
+    The variance is that of the noise, or the bins' if it is more: there the background fluctuates.
     """
     weight, first = means.frames, means.signals[0]
     total = np.maximum(weight.sum(axis=0), 1.0)
@@ -165,10 +163,8 @@ def _long_run(residual: Array, weight: Array, used: Array, noise: float) -> Arra
     freedom = np.maximum(used - 4, 1)
     variance = (scaled**2).sum(axis=0) / freedom
     power = np.maximum((scaled**2).sum(axis=0), np.finfo(np.float64).tiny)
-    lags = [
-        (scaled[lag:] * scaled[:-lag]).sum(axis=0) / power for lag in (1, 2) if lag < len(scaled)
-    ]
-    correlated = 1.0 + 2.0 * np.sum([np.maximum(lag, 0.0) for lag in lags], axis=0)
+    lags = [(scaled[lag:] * scaled[:-lag]).sum(axis=0) for lag in (1, 2) if lag < len(scaled)]
+    correlated = 1.0 + 2.0 * np.sum([np.maximum(lag / power, 0.0) for lag in lags], axis=0)
     more = variance > noise * (1.0 + 3.0 * np.sqrt(2.0 / freedom))
     return np.asarray(np.where(more, variance * correlated, noise))
 
@@ -205,9 +201,7 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     # e_1 = 1 / a, e_m = rho_m / a; de_1 = -e_1 / a da, de_m = (drho_m - e_m da) / a.
     a = mean[0]
     point = np.concatenate([np.ones((1, a.size)), mean[1:-1]]) / a
-    change = (
-        np.eye(len(mean))[..., np.newaxis] * np.append(np.full(len(point), 1), 0)[:, None, None] / a
-    )
+    change = np.eye(len(mean))[..., np.newaxis] / a
     change[:-1, 0] = -point / a
     change[-1, -1] = 1.0
     spread = np.einsum("imp,mnp,jnp->ijp", change, spread, change, optimize=True)
@@ -237,9 +231,8 @@ def _quadratic(tile: Tile, data: Curve, grid: Array, e: Array, c: Array) -> Arra
         # L = L0 + g d - d A d / 2 with d = (e, c) less the point.
         value = value - slope[0] * one - slope[1] * c
         value = value - 0.5 * (ee * one**2 + 2.0 * ec * one * c + cc * c**2)
-        parts.append(
-            [value, slope[0] + ee * one + ec * c, slope[1] + ec * one + cc * c, ee, ec, cc]
-        )
+        slope = slope[0] + ee * one + ec * c, slope[1] + ec * one + cc * c
+        parts.append([value, *slope, ee, ec, cc])
     return np.moveaxis(np.array(parts), 1, 0)
 
 
@@ -262,9 +255,7 @@ def _eliminate(
     slope = -ec / stiff
     e = right / stiff + slope * c[:, np.newaxis]
     slope = np.concatenate([slope, np.ones_like(c)[:, np.newaxis]], axis=1)
-    covariance = (
-        slope[:, :, np.newaxis] * slope[:, np.newaxis] / curvature[:, np.newaxis, np.newaxis]
-    )
+    covariance = slope[:, :, None] * slope[:, None] / curvature[:, None, None]
     for m in range(e.shape[1]):
         covariance[:, m, m] += 1.0 / stiff[:, m]
     return evidence, np.concatenate([e, c[:, np.newaxis]], axis=1), covariance
@@ -277,16 +268,14 @@ def _average(
     scales = np.ones((values.shape[1], *scale.shape))
     scales[:-1] = scale
     head = np.broadcast_to(first, (values.shape[0], 1, *first.shape))
-    parts = np.where(
-        weight[:, np.newaxis] > 0, np.concatenate([head, values * scales], axis=1), 0.0
-    )
+    parts = np.concatenate([head, values * scales], axis=1)
+    parts = np.where(weight[:, np.newaxis] > 0, parts, 0.0)
     mean = np.einsum("kgp,kigp->ip", weight, parts)
     off = parts - mean[:, np.newaxis]
     total = np.einsum("kgp,kigp,kjgp->ijp", weight, off, off, optimize=True)
     inner = np.where(weight[:, np.newaxis, np.newaxis] > 0, covariance, 0.0)
-    total[1:, 1:] += np.einsum(
-        "kgp,kijgp,igp,jgp->ijp", weight, inner, scales, scales, optimize=True
-    )
+    within = np.einsum("kgp,kijgp,igp,jgp->ijp", weight, inner, scales, scales, optimize=True)
+    total[1:, 1:] += within
     return mean, total
 
 

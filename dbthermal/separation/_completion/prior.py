@@ -82,18 +82,10 @@ def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> M
         if missing := {"emissivity", "emissivity_std"} - set(prior):
             raise ValueError(f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}.")
         prior, std = prior["emissivity"], prior["emissivity_std"]
-    values = schema.band_values(prior, bands, "prior", "1")
-    if not np.all((values > 0) & (values < 1)):
-        raise ValueError(
-            f"Invalid emissivities {values.tolist()} of the prior. Must lie in (0, 1)."
-        )
-    stds = np.full(len(bands), SAMPLE_STD)
+    values, stds = schema.band_values(prior, bands, "prior", "1"), np.full(len(bands), SAMPLE_STD)
     if std is not None:
         stds = schema.band_values(std, bands, "emissivity_std of the prior", "1")
-    if not np.all((stds > 0) & (stds < 1)):
-        raise ValueError(
-            f"Invalid emissivity_std {stds.tolist()} of the prior. Must lie in (0, 1)."
-        )
-    return Mixture(
-        np.ones(1), values[np.newaxis, :, np.newaxis], np.diag(stds**2)[np.newaxis, ..., np.newaxis]
-    )
+    for name, part in (("emissivities", values), ("emissivity_std", stds)):
+        if not np.all((part > 0) & (part < 1)):
+            raise ValueError(f"Invalid {name} {part.tolist()} of the prior. Must lie in (0, 1).")
+    return Mixture(np.ones(1), values[None, :, None], np.diag(stds**2)[None, ..., None])

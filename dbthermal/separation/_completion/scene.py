@@ -64,11 +64,6 @@ class Scene:
         value, covariance = self.emissivity[:, places], self.covariance[..., places]
         return Mixture(np.ones(1), value[np.newaxis], covariance[np.newaxis])
 
-    def kelvin(self, signal: Any) -> Array:
-        """Temperature [K] of signals of the quietest band, less its reference."""
-        curve = self.inputs.curves[self.inputs.bands[0]]
-        return curve.temperature(np.asarray(signal) + curve.reference)
-
     def tile(self, part: xr.Dataset, grains: Any = None) -> tuple[Tile, Mask]:
         """Tile of all pixels of a part of the capture, and its valid samples (time, pixel)."""
         inputs = self.inputs
@@ -155,14 +150,12 @@ def require_same_capture(scene: Scene, result: xr.Dataset) -> None:
 
 def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Level:
     """Level of stated surroundings, of all pixels or of each."""
-    schema.check_numbers(xr.DataArray(surroundings), "surroundings", "K")
-    values = np.asarray(surroundings, dtype=np.float64)
-    if isinstance(surroundings, xr.DataArray):
-        if surroundings.dims not in ((), ("y", "x")):
-            rule = "Must be () or ('y', 'x')."
-            raise ValueError(f"Invalid dims {surroundings.dims} of surroundings. {rule}")
-        capture = scene.inputs.capture
-        values = laid_on(surroundings, capture, "surroundings", "the capture").values.ravel()
+    given = schema.check_numbers(xr.DataArray(surroundings), "surroundings", "K")
+    if given.dims not in ((), ("y", "x")):
+        raise ValueError(f"Invalid dims {given.dims} of surroundings. Must be () or ('y', 'x').")
+    given = laid_on(given, scene.inputs.capture, "surroundings", "the capture")
+    values = given.values.astype(np.float64)
+    values = values.ravel() if given.dims else values
     bad = ~((values >= _COLDEST) & (values < np.inf))
     if np.any(bad):
         raise ValueError(
@@ -194,13 +187,11 @@ def solve(
         found = frames.solve(tile, static.point, static.level, variance, apart=scene.apart)
         signal, left = frames.smooth(found.signal, found.white, valid, tile.time)
         left = left + found.shared + frames.through(found.sensitivity, static.covariance)
-        around = found.background_variance + frames.through(
-            found.background_sensitivity, static.covariance
-        )
+        around = frames.through(found.background_sensitivity, static.covariance)
+        around = found.background_variance + around
         values: Values = {}
-        for name, mean, spread in zip(
-            FILMS, (signal, found.background), (left, around), strict=True
-        ):
+        films = (signal, left), (found.background, around)
+        for name, (mean, spread) in zip(FILMS, films, strict=True):
             temperature = tile.temperature(0, np.where(valid, mean, np.nan))
             values[name] = temperature
             values[f"{name}_std"] = np.sqrt(spread) / tile.curves[0].slope(temperature)
@@ -221,11 +212,11 @@ def find_level(scene: Scene) -> Level:
     """
     tile, valid, places = scene.sample()
     sources = np.where(valid.any(axis=0), scene.source[places], -1)
-    parts = [
-        solve(scene, tile.select_pixels(here), valid[:, here], int(source), places[here])[1]
-        for source in np.unique(sources[sources >= 0])
-        for here in [sources == source]
-    ]
+    parts = []
+    for source in np.unique(sources[sources >= 0]):
+        here = sources == source
+        part = tile.select_pixels(here), valid[:, here], int(source), places[here]
+        parts.append(solve(scene, *part)[1])
     if not parts:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(parts, axis=1)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from dbthermal import planck
+from dbthermal.separation._inputs import require
 
 _CHOICES: Final = {
     "start": ("random", "subspace"),
@@ -15,11 +16,9 @@ _CHOICES: Final = {
 
 @dataclass(frozen=True)
 class DbvtSettings:
-    r"""
-    Options of the paper's optimiser: losses, starts, homotopy, Newton's steps; none is published.
+    r"""Options of the paper's optimiser: losses, starts, homotopy, Newton's steps.
 
-    The scales of the losses are the noise's wherever they can be, so that one set serves at every
-    noise level. A weight of 0 leaves a loss out.
+    None is published. A weight of 0 leaves a loss out.
 
     Attributes
     ----------
@@ -50,8 +49,8 @@ class DbvtSettings:
         Emissivities uniform in (0, 1), as published; or emissivities and object of the subspace
         separator, and at random where it has none.
     starts : int
-        Random starts, of which the one of least objective is kept; 1 as published. A start at the
-        separator comes before them, and is one of them.
+        Starts, of which the one of least objective is kept; 1 as published. All but a first one at
+        the separator are random.
     smooth_from_zero : bool
         A random start's smooth signal is zero, as published, and not the signal itself.
     bend_updates : int
@@ -102,18 +101,12 @@ class DbvtSettings:
         counts = ("stages", "stage_steps", "steps", "patience", "starts", "batch")
         for least, names in enumerate((weights, counts)):
             for name in names:
-                value = getattr(self, name)
-                if not least <= value < float("inf"):
-                    raise ValueError(
-                        f"Invalid {name} {value} of method 'dbvt'. Must be at least {least}."
-                    )
+                holds = least <= getattr(self, name) < float("inf")
+                require(self, "dbvt", name, holds, f"be at least {least}")
         positive = ("curvature", "huber_threshold", "deviation_floor")
         for name in (*positive, "first_share", "tolerance", "largest_step"):
             planck.require_positive(f"{name} of method 'dbvt'", getattr(self, name))
-        if not 0 < self.margin < 0.5:
-            raise ValueError(
-                f"Invalid margin {self.margin} of method 'dbvt'. Must lie in (0, 0.5)."
-            )
+        require(self, "dbvt", "margin", 0 < self.margin < 0.5, "lie in (0, 0.5)")
         cuda = self.device.startswith("cuda")
         if cuda and not importlib.import_module("torch").cuda.is_available():
             raise ValueError(f"Invalid device '{self.device}' of method 'dbvt'. CUDA is missing.")

@@ -10,7 +10,6 @@ import importlib
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy import ndimage
 
@@ -18,8 +17,7 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal.noise import MAD
-
-Labels = npt.NDArray[np.intp]
+from dbthermal.separation._pooling.region_merging import Labels
 
 # Rows of a capture that are read at a time.
 _ROWS: Final = 64
@@ -56,9 +54,12 @@ def mean_signals(
     inverse = np.divide(1.0, frames, out=np.full(shape, np.inf), where=frames > 0)
     variances = noise[:, np.newaxis, np.newaxis] ** 2 * inverse
     for index in range(1, len(bands)):
+        image = means[index] - means[0]
+        bend = (image[2:] - 2.0 * image[1:-1] + image[:-2]) / np.sqrt(6.0)  # of variance s^2
+        known = np.abs(bend[np.isfinite(bend)])
+        scatter = MAD * float(np.median(known)) if known.size else 0.0
         of_noise = float(np.median(variances[0] + variances[index]))
-        pattern = _pixel_scatter(means[index] - means[0]) ** 2 - of_noise
-        variances[index] += max(pattern, 0.0)
+        variances[index] += max(scatter**2 - of_noise, 0.0)
     return means, variances
 
 
@@ -98,14 +99,6 @@ def reflected_difference(result: xr.Dataset, bands: list[int]) -> tuple[Array, A
     variance = (np.pi / 2 - 1) * (share * deviation) ** 2 / frames
     known = np.isfinite(share * excess * variance)
     return np.where(known, share * excess, 0.0), np.where(known, variance, 0.0)
-
-
-def _pixel_scatter(image: Array) -> float:
-    """Robust standard deviation from pixel to pixel [K], a fixed pattern's included; 0 if none."""
-    # var(a - 2 b + c) = 6 s^2
-    bend = (image[2:] - 2.0 * image[1:-1] + image[:-2]) / np.sqrt(6.0)
-    known = np.abs(bend[np.isfinite(bend)])
-    return MAD * float(np.median(known)) if known.size else 0.0
 
 
 def edges(maps: Array, variances: Array) -> Array:

@@ -1,7 +1,7 @@
 r"""Materials of a capture, found from a first separation, to pool a second one over.
 
-The reflection ratio :math:`k_m = (1-e_m)/(1-e_{ref})` belongs to the material alone, but of one
-pixel it is known to a few percent only. So the maps propose and the statistics decide:
+Of one pixel the reflection ratio :math:`k_m = (1-e_m)/(1-e_{ref})` of its material is known to a
+few percent only. So the maps propose and the statistics decide:
 
 1. `feature_maps` cuts the image into cells, along the edges of the ratio and of the difference of
    the bands' mean signals, in which the object's temperature shows far less than its emissivity.
@@ -74,15 +74,14 @@ def materials(
     Parameters
     ----------
     result : Dataset
-        From `solve` without labels, of the same capture, with `reflection_ratio` and `emissivity`
-        (band, y, x) [1], `background_temperature` (time, y, x) [K], their deviations, `noise` and
-        `status`. Pixels with a ratio of NaN are labelled by the maps alone.
+        From `solve` without labels, of the same capture, by a method with reflection ratios. Pixels
+        whose ratio is NaN are labelled by the maps alone.
     corrected, response : Dataset
-        As in `solve`. The capture may be lazy; only means over time are kept. Frames that are NaN
-        are left out, and of a capture with a `segment` all but the longest.
+        As in `solve`. The capture may be lazy; only means over time are kept, of one with a
+        `segment` those of the longest.
     error_rate : float
         Probability, in the whole image, that cells of one material are cut or held apart by
-        chance [1]. It is shared out among the tests.
+        chance [1].
     resolution : float
         Relative difference of the ratio that must be seen before two regions are joined by their
         ratios [1]; materials closer than this may be joined.
@@ -109,8 +108,7 @@ def materials(
     deviations of the ratios of several bands are taken as independent.
 
     Borders are found within 2 pixels, single pixels apart. A few pixels at a border may belong to
-    no material, and those where nothing moved and the object hardly changed. A ratio that is
-    withheld by its own value, as for being close to 1, biases the pooled one.
+    no material, and those where nothing moved and the object hardly changed.
 
     Examples
     --------
@@ -129,10 +127,16 @@ def materials(
     >>> pooled = separation.solve(capture, response, pool=labels)
     """
     result = _checked(result, corrected, error_rate, resolution)
-    frames = _longest_segment(corrected)
-    corrected, result = corrected.isel(time=frames), result.isel(time=frames)
-    bands, noise = _order(result, response)
-    means, variances = feature_maps.mean_signals(corrected, response, bands, noise)
+    if "segment" in corrected:  # means across a shutter event would show the pattern's step
+        segments, counts = np.unique(corrected["segment"], return_counts=True)
+        frames = corrected["segment"].values == segments[np.argmax(counts)]
+        corrected, result = corrected.isel(time=frames), result.isel(time=frames)
+    # Bands from the quietest, which is the reference.
+    names = [str(name) for name in result["band"].values]
+    slopes = np.array([responses.curve(response, name).reference_slope for name in names])
+    noise = result["noise"].values / slopes  # [K]
+    bands = [int(band) for band in np.argsort(noise, kind="stable")]
+    means, variances = feature_maps.mean_signals(corrected, response, bands, noise[bands])
     change = feature_maps.signal_change(corrected, response, bands[0])
     reflected, reflected_variance = feature_maps.reflected_difference(result, bands)
     ratios, features = _features(result, bands)
@@ -168,13 +172,11 @@ def joined(labels: xr.DataArray, pooled: xr.Dataset, *, resolution: float = 0.1)
     A material is cut where ratios of single pixels are biased by what their order leaves of the
     object; pooled ratios are not.
     """
-    reference = [str(name) for name in pooled["band"].values].index(pooled.attrs["reference_band"])
+    bands = [str(name) for name in pooled["band"].values]
+    reference = bands.index(pooled.attrs["reference_band"])
     cells = np.asarray(labels.values + 1, dtype=np.intp)
-    _, features = _features(
-        pooled, [reference, *np.delete(np.arange(pooled.sizes["band"]), reference)]
-    )
-    features = replace(features, common=np.ones_like(features.common))
-    found = Regions(cells, features, 0.01)
+    _, features = _features(pooled, [reference, *np.delete(np.arange(len(bands)), reference)])
+    found = Regions(cells, replace(features, common=np.ones_like(features.common)), 0.01)
     found.join_alike(region_merging.neighbours(cells), resolution)
     return _labelled(cells, found, pooled)
 
@@ -200,23 +202,6 @@ def _checked(
     return laid_on(result, corrected, "the result", "the capture")
 
 
-def _longest_segment(corrected: xr.Dataset) -> Mask:
-    """Frames between two shutter events: means across one would show the pattern's step."""
-    if "segment" not in corrected:
-        return np.ones(corrected.sizes["time"], dtype=bool)
-    names, counts = np.unique(corrected["segment"], return_counts=True)
-    return np.asarray(corrected["segment"].values == names[np.argmax(counts)])
-
-
-def _order(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
-    """Bands from the quietest, which is the reference, and their noise in that order [K]."""
-    names = [str(name) for name in result["band"].values]
-    slopes = np.array([responses.curve(response, name).reference_slope for name in names])
-    noise = result["noise"].values / slopes
-    bands = [int(band) for band in np.argsort(noise, kind="stable")]
-    return bands, noise[bands]
-
-
 def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:
     """Ratios of all bands but the reference; and these with the reference's emissivity."""
     ratio, ratio_std, emissivity, emissivity_std = (
@@ -225,18 +210,15 @@ def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]
     )
     others, reference = bands[1:], bands[:1]
     vague = ~(ratio_std[others] < _VAGUE * np.abs(ratio[others]))
-    ratio[others] = np.where(vague, np.nan, ratio[others])
+    ratio = np.where(vague, np.nan, ratio[others])
     emissivity = np.where(np.any(vague, axis=0), np.nan, emissivity)
-    common = np.zeros(len(others), dtype=bool)
-    tolerance = np.full(len(others), _TOLERANCE)
-    ratios = Features(ratio[others], ratio_std[others] ** 2, common, tolerance)
     both = Features(
-        np.concatenate([ratios.values, emissivity[reference]]),
-        np.concatenate([ratios.variances, emissivity_std[reference] ** 2]),
-        np.append(common, True),
-        np.append(tolerance, 0.0),
+        np.concatenate([ratio, emissivity[reference]]),
+        np.concatenate([ratio_std[others] ** 2, emissivity_std[reference] ** 2]),
+        np.arange(len(bands)) == len(others),
+        np.append(np.full(len(others), _TOLERANCE), 0.0),
     )
-    return ratios, both
+    return Features(*(part[: len(others)] for part in vars(both).values())), both
 
 
 def _cells(

@@ -1,19 +1,22 @@
 """Reflection ratios and emissivity of each material, from the surveys of its pixels."""
 
-from dataclasses import dataclass, fields
-from typing import Final
+from concurrent.futures import Executor
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._inputs import Inputs, Labels
 from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._tiles import Array, Mask, Material, Survey
-
-Labels = npt.NDArray[np.intp]
 
 MOST: Final = 2048
 """Pixels of one material that are surveyed: more would not lower its systematic error."""
 
+# Share of the pixels of the materials that have an emissivity alone, from which it is theirs [1].
+_MOST_TOLD: Final = 0.98
 # Deviations beyond which a pixel is not of the material, and rounds of leaving such ones out.
 _OUTLIER_SIGMAS: Final = 4.0
 _ROUNDS: Final = 6
@@ -24,6 +27,61 @@ _MAJORITY: Final = 0.5
 # Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
 _ENERGY_SIGMAS: Final = 8.0
 _LEAST_ENERGY: Final = 0.01
+
+
+def materials(
+    inputs: Inputs, threads: Executor, bar: Any, *, every: bool = False
+) -> Material | None:
+    """Ratios and emissivity of the material of each pixel of the image; None if none are told.
+
+    Pixels that have an emissivity alone are a selection by their ratios: unless they are nearly
+    all, or `every` is set, all are surveyed again with the ratios of their material.
+    """
+    labels = inputs.labels
+    if labels is None:
+        return None
+    selected, blocks = select(labels), inputs.blocks
+
+    def pooled(before: Material | None) -> tuple[Material | None, float]:
+        """Materials, and the share of their pixels that have an emissivity."""
+        survey = partial(_survey, inputs, selected, bar, before)
+        surveys = [part for block in threads.map(survey, blocks) for part in block]
+        if not surveys:
+            return None, 0.0
+        places = np.concatenate([place for place, _ in surveys])
+        whole = surveys[0][1].join([part for _, part in surveys[1:]])
+        noise = inputs.noise[inputs.bands]
+        found = estimate(labels[places], int(labels.max()) + 1, whole, noise)
+        told = np.isfinite(whole.emissivity).sum() / max((whole.frames > 0).sum(), 1)
+        return expand(found, labels), told
+
+    material, told = pooled(None)
+    if material is None or every or told > _MOST_TOLD:
+        return material
+    return pooled(replace(material, emissivity=np.full_like(material.emissivity, np.nan)))[0]
+
+
+def _survey(
+    inputs: Inputs, selected: Mask, bar: Any, material: Material | None, rows: slice
+) -> list[tuple[Labels, Survey]]:
+    """Survey the selected pixels of a block of rows; with their numbers in the image."""
+    surveys = []
+    for cut in tiles.cut(inputs, rows, material):
+        numbers = tiles.numbers(cut.window, inputs.capture.sizes["x"])
+        for _, pixels, tile in cut.parts:
+            wanted = selected[numbers[pixels]]
+            if np.any(wanted):
+                part = tile if np.all(wanted) else tile.select_pixels(wanted)
+                survey: Survey = inputs.apply(inputs.method.survey, part)
+                # Whitened by one noise for all, not by that of the tile.
+                scale = np.array(part.noise) / inputs.noise[inputs.bands]
+                square = np.multiply.outer(scale, scale)[..., np.newaxis]
+                scatters = survey.scatter * square, survey.rapid_scatter * square
+                survey = replace(survey, scatter=scatters[0], rapid_scatter=scatters[1])
+                surveys.append((numbers[pixels][wanted], survey))
+        if material is None:
+            bar.update(cut.status.size)
+    return surveys
 
 
 def select(labels: Labels) -> Mask:

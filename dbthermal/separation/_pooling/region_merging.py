@@ -6,7 +6,6 @@ the order in which they are joined.
 
 import heapq
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,29 +25,21 @@ class Features:
     common: Mask  # errors that neighbours share: a mean is no surer than one pixel (feature,)
     tolerance: Array  # relative standard deviation that pooling does not reduce (feature,) [1]
 
-    def weights(self) -> Array:
-        """Inverse variances (feature, y, x), 0 without an estimate."""
-        known = np.isfinite(self.values) & np.isfinite(self.variances) & (self.variances > 0)
-        return np.divide(1.0, self.variances, out=np.zeros_like(self.values), where=known)
+    def sums(self, cells: Labels) -> Array:
+        """Sums (4, feature, cell + 1) over cells of weight w, w f, w f^2, and the pixels' number.
 
-    def sums(self, cells: Labels) -> tuple[Array, Array, Array, Array]:
-        """Sums (feature, cell + 1) over cells of weight w, w f, w f^2, and the pixels' number."""
-        weight = self.weights()
+        The weight is the inverse variance, 0 without an estimate; pixels of no cell come first.
+        """
+        known = np.isfinite(self.values) & np.isfinite(self.variances) & (self.variances > 0)
+        weight = np.divide(1.0, self.variances, out=np.zeros_like(self.values), where=known)
         values = np.where(weight > 0, self.values, 0.0)
         parts = (weight, weight * values, weight * values**2, weight > 0)
-        total, first, second, count = (_sums(cells, part) for part in parts)
-        return total, first, second, count
-
-
-def _sums(cells: Labels, maps: npt.NDArray[Any]) -> Array:
-    """Sums (feature, cell + 1) of maps (feature, y, x) over cells, those of no cell first."""
-    size, flat = int(cells.max()) + 1, cells.ravel()
-    return np.stack([np.bincount(flat, part.ravel(), minlength=size) for part in maps])
+        size, flat = int(cells.max()) + 1, cells.ravel()
+        return np.array([[np.bincount(flat, m.ravel(), size) for m in part] for part in parts])
 
 
 def mixed(cells: Labels, features: Features, error_rate: float) -> Mask:
-    r"""
-    Cells (cell + 1,) whose pixels do not agree; those of one material at most at the error rate.
+    r"""Cells (cell + 1,) whose pixels do not agree; of one material at most at the error rate.
 
     .. math:: \sum_p (f_p - \bar f)^2 / s_p^2 > \chi^2_{n - 1}(1 - \alpha / \mathrm{cells})
     """

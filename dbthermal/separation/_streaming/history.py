@@ -12,13 +12,14 @@ from dbthermal.schema import Status
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import Bits
+from dbthermal.separation._streaming.kernels import APART
 from dbthermal.separation._subspace.method import METHOD, separate_smooth
 
 Planes = npt.NDArray[np.float32]
 Threads = Callable[[Callable[[Any], None], Iterable[Any]], None]
 
 _SAMPLES: Final = 128  # at most; half of them at least, once they were as many
-APART: Final = 2.0  # lengths of a mean, from which two are not neighbours
+_TOGETHER: Final = 4  # tiles of pixels that a thread separates at once
 
 
 class History:
@@ -92,9 +93,8 @@ class History:
                 {"time": self._times[0, :complete]},
             ),
         )
-        parts = np.array_split(
-            np.arange(self._next, stop), min(number, 1 + number * width // tiles.PIXELS)
-        )
+        together = 1 + number * width // (_TOGETHER * tiles.PIXELS)
+        parts = np.array_split(np.arange(self._next, stop), min(number, together))
         apply(lambda rows: self._separate(inputs, rows), [rows for rows in parts if rows.size])
         self._next, self.solved = stop % height, True
 

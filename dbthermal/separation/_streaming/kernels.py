@@ -13,18 +13,23 @@ import numpy.typing as npt
 from numba import njit
 
 from dbthermal.schema import LARGEST, Status
+from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels
 from dbthermal.separation._subspace.kernels import Table, compiled
-from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS
+from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS, Array
 
 Planes = npt.NDArray[np.float32]
 
+# Latencies before and after a frame that its object is smoothed over, and the degree of the fit.
+WINDOWS: Final = ((0.0, 0.0, 1), (0.5, 0.5, 1), (2.0, 1.0, 2), (4.0, 1.0, 2))
+APART: Final = 2.0  # lengths of a mean, from which two are not neighbours
 # Deviations within which narrower fits agree with a wider one; see `_frames`.
 _AGREE: Final = 1.5
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _NAN, _SIGMAS, _LARGEST = np.float32(np.nan), np.float32(RANGE_SIGMAS), np.float32(LARGEST)
-_NEWTON: Final = 3  # steps towards the object
+_NEWTON: Final = 3  # steps towards the object, at most
+_NEAR: Final = 1e-5  # one after which no further step is worth while [K]
 _UNDEFINED: Final = int(Status.NO_BACKGROUND_MOTION | Status.GRAY | Status.INVALID_SAMPLES)
 _BEYOND: Final = np.uint32(Status.OUTSIDE_RESPONSE)
 _AMBIGUOUS: Final = int(Status.CONSTANT_OBJECT | Status.ROLES_MAY_BE_SWAPPED)
@@ -47,8 +52,56 @@ class Fit(NamedTuple):
     """Local polynomials over the means around one, from the narrowest to the widest."""
 
     weights: npt.NDArray[np.float64]  # of the means in value and slope (fit, 2, mean) [1, 1/s]
+    ends: npt.NDArray[np.intp]  # first mean that has a weight, and the first after (fit, 2)
     variance: npt.NDArray[np.float64]  # of the value, over that of a frame (fit)
     time: npt.NDArray[np.float64]  # of the frames about the mean's time (frame) [s]
+
+
+def camera(inputs: Inputs) -> tuple[Camera, Camera]:
+    """Responses and noise of both bands, the quietest first, in double and in single precision."""
+    one, two = inputs.curves
+    pattern = np.zeros(2) if inputs.pattern is None else inputs.pattern
+    double = Camera(
+        first=kernels.table(one),
+        second=kernels.table(two),
+        counts=(one.reference_counts, two.reference_counts),
+        slopes=(one.reference_slope, two.reference_slope),
+        noise=(float(inputs.noise[0]), float(inputs.noise[1])),
+        pattern=(float(pattern[0]), float(pattern[1])),
+        lowest=one.lowest,
+        highest=one.highest,
+    )
+    return double, _single(double)
+
+
+def _single(record: Any) -> Any:
+    """Record of numbers, and of tuples of them, in single precision."""
+    if not isinstance(record, tuple):
+        return np.float32(record) if isinstance(record, float) else record
+    parts = [_single(part) for part in record]
+    return type(record)(*parts) if hasattr(record, "_fields") else tuple(parts)
+
+
+def fit(means: Array, centre: int, latency: int, interval: float, frames: Array) -> Fit:
+    """Local polynomials, from narrow to wide, over the means without a gap around that of frames.
+
+    Of times [s] and segments of the means (2, mean), an interval [s] apart, of which `centre` is
+    that of the frames' times (frame) [s]; the latency is in means.
+    """
+    times, segments = means
+    apart = np.diff(times) > (1.0 + APART) * interval
+    piece = np.concatenate([[0], np.cumsum(apart | (np.diff(segments) > 0))])
+    reach, weights = np.arange(times.size) - centre, np.zeros((len(WINDOWS), 2, times.size))
+    ends = np.empty((len(WINDOWS), 2), np.intp)
+    for both, end, (before, after, degree) in zip(weights, ends, WINDOWS, strict=True):
+        inside = (reach >= -max(1, int(before * latency))) & (piece == piece[centre])
+        inside &= reach <= max(1, int(after * latency))
+        order = min(int(degree) + 1, int(np.count_nonzero(inside)))
+        powers = (times[inside, np.newaxis] - times[centre]) ** np.arange(order)
+        both[:order, inside] = np.linalg.pinv(powers)[:2]
+        end[:] = np.flatnonzero(inside)[[0, -1]] + (0, 1)
+    variance = (weights[:, 0] ** 2).sum(axis=1) / frames.size
+    return Fit(weights, ends, variance, frames - times[centre])
 
 
 class Block(NamedTuple):
@@ -62,7 +115,7 @@ class Block(NamedTuple):
 
 
 class Result(NamedTuple):
-    """Temperatures of the frames, and scratch rows; separate, so that none is taken to overlap."""
+    """Temperatures of the frames, and scratch rows, apart from one another."""
 
     status: npt.NDArray[np.uint32]  # (y, x)
     films: Planes  # object, deviation, background, deviation (film, frame, y, x) [K]
@@ -70,8 +123,7 @@ class Result(NamedTuple):
     out: tuple[Planes, ...]  # films of a frame, and if they are out of range
 
 
-ROWS: Final = (18, 5)
-"""Numbers of the scratch rows."""
+ROWS: Final = (18, 5)  # numbers of the scratch rows
 
 
 @compiled
@@ -86,11 +138,7 @@ def _add(one: Any, two: Any, total: Any, other: Any, number: Any) -> None:
 
 @compiled
 def _absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
-    """
-    Means (band, y, x) of frames (band, frame, y, x) [count], in place; NaN of less than half.
-
-    A sample counts if it is a number in both bands.
-    """
+    """Means (band, y, x) of frames (band, frame, y, x) [count] in both, NaN of less than half."""
     width = frames.shape[3]
     total, other = np.empty(width, np.float32), np.empty(width, np.float32)
     number = np.empty(width, np.float32)
@@ -128,30 +176,56 @@ def _bridge(means: Any) -> bool:
 
 
 @compiled
-def _fitted(means: Any, fit: Fit, w: tuple[float, float], null: float, found: Any) -> float:
-    """
-    Value and slope (band, 2) of the widest fit that agrees with all narrower ones, in place.
+def _gather(mean: Any, count: float, here: Any, lost: Any) -> None:
+    """Row of a mean less the reference [count], in place; and how many of its pixels' are lost."""
+    for x in range(here.size):
+        here[x] = mean[x] - count
+        lost[x] += 0 if here[x] == here[x] else 1
 
-    The variance of the null combination's value; see `_frames`.
+
+@compiled
+def _weigh(here: Any, value: float, slope: float, total: Any, steepness: Any) -> None:
+    """Add a row of a mean to the value and the slope of a local polynomial."""
+    for x in range(here.size):
+        total[x] += value * here[x]
+        steepness[x] += slope * here[x]
+
+
+@compiled
+def _fitted(
+    block: Block, fit: Fit, camera: Camera, y: int, here: Any, lost: Any, fits: Any
+) -> None:
+    """Values and slopes (fit, 2 band, x) [count] of all fits to a row of means, in place."""
+    lost[:], fits[:] = 0, 0.0
+    for band in range(2):
+        for i in range(block.order.size):
+            _gather(block.means[block.order[i], band, y], camera.counts[band], here[band, i], lost)
+    for x in range(lost.size):
+        if lost[x] > 0 and not _bridge(here[:, :, x]):
+            here[:, :, x] = np.nan
+    for j in range(fit.variance.size):
+        for i in range(fit.ends[j, 0], fit.ends[j, 1]):
+            for band in range(2):
+                value, slope = fit.weights[j, 0, i], fit.weights[j, 1, i]
+                _weigh(here[band, i], value, slope, fits[j, 2 * band], fits[j, 2 * band + 1])
+
+
+@compiled
+def _widest(fits: Any, slopes: Any, share: Any, w: Any, null: float, found: Any) -> float:
+    """Value and slope (band, 2) [K] of the widest fit that agrees with all narrower ones, in place.
+
+    The variance of the null combination's value, of a share of a frame's; see `_frames`.
     """
     low, high, variance = -np.inf, np.inf, np.nan
-    for j in range(fit.variance.size):
-        one0, one1, two0, two1 = 0.0, 0.0, 0.0, 0.0
-        for i in range(means.shape[1]):
-            value, slope = fit.weights[j, 0, i], fit.weights[j, 1, i]
-            one0 += value * means[0, i]
-            one1 += slope * means[0, i]
-            two0 += value * means[1, i]
-            two1 += slope * means[1, i]
-        combined, deviation = w[0] * one0 + w[1] * two0, sqrt(null * fit.variance[j])
-        low, high = (
-            max(low, combined - _AGREE * deviation),
-            min(high, combined + _AGREE * deviation),
-        )
+    for j in range(share.size):
+        combined = w[0] / slopes[0] * fits[j, 0] + w[1] / slopes[1] * fits[j, 2]
+        within = _AGREE * sqrt(null * share[j])
+        low, high = max(low, combined - within), min(high, combined + within)
         if j > 0 and low > high:
             break
-        found[0, 0], found[0, 1], found[1, 0], found[1, 1] = one0, one1, two0, two1
-        variance = null * fit.variance[j]
+        found[0, 0], found[0, 1] = fits[j, 0] / slopes[0], fits[j, 1] / slopes[0]
+        found[1, 0], found[1, 1] = fits[j, 2] / slopes[1], fits[j, 3] / slopes[1]
+        variance = null * share[j]
     return variance
 
 
@@ -181,6 +255,8 @@ def _object(
         steepness = one * du + two * dv
         step = (target - one * u - two * v) / steepness
         t += step
+        if abs(step) < _NEAR:  # what is left is of the step's square
+            break
     u, v = u + du * step, v + dv * step
     p = (t - table.middle) / table.half
     # Eq. 6 by implicit differentiation, as in `emission`.
@@ -218,12 +294,6 @@ def _object(
 
 
 @compiled
-def _blank(line: Any, x: int) -> None:
-    for row in line:
-        row[x] = np.nan
-
-
-@compiled
 def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -> None:
     """Temperatures of a row of one frame, their deviations, and if they are in range, in place."""
     table, other = camera.first, camera.second
@@ -231,10 +301,8 @@ def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -
         z0 = (one[x] - camera.counts[0]) / camera.slopes[0]
         z1 = (two[x] - camera.counts[1]) / camera.slopes[1]
         valid = _ZERO * (z0 + z1)  # NaN where one is none
-        r0, r1 = (
-            line[3][x] * (z0 - line[5][x] - line[6][x] * dt),
-            line[4][x] * (z1 - line[7][x] - line[8][x] * dt),
-        )
+        r0 = line[3][x] * (z0 - line[5][x] - line[6][x] * dt)
+        r1 = line[4][x] * (z1 - line[7][x] - line[8][x] * dt)
         guess = (r0 + r1 - table.middle_signal) / table.half_signal
         t = kernels.polynomial(table.inverse, guess)
         # One Gauss-Newton step of eq. 9.
@@ -260,18 +328,13 @@ def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -
 @compiled
 def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, work: Any) -> None:
     """Terms of one pixel of a row, NaN where the object is not defined; see `_object`."""
-    line, here, found, pixel = work
-    size = block.order.size
+    line, fits, found, pixel = work
     if (status & _UNDEFINED) != 0 or (status & _AMBIGUOUS) == _AMBIGUOUS:
-        _blank(line, x)
+        for row in line:
+            row[x] = np.nan
         return
     for i in range(7):
         pixel[i] = block.maps[i, y, x]
-    for i in range(size):
-        for band in range(2):
-            signal = block.means[block.order[i], band, y, x] - camera.counts[band]
-            here[band, i] = signal / camera.slopes[band]
-    bridged = _bridge(here)
     k, noise = pixel[0], (camera.noise[0], camera.noise[1] * block.gain[y, x])
     first, last = pixel[2], pixel[3]
     if np.isnan(first):  # of a constant object, as in `emission`
@@ -280,23 +343,22 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, 
         last = 1.0 - k * (1.0 - first)
     w = -k / (1.0 - k), 1.0 / (1.0 - k)
     null = (w[0] * noise[0]) ** 2 + (w[1] * noise[1]) ** 2
-    variance = _fitted(here, fit, w, null, found)
+    variance = _widest(fits[:, :, x], camera.slopes, fit.variance, w, null, found)
     _object(camera, found, pixel, noise, variance, (first, last), line, x)
-    if not bridged:
-        _blank(line, x)
 
 
 @compiled
 def _emit(
     block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
 ) -> None:
-    """Films of the frames of one mean, and in the status the calibrated range, in place.
-
-    With the camera's numbers in double and in single precision.
-    """
+    """Films of the frames of one mean, and in the status the calibrated range, in place."""
     line, out, films = result.line, result.out, result.films
-    work = line, np.empty((2, block.order.size)), np.empty((2, 2)), np.empty(7)
+    width = films.shape[3]
+    here, lost = np.empty((2, block.order.size, width)), np.empty(width, np.int64)
+    fits = np.empty((fit.variance.size, 4, width))
+    work = line, fits, np.empty((2, 2)), np.empty(7)
     for y in range(top, stop):
+        _fitted(block, fit, camera, y, here, lost, fits)
         for x in range(films.shape[3]):
             _terms(block, fit, camera, y, result.status[y, x], x, work)
         out[4][:] = 0.0

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,8 +18,8 @@ from dbthermal.separation import _displaced as displaced
 from dbthermal.separation import _inputs
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._streaming import kernels
-from dbthermal.separation._streaming.history import APART, History
-from dbthermal.separation._subspace import kernels as tables
+from dbthermal.separation._streaming.history import History
+from dbthermal.separation._streaming.kernels import APART
 from dbthermal.separation._subspace.method import METHOD
 from dbthermal.separation._subspace.steps import FILMS
 
@@ -29,8 +30,6 @@ Array = npt.NDArray[np.float64]
 Planes = npt.NDArray[np.float32]
 
 _PARTS: Final = 5  # means over the latency
-# Latencies before and after a frame that its object is smoothed over, and the degree of the fit.
-_WINDOWS: Final = ((0.0, 0.0, 1), (0.5, 0.5, 1), (2.0, 1.0, 2), (4.0, 1.0, 2))
 _LOST: Final = 1.5  # intervals between frames, from which some are lost
 _GLANCE: Final = 24  # pixels along the shorter side, by which a frame is told from another
 _ROWS: Final = 16  # that a thread takes at once
@@ -52,8 +51,8 @@ class Stream:
     Parameters
     ----------
     template : Dataset
-        Stage `corrected` of `schema`, one frame or more: its bands, sizes, coordinates, and where
-        present its `status`, `pattern_std` and `noise_factor` are those of the stream.
+        Stage `corrected` of `schema`, one frame or more: bands, sizes, coordinates, and where
+        present `status`, `pattern_std` and `noise_factor` are those of the stream.
     response : Dataset
         From `calibration.fit_response`, with `noise`.
     frame_rate : float
@@ -61,7 +60,7 @@ class Stream:
     latency : float
         Age of a frame when its temperatures are known, about [s].
     memory : float
-        Time that is remembered, at least [s]; at most four times as long.
+        Time that is remembered, at least, and at most four times as long [s].
     refresh : float
         Time in which all rows are separated anew [s].
     settings : SubspaceSettings, optional
@@ -78,16 +77,13 @@ class Stream:
     ----------
     bands : tuple of str
         Names of the bands, as in the template.
-    is_ready : bool
-        True once temperatures are known.
     lost_frames : int
         Frames that did not come, by the times of the others, or were of no use.
 
     Raises
     ------
     TypeError, ValueError
-        As `solve`, for a template or a response that is not as described; if the bands are not two,
-        the response has no noise, or a number is not positive.
+        As `solve`; if the bands are not two, the response has no noise, a number is not positive.
 
     Notes
     -----
@@ -132,20 +128,18 @@ class Stream:
         numbers = {"frame_rate [Hz]": frame_rate, "latency [s]": latency, "memory [s]": memory}
         for name, value in {**numbers, "refresh [s]": refresh, "workers": workers}.items():
             planck.require_positive(name, value)
-        known: dict[str, Any] = dict.fromkeys(("emissivity", "emissivity_std", "mask", "pool"))
-        known |= {"settings": settings, "seed": 0, "response_kind": response_kind}
-        known |= {"reflection_shift": reflection_shift}
-        two = replace(METHOD, minimum_frames=1, any_bands=False)
-        inputs = _inputs.check(template, response, two, "stream", **known)
+        known: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
+        known |= {"reflection_shift": reflection_shift, "name": "stream", "response": response}
+        known["method"] = replace(METHOD, minimum_frames=1, any_bands=False)
+        inputs = _inputs.check(template, **known)
         self.bands = tuple(curve.band for curve in inputs.curves)
         responses.noise(response, list(self.bands))
         # From here on the quietest band is the first one.
         self._order, template = inputs.bands, template.isel(band=inputs.bands)
-        inputs = _inputs.check(template, response, two, "stream", **known)
+        inputs = _inputs.check(template, **known)
         self._template, self._kind = template.isel(time=0, drop=True), response_kind
         self._shape = shape = (template.sizes["y"], template.sizes["x"])
-        self._camera = _camera(inputs)
-        self._fine = _single(self._camera)
+        self._camera = kernels.camera(inputs)
         self._status, self._gain = np.zeros(shape, np.uint32), np.ones(shape, np.float32)
         if "status" in template:
             self._status |= template["status"].values.astype(np.uint32)
@@ -159,7 +153,7 @@ class Stream:
         self._history = History(inputs, self._status, self._gain, self._block, timing)
         # The frames that wait, and the means around them [count]; their times [s], and segments.
         self._frames = np.empty((half + 1, 2, self._block, *shape), np.float32)
-        self._means = np.empty((int(_WINDOWS[-1][0] + 1) * half + 1, 2, *shape), np.float32)
+        self._means = np.empty((int(kernels.WINDOWS[-1][0] + 1) * half + 1, 2, *shape), np.float32)
         self._frame_times = np.empty((half + 1, self._block))
         self._mean_times = np.empty((2, 0))
         self._blocks, self._filled, self._now, self._segment = 0, 0, -np.inf, 0
@@ -188,8 +182,7 @@ class Stream:
     def update(
         self, time: npt.ArrayLike, frames: npt.NDArray[np.floating], *, segment: int = 0
     ) -> xr.Dataset:
-        """
-        Take one frame of both bands, or several, and return the temperatures that became known.
+        """Take one frame of both bands, or several, and return the temperatures that became known.
 
         Parameters
         ----------
@@ -197,8 +190,8 @@ class Stream:
             When the frame was exposed, or each of the frames (time) [s].
         frames : ndarray
             Corrected counts (band, y, x) or (band, time, y, x) [count], the bands as in the
-            template. A sample that is NaN is left out. A frame is lost if a band of it has no
-            number, or repeats the frame before.
+            template, NaN for no sample. A frame is lost if a band of it has no number, or repeats
+            the frame before.
         segment : int
             Number of shutter events before the frames.
 
@@ -211,10 +204,8 @@ class Stream:
 
         Raises
         ------
-        TypeError
-            If the frames are not floating: raw counts.
-        ValueError
-            If their shape is another one, a time is no number or does not rise, or the segment
+        TypeError, ValueError
+            If the frames are not floating or of another shape, a time does not rise, or the segment
             falls.
         """
         times, counts = self._checked(time, frames, segment)
@@ -234,8 +225,7 @@ class Stream:
         return self._result.isel(time=slice(0)).assign_attrs(lost_frames=self.lost_frames)
 
     def result(self) -> xr.Dataset:
-        """
-        Return what the last `update` returned that made any temperatures known.
+        """Return what the last `update` returned that made any temperatures known.
 
         Returns
         -------
@@ -326,66 +316,50 @@ class Stream:
         times, means = self._frame_times[slot].copy(), self._mean_times.shape[1]
         order = np.arange(self._blocks - means, self._blocks) % len(self._means)
         films = np.empty((4, self._block, *self._shape), np.float32)
-        status = self._history.status.copy()
-        fit = self._fit(means - 1 - self._half, times)
-        self._apply(
-            lambda rows: self._temperatures(slot, order, fit, films, status, rows), self._rows()
-        )
+        maps, status = self._history.maps, self._history.status.copy()
+        block = kernels.Block(self._frames[slot], self._means, order, maps, self._gain)
+        interval, centre = self._block / self._rate, means - 1 - self._half
+        fit = kernels.fit(self._mean_times, centre, self._half, interval, times)
+        self._apply(partial(self._temperatures, block, fit, status, films), self._rows())
         return times, films, status
 
     def _temperatures(
         self,
-        slot: int,
-        order: npt.NDArray[np.intp],
+        block: kernels.Block,
         fit: kernels.Fit,
-        films: Planes,
         status: quality.Bits,
+        films: Planes,
         rows: slice,
     ) -> None:
         """Films and status of some rows of a block, in place."""
-        maps = self._history.maps
-        block = kernels.Block(self._frames[slot], self._means, order, maps, self._gain)
         scratch = (tuple(np.empty((n, self._shape[1]), np.float32)) for n in kernels.ROWS)
         result = kernels.Result(status, films, *scratch)
-        kernels.emit(block, fit, self._camera, self._fine, result, rows.start, rows.stop)
+        kernels.emit(block, fit, *self._camera, result, rows.start, rows.stop)
 
     def _warm(self) -> None:
         """Compile all that frames need, before the first one comes."""
         kernels.absorb(self._frames[0], self._means[0], 0, 0)
-        order, films = np.arange(1), np.empty((4, self._block, *self._shape), np.float32)
-        fit = kernels.Fit(np.zeros((len(_WINDOWS), 2, 1)), np.zeros(1), np.zeros(self._block))
-        self._temperatures(0, order, fit, films, self._history.status, slice(0, 0))
-        self._history.warm()
-
-    def _fit(self, centre: int, frames: Array) -> kernels.Fit:
-        """Local polynomials, from narrow to wide, over the means around one without a gap."""
-        times, segments = self._mean_times
-        apart = np.diff(times) > (1.0 + APART) * self._block / self._rate
-        piece = np.concatenate([[0], np.cumsum(apart | (np.diff(segments) > 0))])
-        reach, weights = np.arange(times.size) - centre, np.zeros((len(_WINDOWS), 2, times.size))
-        for both, (before, after, degree) in zip(weights, _WINDOWS, strict=True):
-            inside = (reach >= -max(1, int(before * self._half))) & (piece == piece[centre])
-            inside &= reach <= max(1, int(after * self._half))
-            order = min(int(degree) + 1, int(np.count_nonzero(inside)))
-            powers = (times[inside, np.newaxis] - times[centre]) ** np.arange(order)
-            both[:order, inside] = np.linalg.pinv(powers)[:2]
-        variance = (weights[:, 0] ** 2).sum(axis=1) / self._block
-        return kernels.Fit(weights, variance, frames - times[centre])
+        films, history = np.empty((4, self._block, *self._shape), np.float32), self._history
+        fit = kernels.fit(np.zeros((2, 1)), 0, 1, 1.0, np.zeros(self._block))
+        block = kernels.Block(self._frames[0], self._means, np.arange(1), history.maps, self._gain)
+        self._temperatures(block, fit, history.status, films, slice(0, 0))
+        history.warm()
 
     def _dataset(self, known: list[Array], films: list[Planes], status: quality.Bits) -> xr.Dataset:
         """Stage `separated` of the films (film, frame, y, x) at the times, and the maps of now."""
         k, variance, one, two, a, b, d = self._history.maps
-        none = np.float32(0.0) * k
+        zero = np.float32(0.0) * k
         maps = {
             "emissivity": np.stack([one, two]),
             "emissivity_std": np.sqrt([a, d]),
             "emissivity_covariance": np.array([[a, b], [b, d]]),
-            "reflection_ratio": np.stack([none + 1.0, k]),
-            "reflection_ratio_std": np.stack([none, np.sqrt(variance)]),
+            "reflection_ratio": np.stack([zero + 1.0, k]),
+            "reflection_ratio_std": np.stack([zero, np.sqrt(variance)]),
             "status": status,
         }
-        together = np.concatenate([np.empty((4, 0, *self._shape), np.float32), *films], axis=1)
-        maps |= zip(FILMS, together, strict=True)
+        if len(films) != 1:
+            films = [np.concatenate([np.empty((4, 0, *self._shape), np.float32), *films], axis=1)]
+        maps |= zip(FILMS, films[0], strict=True)
         attrs = {name: v for name, v in self._template.attrs.items() if name in _KEPT}
         stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
         variables = {
@@ -410,8 +384,7 @@ class Stream:
 
     def _apply(self, function: Callable[[Any], None], parts: Iterable[Any]) -> None:
         """Apply a function to parts of the image, in threads."""
-        for _ in self._threads.map(function, parts):
-            pass
+        list(self._threads.map(function, parts))
 
     def _pair(self, displacement: displaced.Displacement) -> None:
         """Resample the second camera by the shift of what is reflected; see `_displaced`."""
@@ -422,27 +395,3 @@ class Stream:
         self._status |= quality.status_bits({Status.NO_REFLECTION_PAIR: unpaired})
         edges = [rows.start * width for rows in self._rows()] + [weights.shape[0]]
         self._resample = [weights[start:stop] for start, stop in pairwise(edges)]
-
-
-def _camera(inputs: _inputs.Inputs) -> kernels.Camera:
-    """Responses and noise of both bands, the quietest first."""
-    curves = inputs.curves
-    pattern = np.zeros(2) if inputs.pattern is None else inputs.pattern
-    return kernels.Camera(
-        first=tables.table(curves[0]),
-        second=tables.table(curves[1]),
-        counts=(curves[0].reference_counts, curves[1].reference_counts),
-        slopes=(curves[0].reference_slope, curves[1].reference_slope),
-        noise=(float(inputs.noise[0]), float(inputs.noise[1])),
-        pattern=(float(pattern[0]), float(pattern[1])),
-        lowest=curves[0].lowest,
-        highest=curves[0].highest,
-    )
-
-
-def _single(record: Any) -> Any:
-    """Record of numbers, and of tuples of them, in single precision."""
-    if not isinstance(record, tuple):
-        return np.float32(record) if isinstance(record, float) else record
-    parts = [_single(part) for part in record]
-    return type(record)(*parts) if hasattr(record, "_fields") else tuple(parts)
