@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask
 
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 
@@ -29,17 +29,29 @@ class Subspace:
     object_part: Array  # the same columns less the steps of the camera in them
     steps: int  # columns of every order, beside the constant
     rising: Array  # polynomials (time, degree) from 1 up, less the steps of the camera
+    pieces: npt.NDArray[np.intp] | None = None  # frames with a column, if not all (column, 2)
 
     @property
     def orders(self) -> int:
         """Largest order."""
         return int(self.functions.shape[1]) - self.steps
 
+    @property
+    def spans(self) -> npt.NDArray[np.intp]:
+        """First frame with each column, and the end (column, 2)."""
+        frames, columns = self.functions.shape
+        return np.full((columns, 2), [0, frames]) if self.pieces is None else self.pieces
+
     def leverage(self) -> Array:
         r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
-        return np.asarray(np.cumsum(self.object_part**2, axis=1)[:, self.steps :])
+        result = np.zeros((self.orders, len(self.functions)))
+        for column, (start, stop) in enumerate(self.spans):
+            result[max(column - self.steps, 0) :, start:stop] += (
+                self.object_part[start:stop, column] ** 2
+            )
+        return result.T
 
-    def columns(self, order: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+    def columns(self, order: npt.NDArray[np.intp]) -> Mask:
         """Columns in use (column, pixel) at each pixel's order, 1 for the constant alone."""
         places = np.arange(self.functions.shape[1])[:, np.newaxis]
         return np.asarray(places < order + self.steps)
@@ -54,7 +66,7 @@ def subspace(
     signal has a step of its own, which is not the object's. ValueError as `polynomial_basis`, or if
     there are more functions than times.
     """
-    plain, steps = polynomial_basis(time, order), camera_steps(segment)
+    plain, steps = np.asfortranarray(polynomial_basis(time, order)), camera_steps(segment)
     if not steps:
         return Subspace(plain, plain, 0, plain[:, 1:])
     if order + len(steps) > len(plain):
@@ -68,7 +80,7 @@ def subspace(
 
 def piecewise(
     time: npt.ArrayLike,
-    first: npt.NDArray[np.bool_],
+    first: Mask,
     rising: Array,
     *,
     segment: npt.NDArray[np.integer] | None = None,
@@ -81,19 +93,23 @@ def piecewise(
     be the object's as well.
     """
     time = np.asarray(time, dtype=np.float64)
-    edges = [*np.flatnonzero(first), time.size]
-    blocks = []
+    edges, parts = [*np.flatnonzero(first), time.size], []
     for start, stop in pairwise(edges):
-        inside = slice(start, stop)
-        events = len(camera_steps(None if segment is None else segment[inside]))
-        block = np.zeros((time.size, min(number, stop - start - events)))
-        block[inside] = _known_basis(time[inside].tobytes(), block.shape[1])
-        blocks.append(block)
+        events = len(camera_steps(None if segment is None else segment[start:stop]))
+        order = min(number, stop - start - events)
+        parts.append((start, stop, _known_basis(time[start:stop].tobytes(), order)))
+    spans = np.repeat(
+        [(start, stop) for start, stop, _ in parts], [one.shape[1] for *_, one in parts], axis=0
+    )
+    # A column after another, of which a piece fills a part: what is zero takes no memory.
+    together, column = np.zeros((len(spans), time.size)), 0
+    for start, stop, basis in parts:
+        together[column : column + basis.shape[1], start:stop] = basis.T
+        column += basis.shape[1]
     if not camera_steps(segment):  # of two pieces, orthonormal as they are
-        together = np.hstack(blocks)
-        return Subspace(together, together, together.shape[1] - 1, rising)
+        return Subspace(together.T, together.T, len(together) - 1, rising, spans)
     functions, object_part = _without_steps(
-        np.hstack(blocks), camera_steps(segment), np.empty((time.size, 0))
+        together.T, camera_steps(segment), np.empty((time.size, 0))
     )
     return Subspace(functions, object_part, functions.shape[1] - 1, rising)
 
@@ -124,34 +140,29 @@ def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Arr
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
     r"""Orthonormal polynomials over given times, the discrete Legendre polynomials.
 
+    Column j (..., time, order) is a polynomial of degree j, and :math:`\Phi^T \Phi = 1`.
+
     Parameters
     ----------
-    time : array_like, shape (time,)
-        Times [s], strictly increasing, not necessarily evenly spaced.
+    time : array_like, shape (..., time)
+        Times [s], strictly increasing, not necessarily evenly spaced; of many captures at once.
     order : int
-        Number of functions, the constant included.
-
-    Returns
-    -------
-    ndarray, shape (time, order)
-        Column j is a polynomial of degree j; :math:`\Phi^T \Phi = 1`.
-
-    Raises
-    ------
-    ValueError
-        If the order is not in [1, number of times].
+        Number of functions, the constant included, at most that of the times, or a ValueError.
     """
     time = np.asarray(time, dtype=np.float64)
-    if not 1 <= order <= time.size:
+    frames = time.shape[-1]
+    if not 1 <= order <= frames:
         raise ValueError(
-            f"Invalid order {order} of the smooth subspace. Must lie in [1, {time.size}], "
+            f"Invalid order {order} of the smooth subspace. Must lie in [1, {frames}], "
             "the number of frames."
         )
-    span = time[-1] - time[0] if time.size > 1 else 1.0
-    position = 2.0 * (time - time[0]) / span - 1.0
+    span = time[..., -1:] - time[..., :1] if frames > 1 else 1.0
+    position = 2.0 * (time - time[..., :1]) / span - 1.0
     columns, triangle = np.linalg.qr(np.polynomial.legendre.legvander(position, order - 1))
-    size = np.abs(np.diag(triangle))
-    return np.asarray(columns) if size.min() > _ROUNDED * size.max() else _arnoldi(position, order)
+    size = np.abs(np.einsum("...jj->...j", triangle))
+    for place in np.argwhere(size.min(axis=-1) <= _ROUNDED * size.max(axis=-1)):
+        columns[tuple(place)] = _arnoldi(position[tuple(place)], order)
+    return np.asarray(columns)
 
 
 def _arnoldi(position: Array, order: int) -> Array:

@@ -133,12 +133,13 @@ def test_response_of_the_kernels(kind: str) -> None:
     for name in RIG.bands:
         curve: Curve = response.curve(RIG.response(), name, kind)
         temperature = np.linspace(150.0, 900.0, 2000)
+        table = kernels.table(curve)
         signal, slope, back = (np.empty(temperature.size) for _ in range(3))
-        kernels.blackbody(kernels.table(curve), temperature, signal, slope)
+        kernels.blackbody(table, temperature, signal, slope)
         expected = curve.signal(temperature) - curve.reference
         np.testing.assert_allclose(signal, expected, rtol=1e-9, atol=1e-6)  # K
         np.testing.assert_allclose(slope, curve.slope(temperature), rtol=1e-9, atol=1e-6)
-        kernels.temperature(kernels.table(curve), expected, back)
+        kernels.temperature(table, expected, back)
         np.testing.assert_allclose(back, temperature, rtol=1e-9, atol=1e-6)  # K
 
 

@@ -28,20 +28,18 @@ class Bars(NamedTuple):
 def _curve_variance(model: Model, kernel: Array, count: int, variance: float, work: Work) -> float:
     """Variance of a kernel's sum over the object's smoothed noise."""
     part = work.columns[:count]
-    kernels.projected(model.object_part, count, kernel, part)
+    kernels.projected(model.object_part, model.spans, count, kernel, part)
     return float(variance * kernels.dot(part, part))
 
 
 @compiled
 def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[float, float]:
     """Variance of the slope by a background that walks, and its bound; `emission.walk_variance`."""
-    degrees, kept = len(model.rising), work.spare
-    spectrum, curve = work.columns[:degrees], work.spectrum[:degrees]
+    degrees, kept, (spectrum, curve) = len(model.rising), work.spare, work.spectra
     share = kernels.mean(work.weights)
     for t in range(kept.size):
         kept[t] = work.residual[t] * work.weights[t] / share
-    kernels.projected(model.rising, degrees, kept, spectrum)
-    kernels.projected(model.rising, degrees, work.emitted, curve)
+    kernels.projected_both(model.rising, model.whole, kept, work.emitted, work.spectra)
     energy, product = kernels.dot(curve, curve), kernels.dot(curve, spectrum)
     scale, expected, upper = 0.0, 0.0, 0.0
     for j in range(degrees):
@@ -67,8 +65,8 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
     emitted, residual, weights = work.emitted, work.residual, work.weights
     kernel, again = work.kernel, work.spare
     kept, slope, size, length = weights, 0.0, 0.0, 0.0
+    slope, level, _ = kernels.moments(emitted, drift, kept)
     for last in range(2):
-        slope, level, _ = kernels.moments(emitted, drift, kept)
         length, size = 0.0, 0.0
         for t in range(frames):
             kernel[t] = kept[t] * (drift[t] - level - slope * emitted[t])
@@ -78,8 +76,8 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
         if last == 0:
             for t in range(frames):
                 again[t] = residual[t] - size * (drift[t] - level - slope * emitted[t])
-            kernels.bisquare(again, line.scale, again)
-            kept = again
+            kept = work.variance
+            slope, level, _ = kernels.reweighted(emitted, drift, again, line.scale, kept)
     variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
     curve = _curve_variance(model, kernel, count, ratios.null_variance, work)
     variance = (variance + line.emissivity[0] ** 2 * curve) / length**2
@@ -94,7 +92,7 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: 
     count, null, noise = ratios.order + model.steps, ratios.null_variance, model.noise[0]
     # Of eq. 6 by implicit differentiation, and what the residual of a frame of rest holds.
     sensitivity, smooth_variance = work.sensitivity, work.smooth_variance
-    kernels.combined(model.object_part, work.coefficients[0], count, sensitivity)
+    kernels.combined(model.object_part, model.spans, work.coefficients[0], count, sensitivity)
     resting, more, leverage = 0.0, 1.0 + log(work.first.size) / count, model.leverage
     beside = 1.0 / (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
     for t in range(work.first.size):
@@ -115,21 +113,20 @@ def bars(model: Model, ratios: Ratio, line: Line, work: Work) -> Bars:
     z, emitted, weights, kernel = work.first, work.emitted, work.weights, work.kernel
     count, null, w = ratios.order + model.steps, ratios.null_variance, ratios.weights
     # Kernel of the slope, sum k z; its variance, of the ordinate's noise and the abscissa's.
-    total, product, reflected, low, high = 0.0, 0.0, 0.0, np.inf, -np.inf
+    total, product, reflected = 0.0, 0.0, 0.0
     for t in range(z.size):
         total += weights[t]
         product += weights[t] * emitted[t]
         reflected += z[t] - emitted[t]
     for t in range(z.size):
         kernel[t] = weights[t] * (emitted[t] - product / total) / line.energy
-        low, high = min(low, emitted[t]), max(high, emitted[t])
     first = line.emissivity[0]
     noise_variance = line.variance
     noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
     walk, upper = _walk(model, first**2 * null, count, work)
     limit = (1.0 - first) * model.drift
     linear = _linear(model, ratios, line, limit, work)
-    drift_variance = (limit / (high - low)) ** 2 + max(upper, linear)
+    drift_variance = (limit / kernels.range_of(emitted)) ** 2 + max(upper, linear)
     if line.known:
         noise_variance, drift_variance = work.material[3], work.material[4]
     # Of the ratio, through the background's level; see `emission._level_std`.
@@ -188,9 +185,11 @@ def _background(
         variance[t] = value + contrast**2 * steady
     if pattern[0] > 0.0 or pattern[1] > 0.0:
         direct0, direct1 = one / (1.0 - first), two / (1.0 - last)
-        kernels.response(model.first, work.background, work.spare, 1)
+        kernels.blackbody(model.first, work.background, work.mean, work.spare)
+        kernels.blackbody(model.first, work.temperature, work.mean, work.rapid)
+        kernels.blackbody(model.second, work.temperature, work.mean, work.null_residual)
         for t in range(variance.size):
-            slope0, slope1 = work.object_slope[t], work.other_object_slope[t]
+            slope0, slope1 = work.rapid[t], work.null_residual[t]
             steepness = w[0] * first * slope0 + w[1] * last * slope1
             through = direct0 * first * slope0 + direct1 * last * slope1
             a, b = w[0] / steepness, w[1] / steepness

@@ -6,6 +6,7 @@ one number, along the normal n: of a scatter the energy :math:`n^T S n`.
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from math import acos, sqrt
 from typing import Final, NamedTuple
 
@@ -59,7 +60,7 @@ def divide(
     signals: Array, time: Array, noise: Array, segment: Whole | None, known: Array | None = None
 ) -> list[pieces.Division]:
     """As `pieces.divide`, of two bands."""
-    tree = _packed(time, segment)
+    tree = _packed(time.tobytes(), None if segment is None else segment.tobytes())
     frames, pixels = signals.shape[1:]
     count, axes = len(tree.edges), len(tree.starts) + (known is not None)
     functions = smooth.PIECE_ORDER + int(tree.event.sum())
@@ -87,14 +88,15 @@ def divide(
     return [pieces.Division(*one) for one in zip(first, cost, strict=True)]
 
 
-def _packed(time: Array, segment: Whole | None) -> Tree:
-    levels = pieces.tree(time.tobytes(), None if segment is None else segment.tobytes())[1]
+@lru_cache(maxsize=4)
+def _packed(times: bytes, events: bytes | None) -> Tree:
+    levels, time = pieces.tree(times, events)[1], np.frombuffer(times)
     every = [piece for level in levels for piece in level]
     sizes = np.array([basis.size for _, basis, _ in every])
     begun = [np.arange(2**level - 1, 2 ** (level + 1) - 1) for level in pieces.STARTS]
     event = np.zeros(time.size, dtype=bool)
-    if segment is not None:
-        event[1:] = np.diff(segment) > 0
+    if events is not None:
+        event[1:] = np.diff(np.frombuffer(events, dtype=np.intp)) > 0
     return Tree(
         edges=np.array([(inside.start, inside.stop) for inside, _, _ in every]),
         columns=np.array([basis.shape[1] for _, basis, _ in every]),

@@ -26,14 +26,17 @@ from dbthermal.separation._subspace.shared import Model, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
 from dbthermal.separation._tiles import Tile
 
-_BLOCK: Final = 16  # pixels whose samples are turned at once
+# Samples that are turned at once, to stay in the cache, and the fewest pixels.
+_TURNED: Final = 2**14
+_BLOCK: Final = 8
+_ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
+_SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
 
 
 @compiled
-def _unsteady(
-    model: Model, ratios: Ratio, residual: Array, rapid: Array, steep: Array
-) -> tuple[float, float, bool]:
+def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
     """Autocorrelation, delay of the bands, and whether the residual is noise; see `residuals`."""
+    residual, rapid, steep = work.null_residual, work.rapid, work.spare
     frames, null, noise = residual.size, ratios.null_variance, model.noise[0]
     energy = kernels.dot(residual, residual)
     lagged = 0.0
@@ -64,22 +67,25 @@ def _unsteady(
     return (
         correlation * sqrt(residuals.LAGS * frames),
         score,
-        _unexplained(model, ratios, residual, rapid, common),
+        _unexplained(model, ratios, work, common),
     )
 
 
 @compiled
-def _unexplained(model: Model, ratios: Ratio, residual: Array, rapid: Array, common: float) -> bool:
+def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
     """As `residuals.unexplained`."""
-    blocks = model.edges.size - 1
+    blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
     sums, together = np.zeros(blocks), 0.0
-    leverage = model.leverage[ratios.order - 1]
+    leverage, products, squares = model.leverage[ratios.order - 1], work.kernel, work.mean
+    for t in range(residual.size):
+        products[t] = residual[t] * rapid[t] - common * (1.0 - leverage[t])
+        squares[t] = rapid[t] ** 2
     for block in range(blocks):
         product, square = 0.0, 0.0
-        for t in range(model.edges[block], model.edges[block + 1]):
+        for t in range(np.uintp(model.edges[block]), np.uintp(model.edges[block + 1])):
             sums[block] += residual[t]
-            product += residual[t] * rapid[t] - common * (1.0 - leverage[t])
-            square += rapid[t] ** 2
+            product += products[t]
+            square += squares[t]
         together += product**2 / square if square > 0 else 0.0
     if together / ratios.null_variance > model.limits[0]:
         return True
@@ -99,20 +105,20 @@ def _unexplained(model: Model, ratios: Ratio, residual: Array, rapid: Array, com
 @compiled
 def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
-) -> tuple[float, float, bool]:
+) -> tuple[Any, Any, Any]:
     """A temperature and its deviation, NaN where useless; and what is wrong with them."""
-    lost, missing, beyond = 0.0, 0.0, 0.0
+    lost, missing, beyond, zero, one = _ZERO, _ZERO, _ZERO, _ZERO, _ONE
+    lowest, highest = np.float32(model.lowest), np.float32(model.highest)
     for t in range(temperature.size):
-        one, deviation = temperature[t], sqrt(variance[t])
-        missing += 1.0 if np.isnan(one) else 0.0
-        margin = tiles.RANGE_SIGMAS * (0.0 if np.isnan(deviation) else deviation)
-        outside = (one < model.lowest - margin) | (one > model.highest + margin)
-        beyond += 1.0 if outside else 0.0
-        useful = (abs(one) < tiles.USELESS) & (deviation < tiles.USELESS)
-        lost += 0.0 if useful else 1.0
-        value[t] = one if useful else np.nan
-        std[t] = deviation if useful else np.nan
-    return lost, missing, beyond > 0.0
+        kelvin, deviation = np.float32(temperature[t]), np.sqrt(np.float32(variance[t]))
+        missing += one if np.isnan(kelvin) else zero
+        margin = _SIGMAS * (zero if np.isnan(deviation) else deviation)
+        beyond += one if (kelvin < lowest - margin) | (kelvin > highest + margin) else zero
+        useful = (abs(kelvin) < _USELESS) & (deviation < _USELESS)
+        lost += zero if useful else one
+        value[t] = kelvin if useful else _NAN
+        std[t] = deviation if useful else _NAN
+    return lost, missing, beyond > zero
 
 
 _FIELDS: Final[dict[Any, dict[str, tuple[int, ...]]]] = {
@@ -162,7 +168,7 @@ def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums
     work.removed[:] = 0.0
     gray, again = False, 0
     while True:
-        ratios = pixel.ratios(model, work, again)
+        ratios = pixel.ratios(model, work)
         line = pixel.emission(model, ratios, work, again)
         pixel.background(model, line, work)
         # The bend of a gray body is not known: it is told from the signals as they are.
@@ -196,18 +202,19 @@ def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) ->
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
     count, w = ratios.order + model.steps, ratios.weights
     combined = w[0] * coefficients[0] + w[1] * coefficients[1]
-    kernels.combined(model.functions, coefficients[0], count, rapid)
-    kernels.combined(model.functions, combined, count, residual)
+    kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
+    kernels.combined(model.functions, model.spans, combined, count, residual)
     for t in range(rapid.size):
         rapid[t] = work.first[t] - rapid[t]
         residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
-    record.correlation, record.delay, record.unexplained = _unsteady(
-        model, ratios, residual, rapid, work.spare
-    )
+    record.correlation, record.delay, record.unexplained = _unsteady(model, ratios, work)
     for block in range(model.parts.size - 1):
-        for t in range(model.parts[block], model.parts[block + 1]):
-            sums[0, block] += residual[t]
-            sums[1, block] += work.target[t]
+        one, other = 0.0, 0.0
+        # Whole numbers without a sign: an index from the end need not be looked for.
+        for t in range(np.uintp(model.parts[block]), np.uintp(model.parts[block + 1])):
+            one += residual[t]
+            other += work.target[t]
+        sums[0, block], sums[1, block] = one, other
 
 
 @compiled
@@ -245,8 +252,9 @@ def _turn(samples: Any, start: int, size: int, turned: Any) -> None:
     """Samples (kind, time, pixel) of a few pixels as (kind, pixel, time), in place."""
     for kind in range(turned.shape[0]):
         for t in range(turned.shape[2]):
+            row = samples[kind, t, start : start + size]
             for p in range(size):
-                turned[kind, p, t] = samples[kind, t, start + p]
+                turned[kind, p, t] = row[p]
 
 
 @compiled
@@ -254,8 +262,9 @@ def _return(turned: Any, start: int, size: int, samples: Any) -> None:
     """The reverse of `_turn`, in place."""
     for kind in range(turned.shape[0]):
         for t in range(turned.shape[2]):
+            row = samples[kind, t, start : start + size]
             for p in range(size):
-                samples[kind, t, start + p] = turned[kind, p, t]
+                row[p] = turned[kind, p, t]
 
 
 def _compiled(digest: str) -> Callable[..., None]:
@@ -268,9 +277,10 @@ def _compiled(digest: str) -> Callable[..., None]:
         if not digest:  # a constant of the compiled code, which is kept with it
             return
         frames, pixels = signals.shape[1:]
-        inside, outside = np.empty((2, _BLOCK, frames)), np.empty((4, _BLOCK, frames), np.float32)
-        for start in range(0, pixels, _BLOCK):
-            size = min(_BLOCK, pixels - start)
+        block = max(_BLOCK, _TURNED // frames)
+        inside, outside = np.empty((2, block, frames)), np.empty((4, block, frames), np.float32)
+        for start in range(0, pixels, block):
+            size = min(block, pixels - start)
             _turn(signals, start, size, inside)
             for p in range(size):
                 here = start + p
@@ -299,11 +309,13 @@ def _share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
     freedom = [min(high - 1, degrees) - low + 1 - lost for low, high, lost in emissions.OCTAVES]
     edges, limits = residuals.blocks(tile.time.size)
     return Model(
-        first=kernels.table(first),
-        second=kernels.table(second),
+        first=kernels.table(first, second),
+        second=kernels.table(second, first),
         functions=columns,
         object_part=of_object,
+        spans=functions.spans,
         rising=np.ascontiguousarray(functions.rising.T),
+        whole=np.full((degrees, 2), [0, tile.time.size]),
         spread=float(np.ptp(functions.rising[:, 0])),
         leverage=np.ascontiguousarray(functions.leverage().T),
         steps=int(functions.steps),
@@ -336,13 +348,13 @@ def _work_space(functions: smooth.Subspace) -> Work:
     rest: dict[str, Any] = {
         "few": np.empty((6, frames), np.float32),
         "coefficients": np.empty((2, columns)),
-        "columns": np.empty(columns + functions.rising.shape[1]),
-        "spectrum": np.empty(functions.rising.shape[1]),
+        "columns": np.empty(columns),
+        "spectra": np.empty((2, functions.rising.shape[1])),
         "scatter": np.empty((functions.orders, 3)),
         "material": np.empty(5),
     }
     curves = {name: np.empty(frames) for name in Work._fields}
-    return Work(**curves | rest | {"ones": np.ones(frames)})
+    return Work(**curves | rest)
 
 
 def solve(

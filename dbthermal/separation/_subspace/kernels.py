@@ -22,6 +22,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import residuals
 
 _ERROR: Final = 1e-7  # of a response's polynomials [K]
+_INVERSE_ERROR: Final = 5e-7  # [K]
 _MARGIN: Final = 0.25  # of the calibrated range, beside it, in which they hold
 _TERMS: Final = 12  # of a polynomial
 # Degrees, and shares of the range: of a wide one, such as a maker's, the outer parts stay exact.
@@ -61,33 +62,33 @@ class Table(NamedTuple):
 
 
 @lru_cache
-def table(curve: Curve) -> Table:
-    """Polynomials of a response, of the least degree that keeps an error."""
+def table(curve: Curve, *others: Curve) -> Table:
+    """Polynomials of a response, of the least degree that keeps an error; of the others' range."""
     margin = _MARGIN * (curve.highest - curve.lowest)
     widest = max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin
-
-    def signal(temperature: Array) -> Array:
-        return curve.signal(temperature) - curve.reference
-
     for degree, share in _TRIED:
         low, high = (np.mean(widest) + share * np.diff(widest) * np.array([-0.5, 0.5])).tolist()
         dense = np.linspace(low, high, 1001)
-        u, slope = (Chebyshev.interpolate(f, degree, [low, high]) for f in (signal, curve.slope))
-        errors = np.abs([u(dense) - signal(dense), slope(dense) - curve.slope(dense)])
-        if errors.max() < _ERROR:
+        errors = []
+        for one in (*others, curve):
+            u = Chebyshev.interpolate(_signal, degree, [low, high], args=(one,))
+            slope = u.deriv()
+            errors += [u(dense) - _signal(dense, one), slope(dense) - one.slope(dense)]
+        if np.abs(errors).max() < _ERROR:
             break
     else:
         raise ValueError(
-            f"Invalid response in band '{curve.band}': {errors.max():.1g} K from a polynomial of "
-            f"degree {degree}. Must be smooth over its range, {curve.lowest} to {curve.highest} K."
+            f"Invalid response in band '{curve.band}': {np.abs(errors).max():.1g} K from a "
+            f"polynomial of degree {degree}. Must be smooth over its range, {curve.lowest} to "
+            f"{curve.highest} K."
         )
-    ends, a = signal(np.array([low, high])), curve.reference_slope
+    ends, a = _signal(np.array([low, high]), curve), curve.reference_slope
     inverse = Chebyshev.interpolate(
         lambda s: curve.temperature(s + curve.reference), _TERMS - 1, ends
     )
-    values, newton = inverse(signal(dense)), 0
-    while newton < _NEWTON and np.abs(values - dense).max() > _ERROR:
-        values, newton = values - (u(values) - signal(dense)) / slope(values), newton + 1
+    values, newton = inverse(_signal(dense, curve)), 0
+    while newton < _NEWTON and np.abs(values - dense).max() > _INVERSE_ERROR:
+        values, newton = values - (u(values) - _signal(dense, curve)) / slope(values), newton + 1
     return Table(
         signal=_coefficients(u),
         slope=_coefficients(slope),
@@ -105,13 +106,17 @@ def table(curve: Curve) -> Table:
     )
 
 
+def _signal(temperature: Array, curve: Curve) -> Array:
+    return curve.signal(temperature) - curve.reference
+
+
 def _coefficients(series: Chebyshev) -> tuple[float, ...]:
     powers = np.polynomial.chebyshev.cheb2poly(series.coef)
     return tuple(np.pad(powers, (0, _TERMS - powers.size)).tolist())
 
 
 @compiled
-def _exact(table: Table, temperature: float) -> tuple[float, float]:
+def exact(table: Table, temperature: float) -> tuple[float, float]:
     """Signal less the reference [K] and slope [1] of a blackbody at any temperature [K]."""
     if table.linear:
         return table.amplitude * temperature + table.offset, table.amplitude
@@ -131,31 +136,45 @@ def polynomial(c: tuple[float, ...], x: float) -> float:
 
 
 @compiled
+def with_slope(c: tuple[float, ...], x: float) -> tuple[float, float]:
+    """Polynomial of twelve rising coefficients, and its derivative."""
+    value, slope = c[11], 0.0
+    slope, value = value, value * x + c[10]
+    slope, value = slope * x + value, value * x + c[9]
+    slope, value = slope * x + value, value * x + c[8]
+    slope, value = slope * x + value, value * x + c[7]
+    slope, value = slope * x + value, value * x + c[6]
+    slope, value = slope * x + value, value * x + c[5]
+    slope, value = slope * x + value, value * x + c[4]
+    slope, value = slope * x + value, value * x + c[3]
+    slope, value = slope * x + value, value * x + c[2]
+    slope, value = slope * x + value, value * x + c[1]
+    return value * x + c[0], slope * x + value
+
+
+@compiled
+def mixed(one: float, a: tuple[float, ...], two: float, b: tuple[float, ...]) -> tuple[float, ...]:
+    """Twelve coefficients of a sum of two polynomials."""
+    low = one * a[0] + two * b[0], one * a[1] + two * b[1], one * a[2] + two * b[2]
+    up = one * a[3] + two * b[3], one * a[4] + two * b[4], one * a[5] + two * b[5]
+    more = one * a[6] + two * b[6], one * a[7] + two * b[7], one * a[8] + two * b[8]
+    high = one * a[9] + two * b[9], one * a[10] + two * b[10], one * a[11] + two * b[11]
+    return low + up + more + high
+
+
+@compiled
 def blackbody(table: Table, temperature: Array, signal: Array, slope: Array) -> None:
     """Signal less the reference [K] and slope [1] of a blackbody (time) [K], in place."""
     outside, scale = 0.0, 1.0 / table.half  # a sum: a largest value would not be taken many at once
     for t in range(temperature.size):
         x = (temperature[t] - table.middle) * scale
         outside += 0.0 if abs(x) <= 1.0 else 1.0
-        signal[t], slope[t] = polynomial(table.signal, x), polynomial(table.slope, x)
+        signal[t], rate = with_slope(table.signal, x)
+        slope[t] = rate * scale
     if outside > 0.0:
         for t in range(temperature.size):
             if not abs(temperature[t] - table.middle) <= table.half:
-                signal[t], slope[t] = _exact(table, temperature[t])
-
-
-@compiled
-def response(table: Table, temperature: Array, result: Array, slope: int) -> None:
-    """Signal less the reference [K], 0, or slope [1], 1, alone, as `blackbody`."""
-    outside, scale, terms = 0.0, 1.0 / table.half, table.slope if slope else table.signal
-    for t in range(temperature.size):
-        x = (temperature[t] - table.middle) * scale
-        outside += 0.0 if abs(x) <= 1.0 else 1.0
-        result[t] = polynomial(terms, x)
-    if outside > 0.0:
-        for t in range(temperature.size):
-            if not abs(temperature[t] - table.middle) <= table.half:
-                result[t] = _exact(table, temperature[t])[slope]
+                signal[t], slope[t] = exact(table, temperature[t])
 
 
 @compiled
@@ -168,9 +187,8 @@ def temperature(table: Table, signal: Array, result: Array) -> None:
         result[t] = polynomial(table.inverse, x)
     for _ in range(table.newton):
         for t in range(signal.size):
-            x = (result[t] - table.middle) * narrow
-            excess = polynomial(table.signal, x) - signal[t]
-            result[t] -= excess / polynomial(table.slope, x)
+            value, slope = with_slope(table.signal, (result[t] - table.middle) * narrow)
+            result[t] -= (value - signal[t]) / slope * table.half
     if outside > 0.0:
         for t in range(signal.size):
             if not abs(signal[t] - table.middle_signal) <= table.half_signal:
@@ -205,41 +223,52 @@ def mean(values: Array) -> float:
     return total / values.size
 
 
+@njit(nogil=True, fastmath=_FLAGS | {"nnan"}, error_model="numpy")
+def range_of(values: Array) -> Any:
+    """Largest less smallest value; with a NaN any number, or these would be taken one by one."""
+    low, high = values[0], values[0]
+    for t in range(values.size):
+        low = min(low, values[t])
+        high = max(high, values[t])
+    return high - low
+
+
 @compiled
-def combined(columns: Array, coefficients: Array, count: int, result: Array) -> None:
-    """Sum of the first columns (column, time) times coefficients, in place; four at once."""
+def combined(columns: Array, spans: tiles.Whole, scales: Array, count: int, result: Array) -> None:
+    """Sum of the first columns (column, time) times scales, in place."""
     result[:] = 0.0
-    four = count - count % 4
-    for j in range(0, four, 4):
-        a, b, c, d = coefficients[j], coefficients[j + 1], coefficients[j + 2], coefficients[j + 3]
-        for t in range(result.size):
-            result[t] += (
-                a * columns[j, t]
-                + b * columns[j + 1, t]
-                + c * columns[j + 2, t]
-                + d * columns[j + 3, t]
-            )
-    for j in range(four, count):
-        a = coefficients[j]
-        for t in range(result.size):
-            result[t] += a * columns[j, t]
+    for j in range(count):
+        start, stop = spans[j]
+        column, part, scale = columns[j, start:stop], result[start:stop], scales[j]
+        for t in range(part.size):
+            part[t] += scale * column[t]
 
 
 @compiled
-def projected(columns: Array, count: int, curve: Array, result: Array) -> None:
-    """Products of the first columns (column, time) with a curve, in place; four at once."""
-    four = count - count % 4
-    for j in range(0, four, 4):
-        a, b, c, d = 0.0, 0.0, 0.0, 0.0
-        for t in range(curve.size):
-            value = curve[t]
-            a += columns[j, t] * value
-            b += columns[j + 1, t] * value
-            c += columns[j + 2, t] * value
-            d += columns[j + 3, t] * value
-        result[j], result[j + 1], result[j + 2], result[j + 3] = a, b, c, d
-    for j in range(four, count):
-        result[j] = dot(columns[j], curve)
+def projected(columns: Array, spans: tiles.Whole, count: int, curve: Array, result: Array) -> None:
+    """Products of the first columns (column, time) with a curve, in place."""
+    for j in range(count):
+        start, stop = spans[j]
+        result[j] = dot(columns[j, start:stop], curve[start:stop])
+
+
+@compiled
+def projected_both(columns: Array, spans: tiles.Whole, first: Array, last: Array, to: Any) -> None:
+    """Products of all columns with two curves, in place; each column is read once."""
+    count = len(columns)
+    for j in range(0, count - count % 2, 2):
+        start, stop, a, b, c, d = spans[j, 0], spans[j + 1, 1], 0.0, 0.0, 0.0, 0.0
+        one, two = columns[j, start:stop], columns[j + 1, start:stop]
+        some, more = first[start:stop], last[start:stop]
+        for t in range(some.size):
+            a += one[t] * some[t]
+            b += two[t] * some[t]
+            c += one[t] * more[t]
+            d += two[t] * more[t]
+        to[0, j], to[0, j + 1], to[1, j], to[1, j + 1] = a, b, c, d
+    if count % 2:
+        projected(columns[-1:], spans[-1:], 1, first, to[0, -1:])
+        projected(columns[-1:], spans[-1:], 1, last, to[1, -1:])
 
 
 @compiled
@@ -264,8 +293,9 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
             high, most = middle, below
         if below == goal:
             break
-        if high == np.float32(np.inf):
-            middle = np.float32(2.0) * low
+        if high == np.float32(np.inf):  # small values are about as many in each interval
+            growth = (goal + np.float32(0.5)) / max(below, np.float32(0.5))
+            middle = low * min(max(growth, np.float32(1.01)), np.float32(4.0))
         elif turn % 3 == 2:
             middle = np.float32(0.5) * (low + high)
         else:
@@ -280,11 +310,18 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
 
 
 def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
-    """Weighted line, and bisquare weights, of arrays of a precision, compiled."""
+    """Weighted line, and that of bisquare weights, of arrays of a precision, compiled."""
     zero, one = real(0.0), real(1.0)
 
     @compiled
-    def moments(x: Any, y: Any, weights: Any) -> tuple[Any, Any, Any]:
+    def line(total: Any, first: Any, second: Any, square: Any, product: Any) -> Any:
+        middle, centre = first / total, second / total
+        energy = square - total * middle * middle
+        slope = (product - total * middle * centre) / energy
+        return slope, centre - slope * middle, energy
+
+    @compiled
+    def moments(x: Any, y: Any, weights: Any) -> Any:
         """Slope and intercept of a weighted line, and the energy of the abscissa about its mean."""
         total, first, second, square, product = zero, zero, zero, zero, zero
         for t in range(x.size):
@@ -295,25 +332,31 @@ def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
             second += w * y[t]
             square += wx * x[t]
             product += wx * y[t]
-        middle, centre = first / total, second / total
-        energy = square - total * middle * middle
-        slope = (product - total * middle * centre) / energy
-        return slope, centre - slope * middle, energy
+        return line(total, first, second, square, product)
 
     @compiled
-    def bisquare(residual: Any, scale: float, weights: Any) -> None:
-        """Tukey's bisquare weights of residuals, in place."""
+    def reweighted(x: Any, y: Any, residual: Any, scale: float, weights: Any) -> Any:
+        """As `moments`, with Tukey's bisquare weights of residuals, in place."""
         inverse = real(1.0 / (residuals.TUNING * scale))
-        for t in range(residual.size):
+        total, first, second, square, product = zero, zero, zero, zero, zero
+        for t in range(x.size):
             r = residual[t] * inverse
             kept = max(one - r * r, zero)
-            weights[t] = kept * kept
+            w = kept * kept
+            weights[t] = w
+            wx = w * x[t]
+            total += w
+            first += wx
+            second += w * y[t]
+            square += wx * x[t]
+            product += wx * y[t]
+        return line(total, first, second, square, product)
 
-    return moments, bisquare
+    return moments, reweighted
 
 
-moments, bisquare = _of(np.float64)
-_moments, _bisquare = _of(np.float32)
+moments, reweighted = _of(np.float64)
+_moments, _reweighted = _of(np.float32)
 
 
 @compiled
@@ -333,17 +376,21 @@ def _started(x: Array, y: Array, noise: float, residual: Array, few: Any) -> Non
     best, best_slope, best_intercept = np.inf, np.inf, np.inf
     for start in range(3):
         sign = np.float32(2 * start - 3) if start > 0 else zero
-        deviation = noise
         for i in range(count):
             weights[i] = 1.0 if sign * plain[i] >= zero else 0.0
-        for _ in range(residuals.STARTING_STEPS):
-            slope, intercept, _ = _moments(xs, ys, weights)
+        slope, intercept, _ = _moments(xs, ys, weights)
+        deviation = 0.0
+        for turn in range(residuals.STARTING_STEPS):
+            if turn > 0:
+                scale = max(noise, residuals.ANNEALING * residuals.TO_STD * deviation)
+                slope, intercept, _ = _reweighted(xs, ys, rest, scale, weights)
+            total = zero
             for i in range(count):
                 rest[i] = ys[i] - intercept - slope * xs[i]
                 magnitude[i] = abs(rest[i])
-            deviation = ranked(magnitude, rank, deviation)
-            scale = max(noise, residuals.ANNEALING * residuals.TO_STD * deviation)
-            _bisquare(rest, scale, weights)
+                total += magnitude[i]
+            guess = deviation if turn > 0 else 0.5 * total / count
+            deviation = ranked(magnitude, rank, max(guess, noise / residuals.TO_STD))
         if deviation < best:
             best, best_slope, best_intercept = deviation, slope, intercept
     for t in range(x.size):
@@ -366,14 +413,13 @@ def regress(
     else:
         _started(x, y, noise, residual, few)
     magnitude, rank = few[5], int(residuals.SHARE * x.size)
-    deviation = noise
+    deviation = 0.0
     for t in range(x.size):
         magnitude[t] = abs(residual[t])
     for _ in range(residuals.STEPS):
-        deviation = ranked(magnitude, rank, deviation)
+        deviation = ranked(magnitude, rank, max(deviation, noise / residuals.TO_STD))
         scale = max(noise, residuals.TO_STD * deviation)
-        bisquare(residual, scale, weights)
-        slope, intercept, energy = moments(x, y, weights)
+        slope, intercept, energy = reweighted(x, y, residual, scale, weights)
         for t in range(x.size):
             residual[t] = y[t] - intercept - slope * x[t]
             magnitude[t] = abs(residual[t])

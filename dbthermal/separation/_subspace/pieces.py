@@ -126,19 +126,27 @@ def tree(time: bytes, segment: bytes | None) -> tuple[Whole, list[list[Piece]]]:
     halved: list[list[Piece]] = []
     for level in range(levels + 1):
         bounds = edges[:: 2 ** (levels - level)]
-        inside = [slice(start, stop) for start, stop in pairwise(bounds)]
-        halved.append(
-            [
-                (
-                    one,
-                    *functions(
-                        times[one].tobytes(), None if events is None else events[one].tobytes()
-                    ),
-                )
-                for one in inside
-            ]
-        )
+        halved.append([])
+        for (start, stop), basis in zip(pairwise(bounds), _bases(times, bounds), strict=True):
+            one, inside = slice(start, stop), None if events is None else events[start:stop]
+            if inside is not None and inside[0] < inside[-1]:
+                halved[-1].append((one, *functions(times[one].tobytes(), inside.tobytes())))
+            else:
+                chosen = FUNCTIONS if len(basis) > smooth.PIECE_ORDER else basis.shape[1]
+                halved[-1].append((one, basis, chosen))
     return edges, halved
+
+
+def _bases(times: Array, bounds: Whole) -> list[Array]:
+    """Polynomials (time, function) of each piece; those of one length at once."""
+    lengths, bases = np.diff(bounds), [np.empty((0, 0))] * (bounds.size - 1)
+    for length in np.unique(lengths):
+        places = np.flatnonzero(lengths == length)
+        order = min(smooth.PIECE_ORDER, int(length))
+        together = times[bounds[places, np.newaxis] + np.arange(length)]
+        for place, basis in zip(places, smooth.polynomial_basis(together, order), strict=True):
+            bases[place] = basis
+    return bases
 
 
 def _scatters(white: Array, pieces: list[Piece]) -> Array:

@@ -44,12 +44,10 @@ class Line(NamedTuple):
 
 
 @compiled
-def ratios(model: Model, work: Work, again: int) -> Ratio:
-    """Step 1; coefficients (2, column) in place, those of the first band unless done before."""
-    coefficients, columns = work.coefficients, len(model.functions)
-    if not again:
-        kernels.projected(model.functions, columns, work.first, coefficients[0])
-    kernels.projected(model.functions, columns, work.straight, coefficients[1])
+def ratios(model: Model, work: Work) -> Ratio:
+    """Step 1; coefficients (2, column) in place."""
+    curves = work.first, work.straight
+    kernels.projected_both(model.functions, model.spans, curves[0], curves[1], work.coefficients)
     _scatter(model, work)
     noise, scatter, material = model.noise, work.scatter, work.material
     orders, frames = len(scatter), work.first.size
@@ -162,24 +160,66 @@ def may_be_gray(model: Model, ratios: Ratio) -> bool:
 
 
 @compiled
-def _newton(ratios: Ratio, emissivity: float, work: Work) -> None:
-    """A step towards h(x) = q (eq. 6) with u(x) at hand; h' and the partial derivative too."""
-    emitted, other, slope, other_slope = work.emitted, work.other, work.slope, work.other_slope
-    target, temperature = work.target, work.temperature
-    one = ratios.weights[0] * emissivity
-    two = ratios.weights[1] * (1.0 - ratios.ratio * (1.0 - emissivity))
-    for t in range(target.size):
-        steepness = one * slope[t] + two * other_slope[t]
-        work.steepness[t] = steepness
-        work.partial[t] = other[t] + emissivity * (emitted[t] - other[t])
-        temperature[t] += (target[t] - one * emitted[t] - two * other[t]) / steepness
+def _weights(ratios: Ratio, emissivity: float) -> tuple[float, float]:
+    """Weights w_m e_m of the bands' signals in h (eq. 6)."""
+    last = 1.0 - ratios.ratio * (1.0 - emissivity)
+    return ratios.weights[0] * emissivity, ratios.weights[1] * last
 
 
 @compiled
-def _responses(model: Model, temperature: Array, work: Work) -> None:
-    """Signals u(T) and slopes u'(T) of both bands, in place."""
-    kernels.blackbody(model.first, temperature, work.emitted, work.slope)
-    kernels.blackbody(model.second, temperature, work.other, work.other_slope)
+def _approach(model: Model, ratios: Ratio, emissivity: float, work: Work) -> None:
+    """A step towards h(x) = q (eq. 6), and the object's signal there, in place."""
+    first, second, now, after = model.first, model.second, work.temperature, work.spare
+    target, middle, scale, outside = work.target, first.middle, 1.0 / first.half, 0.0
+    one, two = _weights(ratios, emissivity)
+    mixed = kernels.mixed(one, first.signal, two, second.signal)
+    for t in range(now.size):
+        x = (now[t] - middle) * scale
+        value, slope = kernels.with_slope(mixed, x)
+        y = x + (target[t] - value) / slope
+        outside += 0.0 if (abs(x) <= 1.0) & (abs(y) <= 1.0) else 1.0
+        after[t] = middle + first.half * y
+        work.emitted[t] = kernels.polynomial(first.signal, y)
+    if outside > 0.0:
+        for t in range(now.size):
+            if not max(abs(now[t] - middle), abs(after[t] - middle)) <= first.half:
+                a, slope = kernels.exact(first, now[t])
+                b, other_slope = kernels.exact(second, now[t])
+                steepness = one * slope + two * other_slope
+                after[t] = now[t] + (target[t] - one * a - two * b) / steepness
+                work.emitted[t] = kernels.exact(first, after[t])[0]
+    now[:] = after
+
+
+@compiled
+def _arrive(model: Model, ratios: Ratio, emissivity: float, work: Work) -> None:
+    """The last step, with h' and the partial derivative; and both signals there, in place."""
+    first, second, now, after = model.first, model.second, work.temperature, work.spare
+    target, middle, scale, outside = work.target, first.middle, 1.0 / first.half, 0.0
+    one, two = _weights(ratios, emissivity)
+    mixed = kernels.mixed(one, first.signal, two, second.signal)
+    for t in range(now.size):
+        x = (now[t] - middle) * scale
+        value, slope = kernels.with_slope(mixed, x)
+        other = kernels.polynomial(second.signal, x)
+        y = x + (target[t] - value) / slope
+        outside += 0.0 if (abs(x) <= 1.0) & (abs(y) <= 1.0) else 1.0
+        work.steepness[t] = slope * scale
+        work.partial[t] = other + emissivity * (work.emitted[t] - other)
+        after[t] = middle + first.half * y
+        work.at_object[t] = kernels.polynomial(first.signal, y)
+        work.other_at_object[t] = kernels.polynomial(second.signal, y)
+    if outside > 0.0:
+        for t in range(now.size):
+            if not max(abs(now[t] - middle), abs(after[t] - middle)) <= first.half:
+                a, slope = kernels.exact(first, now[t])
+                b, other_slope = kernels.exact(second, now[t])
+                work.steepness[t] = one * slope + two * other_slope
+                work.partial[t] = b + emissivity * (a - b)
+                after[t] = now[t] + (target[t] - one * a - two * b) / work.steepness[t]
+                work.at_object[t] = kernels.exact(first, after[t])[0]
+                work.other_at_object[t] = kernels.exact(second, after[t])[0]
+    now[:] = after
 
 
 @compiled
@@ -188,26 +228,26 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     z, weights, temperature = work.first, work.weights, work.temperature
     count, w, material = ratios.order + model.steps, ratios.weights, work.material
     combined = w[0] * work.coefficients[0] + w[1] * work.coefficients[1]
-    kernels.combined(model.object_part, combined, count, work.target)
+    kernels.combined(model.object_part, model.spans, combined, count, work.target)
     kernels.temperature(model.second, work.target, temperature)
     largest = max(1.0, ratios.ratio)
     middle = 0.5 * (1.0 + (largest - 1.0) / largest)
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
-    _responses(model, temperature, work)
-    guess = kernels.moments(work.emitted, z, work.ones)[0]
+    kernels.blackbody(model.first, temperature, work.emitted, work.spare)
+    work.partial[:] = 1.0
+    guess = kernels.moments(work.emitted, z, work.partial)[0]
     emissivity = guess if 0 < guess < 1 else middle
-    _newton(ratios, emissivity, work)
     known = ratios.pooled and not np.isnan(material[2])
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
     for turn in range(emissions.ROUNDS):
-        _responses(model, temperature, work)
+        _approach(model, ratios, emissivity, work)
         slope, variance, scale, energy = kernels.regress(
             work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
         )
         constant = energy < emissions.OBJECT_TO_NOISE * count * ratios.null_variance and not known
         emissivity = material[2] if known else middle if constant else slope
-        _newton(ratios, emissivity, work)
+    _arrive(model, ratios, emissivity, work)
     other = 1.0 - ratios.ratio * (1.0 - emissivity)
     return Line((emissivity, other), variance, scale, energy, constant, known)
 
@@ -216,31 +256,41 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
 def background(model: Model, line: Line, work: Work) -> None:
     """Step 4 (eq. 9), and the bend of the reflections (eq. 11), in place."""
     z, other, mean, result, bend = work.first, work.second, work.mean, work.background, work.bend
-    at_object, other_at_object = work.at_object, work.other_at_object
-    kernels.blackbody(model.first, work.temperature, at_object, work.object_slope)
-    kernels.blackbody(model.second, work.temperature, other_at_object, work.other_object_slope)
     first, last = line.emissivity
     one, two = ((1.0 - first) / model.noise[0]) ** 2, ((1.0 - last) / model.noise[1]) ** 2
     one, two = one / (one + two), two / (one + two)
-    inverse, other_inverse = 1.0 / (1.0 - first), 1.0 / (1.0 - last)
+    inverse, other_inverse, reflected = 1.0 / (1.0 - first), 1.0 / (1.0 - last), work.spare
     for t in range(z.size):
-        reflected = (z[t] - first * at_object[t]) * inverse
-        work.reflected[t] = (other[t] - last * other_at_object[t]) * other_inverse
-        mean[t] = one * reflected + two * work.reflected[t]
+        reflected[t] = (z[t] - first * work.at_object[t]) * inverse
+        bend[t] = (other[t] - last * work.other_at_object[t]) * other_inverse
+        mean[t] = one * reflected[t] + two * bend[t]
     # From the temperature of the mean signal, one Gauss-Newton step on the exact responses.
     kernels.temperature(model.first, mean, result)
-    kernels.response(model.first, result, work.back_slope, 1)
-    kernels.blackbody(model.second, result, bend, work.other_back_slope)
+    middle, half, scale, outside = model.first.middle, model.first.half, 1.0 / model.first.half, 0.0
+    apart = kernels.mixed(1.0, model.second.signal, -1.0, model.first.signal)
     for t in range(z.size):
-        a, b = work.back_slope[t], work.other_back_slope[t]
-        reflected = (z[t] - first * at_object[t]) * inverse
-        step = one * a * (reflected - mean[t]) + two * b * (work.reflected[t] - bend[t])
-        result[t] += step / (one * a**2 + two * b**2)
-    kernels.response(model.second, result, bend, 0)
-    kernels.response(model.first, result, mean, 0)
-    finite = 0.0
-    for t in range(bend.size):
-        bend[t] = (1.0 - last) * (bend[t] - mean[t])
-        finite += bend[t] * 0.0
+        x = (result[t] - middle) * scale
+        u, a = kernels.with_slope(model.first.signal, x)
+        v, b = kernels.with_slope(model.second.signal, x)
+        step = one * a * (reflected[t] - u) + two * b * (bend[t] - v)
+        y = x + step / (one * a**2 + two * b**2)
+        outside += 0.0 if (abs(x) <= 1.0) & (abs(y) <= 1.0) else 1.0
+        work.back_slope[t], work.other_back_slope[t] = a * scale, b * scale
+        mean[t] = middle + half * y
+        bend[t] = (1.0 - last) * kernels.polynomial(apart, y)
+    if outside > 0.0:
+        for t in range(z.size):
+            if not max(abs(result[t] - middle), abs(mean[t] - middle)) <= half:
+                u, a = kernels.exact(model.first, result[t])
+                v, b = kernels.exact(model.second, result[t])
+                other_reflected = (other[t] - last * work.other_at_object[t]) * other_inverse
+                step = one * a * (reflected[t] - u) + two * b * (other_reflected - v)
+                work.back_slope[t], work.other_back_slope[t] = a, b
+                mean[t] = result[t] + step / (one * a**2 + two * b**2)
+                apart_exactly = kernels.exact(model.second, mean[t])[0]
+                apart_exactly -= kernels.exact(model.first, mean[t])[0]
+                bend[t] = (1.0 - last) * apart_exactly
+    result[:] = mean
+    finite = kernels.mean(bend) * 0.0
     if not (0 < first < 1 and 0 < last < 1 and finite == 0):
         bend[:] = 0.0

@@ -2,11 +2,9 @@
 
 from typing import Any, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import kernels
+from dbthermal.separation._tiles import Whole
 
 
 class Model(NamedTuple):
@@ -16,7 +14,9 @@ class Model(NamedTuple):
     second: kernels.Table
     functions: Array  # (column, time), of `smooth.Subspace`
     object_part: Array  # (column, time)
+    spans: Whole  # first frames of these functions, and the ends (column, 2)
     rising: Array  # (degree, time)
+    whole: Whole  # of these (degree, 2)
     spread: float  # of the first of these
     leverage: Array  # (order, time)
     steps: int
@@ -26,9 +26,9 @@ class Model(NamedTuple):
     rate: float  # change of the ratio of the responses' slopes with the background [1/K]
     gray: Array  # ratios of the slopes at temperatures of the background [1]
     widened: Array  # of the octaves' variances, at the end of their 95 % interval [1]
-    edges: npt.NDArray[np.intp]  # of the blocks of a residual
+    edges: Whole  # of the blocks of a residual
     limits: tuple[float, float]  # of its chi-square statistics
-    parts: npt.NDArray[np.intp]  # of the means by which pieces are asked for
+    parts: Whole  # of the means by which pieces are asked for
     lowest: float  # calibrated temperatures [K]
     highest: float
 
@@ -39,25 +39,18 @@ class Work(NamedTuple):
     first: Array  # signals [K]
     second: Array
     straight: Array  # the second less the bend of the reflections
-    ones: Array
     target: Array  # null combination of the bands, smoothed (eq. 5)
     temperature: Array  # of the object [K]
-    emitted: Array  # signals of the object at the last regression, and their slopes
-    other: Array
-    slope: Array
-    other_slope: Array
+    emitted: Array  # signal of the object at the last regression
     steepness: Array  # see `emission._Fit`
     partial: Array
     weights: Array  # of the regression
     residual: Array
     kernel: Array
     spare: Array
-    at_object: Array  # signals of the object, and their slopes
+    at_object: Array  # signals of the object
     other_at_object: Array
-    object_slope: Array
-    other_object_slope: Array
     mean: Array  # signal of the background
-    reflected: Array  # of the second band
     background: Array  # [K]
     back_slope: Array
     other_back_slope: Array
@@ -72,6 +65,6 @@ class Work(NamedTuple):
     few: Any  # in single precision (6, time)
     coefficients: Array  # of the signals on the functions (2, column)
     columns: Array  # (column)
-    spectrum: Array  # (column)
+    spectra: Array  # (2, degree)
     scatter: Array  # see `reflection_ratio`, first, mixed and last element (order, 3)
     material: Array  # ratio, inverse energy, emissivity, its two variances; NaN for none
