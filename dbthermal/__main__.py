@@ -177,6 +177,10 @@ result.zarr aligned.zarr response.zarr --region 10 60 10 90 -o scene.html
 data steps.data
 list the filters and materials that come with the package
 --json
+
+completion main.completion
+print the completion of commands for bash, taken over by: eval "$(dbthermal completion)"
+-
 """
 """Command, its function and arguments; its summary; examples."""
 
@@ -189,7 +193,9 @@ def _parser() -> argparse.ArgumentParser:
     for block in _COMMANDS.replace(" \\\n    ", " ").strip().split("\n\n"):
         head, summary, *lines = block.splitlines()
         name, place, *arguments = head.split()
-        ends = "\n".join(["examples:", *(f"  dbthermal {name} {line}" for line in lines)])
+        ends = "\n".join(
+            ["examples:", *(f"  dbthermal {name} {line}".rstrip(" -") for line in lines)]
+        )
         title = f"{summary[0].upper()}{summary[1:]}."
         added = commands.add_parser(name, help=summary, description=title, epilog=ends, **plain)
         added.set_defaults(place=place)
@@ -252,6 +258,9 @@ def _reason(error: Exception, command: str) -> str:
 
 def _carry_out(options: argparse.Namespace) -> int:
     """Check what is read and written, run the command, and print its summary."""
+    if options.command == "completion":
+        print(_completion())
+        return 0
     if options.command == "record":
         return int(_function(options)(options))
     values = vars(options).items()
@@ -275,6 +284,21 @@ def _carry_out(options: argparse.Namespace) -> int:
     text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
     print(text, flush=True)
     return 0
+
+
+def _completion() -> str:
+    """Function of bash for the names of commands and of their options; files are left to it."""
+    commands: Any = next(one for one in _parser()._actions if one.choices)
+    named = {name: " ".join(one._option_string_actions) for name, one in commands.choices.items()}
+    cases = "\n".join(f"    {name}) words='{words}';;" for name, words in named.items())
+    return f"""_dbthermal() {{
+  local words='{" ".join(named)}'
+  [ "$COMP_CWORD" -gt 1 ] && case "${{COMP_WORDS[1]}}" in
+{cases}
+  esac
+  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o default -F _dbthermal dbthermal"""
 
 
 def _function(options: argparse.Namespace) -> Any:

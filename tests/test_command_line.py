@@ -309,6 +309,17 @@ def test_missing_extras_are_named(
     assert f"pip install 'dbthermal[{extra}]'" in line
 
 
+def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
+    """Bash takes the completion over, and completes a command and an option of one."""
+    (tmp_path / "completion").write_text(run(tmp_path, "completion").stdout, encoding="utf-8")
+    for typed, completed in ((["al"], "align"), (["align", "--ref"], "--reference")):
+        words = f"COMP_WORDS=(dbthermal {' '.join(typed)}); COMP_CWORD={len(typed)}"
+        code = f"source completion; {words}; _dbthermal; echo ${{COMPREPLY[@]}}"
+        command = ["bash", "-c", code]
+        found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert found.stdout.split() == [completed]
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_examples(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """The help of every command has examples that the parser takes."""
