@@ -24,6 +24,7 @@ __dir__ = __all__.copy
 
 _EXTRAS: Final = {
     **dict.fromkeys(("anywidget", "ipywidgets"), "explorer"),
+    "jinja2": "report",
     **dict.fromkeys(("pydantic", "serial", "usb", "yaml"), "instruments"),
     **dict.fromkeys(("h5netcdf", "h5py", "tifffile"), "recordings"),
     "av": "video",
@@ -64,8 +65,9 @@ capture path            store of a capture
 correction path?        store of gain and offset; none if the cameras correct them
 response path           store of the cameras' response
 result path             store of a result
+shown path*             its capture, and the cameras' response, to be shown beside it
 materials text*         as listed by 'data'; all by default
---output path!          store *.zarr that is made; of 'export' *.csv, *.tif, *.png or *.nc
+--output path!          what is made: store *.zarr, or of the kind that the examples below have
 --overwrite flag        replace the output
 --dry-run flag          only say what would be read and written
 --json flag             print the summary as JSON
@@ -164,9 +166,21 @@ result.zarr --variable background_temperature -o film.tif
 result.zarr -o object.png
 result.zarr -o result.nc
 
+explore export.explore result shown --output
+make a notebook to look around in a result or a capture, for JupyterLab
+result.zarr aligned.zarr response.zarr -o look.ipynb
+
+report export.report result shown --region --output
+write a report on a result, one HTML file that needs no network
+result.zarr aligned.zarr response.zarr --region 10 60 10 90 -o scene.html
+
 data steps.data
 list the filters and materials that come with the package
 --json
+
+completion main.completion
+print the completion of commands for bash, taken over by: eval "$(dbthermal completion)"
+-
 """
 """Command, its function and arguments; its summary; examples."""
 
@@ -179,7 +193,9 @@ def _parser() -> argparse.ArgumentParser:
     for block in _COMMANDS.replace(" \\\n    ", " ").strip().split("\n\n"):
         head, summary, *lines = block.splitlines()
         name, place, *arguments = head.split()
-        ends = "\n".join(["examples:", *(f"  dbthermal {name} {line}" for line in lines)])
+        ends = "\n".join(
+            ["examples:", *(f"  dbthermal {name} {line}".rstrip(" -") for line in lines)]
+        )
         title = f"{summary[0].upper()}{summary[1:]}."
         added = commands.add_parser(name, help=summary, description=title, epilog=ends, **plain)
         added.set_defaults(place=place)
@@ -222,14 +238,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if options.traceback:
             raise
-        status, reason = 1, _reason(error)
+        status, reason = 1, _reason(error, options.command)
     print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
     return status
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: Exception, command: str) -> str:
     """Message of an error in one line, with the extra that a missing library belongs to."""
-    if isinstance(error, ImportError) and (extra := _EXTRAS.get(str(error.name).split(".")[0])):
+    extra = _EXTRAS.get(str(error.name).split(".")[0]) if isinstance(error, ImportError) else None
+    if isinstance(error, ImportError) and extra:
+        extra = command if command == "report" else extra  # which has all that it needs
         rule = f"Must be installed: python -m pip install 'dbthermal[{extra}]'"
         return f"Missing library '{error.name}', of the extra '{extra}'. {rule}."
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
@@ -240,6 +258,9 @@ def _reason(error: Exception) -> str:
 
 def _carry_out(options: argparse.Namespace) -> int:
     """Check what is read and written, run the command, and print its summary."""
+    if options.command == "completion":
+        print(_completion())
+        return 0
     if options.command == "record":
         return int(_function(options)(options))
     values = vars(options).items()
@@ -263,6 +284,21 @@ def _carry_out(options: argparse.Namespace) -> int:
     text = json.dumps(summary, default=_plain) if options.json else "\n".join(_lines(summary))
     print(text, flush=True)
     return 0
+
+
+def _completion() -> str:
+    """Function of bash for the names of commands and of their options; files are left to it."""
+    commands: Any = next(one for one in _parser()._actions if one.choices)
+    named = {name: " ".join(one._option_string_actions) for name, one in commands.choices.items()}
+    cases = "\n".join(f"    {name}) words='{words}';;" for name, words in named.items())
+    return f"""_dbthermal() {{
+  local words='{" ".join(named)}'
+  [ "$COMP_CWORD" -gt 1 ] && case "${{COMP_WORDS[1]}}" in
+{cases}
+  esac
+  COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
+}}
+complete -o default -F _dbthermal dbthermal"""
 
 
 def _function(options: argparse.Namespace) -> Any:

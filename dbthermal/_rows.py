@@ -15,17 +15,16 @@ from xarray.core import indexing
 
 Values = npt.NDArray[Any]
 
-# Samples of a block that is computed at once.
-_BLOCK: Final = 2**24
+_BLOCK: Final = 2**24  # samples of a block that is computed at once
 
 
 class _Rows(BackendArray):
-    """Array (..., y, x) by a function of some rows of it."""
+    """Array (..., y, x) of float32 by a function of some rows of it."""
 
-    def __init__(
-        self, compute: Callable[[slice], Values], shape: tuple[int, ...], dtype: str
-    ) -> None:
-        self._compute, self.shape, self.dtype = compute, shape, np.dtype(dtype)
+    dtype = np.dtype("float32")
+
+    def __init__(self, compute: Callable[[slice], Values], shape: tuple[int, ...]) -> None:
+        self._compute, self.shape = compute, shape
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Values:
         kind = indexing.IndexingSupport.OUTER
@@ -54,10 +53,8 @@ def blocks(shape: tuple[int, ...], samples: int = 0) -> Iterator[slice]:
         yield slice(top, min(top + rows, height))
 
 
-def lazy(
-    compute: Callable[[slice], Values], like: xr.DataArray, dtype: str = "float32"
-) -> xr.DataArray:
-    """Array of the dims (..., y, x), coordinates and attributes of another, computed by rows."""
-    array = _Rows(compute, like.shape, dtype)
+def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray:
+    """Array (..., y, x) as another, with its coordinates and attributes, computed by rows."""
+    array = _Rows(compute, like.shape)
     variable = xr.Variable(like.dims, indexing.LazilyIndexedArray(array), like.attrs)
     return xr.DataArray(variable, coords=like.coords, name=like.name)

@@ -30,8 +30,7 @@ PIXELS: Final = 16  # about as many pixels tell the noise and the step of the co
 
 # The probability of a value is taken so much larger, for noise that differs from pixel to pixel.
 _MARGIN: Final = 1.25
-# Probability of a value above which counts are too coarse to be judged.
-_COARSE: Final = 0.4
+_COARSE: Final = 0.4  # probability of a value above which counts are too coarse to be judged
 # A pixel, or a frame, is taken for spoilt by chance once in so many.
 _FALSE_ALARM: Final = 1e-5
 FEWEST: Final = 3
@@ -39,8 +38,7 @@ FEWEST: Final = 3
 
 # Distance from a multiple of the step at which a change of counts is none.
 _OFF_MULTIPLE: Final = 0.01
-# Width [noise] of the end of a pixel's values.
-_END: Final = 2.0
+_END: Final = 2.0  # width [noise] of the end of a pixel's values
 
 
 def noise(signal: npt.NDArray[Any]) -> Array:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask
 
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 
@@ -51,7 +51,7 @@ class Subspace:
             )
         return result.T
 
-    def columns(self, order: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
+    def columns(self, order: npt.NDArray[np.intp]) -> Mask:
         """Columns in use (column, pixel) at each pixel's order, 1 for the constant alone."""
         places = np.arange(self.functions.shape[1])[:, np.newaxis]
         return np.asarray(places < order + self.steps)
@@ -80,7 +80,7 @@ def subspace(
 
 def piecewise(
     time: npt.ArrayLike,
-    first: npt.NDArray[np.bool_],
+    first: Mask,
     rising: Array,
     *,
     segment: npt.NDArray[np.integer] | None = None,
@@ -140,22 +140,14 @@ def _without_steps(before: Array, steps: list[Array], after: Array) -> tuple[Arr
 def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
     r"""Orthonormal polynomials over given times, the discrete Legendre polynomials.
 
+    Column j (..., time, order) is a polynomial of degree j, and :math:`\Phi^T \Phi = 1`.
+
     Parameters
     ----------
     time : array_like, shape (..., time)
         Times [s], strictly increasing, not necessarily evenly spaced; of many captures at once.
     order : int
-        Number of functions, the constant included.
-
-    Returns
-    -------
-    ndarray, shape (..., time, order)
-        Column j is a polynomial of degree j; :math:`\Phi^T \Phi = 1`.
-
-    Raises
-    ------
-    ValueError
-        If the order is not in [1, number of times].
+        Number of functions, the constant included, at most that of the times, or a ValueError.
     """
     time = np.asarray(time, dtype=np.float64)
     frames = time.shape[-1]

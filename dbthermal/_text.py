@@ -175,15 +175,12 @@ def parse_json(text: str, source: str) -> Any:
 def read_yaml(path: str | Path) -> dict[Any, Any]:
     """Mapping in a YAML file, whose values mean the same in YAML 1.1 and 1.2.
 
+    Keys are text or numbers; values are mappings, lists, text, finite numbers, bool or None.
+
     Parameters
     ----------
     path : str or Path
         Regular file in UTF-8 of at most `YAML_LIMIT` bytes.
-
-    Returns
-    -------
-    dict
-        Keys are text or numbers; values are mappings, lists, text, finite numbers, bool or None.
 
     Raises
     ------

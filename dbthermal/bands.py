@@ -160,12 +160,7 @@ def get(name: str) -> Band:
     Parameters
     ----------
     name : str
-        Name, e.g. "9.5".
-
-    Raises
-    ------
-    KeyError
-        If there is no such filter; the error lists those known.
+        Name, e.g. "9.5"; KeyError, which lists those known, for another.
 
     Examples
     --------

@@ -20,7 +20,10 @@ __dir__ = __all__.copy
 def correlation(
     first: xr.DataArray, second: xr.DataArray, mask: xr.DataArray | None = None
 ) -> xr.DataArray:
-    """Pearson's correlation [1] of two maps, frame by frame.
+    """Pearson's correlation of two maps, in [-1, 1], over the dims other than y and x.
+
+    ValueError if coordinates differ, fewer than two pixels count, one is not finite, or a map is
+    constant.
 
     Parameters
     ----------
@@ -28,16 +31,6 @@ def correlation(
         Maps (..., y, x), each in a unit of its own.
     mask : DataArray of bool, optional
         Pixels (y, x) that count; all by default.
-
-    Returns
-    -------
-    DataArray
-        Correlation [1], in [-1, 1], over the dims other than y and x.
-
-    Raises
-    ------
-    ValueError
-        If coordinates differ, fewer than two pixels count, one is not finite, or a map is constant.
 
     Examples
     --------
@@ -57,7 +50,8 @@ def correlation(
     if np.any(norm <= 0):
         raise ValueError(f"Constant map in {np.sum(norm <= 0)} of {norm.size} frames. Must vary.")
     result = first.isel(y=0, x=0, drop=True).copy(data=np.sum(left * right, axis=-1) / norm)
-    return _labelled(result, "correlation", "1", "correlation of the maps")
+    attrs = {"long_name": "correlation of the maps", "units": "1"}
+    return result.drop_attrs(deep=False).rename("correlation").assign_attrs(attrs)
 
 
 def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.DataArray:
@@ -71,17 +65,8 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     Parameters
     ----------
     estimate, truth : DataArray
-        Temperatures [K].
-
-    Returns
-    -------
-    DataArray
-        Error [percent], of the broadcast shape. NaN where the estimate is NaN.
-
-    Raises
-    ------
-    ValueError
-        If coordinates differ, a unit is not K, or a true temperature is not above 273.15 K.
+        Temperatures [K] of the same coordinates; ValueError if a true one is not above 273.15 K.
+        The result is NaN where the estimate is.
 
     Examples
     --------
@@ -103,7 +88,8 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     truth = laid_on(truth, estimate, "the truth", "the estimate")
     result = 100.0 * abs(estimate - truth) / (truth - zero_Celsius)
     label = "error relative to the true temperature in degrees Celsius"
-    return _labelled(result, "relative_error", "percent", label)
+    bare: xr.DataArray = result.drop_attrs(deep=False).rename("relative_error")
+    return bare.assign_attrs(long_name=label, units="percent")
 
 
 def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
@@ -127,8 +113,3 @@ def _centred(maps: xr.DataArray, mask: xr.DataArray | None) -> Array:
     # The correlation has no unit: in that of the largest value no square overflows.
     chosen /= max(float(np.abs(chosen).max()), np.finfo(np.float64).tiny)
     return np.asarray(chosen - chosen.mean(axis=-1, keepdims=True))
-
-
-def _labelled(result: xr.DataArray, name: str, units: str, long_name: str) -> xr.DataArray:
-    """Result with a name, a unit and a meaning."""
-    return result.drop_attrs(deep=False).rename(name).assign_attrs(long_name=long_name, units=units)

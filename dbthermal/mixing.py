@@ -29,11 +29,6 @@ def mixed(emissivity: Any, emitted: Any, reflected: Any) -> Any:
     emitted, reflected : array or tensor
         Blackbody signals at the object's and at the background's temperature, in one unit.
 
-    Returns
-    -------
-    array or tensor
-        Signal in the same unit, of the broadcast shape.
-
     Examples
     --------
     >>> mixed(0.9, 60.0, 20.0)
@@ -51,11 +46,6 @@ def background(emissivity: Any, signal: Any, emitted: Any) -> Any:
         Emissivity e [1], not 1.
     signal, emitted : array or tensor
         Signal of the surface, and blackbody signal at the object's temperature, in one unit.
-
-    Returns
-    -------
-    array or tensor
-        Signal in the same unit, of the broadcast shape.
     """
     return (signal - emissivity * emitted) / (1.0 - emissivity)
 
@@ -66,19 +56,9 @@ def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.Ar
     Parameters
     ----------
     emissivity : array_like
-        Emissivity [1].
+        Emissivity [1]; ValueError if one lies outside [0, 1] or is NaN.
     emitted, reflected : array_like
         Blackbody signal at the object's and at the background's temperature, in one unit.
-
-    Returns
-    -------
-    ndarray
-        Signal in the same unit, of the broadcast shape.
-
-    Raises
-    ------
-    ValueError
-        If an emissivity lies outside [0, 1] or is NaN.
 
     Examples
     --------
@@ -95,35 +75,26 @@ def leaving(emissivity: npt.ArrayLike, emitted: npt.ArrayLike, reflected: npt.Ar
 
 
 def matrix(emissivity: npt.ArrayLike) -> Array:
-    r"""Mixing matrix E of several bands, rows :math:`(e_m, 1 - e_m)`.
+    r"""Mixing matrix (..., band, 2) of several bands, rows :math:`(e_m, 1 - e_m)`: equation 14.
 
     Parameters
     ----------
     emissivity : array_like, shape (..., band)
         Emissivity a band [1].
-
-    Returns
-    -------
-    ndarray, shape (..., band, 2)
-        Columns: weight of the object, weight of the background (equation 14 of the paper).
     """
     emissivity = np.asarray(emissivity, dtype=np.float64)
     return np.stack([emissivity, 1.0 - emissivity], axis=-1)
 
 
 def condition_number(emissivity: npt.ArrayLike) -> Array:
-    """Condition number of the mixing matrix in the 2-norm; infinite for a gray body.
+    """Condition number (...) of the mixing matrix in the 2-norm, 1 at best.
+
+    Infinite for a gray body, NaN of an unknown emissivity.
 
     Parameters
     ----------
     emissivity : array_like, shape (..., band)
         Emissivity a band [1]; at least two bands.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Ratio of the largest to the smallest singular value, 1 at best; NaN of an unknown
-        emissivity.
 
     Examples
     --------

@@ -40,23 +40,15 @@ _CORRELATION_STD = np.sqrt(35.0 / 18.0)
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """Second difference in time of signals (time, pixel), in which white noise keeps its variance.
 
+    Each sample less the line through its two neighbours (time - 2, pixel), over the root of the sum
+    of the squared weights.
+
     Parameters
     ----------
     signal : Array
-        Signals (time, pixel).
+        Signals (time, pixel); ValueError if a sample is infinite.
     time : array_like
         Times (time,) [s], which need not be even.
-
-    Returns
-    -------
-    Array
-        Each sample less the line through its two neighbours (time - 2, pixel), over the root of the
-        sum of the squared weights.
-
-    Raises
-    ------
-    ValueError
-        If a sample is infinite.
     """
     if np.any(np.isinf(signal)):
         raise ValueError("Invalid signal: infinite. Must be finite, or NaN.")
@@ -67,7 +59,7 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
 
 
 def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, float]:
-    r"""Noise of two bands from their signals.
+    r"""Noise of two bands, as standard deviations in the units of their signals.
 
     For each pixel, with D the covariance of the trimmed second differences of the residual on a
     smooth curve, and k the ratio of the bands' rapid changes (from their covariance one frame
@@ -88,11 +80,6 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
         Signals of the two bands, each in a unit of its own.
     time : array_like, shape (time,)
         Times [s].
-
-    Returns
-    -------
-    tuple of float
-        Standard deviations of the noise, in the signals' units.
 
     Raises
     ------
@@ -166,15 +153,11 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
         return np.array(estimate(signals[0], signals[1], time))
     rough = [np.median(np.abs(second_difference(part, time))) for part in signals]
     quiet = int(np.argmin(rough))
-    pairs = {
-        band: estimate(signals[quiet], part, time)
-        for band, part in enumerate(signals)
-        if band != quiet
-    }
+    others = [band for band in range(len(signals)) if band != quiet]
+    pairs = [estimate(signals[quiet], signals[band], time) for band in others]
     result = np.empty(len(signals))
-    result[quiet] = np.median([pair[0] for pair in pairs.values()])
-    for band, pair in pairs.items():
-        result[band] = pair[1]
+    result[quiet] = np.median([pair[0] for pair in pairs])
+    result[others] = [pair[1] for pair in pairs]
     return result
 
 

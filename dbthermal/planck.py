@@ -32,7 +32,7 @@ Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 
 
 def require_positive(name: str, value: npt.ArrayLike) -> Array:
-    """Value as a float array, of which every element must be finite and positive.
+    """Value as a float array, of which every element must be finite and positive, or a ValueError.
 
     Parameters
     ----------
@@ -40,16 +40,6 @@ def require_positive(name: str, value: npt.ArrayLike) -> Array:
         Name of the quantity, for the error.
     value : array_like
         Its values, of any shape.
-
-    Returns
-    -------
-    Array
-        The values as float64.
-
-    Raises
-    ------
-    ValueError
-        If an element is not finite and positive, with the name and the first such element.
     """
     array = np.asarray(value, dtype=np.float64)
     bad = ~(np.isfinite(array) & (array > 0))
@@ -66,22 +56,12 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
     The first equation of the paper (doi:10.48550/arXiv.2509.11334) has the factor :math:`\lambda^5`
     and the :math:`-1` on one level of the denominator; this is the law as Planck gave it.
 
+    ValueError if a wavelength or a temperature is not finite and positive.
+
     Parameters
     ----------
-    wavelength : array_like
-        Wavelength [m], broadcast against the temperature.
-    temperature : array_like
-        Temperature [K].
-
-    Returns
-    -------
-    ndarray
-        Spectral radiance [W m^-2 sr^-1 m^-1], of the broadcast shape.
-
-    Raises
-    ------
-    ValueError
-        If a wavelength or a temperature is not finite and positive.
+    wavelength, temperature : array_like
+        Wavelength [m] and temperature [K], broadcast against one another.
 
     Examples
     --------
@@ -109,10 +89,8 @@ def spectral_radiance_slope(wavelength: npt.ArrayLike, temperature: npt.ArrayLik
 
     Parameters
     ----------
-    wavelength : array_like
-        Wavelength [m].
-    temperature : array_like
-        Temperature [K].
+    wavelength, temperature : array_like
+        Wavelength [m] and temperature [K].
     """
     radiance = spectral_radiance(wavelength, temperature)
     temperature = np.asarray(temperature, dtype=np.float64)
@@ -129,10 +107,8 @@ def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -
 
     Parameters
     ----------
-    wavelength : array_like
-        Wavelength [m].
-    radiance : array_like
-        Spectral radiance [W m^-2 sr^-1 m^-1].
+    wavelength, radiance : array_like
+        Wavelength [m] and spectral radiance [W m^-2 sr^-1 m^-1].
 
     Examples
     --------

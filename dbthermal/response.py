@@ -36,8 +36,7 @@ KINDS: Final = ("exact", "linear")
 COEFFICIENTS: Final = ("amplitude", "effective_wavelength", "wavelength_shift", "offset")
 """Variables of a response that hold the Sakuma-Hattori curve."""
 
-# Temperatures at which the slope of a curve is checked.
-_SLOPE_POINTS: Final = 16
+_SLOPE_POINTS: Final = 16  # temperatures at which the slope of a curve is checked
 
 
 @dataclass(frozen=True)
@@ -167,12 +166,7 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
     curve : Curve
         Curve of a band.
     name : str
-        Name of the temperatures, for the error.
-
-    Raises
-    ------
-    ValueError
-        With the name and the first temperature that lies outside or is NaN.
+        Name of the temperatures, for the ValueError with the first that lies outside or is NaN.
     """
     values = np.asarray(temperature, dtype=np.float64)
     bad = ~((values >= curve.lowest) & (values <= curve.highest))
@@ -195,11 +189,6 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
         Name of the band.
     kind : {"exact", "linear"}
         Sakuma-Hattori, or the linear pair.
-
-    Returns
-    -------
-    Curve
-        Of the kind wanted; a `LinearCurve` if linear.
 
     Raises
     ------
@@ -239,15 +228,10 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     Parameters
     ----------
     response : Dataset
-        Response of stage `response`.
+        Stage `response` of `schema`, with a finite and positive `noise` of each band, or a
+        ValueError.
     bands : list of str
         Names of the bands, in the order of the result.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If there is no noise, its dims or unit are others, a band is missing, or a value is not
-        finite and positive.
     """
     if "noise" not in response:
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
@@ -263,7 +247,7 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     return values
 
 
-def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact") -> xr.DataArray:
+def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
     """Counts (band, ...) [count] of a blackbody in every band of a response.
 
     Parameters
@@ -271,32 +255,20 @@ def counts(response: xr.Dataset, temperature: xr.DataArray, kind: str = "exact")
     response : Dataset
         Stage `response` of `schema`.
     temperature : DataArray
-        Temperature [K], any dims but `band`.
-    kind : {"exact", "linear"}
-        Kind of response.
-
-    Returns
-    -------
-    DataArray
-        Counts (band, ...) [count].
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the calibrated range of the response.
+        Temperature [K] in the calibrated range, or a ValueError; any dims but `band`.
     """
     names = [str(name) for name in response["band"].values]
-    curves = [curve(response, name, kind) for name in names]
+    curves = [curve(response, name) for name in names]
     values = require_range(temperature.values, curves[0], "temperature")
     parts = [temperature.copy(data=one.counts(values)) for one in curves]
     result = xr.concat(parts, dim=xr.DataArray(names, dims="band", name="band"))
     return result.assign_attrs(schema.STAGES["blackbody"]["counts"].attrs).rename("counts")
 
 
-def apparent_temperature(
-    response: xr.Dataset, counts: xr.DataArray, kind: str = "exact"
-) -> xr.DataArray:
-    """Temperature of the blackbody that would give the same counts, band by band.
+def apparent_temperature(response: xr.Dataset, counts: xr.DataArray) -> xr.DataArray:
+    """Temperature (band, ...) [K] of the blackbody that would give the same counts, band by band.
+
+    Extrapolated beyond the calibrated range; NaN where no temperature gives such counts.
 
     Parameters
     ----------
@@ -304,19 +276,6 @@ def apparent_temperature(
         Stage `response` of `schema`.
     counts : DataArray
         (band, ...) [count].
-    kind : {"exact", "linear"}
-        Kind of response.
-
-    Returns
-    -------
-    DataArray
-        Apparent temperature (band, ...) [K], extrapolated beyond the calibrated range; NaN where
-        no temperature gives such counts.
-
-    Raises
-    ------
-    ValueError
-        If a band is missing in the response.
 
     Examples
     --------
@@ -332,8 +291,7 @@ def apparent_temperature(
         raise ValueError(f"Invalid dims {counts.dims} of the counts. Must begin with 'band'.")
     names = [str(name) for name in counts["band"].values]
     values = [
-        curve(response, name, kind).inverse(part)
-        for name, part in zip(names, counts.values, strict=True)
+        curve(response, name).inverse(part) for name, part in zip(names, counts.values, strict=True)
     ]
     result = counts.copy(data=np.stack(values)).rename("apparent_temperature")
     return result.assign_attrs(units="K", long_name="apparent temperature")

@@ -58,7 +58,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     3. `separation.separate`.
 
     Clocks and shift are found in a reduced picture, of means over some pixels and frames, if the
-    capture is large.
+    capture is large. Errors as the steps; ImportError without OpenCV, for a registration.
 
     Parameters
     ----------
@@ -88,13 +88,6 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         As from `separation.separate`, on the first band's grid, and `reflection_shift`
         (axis, y, x) [pixel] where the cameras see reflections apart. Attributes of the alignment:
         `clock`, `time_offset` [s], `frames_lost`, `transform`. From a `target` it is lazy.
-
-    Raises
-    ------
-    ImportError
-        If OpenCV, for a registration, is not installed.
-    TypeError, ValueError
-        As the steps do.
 
     Examples
     --------

@@ -1,21 +1,34 @@
 """Glossary: dimensions, type, unit and meaning of every variable at each stage of the data stream.
 
 A name is agreed here first, then used. `check` holds a dataset against its stage and raises with
-the value that offends. The stages follow the stream: capture, corrected, separated; calibration
-data, a response and an emissivity table stand beside it. ``python -m dbthermal.schema`` prints the
-glossary as text, which is docs/nomenclature.md.
+the value that offends. ``python -m dbthermal.schema`` prints the glossary as docs/nomenclature.md.
 """
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import IntFlag
-from types import MappingProxyType
 from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+
+from dbthermal._glossary import (
+    COORDINATES,
+    EMISSIVITY_LIMITS,
+    EXPOSURE_TIME,
+    FRAME_FLAGS,
+    LARGEST,
+    NOISE,
+    NOISE_FACTOR,
+    OPTIONAL,
+    PATTERN_STD,
+    SEGMENT,
+    SHUTTER_CLOSED,
+    STAGES,
+    STATUS,
+    Variable,
+)
 
 __all__ = [
     "COMPLETED",
@@ -25,7 +38,9 @@ __all__ = [
     "FRAME_FLAGS",
     "LARGEST",
     "NOISE",
+    "NOISE_FACTOR",
     "OPTIONAL",
+    "PATTERN_STD",
     "SEGMENT",
     "SHUTTER_CLOSED",
     "STAGES",
@@ -42,179 +57,9 @@ __all__ = [
     "measured",
     "nomenclature",
     "status_attrs",
+    "variables",
 ]
 __dir__ = __all__.copy
-
-
-@dataclass(frozen=True)
-class Variable:
-    """Definition of a variable: dimensions in order, type as written, unit, and meaning.
-
-    Attributes
-    ----------
-    dims : tuple of str
-        Dimensions, in order.
-    dtype : str
-        Type as written; read, any real type of the same kind passes.
-    units, long_name : str
-        Unit and meaning.
-    more : mapping
-        Further attributes.
-    """
-
-    dims: tuple[str, ...]
-    dtype: str
-    units: str
-    long_name: str
-    more: Mapping[str, Any] = field(default_factory=dict, hash=False)
-
-    @property
-    def attrs(self) -> dict[str, Any]:
-        """Attributes to write on the variable."""
-        return {"units": self.units, "long_name": self.long_name, **self.more}
-
-
-def _of(dims: str, units: str, long_name: str, dtype: str = "float64") -> Variable:
-    return Variable(tuple(dims.split()), dtype, units, long_name)
-
-
-def _with_std(name: str, dims: str, units: str, long_name: str) -> dict[str, Variable]:
-    return {
-        name: _of(dims, units, long_name, "float32"),
-        f"{name}_std": _of(dims, units, f"standard deviation of {long_name}", "float32"),
-    }
-
-
-COORDINATES: Final = MappingProxyType(
-    {
-        "time": _of("time", "s", "time since the first frame"),
-        "temperature": _of("temperature", "K", "blackbody temperature"),
-        "wavelength": _of("wavelength", "m", "wavelength"),
-    }
-)
-"""Coordinates with a unit; they must increase strictly. Coordinate `band` names each band."""
-
-NOISE: Final = _of("band", "count", "noise of one pixel and frame")
-"""Variable `noise`: standard deviation of one pixel's counts from frame to frame."""
-
-EXPOSURE_TIME: Final = _of("band time", "s", "when the frame was exposed")
-"""Variable `exposure_time`: each camera's own stamps, NaN for a frame that is no measurement."""
-
-FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uint16")
-"""Variable `frame_flags` of a recording, bits named by its own CF attributes; see `has_flag`."""
-
-SHUTTER_CLOSED: Final = "shutter_closed"
-"""Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
-
-NOISE_FACTOR: Final = _of("band", "1", "noise over that before the alignment")
-"""Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
-
-PATTERN_STD: Final = _of("band", "count", "standard deviation of the residual fixed pattern")
-"""Variable `pattern_std`: what the correction leaves from pixel to pixel, constant in time."""
-
-SEGMENT: Final = _of("time", "1", "shutter events before the frame", "int32")
-"""Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
-
-_STATUS: Final = _of("y x", "1", "validity flags, 0 is good", "uint32")
-
-STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
-    {
-        "capture": {"counts": _of("band time y x", "count", "raw signal", "uint16")},
-        "corrected": {"counts": _of("band time y x", "count", "corrected signal", "float32")},
-        "reflection_shift": {
-            **_with_std("shift", "axis y x", "pixel", "shift of what is reflected"),
-            "known": _of("y x", "1", "texture tells the shift", "bool"),
-        },
-        "separated": {
-            **_with_std("object_temperature", "time y x", "K", "object temperature"),
-            **_with_std("background_temperature", "time y x", "K", "background temperature"),
-            **_with_std("emissivity", "band y x", "1", "band emissivity"),
-            **_with_std("reflection_ratio", "band y x", "1", "reflection ratio"),
-            "status": _STATUS,
-        },
-        "blackbody": {"counts": _of("band temperature", "count", "mean blackbody signal")},
-        "blackbody_movies": {
-            "counts": _of("band temperature frame y x", "count", "raw signal", "uint16")
-        },
-        "blackbody_frames": {
-            "counts": _of("band temperature y x", "count", "mean over the frames")
-        },
-        "correction": {
-            "gain": _of("band y x", "1", "gain of the pixel"),
-            "offset": _of("band y x", "count", "offset of the pixel"),
-        },
-        "response": {
-            "amplitude": _of("band", "count", "Sakuma-Hattori amplitude"),
-            "effective_wavelength": _of("band", "m", "Sakuma-Hattori effective wavelength"),
-            "wavelength_shift": _of("band", "m K", "Sakuma-Hattori wavelength shift"),
-            "offset": _of("band", "count", "Sakuma-Hattori offset"),
-            "linear_slope": _of("band", "count K-1", "slope of the linear response"),
-            "linear_intercept": _of("band", "count", "intercept of the linear response"),
-            "reference_temperature": _of("", "K", "reference temperature"),
-            "temperature_min": _of("", "K", "lowest calibrated temperature"),
-            "temperature_max": _of("", "K", "highest calibrated temperature"),
-        },
-        "contact": {
-            "counts": _of("band measurement", "count", "signal"),
-            "object_temperature": _of("measurement", "K", "object temperature"),
-            "background_temperature": _of("measurement", "K", "background temperature"),
-        },
-        "reflector": {
-            "counts": _of("band measurement", "count", "signal"),
-            "reflected_counts": _of("band measurement", "count", "signal of the reflector"),
-            "object_temperature": _of("measurement", "K", "object temperature"),
-        },
-        "spectrum": {"emissivity": _of("wavelength", "1", "spectral emissivity")},
-        "emissivity_table": {
-            "emissivity": _of("material band", "1", "band emissivity"),
-            "coverage": _of("material band", "1", "share of the band that the spectrum covers"),
-        },
-    }
-)
-"""Stage -> variable -> its definition."""
-
-OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
-    {
-        "capture": {"exposure_time": EXPOSURE_TIME, "frame_flags": FRAME_FLAGS},
-        "corrected": {
-            "exposure_time": EXPOSURE_TIME,
-            "frame_flags": FRAME_FLAGS,
-            "segment": SEGMENT,
-            "drift": _of("band time", "count", "drift taken out"),
-            "noise_factor": NOISE_FACTOR,
-            "pattern_std": PATTERN_STD,
-            "status": _STATUS,
-        },
-        "separated": {
-            "emissivity_covariance": _of(
-                "band other_band y x", "1", "covariance of band emissivities", "float32"
-            )
-        },
-        "blackbody_frames": {"noise": NOISE},
-        "correction": {
-            "bad": _of("band y x", "1", "bad pixel", "bool"),
-            "residual": _of("band", "count", "RMS residual over the good pixels"),
-            "level": _of("band temperature", "count", "mean over the good pixels"),
-            "offset_std": _of("band", "count", "standard deviation of the offset at the centre"),
-            "gain_std": _of("band", "1", "standard deviation of the gain"),
-            "centre": _of("band", "count", "level at which the two errors are independent"),
-        },
-        "response": {
-            "noise": NOISE,
-            "netd": _of("band", "K", "noise-equivalent temperature difference"),
-        },
-    }
-)
-"""Stage -> variable that it may hold -> its definition."""
-
-LARGEST: Final = 1e9
-"""Magnitude from which a number of counts or kelvin is no measurement of any detector."""
-
-EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
-"""A spectral emissivity outside is no measurement, but a wrong unit or a damaged file [1].
-
-The extremes of the libraries are -0.16 (trona) and 1.014 (maple bark), from reflectances of 116 %
-and -1.4 % relative to the reference."""
 
 
 class Flags(IntFlag):
@@ -229,7 +74,7 @@ class Flags(IntFlag):
     meaning: str
 
     def __new__(cls, value: int, meaning: str = "") -> Self:
-        """Make a bit from its value and its sentence."""
+        """Bit of a value and a sentence."""
         member = int.__new__(cls, value)
         member._value_ = value
         member.meaning = meaning
@@ -282,18 +127,13 @@ class Status(Flags):
     NO_REFLECTION_PAIR = 1 << 20, "the second camera does not see this reflection: nothing is known"
 
 
-COMPLETED: Final = (
-    Status.COMPLETED_FROM_MATERIAL
-    | Status.COMPLETED_FROM_PRIOR
-    | Status.COMPLETED_FROM_SURROUNDINGS
-    | Status.COMPLETED_FRAMES
-)
+COMPLETED: Final = Status(sum(bit for bit in Status if bit.label.startswith("completed")))
 """Bits of a pixel of which something is completed, not measured."""
 
 
 def status_attrs() -> dict[str, object]:
     """CF attributes of a `status` variable: `flag_masks` (uint32), `flag_meanings`, units."""
-    return Status.cf_attrs(_STATUS)
+    return Status.cf_attrs(STATUS)
 
 
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
@@ -305,23 +145,12 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
         `status` or `frame_flags`, whole numbers of any size, with ``flag_masks`` and
         ``flag_meanings``.
     *names : str
-        Names of flags, in lower case.
-
-    Returns
-    -------
-    DataArray of bool
-        Of the shape of the flags.
-
-    Raises
-    ------
-    ValueError
-        If a name is not among the attributes.
+        Names of flags, in lower case; ValueError for one that is not among the attributes.
 
     Examples
     --------
     >>> import numpy as np, xarray as xr
-    >>> bits = np.array([0, 1024, 128], dtype=np.uint32)
-    >>> status = xr.DataArray(bits, dims="x", attrs=status_attrs())
+    >>> status = xr.DataArray(np.uint32([0, 1024, 128]), dims="x", attrs=status_attrs())
     >>> has_flag(status, "dead_pixel", "gray").values
     array([False,  True, False])
     """
@@ -358,15 +187,14 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
     dataset : Dataset
         Data of a stage.
     stage : str
-        One of `STAGES`.
+        Its name.
 
     Raises
     ------
-    TypeError
-        If it is not a Dataset, or a variable's dtype is not a real number.
-    ValueError
-        If a variable, dimension or coordinate is missing, misnamed or out of order, a unit is
-        another one, a coordinate does not increase strictly, or bands repeat.
+    TypeError, ValueError
+        If it is not a Dataset of real numbers, a variable, dimension or coordinate is missing,
+        misnamed or out of order, a unit is another one, a coordinate does not increase strictly, or
+        bands repeat.
 
     Examples
     --------
@@ -391,17 +219,14 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
 
 
 def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
-    """Check a dataset against the stage `corrected`, as `check`, and refuse raw counts.
+    """Check a dataset as `check` does for the stage `corrected`, and refuse raw counts.
+
+    Whole numbers are a TypeError: those are raw, and corrected counts need NaN besides.
 
     Parameters
     ----------
     dataset : Dataset
         Capture, returned unchanged.
-
-    Raises
-    ------
-    TypeError
-        For whole numbers: those are raw, and corrected counts need NaN besides.
     """
     counts = check(dataset, "corrected")["counts"]
     if counts.dtype.kind != "f":
@@ -414,7 +239,7 @@ def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
-    """Check one array against its definition, as `check`.
+    """Check one array against its definition, with the errors of `check`.
 
     Parameters
     ----------
@@ -431,7 +256,7 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         raise ValueError(f"Empty {label}: sizes {dict(array.sizes)}. Must hold at least one value.")
     if variable.dtype != "bool":
         check_numbers(array, label, variable.units)
-        if variable is _STATUS and array.dtype.kind == "f":
+        if variable is STATUS and array.dtype.kind == "f":
             raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be whole numbers.")
     elif array.dtype != bool:
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
@@ -445,6 +270,8 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
     """Check that an array holds real numbers, of a unit if it states one, and return it as it is.
 
+    TypeError for another type or dtype, ValueError for another unit.
+
     Parameters
     ----------
     array : DataArray
@@ -453,13 +280,6 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
         Its name in the error.
     units : str, optional
         Unit that it has if it states one; any by default.
-
-    Raises
-    ------
-    TypeError
-        If the type or dtype is another one.
-    ValueError
-        If it states another unit.
     """
     if not isinstance(array, xr.DataArray):
         raise TypeError(f"Invalid {label} of type {type(array).__name__}. Must be a DataArray.")
@@ -473,6 +293,8 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
     """Positions of bands on the dimension `band`, by name as text.
 
+    ValueError if there is no coordinate `band`, or a band is missing or repeated.
+
     Parameters
     ----------
     array : DataArray or Dataset
@@ -481,11 +303,6 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
         Names of the bands.
     label : str
         Name of the array in the error.
-
-    Raises
-    ------
-    ValueError
-        If there is no coordinate `band`, or a band is missing or repeated.
     """
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
@@ -503,6 +320,8 @@ def band_values(
 ) -> npt.NDArray[np.float64]:
     """Values (band,) of an array of numbers over the bands alone, in the order of some bands.
 
+    Errors as `check_numbers` and `band_positions`; ValueError for other dims, too.
+
     Parameters
     ----------
     array : DataArray
@@ -511,28 +330,31 @@ def band_values(
         Names of the bands, in the order of the result.
     label, units : str
         Name of the array in the error, and the unit that it has if it states one.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `check_numbers` and `band_positions`; ValueError for other dims, too.
     """
     if check_numbers(array, label, units).dims != ("band",):
         raise ValueError(f"Invalid dims {array.dims} of {label}. Must be ('band',).")
     return array.values[band_positions(array, wanted, label)].astype(np.float64)
 
 
+def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Variables of a Dataset of a stage, with the dims and attributes of their definitions.
+
+    Parameters
+    ----------
+    stage : str
+        One of `STAGES`.
+    values : mapping
+        Values by name.
+    """
+    known = {**STAGES[stage], **OPTIONAL.get(stage, {})}
+    return {name: (known[name].dims, value, known[name].attrs) for name, value in values.items()}
+
+
 def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
     if dim not in array.coords:
         raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
-    coordinate, units = array[dim], COORDINATES[dim].units
-    stated = coordinate.attrs.get("units", units)
-    if stated != units:
-        raise ValueError(f"Invalid units '{stated}' of '{dim}' of {label}. Must be '{units}'.")
-    if coordinate.dtype.kind not in "fui":
-        raise TypeError(
-            f"Invalid dtype {coordinate.dtype} of '{dim}' of {label}. Must be numbers in {units}."
-        )
+    units = COORDINATES[dim].units
+    coordinate = check_numbers(array[dim], f"'{dim}' of {label}", units)
     values = coordinate.values.astype(np.float64)
     steps = np.diff(values)
     if not np.all(np.isfinite(values)):

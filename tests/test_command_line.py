@@ -15,6 +15,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import nbformat
 import numpy as np
 import pytest
 import tifffile
@@ -201,6 +202,7 @@ def test_curves_films_pictures(results: Path) -> None:
     object_ = result["object_temperature"].values
     with (results / "curve.csv").open(encoding="utf-8", newline="") as stream:
         rows = [*csv.reader(stream)]
+    assert rows[0][:2] == ["time [s]", "pixel 12 16 mean [K]"]
     assert len(rows) == 201
     assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16], abs=1e-3)  # [K]
     for suffix in ("tif", "png", "nc"):
@@ -214,6 +216,19 @@ def test_curves_films_pictures(results: Path) -> None:
     assert "Must end in one of ['.csv', '.tif', '.png', '.nc']" in line
     line = refused(results, "export", "result.zarr", "--pixel", "24", "0", "-o", "no.csv")
     assert "Must lie in the image of 24 x 32" in line
+
+
+def test_report_and_explorer(results: Path) -> None:
+    """A report is a page with the region's name; the explorer's notebook has one valid cell."""
+    shown = ["result.zarr", "aligned.zarr", "response.zarr"]
+    found = run(results, "report", *shown, "--region", "2", "8", "2", "8", "-o", "out.html")
+    assert found.returncode == 0, found.stderr
+    assert "rows 2 to 8, columns 2 to 8" in (results / "out.html").read_text(encoding="utf-8")
+    done(results, "explore", *shown, "-o", "look.ipynb")
+    notebook = nbformat.read(results / "look.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    paths = ", ".join(repr(str(results / name)) for name in shown)
+    assert f"dbthermal.explore({paths})" in notebook.cells[0].source
 
 
 def test_plan_and_data(tmp_path: Path) -> None:
@@ -292,6 +307,17 @@ def test_missing_extras_are_named(
     assert found.returncode == 1
     (line,) = found.stderr.splitlines()
     assert f"pip install 'dbthermal[{extra}]'" in line
+
+
+def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
+    """Bash takes the completion over, and completes a command and an option of one."""
+    (tmp_path / "completion").write_text(run(tmp_path, "completion").stdout, encoding="utf-8")
+    for typed, completed in ((["al"], "align"), (["align", "--ref"], "--reference")):
+        words = f"COMP_WORDS=(dbthermal {' '.join(typed)}); COMP_CWORD={len(typed)}"
+        code = f"source completion; {words}; _dbthermal; echo ${{COMPREPLY[@]}}"
+        command = ["bash", "-c", code]
+        found = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert found.stdout.split() == [completed]
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -12,6 +12,7 @@ from scipy.integrate import quad
 
 from dbthermal import emissivity, planck, readers, schema
 from dbthermal.bands import FILTERS, Band
+from dbthermal.emissivity import _filters
 
 GLASS = "manmade.generalconstructionmaterial.glas.solid.all.0796uuugls.jhu.becknic.spectrum.txt"
 
@@ -220,7 +221,7 @@ def test_noise_behind_filters() -> None:
 def test_single_frame_std_of_glass() -> None:
     """Plate glass at 0.04 and 0.4 K of noise: 0.40 K, the figure of the closed form."""
     noise = xr.DataArray([0.04, 0.4], coords={"band": ["8-14", "9.5"]}, dims="band")
-    result = emissivity._single_frame_std(table(glass=[0.86, 0.72], gray=[0.9, 0.9]), noise, "8-14")
+    result = _filters._single_frame_std(table(glass=[0.86, 0.72], gray=[0.9, 0.9]), noise, "8-14")
     np.testing.assert_allclose(result[0], [0.408], rtol=0, atol=0.001)
     assert np.isinf(result[1, 0])
     assert result["band"].values.tolist() == ["9.5"]
@@ -232,7 +233,7 @@ def test_single_frame_std_against_draws() -> None:
     mixing = np.array([[0.3, 0.7], [0.5, 0.5]])
     drawn = np.random.default_rng(2).standard_normal((2, 200_000)) * [[0.05], [0.2]]
     spread = np.linalg.solve(mixing, drawn)[0].std()
-    result = emissivity._single_frame_std(table(m=[0.3, 0.5]), noise, "8-14")
+    result = _filters._single_frame_std(table(m=[0.3, 0.5]), noise, "8-14")
     assert float(result[0, 0]) == pytest.approx(spread, rel=0.01)
 
 

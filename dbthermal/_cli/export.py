@@ -1,9 +1,7 @@
 """Results as other programs read them: curves, films, pictures, NetCDF."""
 
 import argparse
-import csv
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import store
+from dbthermal import explorer, store
 from dbthermal._cli.files import opened, provenance
 
 
@@ -29,43 +27,27 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Means of places at each time; deviations as if errors were the same in all of a region.
+    """Mean, extremes, deviation and number of pixels of each place over time; else of the image.
 
-    What is common to the pixels of a region, as the error of an emissivity, does not average out:
-    the mean of the deviations is an upper limit of that of the mean.
+    Flagged pixels count where they are named one by one, and not in a region.
     """
-    names = [name for name in (options.variable, f"{options.variable}_std") if name in result]
-    if set(result[names[0]].dims) != {"time", "y", "x"}:
-        raise ValueError(f"Invalid '{names[0]}' {result[names[0]].dims}. Must be (time, y, x).")
-    columns: dict[str, Any] = {"time_s": result["time"].values}
-    said = {}
-    for label, rows, across in _places(result, options):
-        region = result.isel(y=rows, x=across)
-        valid = np.isfinite(region[names[0]].values).all(axis=0)
-        if not valid.any():
-            raise ValueError(f"Empty {label}: no pixel has values at all times. Must have one.")
-        said[label] = {"pixels": int(valid.sum()), "of": int(valid.size)}
-        for name in names:
-            unit = result[name].attrs.get("units", "1")
-            columns[f"{name}_{label}_{unit}"] = region[name].values[:, valid].mean(axis=1)
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(columns)
-        writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
-    return said
-
-
-def _places(result: xr.Dataset, options: argparse.Namespace) -> Iterator[tuple[str, slice, slice]]:
-    """Label, rows and columns of each place; all of the image if none is named."""
-    height, width = result.sizes["y"], result.sizes["x"]
+    view, columns = explorer.View(result), dict[str, xr.DataArray]()
+    height, width = view.shape
     boxes = [(y, y + 1, x, x + 1) for y, x in options.pixel] + [*map(tuple, options.region)]
     for top, bottom, left, right in boxes or [(0, height, 0, width)]:
+        label = f"rows {top} to {bottom}, columns {left} to {right}"
         if not (0 <= top < bottom <= height and 0 <= left < right <= width):
-            found = f"rows {top} to {bottom}, columns {left} to {right}"
-            raise ValueError(f"Invalid {found}. Must lie in the image of {height} x {width}.")
+            raise ValueError(f"Invalid {label}. Must lie in the image of {height} x {width}.")
+        region = explorer.Region("rectangle", ((top, left), (bottom, right)))
         one = bottom - top == right - left == 1
-        label = f"pixel_{top}_{left}" if one else f"region_{top}_{bottom}_{left}_{right}"
-        yield label, slice(top, bottom), slice(left, right)
+        curve = view.curve(options.variable, region, pixels="all" if one else "unflagged")
+        where = f"pixel {top} {left}" if one else label
+        for name, values in curve.items():
+            columns[f"{where} {name} [{values.attrs.get('units', '1')}]"] = values
+    if any(values.dims != ("time",) for values in columns.values()):
+        raise ValueError(f"Invalid '{options.variable}' without time. Must be a film.")
+    xr.Dataset(columns).to_dataframe().to_csv(path, index_label="time [s]")
+    return {"columns": ["time [s]", *columns]}
 
 
 def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
@@ -106,6 +88,33 @@ def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, 
         attrs.update({name: json.dumps(one) for name, one in long.items()})
     plain.to_netcdf(path, engine="scipy")
     return {"variables": sorted(map(str, result.data_vars))}
+
+
+def report(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `report`."""
+    from dbthermal import reporting  # noqa: PLC0415 - optional
+
+    result, shown = opened(options.result), [opened(one) for one in options.shown]
+    regions = {
+        f"rows {top} to {bottom}, columns {left} to {right}": explorer.Region(
+            "rectangle", ((top, left), (bottom, right))
+        )
+        for top, bottom, left, right in options.region
+    }
+    reporting.report(result, options.output, *shown, regions=regions)
+    return {str(options.output): {"bytes": options.output.stat().st_size}}
+
+
+def explore(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `explore`: a notebook of one cell, which JupyterLab opens."""
+    paths = ", ".join(repr(str(path.resolve())) for path in [options.result, *options.shown])
+    cell: dict[str, Any] = {"id": "explore", "cell_type": "code", "metadata": {}, "outputs": []}
+    cell |= {"execution_count": None, "source": f"import dbthermal\n\ndbthermal.explore({paths})"}
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4}
+    with store.whole(options.output, ".ipynb") as part:
+        part.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
+    return {str(options.output): f"opened by: jupyter lab {options.output}"}
 
 
 _WRITERS = {".csv": _curves, ".tif": _film, ".png": _picture, ".nc": _netcdf}

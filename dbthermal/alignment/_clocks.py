@@ -15,8 +15,7 @@ Indices = npt.NDArray[np.intp]
 
 # A sample nearer than this to the wanted time is taken as it is [frame period].
 _COINCIDENT: Final = 0.01
-# Longest gap that is interpolated across [frame period].
-_GAP: Final = 1.5
+_GAP: Final = 1.5  # longest gap that is interpolated across [frame period]
 # Largest relative deviation of a time step from the median of an even clock [1].
 _EVEN: Final = 0.05
 _MINIMUM_FRAMES: Final = 2
@@ -36,9 +35,8 @@ class Interpolation:
 
     For a random walk that is the line between two frames, for what is smooth from frame to frame
     nearly the cubic through four: the bend b, which is 0 without four frames in a row. The wrong
-    one takes, or adds, a part of the rapid changes, and the reflection of this band would be taken
-    for smaller, or larger: half-way between frames the line keeps 71 % of a change that takes four
-    frames from crest to crest, the cubic 88 %.
+    one takes, or adds, a part of the rapid changes, and so of this band's reflection: half-way
+    between frames the line keeps 71 % of a change of four frames from crest to crest, the cubic 88.
 
     `before`, `after` (wanted): frames; `weight` (wanted): w [1]; `bend` (wanted, 4): b [1];
     `valid` (wanted): false across a gap or past an end; `stamps` (time): exposure times [s].
@@ -118,8 +116,7 @@ def exposure_times(corrected: xr.Dataset) -> Array:
     Raises
     ------
     TypeError, ValueError
-        If the times have other dims or another unit, fewer than two of a band are finite, or they
-        do not increase.
+        If they have other dims or another unit, are fewer than two of a band, or do not increase.
     """
     counts = corrected["counts"]
     if "exposure_time" not in corrected:
@@ -135,12 +132,11 @@ def exposure_times(corrected: xr.Dataset) -> Array:
 def fill_times(stamps: Array) -> Array:
     """Exposure times (time) [s] of one camera, with those of missing frames (NaN) interpolated.
 
-    They increase strictly; before the first and after the last frame by a frame period.
-
     Parameters
     ----------
     stamps : Array
-        Times (time) [s], NaN where a frame is missing.
+        Times (time) [s], NaN where a frame is missing; before the first and after the last by a
+        frame period each.
     """
     slots, step = np.arange(stamps.size), frame_period(stamps)
     recorded = np.flatnonzero(np.isfinite(stamps))
@@ -248,10 +244,9 @@ def interpolation(
 ) -> Interpolation:
     """Interpolation of the frames present, exposed at `stamps` (time) [s], at times `wanted` [s].
 
-    Of a signal with that `growth`, see the function.
-
-    Valid where a frame was exposed within 1 % of a period of the wanted time, or one each before
-    and after it of one `segment` (time), no more than one and a half frame periods apart.
+    Of a signal with that `growth`, see the function. Valid where a frame was exposed within 1 % of
+    a period of the wanted time, or one each before and after it of one `segment` (time), no more
+    than one and a half frame periods apart.
     """
     usable = np.flatnonzero(present & np.isfinite(stamps))
     if usable.size < _MINIMUM_FRAMES:

@@ -39,10 +39,8 @@ SEARCH: Final = 5  # largest lag that is searched by default, either way [frame]
 # Step of one clock against the other from which a lost frame, or a clock that is set, is suspected
 # [frame period].
 _CLOCK_STEP: Final = 0.5
-# Least share of the frames that both bands must have [1].
-_COMMON: Final = 0.5
-# Fewest frames from which an offset is estimated.
-_MINIMUM_FRAMES: Final = 32
+_COMMON: Final = 0.5  # least share of the frames that both bands must have [1]
+_MINIMUM_FRAMES: Final = 32  # fewest frames from which an offset is estimated
 # Groups of pixels of the jackknife, which gives the offset's standard deviation.
 _GROUPS: Final = 16
 _SIGNIFICANCE: Final = 6.0
@@ -75,19 +73,6 @@ class _Pair:
         return _Pair(signals, segments, self.times[:frames])
 
 
-@dataclass(frozen=True)
-class _Covariances:
-    """Covariances of groups of pixels, in rows, by lag, in columns.
-
-    `lags` (lag): frames by which the first band is taken later; `cross` (group, lag): C, of the
-    first band with the second; `auto` (group, 2): R of the first band, one and two frames apart.
-    """
-
-    lags: npt.NDArray[np.int_]
-    cross: Array
-    auto: Array
-
-
 def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int = SEARCH) -> float:
     """Delay of a band's exposures behind the first band's [s]; negative if it is ahead.
 
@@ -107,26 +92,19 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     search : int
         Largest lag to search, either way [frame].
 
-    Returns
-    -------
-    float
-        Offset [s].
-
     Raises
     ------
     TypeError, ValueError
         If the band is missing, the search does not fit the capture's length, there are fewer than
         16 usable pixels, nothing moves in both bands, their covariance is greatest at an end of the
         search, the bands share less than half of their frames, the offset is not known within 0.1
-        frame, the clock of a band was set while it ran, or its times are no exposure times, as of
-        frames that arrive in bursts.
+        frame, a clock was set while it ran, or times are not of exposure, as of frames in bursts.
 
     Notes
     -----
     Cameras side by side see a reflection at different pixels. Where most of what is reflected moves
-    one way, it comes to a pixel of one view earlier, and this looks like an offset; motion either
-    way cancels. Where there is such a parallax, measure the offset otherwise. The standard
-    deviation says nothing of it, for all pixels err alike.
+    one way, it comes to a pixel of one view earlier, and this looks like an offset, of which the
+    standard deviation says nothing; motion either way cancels. There, measure it otherwise.
 
     Examples
     --------
@@ -200,10 +178,9 @@ def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> flo
     label = f"of band '{names[1]}' against '{names[0]}'"
     # Frames of the one side of a pause never meet those of the other, at any lag.
     shared = _on_one_clock(signals, stamps, clocks.segments(pair), search + 3)
-    lag = _peak(_covariances(shared, search, names), label)
+    lag = _peak(_covariances(shared, search, names)[0], label)
     # Whole frames first: smooth functions over the same scene take the same out of both bands.
-    covariances = _covariances(shared.shifted(lag), 1, names)
-    both = lag + _delays(covariances)
+    both = lag + _delays(*_covariances(shared.shifted(lag), 1, names))
     # The pair of frames that it lies best between in all pixels, for the groups as well.
     delays = both[:, np.argmin(np.abs(both[0] - lag - np.array([-0.5, 0.5])))]
     # Jackknife over n groups: var = (n - 1) mean (d_i - mean d)^2.
@@ -284,16 +261,19 @@ def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices, reach:
     return _Pair(result, segments, times)
 
 
-def _covariances(shared: _Pair, search: int, names: list[str]) -> _Covariances:
-    """Covariances of the rapid changes, in groups of pixels."""
+def _covariances(shared: _Pair, search: int, names: list[str]) -> tuple[Array, Array]:
+    """Covariances of the rapid changes, in groups of pixels.
+
+    C (group, lag) of the bands, the first one taken later by each lag up to `search` and two more,
+    either way; and R (group, 2) of the first band, one and two frames apart.
+    """
     # One step at a shutter event of either band, the same for both.
     _, segment = np.unique(shared.segments, axis=1, return_inverse=True)
     here = _common(shared, names)
     first, second = (_rapid(movie, shared.times, here, segment) for movie in shared.signals)
-    lags = np.arange(-search - 2, search + 3)
-    cross = [_lagged(first, second, here, int(lag)) for lag in lags]
+    cross = [_lagged(first, second, here, lag) for lag in range(-search - 2, search + 3)]
     auto = [_lagged(first, first, here, lag) for lag in (1, 2)]
-    return _Covariances(lags, np.stack(cross, axis=1), np.stack(auto, axis=1))
+    return np.stack(cross, axis=1), np.stack(auto, axis=1)
 
 
 def _common(shared: _Pair, names: list[str]) -> Mask:
@@ -331,49 +311,45 @@ def _rapid(movie: Array, times: Array, here: Mask, segment: clocks.Indices) -> A
 
 def _lagged(first: Array, second: Array, here: Mask, lag: int) -> Array:
     """Covariance (group) of the first signal, so many frames later, with the second."""
-    frames = len(first)
-    late, early = (
-        slice(max(lag, 0), frames + min(lag, 0)),
-        slice(max(-lag, 0), frames - max(lag, 0)),
-    )
+    frames = len(first) - abs(lag)
+    late, early = (slice(start, start + frames) for start in (max(lag, 0), max(-lag, 0)))
     products = np.einsum("tp,tp->p", first[late], second[early])
     size = products.size - products.size % _GROUPS
     grouped = products[:size].reshape(-1, _GROUPS).sum(axis=0)
     return np.asarray(grouped / np.sum(here[late] & here[early]))
 
 
-def _peak(covariances: _Covariances, label: str) -> int:
-    """Lag of the largest covariance of the bands [frame], which must be significant."""
-    total = covariances.cross.sum(axis=0)
-    peak = 2 + int(np.argmax(total[2:-2]))
-    groups = covariances.cross[:, peak]
+def _peak(cross: Array, label: str) -> int:
+    """Lag of the largest covariance (group, lag) of the bands [frame]; it must be significant."""
+    middle: int = cross.shape[1] // 2
+    lag = 2 + int(np.argmax(cross.sum(axis=0)[2:-2])) - middle
+    groups = cross[:, lag + middle]
     score = groups.mean() / (groups.std(ddof=1) / np.sqrt(_GROUPS))
     if not score > _SIGNIFICANCE:
         raise ValueError(
             f"Missing time offset {label}: no rapid change that both bands see (a covariance of "
             f"{score:.1f} standard deviations). Must exceed {_SIGNIFICANCE:g}; give the offset."
         )
-    if peak in (2, covariances.lags.size - 3):
+    if abs(lag) == middle - 2:
         raise ValueError(
-            f"Invalid time offset {label}: the largest covariance is at {covariances.lags[peak]} "
+            f"Invalid time offset {label}: the largest covariance is at {lag} "
             "frames, the end of the search. Must lie inside; search farther."
         )
-    return int(covariances.lags[peak])
+    return lag
 
 
-def _delays(covariances: _Covariances) -> Array:
+def _delays(cross: Array, auto: Array) -> Array:
     """
     Offset [frame] near lag 0 if it lies between the frames -1 and 0, and between 0 and 1, columns.
 
     In rows: of all groups of pixels, and without each of them in turn, for the jackknife.
     """
-    kept = np.vstack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)])
-    cross, (near, far) = kept @ covariances.cross, (kept @ covariances.auto).T
+    kept, middle = np.vstack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)]), cross.shape[1] // 2
+    cross, (near, far) = kept @ cross, (kept @ auto).T
     delays = []
     for lag in (-1, 0):
         # C_-1 -+ C_2 = (h0 -+ h1)(R1 -+ R2) of the frames m - 1 and m + 2: delta = h1 / (h0 + h1).
-        place = int(np.argmax(covariances.lags == lag))
-        before, after = cross[:, place - 1], cross[:, place + 2]
+        before, after = cross[:, middle + lag - 1], cross[:, middle + lag + 2]
         share = 0.5 - 0.5 * (before - after) / (near - far) * (near + far) / (before + after)
         delays.append(lag + share)
     return np.stack(delays, axis=1)

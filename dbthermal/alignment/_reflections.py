@@ -14,15 +14,13 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from dbthermal import noise as noises
 from dbthermal import response as responses
 from dbthermal import schema
+from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _matching as matching
-from dbthermal.alignment._delay import delay
-from dbthermal.alignment._matching import Field, Information, Movies, Spline
+from dbthermal.alignment._field import Field, Information, Spline
+from dbthermal.alignment._matching import Movies
 from dbthermal.alignment._offset import sample
 from dbthermal.schema import Status
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 _UNUSABLE: Final = int(Status.DEAD_PIXEL | Status.SATURATED | Status.INVALID_SAMPLES)
 _SMALLEST: Final = 24  # rows and columns of an image, at least
@@ -102,7 +100,7 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
             pictures = capture.rapid(period, used)
             level = Movies.blurred(pictures, capture.valid, capture.noise, freedom, 1)
             times = corrected["time"].values[capture.frames[used]]
-            late = delay(level, field.on(level.centres()), times)
+            late = matching.delay(level, field.on(level.centres()), times)
             return _result(corrected, capture, field, data, spread).assign_attrs(delay=late)
 
 
@@ -311,7 +309,6 @@ def _result(
     slopes = np.square(np.gradient(shift, axis=(1, 2))).sum(axis=0)[:, known]
     growth = np.multiply.outer(slopes.sum(axis=1) / max(1, known.sum()), distance**2)
     std = np.sqrt(np.maximum(variance, 0.0) + growth)
-    definitions = schema.STAGES["reflection_shift"]
     names = [str(name) for name in corrected["band"].values[capture.bands]]
     values = {
         "shift": np.where(near, shift, np.nan).astype(np.float32),
@@ -320,7 +317,7 @@ def _result(
     }
     places = {name: corrected[name] for name in ("y", "x") if name in corrected.coords}
     result = xr.Dataset(
-        {name: (one.dims, values[name], one.attrs) for name, one in definitions.items()},
+        schema.variables("reflection_shift", values),
         coords={"axis": ["y", "x"], **places},
         attrs={**corrected.attrs, "reference_band": names[0], "bands": names[1:]},
     )

@@ -78,8 +78,8 @@ def register(
     ImportError
         If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
-        If the model is unknown, the image is smaller than 16 pixels either way, a mean is not
-        finite, the correlation of two views is below 0.5, or they share less than half the image.
+        If the image is smaller than 16 pixels either way, a mean is not finite, the correlation of
+        two views is below 0.5, or they share less than half the image.
 
     References
     ----------
@@ -131,7 +131,7 @@ def register(
     )
 
 
-def _object_images(view: xr.DataArray, bad: npt.NDArray[np.bool_] | np.bool_) -> list[Array]:
+def _object_images(view: xr.DataArray, bad: Mask | np.bool_) -> list[Array]:
     """Mean over time of what changes smoothly, and its rise (y, x), see `_scaled`."""
     frames = np.asarray(view.values)
     present = np.flatnonzero(~clocks.missing(frames))
@@ -154,7 +154,7 @@ def _object_images(view: xr.DataArray, bad: npt.NDArray[np.bool_] | np.bool_) ->
     return [_scaled(mean, bad), _scaled(rise, bad)]
 
 
-def _scaled(image: Array, bad: npt.NDArray[np.bool_] | np.bool_) -> Array:
+def _scaled(image: Array, bad: Mask | np.bool_) -> Array:
     """Image (y, x) of mean 0 and standard deviation 1, bad pixels as those around them."""
     around = median_filter(image, size=_MEDIAN_WINDOW)
     away = abs(image - around)

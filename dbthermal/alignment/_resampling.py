@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import _rows, schema
 from dbthermal import noise as noises
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
@@ -29,13 +29,10 @@ MAP: Final = schema.Variable(
 )
 """Transform of a curved surface: for each band where each pixel of the first view lies in it."""
 
-# Pixels a side that a sample between pixels is made of.
-_TAPS: Final = 6
-# A weight that is none [1].
-_ROUNDING: Final = 1e-7
+_TAPS: Final = 6  # pixels a side that a sample between pixels is made of
+_ROUNDING: Final = 1e-7  # a weight that is none [1]
 
-# Standard deviations of noise beyond which a step lies between two frames.
-_STEP: Final = 5.0
+_STEP: Final = 5.0  # standard deviations of noise beyond which a step lies between two frames
 # A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
 _DIGITS: Final = 9
 
@@ -57,12 +54,10 @@ def align(
     random walk, nearly a cubic for what is smooth. An offset of whole frames is a pure shift.
 
     Frames are NaN in a band where that would reach over a gap, over a change of `segment`, or
-    past an end, and where its camera gave none: NaN, or a copy of the frame before. Nothing is
-    extrapolated: a recording that pauses is aligned in its parts. Where a signal steps between two
-    frames, by five standard deviations of noise, the sample is NaN, too, for when it changed is not
-    known, and those beside it, where a curve overshoots. Interpolation makes the noise of a band
-    smaller, by up to 0.8 (`noise_factor`), and correlates neighbouring frames; in the quieter of
-    two bands that hardly counts.
+    past an end, and where its camera gave none: NaN, or a copy of the frame before. Where a signal
+    steps between two frames, by five standard deviations of noise, the sample is NaN, too, for when
+    it changed is not known, and those beside it, where a curve overshoots. Interpolation makes the
+    noise of a band smaller, by up to 0.8 (`noise_factor`), and correlates neighbouring frames.
 
     Parameters
     ----------
@@ -94,12 +89,11 @@ def align(
         Stage `corrected` with as many frames: `counts` (band, time, y, x) [count], float32; `time`,
         exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
         `status` is that of all the pixels that it may be made of; `noise_factor` (band) [1], by how
-        much interpolation in time and over pixels lessens the noise, root mean square, which
-        `separation.solve` takes into account; `pattern_std`, lessened over pixels.
-        Attributes: `clock`, `time_offset` (of each band) [s], `frames_lost` (of each band),
-        `pauses` (times of the frames before and after each gap of more than 20 frame periods, in
-        turn) [s], `transform` (the matrices, row by row). `exposure_time` and other variables over
-        `time` on the clocks before, as `drift`, are dropped.
+        much interpolation in time and over pixels lessens the noise, root mean square;
+        `pattern_std`, lessened over pixels. Attributes: `clock`, `time_offset` (of each band) [s],
+        `frames_lost` (of each band), `pauses` (times of the frames before and after each gap of
+        more than 20 frame periods, in turn) [s], `transform` (the matrices, row by row). Other
+        variables over `time`, as `exposure_time` and `drift`, are dropped.
 
     Raises
     ------
@@ -156,9 +150,7 @@ def align(
         for band, plan in enumerate(plans):
             movie = _single(movies.isel(band=band).values)
             if missing[band].any():
-                movie = np.where(
-                    missing[band][:, np.newaxis, np.newaxis], np.float32(np.nan), movie
-                )
+                movie = np.where(missing[band][:, None, None], np.float32(np.nan), movie)
             plan.apply(movie, result[band], _largest(noise[band], movie))
         return result
 
@@ -204,7 +196,7 @@ def interpolation(places: Array, taps: int) -> csr_array:
     return csr_array((weight[kept], pixel[kept], ends), shape=(inside.size, inside.size))
 
 
-def _weights(places: Array, bad: npt.NDArray[np.bool_]) -> csr_array:
+def _weights(places: Array, bad: Mask) -> csr_array:
     """Weights as `interpolation`, of lines near the border and near bad pixels."""
     if np.array_equal(places, np.indices(bad.shape)):
         return eye_array(bad.size, dtype=np.float32, format="csr")
@@ -311,7 +303,7 @@ def _noise(signals: Array, stamps: Array) -> Array:
     return np.array(levels).T
 
 
-def _missing(views: xr.DataArray) -> npt.NDArray[np.bool_]:
+def _missing(views: xr.DataArray) -> Mask:
     """Frames (band, time) that are NaN, or a copy of the one before, in every block of rows."""
     parts = [
         [clocks.missing(_single(movie)) for movie in views.isel(y=rows).values]
@@ -365,13 +357,12 @@ def _warped(view: xr.DataArray, weights: csr_array, rows: slice) -> Movie:
 
 
 def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr.Dataset:
-    counts = corrected["counts"]
-    attrs = schema.STAGES["corrected"]["counts"].attrs
+    """Capture with the aligned counts at the times of the reference."""
     old = [name for name, part in corrected.data_vars.items() if "time" in part.dims]
-    result = corrected.drop_vars(set(old) - {"counts", "segment"}).assign(
-        counts=aligned.variable.copy(deep=False)
-    )
-    result["counts"].attrs = {**counts.attrs, **attrs}
+    result = corrected.drop_vars(set(old) - {"counts", "segment"})
+    result = result.assign(counts=aligned.variable.copy(deep=False))
+    attrs = schema.STAGES["corrected"]["counts"].attrs
+    result["counts"].attrs = {**corrected["counts"].attrs, **attrs}
     result = result.assign_coords(time=("time", times, corrected["time"].attrs))
     return schema.check(result, "corrected")
 

@@ -7,8 +7,13 @@ blackbody (`fit_emissivity`), or by the standards' reflector method (`reflector_
 """
 
 from dbthermal.calibration._emissivity import NO_BIAS, Bias, fit_emissivity, reflector_emissivity
-from dbthermal.calibration._maker import NO_BARS, maker_response
-from dbthermal.calibration._response import AMBIENT, MINIMUM_TEMPERATURES, fit_response
+from dbthermal.calibration._response import (
+    AMBIENT,
+    MINIMUM_TEMPERATURES,
+    NO_BARS,
+    fit_response,
+    maker_response,
+)
 
 __all__ = [
     "AMBIENT",

@@ -6,7 +6,7 @@ reflected signal :math:`W_b`. Both sides have errors, some of them common to all
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -25,8 +25,7 @@ class Bias:
     r"""Errors that all readings of one series have in common, each uniform in a range.
 
     A range's middle is corrected for, and its standard deviation, the width over :math:`\sqrt{12}`,
-    is carried into the result: a rectangular distribution, clause 4.3.7 of the Guide to the
-    expression of uncertainty in measurement (JCGM 100:2008).
+    is carried into the result (JCGM 100:2008, Guide to the expression of uncertainty, 4.3.7).
 
     Attributes
     ----------
@@ -116,33 +115,35 @@ NO_BIAS: Final = Bias()
 """Readings whose errors are independent."""
 
 
-@dataclass(frozen=True)
-class _Signals:
-    """Signals of one band and their errors, n measurements.
+class _Signal(NamedTuple):
+    """Blackbody signal (n) [count]; its independent errors (n), and common ones (term, n)."""
 
-    `counts`, `emitted`, `reflected` (n): I, W_o, W_b [count]; `noise`: standard deviation of the
-    counts [count]; `..._std` (n): independent errors of the other two; `..._bias` (term, n): effect
-    on them of one standard deviation of each common error [count].
-    """
+    values: Array
+    std: Array
+    bias: Array
+
+    def covariance(self, values: Array) -> Array:
+        """Covariance of the signal, times values (n)."""
+        return np.asarray(self.std**2 * values + self.bias.T @ (self.bias @ values))
+
+
+class _Signals(NamedTuple):
+    """Counts I (n) of a band and their noise [count], and the signals W_o and W_b."""
 
     counts: Array
-    emitted: Array
-    reflected: Array
     noise: float
-    emitted_std: Array
-    reflected_std: Array
-    emitted_bias: Array
-    reflected_bias: Array
+    emitted: _Signal
+    reflected: _Signal
 
     @property
     def x(self) -> Array:
         """Abscissa of the line through the origin, W_o - W_b [count]."""
-        return self.emitted - self.reflected
+        return self.emitted.values - self.reflected.values
 
     @property
     def y(self) -> Array:
         """Ordinate of the line, I - W_b [count]."""
-        return self.counts - self.reflected
+        return self.counts - self.reflected.values
 
     def weighted(self, emissivity: float, values: Array) -> Array:
         """Inverse covariance of the residual y - e x, times values (n).
@@ -152,9 +153,9 @@ class _Signals:
         """
         rest = 1.0 - emissivity
         # D = s_I^2 + e^2 s_o^2 + (1 - e)^2 s_b^2.
-        readings = (emissivity * self.emitted_std) ** 2 + (rest * self.reflected_std) ** 2
+        readings = (emissivity * self.emitted.std) ** 2 + (rest * self.reflected.std) ** 2
         variance = self.noise**2 + readings
-        common = np.concatenate([emissivity * self.emitted_bias, rest * self.reflected_bias])
+        common = np.concatenate([emissivity * self.emitted.bias, rest * self.reflected.bias])
         inner = np.eye(len(common)) + common @ (common / variance).T
         scaled = values / variance
         return np.asarray(scaled - (common / variance).T @ np.linalg.solve(inner, common @ scaled))
@@ -162,14 +163,8 @@ class _Signals:
     def adjusted_x(self, emissivity: float, weighted: Array) -> Array:
         """Abscissa (n) [count] as the fit adjusts it, from the weighted residual (n)."""
         # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
-        by_object, by_reflection = (
-            std**2 * weighted + bias.T @ (bias @ weighted)
-            for std, bias in (
-                (self.emitted_std, self.emitted_bias),
-                (self.reflected_std, self.reflected_bias),
-            )
-        )
-        return np.asarray(self.x + emissivity * by_object - (1.0 - emissivity) * by_reflection)
+        by_object = emissivity * self.emitted.covariance(weighted)
+        return self.x + by_object - (1.0 - emissivity) * self.reflected.covariance(weighted)
 
 
 def fit_emissivity(
@@ -188,9 +183,7 @@ def fit_emissivity(
     weighted by the covariance of both sides, of which the independent part is :math:`s_i^2 = s_I^2
     + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2` and every common error of the readings adds the
     outer product of its effects [2]_; iterated in e. As both sides have errors, the differences on
-    the right are weighted as the fit adjusts them [3]_, or their scatter would pass for contrast,
-    and e be too low. Knowing the bias, the fit leans on measurements that it hardly touches: the
-    object near the air's temperature and the blackbody far from it.
+    the right are weighted as the fit adjusts them [3]_: their scatter would pass for contrast.
 
     Parameters
     ----------
@@ -214,9 +207,9 @@ def fit_emissivity(
     Raises
     ------
     ValueError
-        If there are fewer than two measurements, a value is not finite, a temperature lies outside
-        the response, the response has no noise, a deviation is not positive, or object and
-        background never differ by more than three standard deviations of their difference.
+        If an input is not as described or not finite, there are fewer than two measurements, a
+        temperature lies outside the response, or object and background never differ by more than
+        three standard deviations of their difference.
     ArithmeticError
         If the fit does not converge.
 
@@ -251,18 +244,10 @@ def fit_emissivity(
     signals = {}
     for curve, noise, counts in _bands(measured, response, warm):
         require_range(cold, curve, "background temperature")
-        emitted_std, emitted_bias = bias.emitted(curve, warm, float(stds[0]))
-        reflected_std, reflected_bias = bias.reflected(curve, cold, float(stds[1]))
-        signals[curve.band] = _Signals(
-            counts=counts,
-            emitted=curve.counts(warm),
-            reflected=bias.reflection(curve, cold),
-            noise=noise,
-            emitted_std=emitted_std,
-            reflected_std=reflected_std,
-            emitted_bias=emitted_bias,
-            reflected_bias=reflected_bias,
-        )
+        emitted = _Signal(curve.counts(warm), *bias.emitted(curve, warm, float(stds[0])))
+        errors = bias.reflected(curve, cold, float(stds[1]))
+        reflected = _Signal(bias.reflection(curve, cold), *errors)
+        signals[curve.band] = _Signals(counts, noise, emitted, reflected)
     return _fit(signals)
 
 
@@ -280,9 +265,9 @@ def reflector_emissivity(
     .. math:: e = \frac{W - W_r}{W_o - W_r}, \qquad
               s_e = \frac{\sqrt{s_W^2 + e^2 s_{W_o}^2 + (1 - e)^2 s_{W_r}^2}}{|W_o - W_r|}
 
-    Several measurements are combined by least squares with these weights. Its weak point is outside
-    the formula: a foil reflects the whole surroundings, a smooth object one direction of them, and
-    where the emissivity is low the difference is taken for emission.
+    Several measurements are combined by least squares with these weights. A foil reflects the whole
+    surroundings, a smooth object one direction of them: where the emissivity is low the difference
+    is taken for emission.
 
     Parameters
     ----------
@@ -300,12 +285,8 @@ def reflector_emissivity(
     Returns
     -------
     Dataset
-        As `fit_emissivity`. With one measurement the reduced chi-square is NaN.
-
-    Raises
-    ------
-    ValueError, ArithmeticError
-        As `fit_emissivity`, but one measurement is enough.
+        As `fit_emissivity`, and its errors, but one measurement is enough: the reduced chi-square
+        is then NaN.
 
     References
     ----------
@@ -329,28 +310,16 @@ def reflector_emissivity(
     array([0.3, 0.3])
     """
     warm, stds = _readings(measured, "reflector", reading_std, bias)
-    foils = dict(zip(_names(measured), measured["reflected_counts"].values, strict=True))
     signals = {}
-    for curve, noise, counts in _bands(measured, response, warm):
-        foil = foils[curve.band].astype(np.float64)
+    foils = measured["reflected_counts"].values.astype(np.float64)
+    for (curve, noise, counts), foil in zip(_bands(measured, response, warm), foils, strict=True):
         cold = curve.inverse(foil)
         _require_contrast(warm - cold, stds, f"reflection in band '{curve.band}'")
-        emitted_std, emitted_bias = bias.emitted(curve, warm, float(stds[0]))
-        signals[curve.band] = _Signals(
-            counts=counts,
-            emitted=curve.counts(warm),
-            reflected=foil,
-            noise=noise,
-            emitted_std=emitted_std,
-            reflected_std=np.hypot(noise, curve.count_slope(cold) * stds[1]),
-            emitted_bias=emitted_bias,
-            reflected_bias=np.zeros((0, warm.size)),
-        )
+        emitted = _Signal(curve.counts(warm), *bias.emitted(curve, warm, float(stds[0])))
+        std = np.hypot(noise, curve.count_slope(cold) * stds[1])
+        reflected = _Signal(foil, std, np.zeros((0, warm.size)))
+        signals[curve.band] = _Signals(counts, noise, emitted, reflected)
     return _fit(signals)
-
-
-def _names(measured: xr.Dataset) -> list[str]:
-    return [str(name) for name in measured["band"].values]
 
 
 def _readings(
@@ -363,19 +332,17 @@ def _readings(
             raise ValueError(
                 f"Invalid {name}: NaN or infinite, or beyond {schema.LARGEST:g}. Must be finite."
             )
-    stds = planck.require_positive("reading_std [K]", reading_std)
-    return bias.corrected(measured["object_temperature"].values.astype(np.float64)), stds
+    warm = bias.corrected(measured["object_temperature"].values.astype(np.float64))
+    return warm, planck.require_positive("reading_std [K]", reading_std)
 
 
 def _bands(
     measured: xr.Dataset, response: xr.Dataset, warm: Array
 ) -> list[tuple[Curve, float, Array]]:
     """Response, noise and counts (measurement) of each band."""
-    names = _names(measured)
-    bands = []
-    for name, noise, counts in zip(
-        names, responses.noise(response, names), measured["counts"].values, strict=True
-    ):
+    names = [str(name) for name in measured["band"].values]
+    noises, bands = responses.noise(response, names), []
+    for name, noise, counts in zip(names, noises, measured["counts"].values, strict=True):
         curve = responses.curve(response, name)
         require_range(warm, curve, "object temperature")
         bands.append((curve, float(noise), counts.astype(np.float64)))
@@ -395,17 +362,11 @@ def _require_contrast(difference: Array, stds: Array, beside: str) -> None:
 def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
     """Emissivities of all bands; the reduced chi-square of a single measurement is NaN."""
     fits = [_fit_band(band, name) for name, band in signals.items()]
-    value, std, chi2, residual = (np.array(part) for part in zip(*fits, strict=True))
-    unit = {"units": "1"}
-    return xr.Dataset(
-        {
-            "emissivity": ("band", value, unit),
-            "emissivity_std": ("band", std, unit),
-            "reduced_chi2": ("band", chi2, unit),
-            "residual": (("band", "measurement"), residual, {"units": "count"}),
-        },
-        coords={"band": list(signals)},
-    )
+    *values, residual = (np.array(part) for part in zip(*fits, strict=True))
+    names = ("emissivity", "emissivity_std", "reduced_chi2")
+    parts = {name: ("band", one, {"units": "1"}) for name, one in zip(names, values, strict=True)}
+    residuals = (("band", "measurement"), residual, {"units": "count"})
+    return xr.Dataset({**parts, "residual": residuals}, {"band": list(signals)})
 
 
 def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:
@@ -434,5 +395,4 @@ def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]
 
 
 def _uniform_std(span: tuple[float, float]) -> float:
-    """Standard deviation of a uniform distribution."""
     return float((span[1] - span[0]) / np.sqrt(12.0))

@@ -1,6 +1,7 @@
-"""Response of a camera per band from blackbodies: Sakuma-Hattori curve and linear pair."""
+"""Response of a camera per band, of blackbodies or its maker: Sakuma-Hattori and linear pair."""
 
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -22,6 +23,9 @@ TEMPERATURE_STD: Final = 0.1
 """Standard deviation of a blackbody's temperature about its reading [K], as of an area blackbody
 or a calibrated thermocouple on it."""
 
+NO_BARS: Final = "maker's constants, without error bars"
+"""Attribute ``calibration`` of a response, and of what is made with it."""
+
 # Range of the curve's mean wavelength A + B / T at the middle temperature: a known band's edges,
 # wider by this factor (a real detector is no top hat), or else all of the thermal infrared.
 _WAVELENGTH_MARGIN: Final = 1.2
@@ -30,12 +34,11 @@ _THERMAL: Final = bands.Band("thermal infrared", 2e-6, 20e-6)
 # 3-14 um; more than 1 in no band, but for the little that a detector is not linear.
 _GROWTH: Final = (0.6, 1.1)
 _SHAPE_UNIT: Final = planck.SECOND_RADIATION_CONSTANT / 5.0
-# Good counts are refused once in so many sweeps.
-_FALSE_ALARM: Final = 1e-4
-# Standard deviations of a difference by which noise may let counts fall.
-_FALLING: Final = 5.0
-# Variance of rounding to whole counts [count^2].
-_ROUNDING: Final = 1.0 / 12.0
+_FALSE_ALARM: Final = 1e-4  # good counts are refused once in so many sweeps
+_FALLING: Final = 5.0  # standard deviations of a difference by which noise may let counts fall
+_ROUNDING: Final = 1.0 / 12.0  # variance of rounding to whole counts [count^2]
+# Points at which a maker's curve is fitted over the camera's range, and its largest error [K].
+_POINTS, _LARGEST_ERROR = 64, 0.2
 
 
 def fit_response(
@@ -81,11 +84,9 @@ def fit_response(
     Raises
     ------
     TypeError, ValueError
-        If the counts are not a DataArray of numbers, dims, units or order are wrong, there are too
-        few temperatures, a value is NaN, counts do not grow with temperature, or the noise does not
-        fit the bands or is not positive; or if the counts follow no Planck curve, as where a camera
-        saturates, changes its range, or gives counts linear in temperature: the error names the
-        temperature that is off the curve of the others, if it is one.
+        If an input is not as described, a value is NaN, or the counts follow no Planck curve, as
+        where a camera saturates, changes its range, or gives counts linear in temperature: the
+        error names the temperature that is off the curve of the others, if it is one.
 
     References
     ----------
@@ -115,46 +116,125 @@ def fit_response(
     names = [str(name) for name in counts["band"].values]
     temperature = counts["temperature"].values.astype(np.float64)
     values = counts.values.astype(np.float64)
-    noises = np.zeros(len(names)) if noise is None else _noise(noise, names)
-    curves, rows = [], []
+    noises = np.zeros(len(names))
+    if noise is not None:
+        if not isinstance(noise, xr.DataArray):
+            raise TypeError(f"Invalid noise of type {type(noise).__name__}. Must be a DataArray.")
+        noises = schema.band_values(noise, names, "the noise", "count")
+        planck.require_positive("noise [count]", noises)
+    curves, lines = [], []
     for name, row, std in zip(names, values, noises, strict=True):
-        line = np.polynomial.Polynomial.fit(temperature, row, 1).convert().coef[::-1]
+        line = _line(temperature, row)
         reading = np.hypot(std, np.sqrt(_ROUNDING) if np.all(row == np.rint(row)) else 0.0)
         _check_growth(name, temperature, row, float(np.hypot(reading, temperature_std * line[0])))
         curve = fit_band(name, temperature, row)
         slope = np.max(np.diff(curve.counts(temperature)) / np.diff(temperature))
-        error = float(np.hypot(reading, temperature_std * slope))
-        _check_residuals(curve, temperature, row, error)
+        _check_residuals(curve, temperature, row, float(np.hypot(reading, temperature_std * slope)))
         curves.append(curve)
-        rows.append([curve.amplitude, curve.wavelength, curve.shift, curve.offset, *line])
-    parameters = [*responses.COEFFICIENTS, "linear_slope", "linear_intercept"]
-    stage = schema.STAGES["response"]
-    variables: dict[str, xr.DataArray] = {
-        name: xr.DataArray([row[index] for row in rows], dims="band", attrs=stage[name].attrs)
-        for index, name in enumerate(parameters)
-    }
-    scalars = {
-        "reference_temperature": curves[0].reference,
-        "temperature_min": temperature[0],
-        "temperature_max": temperature[-1],
-    }
-    for name, value in scalars.items():
-        variables[name] = xr.DataArray(value, attrs=stage[name].attrs)
-    result = xr.Dataset(variables, coords={"band": names, "temperature": temperature})
-    result["temperature"].attrs.update(units="K", long_name="blackbody temperature")
+        lines.append(line)
+    attrs = {"units": "K", "long_name": "blackbody temperature"}
+    result = _response(curves, lines).assign_coords(temperature=("temperature", temperature, attrs))
     result["counts"] = (("band", "temperature"), values, {"units": "count"})
     for name, kind in (("residual", "exact"), ("linear_residual", "linear")):
-        fitted = np.stack(
-            [responses.curve(result, band, kind).counts(temperature) for band in names]
-        )
+        fitted = [responses.curve(result, band, kind).counts(temperature) for band in names]
         result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
     if noise is None:
         return result
     netd = noises / np.array([curve.reference_slope for curve in curves])
-    return result.assign(
-        noise=("band", noises, {"units": "count", "long_name": "noise of one pixel and frame"}),
-        netd=("band", netd, {"units": "K", "long_name": "NETD"}),
-    )
+    return result.assign(schema.variables("response", {"noise": noises, "netd": netd}))
+
+
+def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
+    r"""Response of each band from the Planck constants that its maker wrote into the file.
+
+    .. math:: I(T) = \frac{R_1}{R_2 (\exp(B / T) - F)} - O
+
+    is, for F = 1, the Sakuma-Hattori curve with :math:`C = R_1 / R_2`, :math:`A = c_2 / B` and no
+    shift; for another F the curve is fitted over the camera's range, with an error that is stated.
+
+    These constants have no error bars, and what a filter in front of the lens takes away is not in
+    them: all deviations of a result count noise alone, and say so in ``calibration``. The maker
+    states 2 K or 2 % as a rule. Emissivity, distance and reflected temperature are not used.
+
+    Parameters
+    ----------
+    files : mapping
+        Attributes of a recording by band: ``capture.attrs["files"]`` of `readers.two_bands`, or
+        ``{"8-14": recording.attrs}`` with a recording from `readers.flir`.
+
+    Returns
+    -------
+    Dataset
+        Stage `response` of `schema`, without `noise`, over the range of temperatures that the
+        cameras share. Attributes ``calibration`` ("maker's constants, without error bars") and
+        ``form_error`` [K], the largest error of the form.
+
+    Raises
+    ------
+    ValueError
+        If a constant is missing or not positive, the ranges do not overlap, or the form does not
+        fit.
+
+    References
+    ----------
+    .. [1] Tattersall (2017), Thermimage, doi:10.5281/zenodo.1069704, for the maker's formula
+
+    Examples
+    --------
+    >>> from dbthermal import response
+    >>> constants = {"R1": 21106.77, "R2": 0.012545258, "B": 1501.0, "F": 1.0, "O": -7340}
+    >>> attrs = {f"file_planck_{key}": value for key, value in constants.items()}
+    >>> made = maker_response({"8-14": attrs | {"file_range_min": 253.0, "file_range_max": 393.0}})
+    >>> round(float(response.curve(made, "8-14").inverse(18000.0)), 2)  # [K]
+    296.18
+    """
+    if not files:
+        raise ValueError("Empty mapping of files. Must have the attributes of one band at least.")
+    ranges = [
+        [_constant(attrs, f"range_{end}", band) for end in ("min", "max")]
+        for band, attrs in files.items()
+    ]
+    lowest, highest = max(low for low, _ in ranges), min(high for _, high in ranges)
+    if not lowest < highest:
+        raise ValueError(f"Invalid ranges {ranges} K of the bands {[*files]}. Must overlap.")
+    temperature = np.linspace(lowest, highest, _POINTS)
+    error, curves, lines = 0.0, [], []
+    for band, attrs in files.items():
+        r1, r2, b, f = (_constant(attrs, f"planck_{key}", band) for key in ("R1", "R2", "B", "F"))
+        offset = -_constant(attrs, "planck_O", band, positive=False)
+        if not np.exp(b / highest) > f:
+            raise ValueError(f"Invalid planck_F {f} of '{band}'. Must be below exp(B / T).")
+        counts = r1 / (r2 * (np.exp(b / temperature) - f)) + offset
+        curve = fit_band(band, temperature, counts)
+        error = max(error, float(np.max(np.abs(curve.inverse(counts) - temperature))))
+        if error > _LARGEST_ERROR:
+            rule = f"Must be at most {_LARGEST_ERROR} K: fit a blackbody, by fit_response"
+            raise ValueError(f"Invalid form of '{band}', F = {f:g}: {error:.2g} K off. {rule}.")
+        curves.append(curve)
+        lines.append(_line(temperature, counts))
+    return _response(curves, lines).assign_attrs(calibration=NO_BARS, form_error=error)
+
+
+def _line(temperature: Array, counts: Array) -> Array:
+    """Slope [count/K] and intercept [count] of the line of least squares."""
+    fit = np.polynomial.Polynomial.fit(temperature, counts, 1)
+    return np.asarray(fit.convert().coef[::-1])
+
+
+def _response(curves: list[Curve], lines: list[Array]) -> xr.Dataset:
+    """Curve and line of each band in the form of the stage `response`."""
+    rows = [
+        [curve.amplitude, curve.wavelength, curve.shift, curve.offset, *line]
+        for curve, line in zip(curves, lines, strict=True)
+    ]
+    names = [*responses.COEFFICIENTS, "linear_slope", "linear_intercept"]
+    values = dict(zip(names, np.transpose(rows), strict=True)) | {
+        "reference_temperature": curves[0].reference,
+        "temperature_min": curves[0].lowest,
+        "temperature_max": curves[0].highest,
+    }
+    bands = [curve.band for curve in curves]
+    return xr.Dataset(schema.variables("response", values), {"band": bands})
 
 
 def _check_blackbody(counts: xr.DataArray) -> None:
@@ -268,10 +348,12 @@ def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
     return Curve(band, amplitude, wavelength, shift, offset, reference, *range_)
 
 
-def _noise(noise: xr.DataArray, names: list[str]) -> Array:
-    """Noise (band) [count] of the named bands, checked."""
-    if not isinstance(noise, xr.DataArray):
-        raise TypeError(f"Invalid noise of type {type(noise).__name__}. Must be a DataArray.")
-    schema.check_variable(noise, schema.NOISE, "the noise")
-    places = schema.band_positions(noise, names, "the noise")
-    return planck.require_positive("noise [count]", noise.values[places])
+def _constant(attrs: Mapping[str, Any], key: str, band: str, *, positive: bool = True) -> float:
+    """Constant of a file; ValueError by band if it is missing or not positive."""
+    if f"file_{key}" not in attrs:
+        rule = "Must be in the file, as in FLIR's: else fit a blackbody, by fit_response"
+        raise ValueError(f"Missing {key} of band '{band}'. {rule}.")
+    value = float(attrs[f"file_{key}"])
+    if positive:
+        planck.require_positive(f"{key} of band '{band}'", value)
+    return value

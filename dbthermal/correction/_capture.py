@@ -1,6 +1,7 @@
 """All corrections of a capture, in the one order in which they are right."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -25,9 +26,10 @@ def correct_capture(
 ) -> xr.Dataset:
     """Raw capture to corrected counts with a status: every correction, in the right order.
 
+    TypeError or ValueError if capture or correction is not of its stage, and as the steps.
+
     1. `find_shutter` on the raw counts, where a frame that the camera repeats is an exact copy; the
-       bit `schema.SHUTTER_CLOSED` of the recorded `frame_flags`, if there are any, adds the frames
-       that the camera reports as closed.
+       bit `schema.SHUTTER_CLOSED` of recorded `frame_flags` adds those that the camera reports.
     2. `renew_offset` and `correct`: gain and offset of each pixel, saturated and dead pixels. The
        limits of the detector hold for raw counts, so this comes before anything mixes frames.
     3. `mark_shutter`: repeated and closed frames become NaN, and so do frames without an exposure
@@ -69,16 +71,9 @@ def correct_capture(
     Dataset
         Stage `corrected`: `counts` (band, time, y, x) [count], float32, NaN where a frame is no
         measurement; `status` (y, x); `segment` (time); `drift` (band, time) [count]; `pattern_std`
-        (band) [count], if the correction has its deviations, as from `correct`. The attributes of
-        the steps state what was done with which parameters: ``shutter_events`` is the number of
-        renewals of the offsets, ``frames_taken_out`` that of the frames set to NaN (by band), and
-        ``shutter_closed_frames`` that of the frames recorded as closed (by band), -1 without
-        `frame_flags`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If capture or correction is not of its stage; as the steps.
+        (band) [count], as from `correct`. Attributes: those of the steps; ``shutter_events``
+        (renewals of the offsets), ``frames_taken_out`` (set to NaN, by band), and
+        ``shutter_closed_frames`` (recorded as closed, by band; -1 without `frame_flags`).
 
     Examples
     --------
@@ -129,21 +124,15 @@ def correct_capture(
 def _by_rows(measured: Callable[[slice], xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
     """All rows of a function of some, block by block; the counts are left to be computed."""
     parts = [measured(rows).drop_vars("counts") for rows in _rows.blocks(raw.shape)]
-    whole = xr.concat(
-        parts,
-        "y",
-        data_vars="minimal",
-        coords="minimal",
-        compat="override",
-        combine_attrs="override",
-    )
+    rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
+    whole = xr.concat(parts, "y", combine_attrs="override", **rule)
     if "pattern_std" in whole:
         squares = [part["pattern_std"].values ** 2 for part in parts]
         whole["pattern_std"].values[:] = np.sqrt(np.mean(squares, axis=0))
-    counts = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
-    return whole.assign(
-        counts=_rows.lazy(lambda rows: measured(rows)["counts"].values, counts)
-    ).assign_attrs(dead_pixels=sum(part.attrs["dead_pixels"] for part in parts))
+    like = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
+    counts = _rows.lazy(lambda rows: measured(rows)["counts"].values, like)
+    dead = sum(part.attrs["dead_pixels"] for part in parts)
+    return whole.assign(counts=counts).assign_attrs(dead_pixels=dead)
 
 
 def _closed(capture: xr.Dataset) -> xr.DataArray | None:

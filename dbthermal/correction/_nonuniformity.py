@@ -1,9 +1,8 @@
 """Non-uniformity correction (NUC): a gain and an offset for each pixel, and its bad pixels.
 
-The correction follows the supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334: a
-blackbody fills the view at several temperatures, and each pixel is brought to the frame's mean by
-least squares. A bad pixel is marked, never filled from its neighbours: a filled pixel looks like a
-measurement but is not one.
+By the supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334: a blackbody fills the
+view at several temperatures, and each pixel is brought to the frame's mean by least squares. A bad
+pixel is marked, never filled from its neighbours, which would look like a measurement.
 """
 
 from typing import Final
@@ -27,8 +26,7 @@ OUTLIER: Final = 6.0
 _PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "offset_renewed"}
 _PATTERN = {"offset_std", "gain_std", "centre"}
 _PASSES = 2
-# About as many samples of a band tell its levels.
-_LEVELS = 65536
+_LEVELS = 65536  # about as many samples of a band tell its levels
 # Below this a difference between pixels is rounding, and no pixel is an outlier [count].
 _ROUNDING = 0.01
 
@@ -37,10 +35,9 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     r"""Mean frames and temporal noise of movies of a blackbody.
 
     The noise of a pixel, :math:`s^2 = \overline{d^2} / 2`, comes from the differences d of
-    successive frames, so that a drift of the camera or of the blackbody does not enter. Its median
-    over pixels and temperatures is divided by that of a chi-square distribution of the degrees of
-    freedom that n differences leave, :math:`2 n^2 / (3 n - 1)`: a median of few frames is otherwise
-    too low (by 33 % for two frames, 5 % for ten).
+    successive frames, free of drift. Its median over pixels and temperatures is divided by that of
+    a chi-square distribution of the degrees of freedom that n differences leave, :math:`2 n^2 /
+    (3 n - 1)`: a median of few frames is else too low (by 33 % for two frames, 5 % for ten).
 
     Parameters
     ----------
@@ -87,13 +84,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
                 "the samples must be finite and vary from frame to frame."
             )
     means = counts.mean("frame", dtype=np.float64, skipna=False)
-    return xr.Dataset(
-        {
-            "counts": means.assign_attrs(schema.STAGES["blackbody_frames"]["counts"].attrs),
-            "noise": ("band", noise, {"units": "count", "long_name": "noise of one sample"}),
-        },
-        attrs={"frames": frames},
-    )
+    variables = schema.variables("blackbody_frames", {"counts": means.values, "noise": noise})
+    return xr.Dataset(variables, means.coords, {"frames": frames})
 
 
 def fit_correction(
@@ -111,8 +103,8 @@ def fit_correction(
     times the median absolute deviation) off the median of the others. Mean, fit and outliers are
     determined twice, then the fit is made with the remaining pixels.
 
-    The means are noisy, and so is the fit: at a level L it leaves from pixel to pixel, the same in
-    every frame of a capture, an error of the variance
+    The noise of the means leaves at a level L, from pixel to pixel, the same in every frame of a
+    capture, an error of the variance
 
     .. math:: \sigma_f^2 + \sigma_g^2 (L - c)^2, \quad \sigma_f^2 = \frac{v}{n}, \quad
        \sigma_g^2 = \frac{v}{\sum_T (\bar I - c)^2}
@@ -174,23 +166,14 @@ def fit_correction(
         frames = band.values.astype(np.float64).reshape(-1, image[0] * image[1])
         parts.append(_fit_band(frames, str(band["band"].item()), threshold, maximum))
     gain, offset, bad, residual, level = (np.stack(part) for part in zip(*parts, strict=True))
-    values = {
-        **{name: part.reshape(-1, *image) for name, part in (("gain", gain), ("offset", offset))},
-        "bad": bad.reshape(-1, *image),
-        "residual": residual,
-        "level": level,
-    }
+    maps = {"gain": gain, "offset": offset, "bad": bad}
+    values = {name: part.reshape(-1, *image) for name, part in maps.items()}
+    values |= {"residual": residual, "level": level}
     values |= _residual_pattern(residual, level, blackbody)
-    stage = {**schema.STAGES["correction"], **schema.OPTIONAL["correction"]}
-    return xr.Dataset(
-        {name: (stage[name].dims, part, stage[name].attrs) for name, part in values.items()},
-        coords={name: counts.coords[name] for name in counts.dims if name in counts.coords},
-        attrs={
-            "blackbody_temperatures": counts["temperature"].values.tolist(),
-            "threshold": threshold,
-            "detector_maximum": maximum,
-        },
-    )
+    coords = {name: counts.coords[name] for name in counts.dims if name in counts.coords}
+    attrs = {"threshold": threshold, "detector_maximum": maximum}
+    attrs |= {"blackbody_temperatures": counts["temperature"].values.tolist()}
+    return xr.Dataset(schema.variables("correction", values), coords, attrs)
 
 
 def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
@@ -200,7 +183,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
 
     with F the image and the mean over the good pixels, so that the band's level stays: a single
     image of unknown temperature says nothing of it (`undo_drift` does). `offset_std` becomes that
-    of an image as noisy as one of the calibration's.
+    of an image as noisy as one of the calibration's. The attribute ``offset_renewed`` is 1.
 
     Parameters
     ----------
@@ -210,16 +193,10 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
         Mean of raw frames of a uniform view, (band, y, x) [count], such as a lens cap or the
         camera's shutter, of the bands of the correction.
 
-    Returns
-    -------
-    Dataset
-        The correction with other `offset` [count], and the attribute ``offset_renewed`` = 1.
-
     Raises
     ------
     TypeError, ValueError
-        If the correction has no `bad`, a band is missing, the pixels are not the same, or a good
-        pixel of the image is not finite.
+        If bands or pixels are not the same, or a good pixel of the image is not finite.
     """
     schema.check(correction, "correction")
     if "bad" not in correction:
@@ -262,21 +239,24 @@ def correct(
     Returns
     -------
     Dataset
-        Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), uint32,
-        with the bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or
-        at 0) of `schema.Status`. The counts of these pixels are kept. `pattern_std` (band) [count]
-        where the correction has its deviations: what it leaves from pixel to pixel, constant in
-        time, root mean square over the levels of the capture. Attributes:
+        Stage `corrected`: `counts` (band, time, y, x) [count], float32; `status` (y, x), with the
+        bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or at 0) of
+        `schema.Status`, whose counts are kept; `pattern_std` (band) [count] where the correction
+        has its deviations, root mean square over the levels of the capture. Attributes:
         ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``), and the
         numbers of marked pixels.
 
     Raises
     ------
     TypeError, ValueError
-        If the capture is not uint16 or was corrected before, a band is missing in the correction, a
-        gain or offset is not finite, or the pixels are not the same.
+        If the capture is not uint16 or was corrected before, or the correction lacks a band, is not
+        finite, or is of other pixels.
     """
-    counts = _require_raw(capture)
+    counts = schema.check(capture, "capture")["counts"]
+    if capture.attrs.get("gain_offset_corrected"):
+        raise ValueError("Invalid capture: gain and offset were corrected before. Must be raw.")
+    if counts.dtype != np.uint16:
+        raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
     maps = _maps(correction, counts)
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
@@ -298,16 +278,9 @@ def correct(
     done = {
         f"gain_offset_{key}": correction.attrs[key] for key in _PARAMETERS & correction.attrs.keys()
     }
-    return schema.check(
-        result.assign_attrs(
-            gain_offset_corrected=1,
-            **done,
-            detector_maximum=maximum,
-            dead_pixels=int(bad.sum()),
-            saturated_pixels=int(saturated.sum()),
-        ),
-        "corrected",
-    )
+    done |= {"gain_offset_corrected": 1, "detector_maximum": maximum}
+    done |= {"dead_pixels": int(bad.sum()), "saturated_pixels": int(saturated.sum())}
+    return schema.check(result.assign_attrs(done), "corrected")
 
 
 def _residual_pattern(residual: Array, level: Array, blackbody: xr.Dataset) -> dict[str, Array]:
@@ -344,15 +317,11 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
 
 def _difference_variance(counts: xr.DataArray) -> Array:
     """Half the mean square of the frames' differences, (band, temperature and pixel)."""
-    parts = [
-        [
-            # Signed before the difference: unsigned counts wrap around.
-            np.square(np.diff(movie.values.astype(np.float32), axis=0)).mean(axis=0, dtype=float)
-            for movie in band
-        ]
-        for band in counts
-    ]
-    return 0.5 * np.asarray(parts, dtype=np.float64).reshape(counts.sizes["band"], -1)
+    result = np.empty((*counts.shape[:2], *counts.shape[3:]))
+    for place in np.ndindex(*counts.shape[:2]):
+        movie = counts[place].values.astype(np.float32)  # signed: unsigned counts wrap around
+        result[place] = np.square(np.diff(movie, axis=0)).mean(axis=0, dtype=float)
+    return 0.5 * result.reshape(len(result), -1)
 
 
 def _fit_band(
@@ -411,16 +380,6 @@ def _inliers(values: Array, good: Mask, threshold: float) -> Mask:
     centre = np.median(values[good])
     scale = MAD * np.median(np.abs(values[good] - centre))
     return np.asarray(np.abs(values - centre) <= threshold * max(scale, _ROUNDING))
-
-
-def _require_raw(capture: xr.Dataset) -> xr.DataArray:
-    """Counts of a capture that is raw."""
-    counts = schema.check(capture, "capture")["counts"]
-    if capture.attrs.get("gain_offset_corrected"):
-        raise ValueError("Invalid capture: gain and offset were corrected before. Must be raw.")
-    if counts.dtype != np.uint16:
-        raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
-    return counts
 
 
 def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:

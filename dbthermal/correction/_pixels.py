@@ -28,12 +28,9 @@ _NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
 _SHARED = 0.3
 _REACH_SECONDS = 0.2
 _REACH_FRAMES = 5
-# Samples in a row that may be NaN within a jump.
-_LONGEST_GAP: Final = 2
-# Differences of the logarithm of the noise that are rounding [1].
-_ROUNDING = 0.01
-# Samples of a block of rows.
-_BLOCK = 8_000_000
+_LONGEST_GAP: Final = 2  # samples in a row that may be NaN within a jump
+_ROUNDING = 0.01  # differences of the logarithm of the noise that are rounding [1]
+_BLOCK = 8_000_000  # samples of a block of rows
 
 
 def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset:
@@ -47,12 +44,10 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
 
     Jumps. A pixel is bad that changes from one frame to the next by more than `threshold` standard
     deviations of a difference, :math:`\sqrt 2 m`, while none of its eight neighbours changes in the
-    same direction by 0.3 of it within 0.2 s or five frames, the longer. Someone walking by is seen
-    by neighbours, be it a little later; a detector that blinks is alone. Frames that are NaN, the
-    steps between segments, and 0.2 s or five frames at either end do not count; over two samples of
-    a pixel that are NaN a jump is still seen, over more it is not. A scene's detail
-    that is one pixel wide, such as a wire, cannot be told from a pixel that blinks, and is marked,
-    too.
+    same direction by 0.3 of it within 0.2 s or five frames, the longer, as by someone who walks by.
+    Frames that are NaN, the steps between segments, and 0.2 s or five frames at either end do not
+    count; a jump is seen over two NaN samples of a pixel, over more it is not. A scene's detail one
+    pixel wide, such as a wire, cannot be told from a pixel that blinks, and is marked, too.
 
     Parameters
     ----------
@@ -65,16 +60,16 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     Returns
     -------
     Dataset
-        The dataset with the bit `Status.DEAD_PIXEL` set in `status` (y, x), other bits as they
-        were, the counts unchanged; and the attributes ``noisy_pixels`` and ``jumping_pixels``,
-        their numbers, ``unjudged_pixels``, the number of those with fewer than 16 samples that are
-        not NaN in a band, which get no bit here, and ``bad_threshold``.
+        The dataset with the bit `Status.DEAD_PIXEL` set in `status` (y, x), the counts unchanged;
+        and the attributes ``noisy_pixels`` and ``jumping_pixels``, their numbers,
+        ``unjudged_pixels``, those with fewer than 16 samples that are not NaN in a band, which get
+        no bit here, and ``bad_threshold``.
 
     Raises
     ------
     TypeError, ValueError
         If the threshold is not positive, or a band has fewer frames that are not NaN than 16, or
-        than 0.4 s and three frames more, or no pixel that can be judged.
+        than 0.4 s and three frames more, or no pixel with 16 samples.
 
     Examples
     --------

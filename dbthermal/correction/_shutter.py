@@ -24,8 +24,7 @@ _MINIMUM_PIXELS: Final = 16
 # event that is missed biases the separation, lost frames that are counted as one cost it one degree
 # of freedom a band.
 _FEWEST_COPIES: Final = 3
-# About as many pixels, on an even grid, are compared first.
-_SAMPLE = 4096
+_SAMPLE = 4096  # about as many pixels, on an even grid, are compared first
 # Most samples of a block of rows that is read at once.
 _BLOCK = 4_000_000
 _EVENT = ("band", "first_frame", "frames", "renewed")
@@ -97,9 +96,9 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     follow without a frame between, are counted as one, so that cameras that fire together cost one
     step. An event before the first or after the last valid frame makes none.
 
-    An event costs accuracy: only the object's smoothness ties the level after it to the one before.
-    Beside five functions over 35 s, one step in the middle raises the standard deviation of the
-    smooth part by 1.9, two, at 11 and 24 s, by 2.7.
+    An event costs accuracy, for only the object's smoothness ties the level after it to the one
+    before: beside five functions over 35 s, one step in the middle raises the standard deviation of
+    the smooth part by 1.9, two, at 11 and 24 s, by 2.7.
 
     Parameters
     ----------
@@ -136,13 +135,13 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     changes = _changes(first[inside], after[inside])
     segment = np.searchsorted(changes, np.arange(frames), side="right").astype(np.int32)
     kept = xr.DataArray(~marked, dims=("band", "time"), coords={"band": counts["band"]})
-    return corrected.assign(
+    result = corrected.assign(
         counts=counts.where(kept).assign_attrs(counts.attrs),
         segment=("time", segment, schema.SEGMENT.attrs),
-    ).assign_attrs(
-        shutter_events=int(renewed.sum()),
-        repeated_frames=int((~renewed).sum()),
-        frames_taken_out=marked.sum(axis=1).tolist(),
+    )
+    number, taken = int(renewed.sum()), marked.sum(axis=1).tolist()
+    return result.assign_attrs(
+        shutter_events=number, repeated_frames=renewed.size - number, frames_taken_out=taken
     )
 
 

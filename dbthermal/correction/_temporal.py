@@ -6,7 +6,7 @@ import xarray as xr
 
 from dbthermal import _rows, planck, schema
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 
 
@@ -40,7 +40,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     ------
     TypeError, ValueError
         If there are fewer than two frames, the lag was undone before, the counts are whole numbers,
-        or a time constant is not finite and positive or a band has none.
+        or a time constant is not finite and positive.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:
@@ -68,22 +68,16 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
 def lag_coefficients(
     time_constant: float | xr.DataArray, counts: xr.DataArray
 ) -> tuple[Array, Array]:
-    r"""Weights of the frame before and of the new signal in a pixel that lags.
+    r"""Weights (band, time - 1) [1] of the frame before and of the new signal in a pixel that lags.
 
-    They are :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a` (band, time - 1) [1], both to full
-    precision.
+    They are :math:`a = e^{-\Delta t / \tau}` and :math:`1 - a`, both to full precision.
 
     Parameters
     ----------
     time_constant : float or DataArray
-        Time constant :math:`\tau` [s], of all bands or (band).
+        Time constant :math:`\tau` [s], positive, of all bands or (band).
     counts : DataArray
         Counts (band, time, ...), whose times are taken.
-
-    Raises
-    ------
-    ValueError
-        If a time constant is not finite and positive, or a band has none.
     """
     interval = np.diff(counts["time"].values.astype(np.float64))
     ratio = interval / _time_constants(time_constant, counts)[:, np.newaxis]
@@ -101,10 +95,9 @@ def undo_drift(
     .. math:: I'(t) = I(t) - [c(t) - c(t_0)]
 
     with c the smooth curve and :math:`t_0` the segment's first frame. The steps between segments
-    are left for the separation, which estimates them pixel by pixel. Of n pixels of noise s the
-    patch adds an error of about :math:`s K / \sqrt{n N}` in N frames with K functions, the one at
-    the ends of a polynomial: 0.11 counts for 100 pixels of 4 counts and 350 frames. A motion in
-    front of the patch, or reflected in it, is taken for drift.
+    are left for the separation. Of n pixels of noise s the patch adds an error of about :math:`s K
+    / \sqrt{n N}` in N frames with K functions, at the ends: 0.11 counts for 100 pixels of 4 counts
+    and 350 frames. A motion in front of the patch, or reflected in it, is taken for drift.
 
     Parameters
     ----------
@@ -126,9 +119,8 @@ def undo_drift(
     Raises
     ------
     TypeError, ValueError
-        If the drift was undone before, the reference is no boolean of its pixels or marks no good
-        pixel, `order` is below 2, or a pixel of the patch is NaN in a frame in which others are
-        not.
+        If the drift was undone before, the reference marks no good pixel, `order` is below 2, or a
+        pixel of the patch is NaN in a frame in which others are not.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "drift" in corrected:
@@ -141,12 +133,6 @@ def undo_drift(
     _require_whole(patch, level)
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(level.shape[1])
     curves = np.stack([_smooth_change(part, segment, order) for part in level])
-    drift = xr.DataArray(
-        curves,
-        dims=("band", "time"),
-        coords={name: counts[name] for name in ("band", "time")},
-        attrs=schema.OPTIONAL["corrected"]["drift"].attrs,
-    )
 
     def undone(part: slice) -> npt.NDArray[np.floating]:
         """Counts of some rows without the drift."""
@@ -154,7 +140,8 @@ def undo_drift(
         return np.asarray(seen - curves[..., np.newaxis, np.newaxis], dtype=seen.dtype)
 
     undo = _rows.lazy(undone, counts) if lazy else counts.copy(data=undone(slice(None)))
-    return corrected.assign(counts=undo, drift=drift).assign_attrs(
+    drift = schema.variables("corrected", {"drift": curves})
+    return corrected.assign(counts=undo, **drift).assign_attrs(
         drift_order=order, drift_pixels=len(rows)
     )
 
@@ -163,13 +150,12 @@ def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -
     """Time constant of each band [s]."""
     names = [str(name) for name in counts["band"].values]
     if isinstance(time_constant, xr.DataArray):
-        places = schema.band_positions(time_constant, names, "the time constants")
-        return planck.require_positive("time_constant [s]", time_constant.values[places])
-    value = planck.require_positive("time_constant [s]", time_constant)
-    return np.full(len(names), float(value))
+        values = schema.band_values(time_constant, names, "the time constants", "s")
+        return planck.require_positive("time_constant [s]", values)
+    return np.full(len(names), float(planck.require_positive("time_constant [s]", time_constant)))
 
 
-def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> npt.NDArray[np.bool_]:
+def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> Mask:
     """Good pixels (y, x) of the reference patch."""
     dtype = getattr(reference, "dtype", type(reference).__name__)
     if str(dtype) != "bool":

@@ -19,6 +19,7 @@ function make(parent, tag, className = "", properties = {}) {
 }
 const surface = (width, height) => make(null, "canvas", "", { width, height }).getContext("2d");
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+const rounded = (value) => Math.round(100 * value) / 100; // [pixel]
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 
 class Link {
@@ -145,7 +146,7 @@ class Picture {
     const hidden = explorer.hidden;
     if (this.pane.kind === "status") table.set(explorer.statusColors);
     else this.paintScale(explorer.palettes[explorer.palette]);
-    for (let at = 0; at < colors.length; at++) colors[at] = hidden[at] ? 0 : table[codes[at]];
+    for (let at = 0; at < colors.length; at++) colors[at] = hidden[at] && this.pane.kind !== "status" ? 0 : table[codes[at]];
     this.image.putImageData(this.pixels, 0, 0);
     explorer.redraw([this]);
   }
@@ -461,7 +462,7 @@ class Explorer {
     this.cursor = within ? [row, column] : null;
     if (this.draft && this.draft.kind !== "polygon") this.draft.points = [this.draft.points[0], at.map((one, i) => clamp(one, 0, this.shape[i]))];
     else if (this.grip?.region) {
-      this.grip.region.points = this.grip.points.map((point) => point.map((one, i) => one + at[i] - this.grip.at[i]));
+      this.grip.region.points = this.grip.points.map((point) => point.map((one, i) => rounded(one + at[i] - this.grip.at[i])));
       this.askCurves();
     } else if (this.grip) this.moveZoom(this.zoom.x + this.grip.at[1] - at[1], this.zoom.y + this.grip.at[0] - at[0], this.zoom.factor);
     if (moved && !pressed) this.askProbe();
@@ -471,7 +472,7 @@ class Explorer {
     const points = this.draft?.points.filter((one, i, all) => !i || Math.hypot(one[0] - all[i - 1][0], one[1] - all[i - 1][1]) > 0.1) ?? [];
     const wide = [0, 1].every((i) => Math.max(...points.map((one) => one[i])) - Math.min(...points.map((one) => one[i])) > 0.5);
     if (wide && points.length >= (this.tool === "polygon" ? 3 : 2)) {
-      this.regions.set(`region ${this.number++}`, { kind: this.draft.kind, points });
+      this.regions.set(`region ${this.number++}`, { kind: this.draft.kind, points: points.map((point) => point.map(rounded)) });
       this.askCurves();
     }
     this.draft = null;

@@ -1,19 +1,15 @@
 """Figures of the calibration: gain and offset of the pixels, response and emissivity of bands."""
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from scipy.constants import zero_Celsius
 
 from dbthermal._coordinates import laid_on
-from dbthermal.figures.drawing import (
-    COLORS,
-    band_label,
-    canvas,
-    draw_image,
-    limits_of,
-    provenance_note,
-)
+from dbthermal.figures import drawing
+from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
 
 
 def gain_offset_maps(correction: xr.Dataset) -> Figure:
@@ -23,11 +19,6 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
     ----------
     correction : Dataset
         From `correction.fit_correction`: `gain` [1], `offset` [count], `bad`, all (band, y, x).
-
-    Returns
-    -------
-    Figure
-        Maps and marks.
     """
     bands = correction["band"].values
     figure, axes = canvas(len(bands), 2, (8.0, 2.8 * len(bands)))
@@ -41,12 +32,16 @@ def gain_offset_maps(correction: xr.Dataset) -> Figure:
             title = f"{band_label(band)}: {name}, {len(bad)} bad pixels"
             draw_image(figure, axis, image, title, label, cmap=cmap, limits=limits_of(image))
             axis.plot(bad[:, 1], bad[:, 0], "x", color="red", markersize=3)
-    figure.suptitle("Gain and offset correction" + provenance_note(correction))
+    figure.suptitle("Gain and offset correction" + drawing.provenance_note(correction))
     return figure
 
 
 def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
     """Response of each band with the residuals of both fits.
+
+    From above: counts over temperature, the line's residuals, and those of the Sakuma-Hattori curve
+    on a scale of their own, with the noise of one pixel and frame where the response has it.
+    Residuals and noise are counts over the slope of the line.
 
     Parameters
     ----------
@@ -54,13 +49,6 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
         From `calibration.fit_response`.
     fine : DataArray
         Fitted counts (band, temperature) on a fine grid of temperatures, from `response.counts`.
-
-    Returns
-    -------
-    Figure
-        From above: counts over temperature, the line's residuals, and those of the
-        Sakuma-Hattori curve on a scale of their own, with the noise of one pixel and frame where
-        the response has it; residuals and noise over the slope of the line.
     """
     bands = response["band"].values
     figure, axes = canvas(3, len(bands), (4.6 * len(bands), 7.2))
@@ -85,7 +73,7 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
             bottom.set_title(f"noise of one pixel and frame: {noise:.0f} mK", fontsize=8)
         for axis in (middle, bottom):
             axis.axhline(0.0, color="0.7", linewidth=0.8)
-    figure.suptitle("Camera response" + provenance_note(response))
+    figure.suptitle("Camera response" + drawing.provenance_note(response))
     return figure
 
 
@@ -96,11 +84,6 @@ def emissivity_bars(table: xr.Dataset) -> Figure:
     ----------
     table : Dataset
         From `emissivity.band_table`: `emissivity` (material, band) [1].
-
-    Returns
-    -------
-    Figure
-        Bars.
     """
     materials, bands = table["material"].values, table["band"].values
     figure, ((axis,),) = canvas(1, 1, (max(7.0, 0.62 * len(materials)), 4.6))
@@ -113,7 +96,7 @@ def emissivity_bars(table: xr.Dataset) -> Figure:
     axis.set_xticks(np.arange(len(materials)), materials, rotation=45, ha="right", fontsize=8)
     axis.set(ylabel="band emissivity [1]", ylim=(0, 1.12))
     axis.legend(frameon=False, ncols=len(bands), loc="upper center", fontsize=8)
-    axis.set_title("Planck-weighted band emissivity" + provenance_note(table))
+    axis.set_title("Planck-weighted band emissivity" + drawing.provenance_note(table))
     return figure
 
 
@@ -125,12 +108,7 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
     summary : DataArray
         (first, second) [1], averaged over materials; NaN or infinite on the diagonal.
     materials : int
-        Number of materials that the average is over.
-
-    Returns
-    -------
-    Figure
-        Matrix with its numbers.
+        Their number.
     """
     figure, ((axis,),) = canvas(1, 1, (5.4, 4.6))
     values = np.where(np.isfinite(summary.values), summary.values, np.nan)
@@ -139,16 +117,15 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
     for row, column in np.ndindex(*values.shape):
         if np.isfinite(values[row, column]):
             color = "white" if values[row, column] > middle else "black"
-            axis.text(
-                column, row, f"{values[row, column]:.0f}", ha="center", va="center", color=color
-            )
+            text = f"{values[row, column]:.0f}"
+            axis.text(column, row, text, ha="center", va="center", color=color)
     for setter, dim in ((axis.set_xticks, "second"), (axis.set_yticks, "first")):
         setter(np.arange(summary.sizes[dim]), [band_label(name) for name in summary[dim].values])
     figure.colorbar(drawn, ax=axis, label="condition number [1]")
     statistic = summary.attrs.get("statistic", "average")
     axis.set_title(
         f"Condition number of band pairs\n({statistic} of {materials} materials; low is good)"
-        + provenance_note(summary)
+        + drawing.provenance_note(summary)
     )
     return figure
 
@@ -162,11 +139,6 @@ def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = Non
         `emissivity`, `emissivity_std` (material, band) [1].
     table : DataArray, optional
         Tabulated values (material, band) [1], drawn as crosses: of a simulation the truth.
-
-    Returns
-    -------
-    Figure
-        One point per band and material.
     """
     figure, ((axis,),) = canvas(1, 1, (8.4, 3.8))
     if table is not None:
@@ -176,21 +148,16 @@ def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = Non
     for index, band in enumerate(bands):
         here = measured.sel(band=band)
         shifted = place + 0.14 * (index - (len(bands) - 1) / 2)
-        axis.errorbar(
-            shifted,
-            here["emissivity"],
-            here["emissivity_std"],
-            fmt="o",
-            markersize=4,
-            capsize=3,
-            color=COLORS[index],
-            label=band_label(band),
-        )
+        style: dict[str, Any] = {"fmt": "o", "markersize": 4, "capsize": 3, "color": COLORS[index]}
+        style["label"] = band_label(band)
+        axis.errorbar(shifted, here["emissivity"], here["emissivity_std"], **style)
         if table is not None:
             label = "table" if index == 0 else None
             axis.plot(shifted, table.sel(band=band), "x", color="black", markersize=7, label=label)
     axis.set_xticks(place, [str(name).replace(" ", "\n") for name in measured["material"].values])
     axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
     figure.legend(frameon=False, loc="outside right center", fontsize=8)
-    axis.set_title("Emissivity by contact, one standard deviation" + provenance_note(measured))
+    axis.set_title(
+        "Emissivity by contact, one standard deviation" + drawing.provenance_note(measured)
+    )
     return figure

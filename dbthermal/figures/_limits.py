@@ -1,7 +1,7 @@
 """Figure of the planner: accuracy to expect of a recording, filter by filter."""
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -10,14 +10,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from dbthermal.figures.drawing import (
-    COLORS,
-    MARKERS,
-    canvas,
-    plain_decades,
-    plain_ticks,
-    provenance_note,
-)
+from dbthermal.figures import drawing
+from dbthermal.figures.drawing import canvas, plain_decades
 
 # Deviations [K] at the ends of the colour map; beyond, a filter is as good or as bad as can be.
 _SCALE: Final = (0.1, 10.0)
@@ -28,6 +22,9 @@ _MICRO: Final = "\N{MICRO SIGN}m"
 def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) -> Figure:
     """Expected accuracy of the object temperature by filter, and by length of the film.
 
+    Left, a map with its numbers, the best filter of each material framed; right, lines over the
+    length.
+
     Parameters
     ----------
     expected : Dataset
@@ -36,19 +33,11 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     durations : Dataset
         From `limits.plan_durations`: `object_temperature_std` (seconds, material, filter) [K].
     materials : sequence of str
-        Whose lines to draw on the right, each with its best filter; a material with none is left
-        out.
-
-    Returns
-    -------
-    Figure
-        Left, a map with its numbers, the best filter of each material framed.
-        Right, lines over the length of the film.
+        Materials of the lines, each with its best filter; one with none is left out.
     """
     std = expected["object_temperature_std"]
-    height = 0.24 * std.sizes["material"] + 1.9
-    width = 2.6 + 0.75 * std.sizes["filter"]
-    figure, ((left, right),) = canvas(1, 2, (width + 5.2, max(4.2, height)))
+    size = (7.8 + 0.75 * std.sizes["filter"], max(4.2, 0.24 * std.sizes["material"] + 1.9))
+    figure, ((left, right),) = canvas(1, 2, size)
     drawn = _map(left, std, expected["best"])
     bar = figure.colorbar(drawn, ax=left, label="expected std [K]", shrink=0.8, extend="both")
     plain_decades(bar.ax)
@@ -60,19 +49,16 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
         right.loglog(
             durations["seconds"],
             durations["object_temperature_std"].sel(material=name, filter=chosen),
-            color=COLORS[index % len(COLORS)],
-            marker=MARKERS[index % len(MARKERS)],
-            markersize=4,
-            linewidth=1,
             label=f"{name}, {chosen} {_MICRO}",
+            **drawing.marked_line(index),
         )
-    plain_ticks(right, durations["seconds"])
+    drawing.plain_ticks(right, durations["seconds"])
     plain_decades(right)
     right.set(xlabel="length of the film [s]", ylabel="expected std [K]")
     if known.size:
         right.legend(frameon=False, fontsize=8, loc="upper right")
     title = "Object temperature of one pixel, expected standard deviation"
-    figure.suptitle(title + provenance_note(expected))
+    figure.suptitle(title + drawing.provenance_note(expected))
     return figure
 
 
@@ -87,16 +73,8 @@ def _map(axis: Axes, std: xr.DataArray, best: xr.DataArray) -> AxesImage:
         text = f"{value:.2g}" if np.isfinite(value) else "\N{EM DASH}"
         color = "white" if value > np.sqrt(_SCALE[0] * _SCALE[1]) else "black"
         frame = {"boxstyle": "round,pad=0.2", "fill": False, "edgecolor": color}
-        axis.text(
-            column,
-            row,
-            text,
-            color=color,
-            fontsize=8,
-            ha="center",
-            va="center",
-            bbox=frame if framed else None,
-        )
+        style: dict[str, Any] = {"color": color, "fontsize": 8, "ha": "center", "va": "center"}
+        axis.text(column, row, text, bbox=frame if framed else None, **style)
     axis.set_xticks(range(len(names)), names, fontsize=8)
     axis.set_yticks(range(len(values)), std["material"].values.tolist(), fontsize=8)
     return drawn

@@ -14,14 +14,8 @@ from matplotlib.text import Text
 from scipy.constants import zero_Celsius
 
 from dbthermal._coordinates import laid_on
-from dbthermal.figures.drawing import (
-    COLORS,
-    band_label,
-    canvas,
-    draw_image,
-    limits_of,
-    provenance_note,
-)
+from dbthermal.figures import drawing
+from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
 
 _WIDTH: Final = 3.2
 
@@ -31,6 +25,8 @@ _DPI: Final = 100
 def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, int]) -> Figure:
     """Truth against estimate over time at one pixel, with two standard deviations.
 
+    Object above, background below.
+
     Parameters
     ----------
     truth : Dataset
@@ -39,19 +35,13 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
         From `separation.solve`.
     pixel : tuple of int
         Row and column.
-
-    Returns
-    -------
-    Figure
-        Object above, background below.
     """
     figure, axes = canvas(2, 1, (7.4, 5.6))
     truth = laid_on(truth, result, "the truth", "the result", dims=("y", "x"))
     place = {"y": pixel[0], "x": pixel[1]}
     true, estimate = truth.isel(place), result.isel(place)
-    for axis, name in zip(
-        axes[:, 0], ("object_temperature", "background_temperature"), strict=True
-    ):
+    names = ("object_temperature", "background_temperature")
+    for axis, name in zip(axes[:, 0], names, strict=True):
         value, std = estimate[name] - zero_Celsius, estimate[f"{name}_std"]
         time = estimate["time"]
         axis.fill_between(time, value - 2 * std, value + 2 * std, color=COLORS[0], alpha=0.25)
@@ -60,7 +50,7 @@ def truth_and_estimate(truth: xr.Dataset, result: xr.Dataset, pixel: tuple[int, 
         axis.set(ylabel=name.replace("_", " ") + " [\N{DEGREE SIGN}C]")
     axes[0, 0].legend(["two standard deviations", "estimate", "truth"], frameon=False, fontsize=8)
     axes[-1, 0].set_xlabel("time [s]")
-    figure.suptitle(f"Truth and estimate at pixel {pixel}" + provenance_note(truth))
+    figure.suptitle(f"Truth and estimate at pixel {pixel}" + drawing.provenance_note(truth))
     return figure
 
 
@@ -84,11 +74,6 @@ def separated_frames(
         Name of the scene.
     labels : tuple of str
         Labels with units of inputs, emission and reflection.
-
-    Returns
-    -------
-    Figure
-        As many rows as there are times.
     """
     emission = laid_on(emission, inputs, "the emission", "the inputs")
     reflection = laid_on(reflection, inputs, "the reflection", "the inputs")
@@ -101,16 +86,14 @@ def separated_frames(
     for index, row in enumerate(axes):
         moment = f"{float(inputs['time'][index]):.1f} s"
         for axis, band, scale in zip(row, bands, scales, strict=False):
-            image = inputs.sel(band=band).isel(time=index)
-            draw_image(
-                figure, axis, image, f"input {band_label(band)}, {moment}", labels[0], limits=scale
-            )
+            image, name = inputs.sel(band=band).isel(time=index), f"input {band_label(band)}"
+            draw_image(figure, axis, image, f"{name}, {moment}", labels[0], limits=scale)
         image = emission.isel(time=index)
         draw_image(figure, row[-2], image, f"emission, {moment}", labels[1], limits=warm)
         image = reflection.isel(time=index)
         title_here = f"reflection less its mean, {moment}"
         draw_image(figure, row[-1], image, title_here, labels[2], cmap="RdBu_r", limits=change)
-    figure.suptitle(title + provenance_note(inputs))
+    figure.suptitle(title + drawing.provenance_note(inputs))
     return figure
 
 
@@ -138,11 +121,6 @@ def separated_temperatures(
     label : str
         Label of the change, with its unit.
 
-    Returns
-    -------
-    Figure
-        As many rows as there are times.
-
     Examples
     --------
     >>> from dbthermal import figures
@@ -160,16 +138,13 @@ def separated_temperatures(
 def reflection_shift(field: xr.Dataset) -> Figure:
     """Shift of the reflections between two cameras: its components and their standard deviations.
 
+    Rows down above, columns to the right below. Extrapolated pixels are hatched, such without a
+    value gray.
+
     Parameters
     ----------
     field : Dataset
         From `alignment.reflection_shift`, (axis, y, x) [pixel].
-
-    Returns
-    -------
-    Figure
-        Rows down above, columns to the right below. Extrapolated pixels are hatched, such without
-        a value gray.
     """
     figure, axes = canvas(2, 2, (7.4, 5.6))
     extrapolated = field["shift"].isel(axis=0).notnull() & ~field["known"]
@@ -178,14 +153,15 @@ def reflection_shift(field: xr.Dataset) -> Figure:
         for place, (name, title) in zip(row, parts.items(), strict=True):
             image = field[name].sel(axis=axis)
             scale = limits_of(image) if name == "shift" else (0.0, limits_of(image)[1])
-            draw_image(
-                figure, place, image, title, f"{title} [pixel]", cmap="viridis", limits=scale
-            )
+            label = f"{title} [pixel]"
+            draw_image(figure, place, image, title, label, cmap="viridis", limits=scale)
             if extrapolated.any():
                 place.contourf(extrapolated.values, [0.5, 1.5], colors="none", hatches=["///"])
     bands = ", ".join(band_label(name) for name in np.atleast_1d(field.attrs["bands"]))
     reference = band_label(field.attrs["reference_band"])
-    figure.suptitle(f"Reflection of {bands} in the picture of {reference}" + provenance_note(field))
+    figure.suptitle(
+        f"Reflection of {bands} in the picture of {reference}" + drawing.provenance_note(field)
+    )
     return figure
 
 
@@ -219,7 +195,7 @@ def separated_film(
     ]
     panels.append(FilmPanel(emission - zero_Celsius, "emission"))
     panels.append(FilmPanel(change, "reflection less its mean", "[K]", symmetric=True))
-    yield from film(panels, title=title + provenance_note(apparent))
+    yield from film(panels, title=title + drawing.provenance_note(apparent))
 
 
 @dataclass(frozen=True)

@@ -41,22 +41,18 @@ REASONS: Final = MappingProxyType(
 """Words and colour of each flag, causes before what follows: a pixel with several is drawn as its
 first. What is completed is drawn as that, whatever was the reason not to measure it."""
 
-_RIGHT: Final = "#a8d5b0"
+_GOOD: Final = ("good", "#a8d5b0")
 
 
 def status(result: xr.Dataset) -> Figure:
     """Map of the pixels without a flag, and of the most decisive flag of the others, in words.
 
+    A colour for each flag that is the first of a pixel's, in the order of `REASONS`, and its share.
+
     Parameters
     ----------
     result : Dataset
         From `separation.solve` or `complete`: `status` (y, x), bits of `schema.Status`.
-
-    Returns
-    -------
-    Figure
-        A map with a colour for each flag that is the first of a pixel's, in the order of `REASONS`,
-        and its share.
 
     Raises
     ------
@@ -76,7 +72,7 @@ def status(result: xr.Dataset) -> Figure:
     shown = {name: share for name, share in shares.items() if share > 0}
     image = np.zeros((*first.shape, 3))
     for name in shown:
-        image[first == name] = to_rgb(REASONS[name][1] if name else _RIGHT)
+        image[first == name] = to_rgb(REASONS.get(name, _GOOD)[1])
     height = 5.2 * first.shape[0] / first.shape[1]
     figure, axes = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
     left, right = axes[0]
@@ -84,7 +80,11 @@ def status(result: xr.Dataset) -> Figure:
     left.imshow(image, interpolation="nearest")
     left.set(xticks=[], yticks=[])
     right.set_axis_off()
-    patches = [_patch(name, share) for name, share in shown.items()]
+    patches = [
+        Patch(facecolor=color, edgecolor="0.5", label=f"{percent(share)}  {words}")
+        for name, share in shown.items()
+        for words, color in [REASONS.get(name, _GOOD)]
+    ]
     right.legend(handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9)
     frames = shares["completed_frames"]
     completed = (
@@ -95,12 +95,6 @@ def status(result: xr.Dataset) -> Figure:
     good += f", {percent(completed)} are completed" if completed else ""
     figure.suptitle(f"Status: {good}" + provenance_note(result))
     return figure
-
-
-def _patch(name: str, share: float) -> Patch:
-    """Legend of a flag, or of no flag, with its share."""
-    words, color = REASONS[name] if name else ("good", _RIGHT)
-    return Patch(facecolor=color, edgecolor="0.5", label=f"{percent(share)}  {words}")
 
 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:

@@ -1,6 +1,6 @@
 """Parts that all figures share: canvas, colours, labels, images, limits, plain ticks."""
 
-from typing import Final
+from typing import Any, Final
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -17,6 +17,7 @@ __all__ = [
     "canvas",
     "draw_image",
     "limits_of",
+    "marked_line",
     "percent",
     "plain_decades",
     "plain_ticks",
@@ -49,35 +50,25 @@ def canvas(
 
 
 def band_label(name: object) -> str:
-    """Label of a band, with its unit.
+    """Label of a band with its unit, such as "9.5 um" with a micro sign.
 
     Parameters
     ----------
     name : object
         Name of the band.
-
-    Returns
-    -------
-    str
-        E.g. "9.5 um", with a micro sign.
     """
     return f"{name} \N{MICRO SIGN}m"
 
 
 def provenance_note(data: xr.Dataset | xr.DataArray) -> str:
-    """Origin of the data in brackets, for a title.
+    """Origin of the data in brackets, for a title; empty for measured radiometric data.
 
     Parameters
     ----------
     data : Dataset or DataArray
-        With the attributes `origin` ("simulated", "measured", ...), `twin` (name of the scene
-        that a simulation is a twin of) and `radiometric` (0 if the values are a picture's and
-        not counts).
-
-    Returns
-    -------
-    str
-        E.g. " (simulated)" or " (not radiometric)"; empty for measured radiometric data.
+        With the attributes `origin` ("simulated", "measured", ...), `twin` (name of the scene that
+        a simulation is a twin of) and `radiometric` (0 if the values are a picture's and not
+        counts).
     """
     notes = []
     origin = str(data.attrs.get("origin", ""))
@@ -115,12 +106,10 @@ def draw_image(
     limits : tuple of float, optional
         Values at the ends of the colour map; the image's own if not given.
     """
-    lowest, highest = limits if limits is not None else (None, None)
+    lowest, highest = limits or (None, None)
     drawn = axis.imshow(image.values, cmap=cmap, vmin=lowest, vmax=highest, interpolation="nearest")
-    axis.set_facecolor("0.8")
+    axis.set(facecolor="0.8", xticks=[], yticks=[])
     axis.set_title(title, fontsize=9)
-    axis.set_xticks([])
-    axis.set_yticks([])
     figure.colorbar(drawn, ax=axis, label=label, shrink=0.85)
 
 
@@ -144,13 +133,25 @@ def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, f
     return float(lowest), float(highest) if highest > lowest else float(lowest) + 1.0
 
 
+def marked_line(index: int) -> dict[str, Any]:
+    """Style of one of several lines with markers, for matplotlib.
+
+    Parameters
+    ----------
+    index : int
+        Number of the line; colours and markers begin anew behind their last.
+    """
+    color, marker = COLORS[index % len(COLORS)], MARKERS[index % len(MARKERS)]
+    return {"color": color, "marker": marker, "markersize": 4, "linewidth": 1}
+
+
 def plain_ticks(axis: Axes, places: xr.DataArray) -> None:
-    """Ticks at some places of a logarithmic axis, as plain numbers, and a grid.
+    """Ticks at some places of a logarithmic horizontal axis, as plain numbers, and a grid.
 
     Parameters
     ----------
     axis : Axes
-        Axes whose horizontal axis is logarithmic.
+        Where to draw.
     places : DataArray
         Places of the ticks, in the unit of the axis.
     """
@@ -165,7 +166,7 @@ def plain_decades(axis: Axes) -> None:
     Parameters
     ----------
     axis : Axes
-        Axes whose vertical axis is logarithmic.
+        Where to draw.
     """
     axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))

@@ -12,7 +12,7 @@ import xarray as xr
 from dbthermal import mixing, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
-from dbthermal.limits._fisher import QUANTITIES, Truth, deviations, smallest_order
+from dbthermal.limits._fisher import QUANTITIES, TEMPERATURES, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
 _UNIFORM: Final = 1.0 / np.sqrt(12.0)
@@ -26,11 +26,6 @@ def reflection_ratio(emissivity: npt.ArrayLike) -> Array:
     ----------
     emissivity : array_like, shape (2, ...)
         Emissivities [1].
-
-    Returns
-    -------
-    ndarray
-        Ratio [1].
 
     Examples
     --------
@@ -61,11 +56,6 @@ def ratio_variance_bound(
         Background temperature [K].
     functions : ndarray, shape (time, order)
         Orthonormal functions that span the smooth subspace.
-
-    Returns
-    -------
-    ndarray
-        Smallest variance [1] of an unbiased estimate.
 
     Examples
     --------
@@ -132,18 +122,16 @@ def bounds(
     Raises
     ------
     ValueError
-        If a variable is missing or its dims or unit are others, there is one band only, an
-        emissivity lies outside (0, 1), a temperature outside the response's range, the response
-        lacks a band or the noise, or no smooth subspace holds the object.
+        If an input is not as described, there is one band only, an emissivity lies outside (0, 1),
+        a temperature outside the response's range, or no smooth subspace holds the object.
 
     Notes
     -----
     For the linear response and two bands, ``resting=False`` gives the reflection ratio the bound
     of `ratio_variance_bound`, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
-    alike changes no sample. Frames at rest determine the emissivities, and sharpen the ratio. The
-    exact response determines them without, by its curvature, but hardly; as nothing then keeps y
-    near the truth, the bound of the ratio is loose. An `emissivity_std` of 0.29, that of a uniform
-    number in (0, 1), tightens it. Pixels that share a material do better than one.
+    alike changes no sample. Frames at rest determine the emissivities, and sharpen the ratio; the
+    curvature of the exact response determines them without, but hardly, and the bound of the ratio
+    is then loose. An `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
 
     References
     ----------
@@ -168,7 +156,7 @@ def bounds(
     truth = _truth(scene, resting=resting)
     names = [str(name) for name in scene["band"].values]
     curves = [responses.curve(response, name, response_kind) for name in names]
-    for name in ("object_temperature", "background_temperature"):
+    for name in TEMPERATURES:
         for curve in curves:
             require_range(getattr(truth, name), curve, name)
     noise = responses.noise(response, names) / [curve.reference_slope for curve in curves]
@@ -192,7 +180,7 @@ def bounds(
 def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
     """Checked truth of a scene."""
     stage = schema.STAGES["separated"]
-    names = ("object_temperature", "background_temperature", "emissivity")
+    names = (*TEMPERATURES, "emissivity")
     for name in names:
         if name not in scene:
             raise ValueError(f"Missing variable '{name}' in the scene.")

@@ -21,13 +21,9 @@ from dbthermal.response import Curve
 
 Indices = npt.NDArray[np.intp]
 
-QUANTITIES: Final = (
-    "object_temperature",
-    "background_temperature",
-    "emissivity",
-    "reflection_ratio",
-)
-"""Quantities that have a bound."""
+TEMPERATURES: Final = ("object_temperature", "background_temperature")
+QUANTITIES: Final = (*TEMPERATURES, "emissivity", "reflection_ratio")
+"""Quantities that have a bound; those of the bands behind the temperatures, which have frames."""
 
 # Energy of the object outside its smooth subspace that is negligible, in units of the noise's
 # variance, and the largest subspace that is tried.

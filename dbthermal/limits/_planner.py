@@ -1,6 +1,6 @@
 """Accuracy to expect of a capture before it is recorded, and the filter to record it with."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final
@@ -8,10 +8,9 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import mixing, planck, schema
+from dbthermal import bands, mixing, planck, schema
 from dbthermal._arrays import Array
-from dbthermal.bands import FILTERS, Band
-from dbthermal.limits._fisher import TopHat, Truth, deviations, smallest_order
+from dbthermal.limits._fisher import TEMPERATURES, TopHat, Truth, deviations, smallest_order
 
 # Entry of a material without a best filter: none of them determines its temperature.
 _NO_FILTER: Final = "none"
@@ -83,7 +82,6 @@ def plan(
     *,
     beside: str = "8-14",
     together: int = 1,
-    filters: Mapping[str, Band] = FILTERS,
     temperature: float = 300.0,
 ) -> xr.Dataset:
     r"""Expected accuracy of one pixel for each material and filter, and the best filter.
@@ -95,7 +93,7 @@ def plan(
     Parameters
     ----------
     table : Dataset
-        Stage `emissivity_table`, of the camera's own band and the filters.
+        Stage `emissivity_table`, of bands of `bands.FILTERS`: the camera's own and filters.
     noise : DataArray
         Noise (band) [K] of every band of the table, such as from `emissivity.filter_noise`.
     design : CaptureDesign, optional
@@ -104,8 +102,6 @@ def plan(
         Name of the band that is always recorded.
     together : int
         Number of filters recorded beside it at once.
-    filters : mapping of str to Band
-        The bands of the table, by name.
     temperature : float
         Temperature [K] at which the noise is stated; in counts it is the same at all.
 
@@ -122,11 +118,9 @@ def plan(
 
     Raises
     ------
-    KeyError
-        If a band of the table is not in the filters.
-    TypeError, ValueError
-        If table or noise are not as `schema` has them, an emissivity lies outside (0, 1), the band
-        `beside` is missing, or there are fewer filters than are to be used together.
+    KeyError, TypeError, ValueError
+        If table or noise are not as `schema` has them, a band is unknown, an emissivity
+        lies outside (0, 1), or the band `beside` or as many others as used together are missing.
 
     Examples
     --------
@@ -141,10 +135,7 @@ def plan(
     names = [str(name) for name in table["band"].values]
     sets = _combinations(names, beside, together)
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
-    for name in names:
-        if name not in filters:
-            raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(filters)}.")
-    bodies = [TopHat(filters[name], temperature) for name in names]
+    bodies = [TopHat(bands.get(name), temperature) for name in names]
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
     parts = [
         _expected(truth, [bodies[band] for band in chosen], std[chosen])
@@ -177,7 +168,7 @@ def plan_durations(
     table, noise
         See `plan`.
     seconds : sequence of float
-        Lengths [s], strictly increasing. The object's rise and the pulses are the same in all.
+        Lengths [s], which must increase; the object's rise and the pulses are the same in all.
     design : CaptureDesign, optional
         All conditions but the length.
 
@@ -185,11 +176,6 @@ def plan_durations(
     -------
     Dataset
         That of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all.
-
-    Raises
-    ------
-    ValueError
-        As `plan`, or if the lengths do not increase.
 
     Examples
     --------
@@ -262,7 +248,7 @@ def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str,
     order = smallest_order(truth, truth.sensitivity(bodies, noise))
     sensitivity = truth.smoothed(order).sensitivity(bodies, noise)
     stds = deviations(sensitivity, truth.time, order, reference=0)
-    for name in ("object_temperature", "background_temperature"):
+    for name in TEMPERATURES:
         stds[name] = np.sqrt(np.mean(stds[name] ** 2, axis=0))
     return stds | {"condition_number": mixing.condition_number(truth.emissivity.T)}
 
@@ -272,17 +258,18 @@ def _dataset(
 ) -> xr.Dataset:
     """Deviations of all combinations, side by side."""
     size = (table.sizes["material"], len(labels))
-    variables: dict[str, tuple[tuple[str, ...], Array, dict[str, str]]] = {}
-    for name in ("object_temperature_std", "background_temperature_std", "condition_number"):
-        values = np.stack([part[name.removesuffix("_std")] for part in parts], axis=1)
-        units = "K" if "temperature" in name else "1"
+    variables = {}
+    for quantity in parts[0]:
+        name = quantity if quantity == "condition_number" else f"{quantity}_std"
+        units = "K" if quantity in TEMPERATURES else "1"
         attrs = {"units": units, "long_name": f"expected {name.replace('_', ' ')}"}
-        variables[name] = (("material", "filter"), values, attrs)
-    for name in ("emissivity_std", "reflection_ratio_std"):
-        values = np.full((*size, table.sizes["band"]), np.nan)
-        for place, (part, chosen) in enumerate(zip(parts, sets, strict=True)):
-            values[:, place, chosen] = part[name.removesuffix("_std")].T
-        attrs = {"units": "1", "long_name": f"expected {name.replace('_', ' ')}"}
-        variables[name] = (("material", "filter", "band"), values, attrs)
+        dims = ["material", "filter"]
+        if parts[0][quantity].ndim == 1:
+            values = np.stack([part[quantity] for part in parts], axis=1)
+        else:
+            dims, values = [*dims, "band"], np.full((*size, table.sizes["band"]), np.nan)
+            for place, (part, chosen) in enumerate(zip(parts, sets, strict=True)):
+                values[:, place, chosen] = part[quantity].T
+        variables[name] = (dims, values, attrs)
     coords = {"material": table["material"].values, "filter": labels, "band": table["band"].values}
     return xr.Dataset(variables, coords)

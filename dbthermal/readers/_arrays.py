@@ -87,13 +87,12 @@ def array(
         if not isinstance(source, str | Path):
             check(source)
         elif containers.kind_of(Path(source)):
-            values = containers.read(Path(source), name, check, stack)
+            values = containers.read(Path(source), name, check, memory, stack)
         else:
             (path,) = recordings.files([source])
             values = _numpy_file(path, name, memory, stack)
         counts = np.asarray(values).astype(np.uint16)
-    seconds = recordings.stamps(clock, len(counts), label)
-    return recordings.recording(counts, seconds, label, {"source": label, "format": "array"})
+    return recordings.clocked(counts, clock, label, format="array")
 
 
 def _check(shape: tuple[int, ...], dtype: np.dtype[Any], memory: float, name: str) -> None:

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import xarray as xr
 import zarr
 
@@ -27,9 +28,15 @@ def kind_of(path: Path) -> str:
     return "HDF5" if start == b"\x89HDF\r\n\x1a\n" else "NetCDF" if start[:3] == b"CDF" else ""
 
 
-def read(path: Path, name: str | None, check: Callable[[Any], None], stack: ExitStack) -> Any:
+def read(
+    path: Path, name: str | None, check: Callable[[Any], None], memory: float, stack: ExitStack
+) -> Any:
     """Numbers of an array of three dimensions, by its name if there are several, once checked."""
     kind = kind_of(path)
+    limit = max(2 * memory, 2**20)
+    if kind == "NetCDF" and path.stat().st_size > limit:
+        rule = f"Must be at most {limit:.3g} bytes, twice memory=, for it is read at once"
+        raise ValueError(f"Invalid size of '{path.name}'. {rule}.")
     try:
         stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
         warnings.simplefilter("error", UserWarning)  # as of one dimension twice
@@ -79,10 +86,33 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
 
 def _netcdf(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
     opened = xr.open_dataset(
-        path, engine="scipy", decode_times=False, decode_coords=False, create_default_indexes=False
+        path,
+        engine="scipy",
+        mmap=False,  # what is mapped cannot be closed while an error refers to it
+        decode_times=False,
+        decode_coords=False,
+        concat_characters=False,
+        create_default_indexes=False,
     )
-    variables = stack.enter_context(opened).variables.items()
-    return {str(name): (one, [*map(str, one.dims)]) for name, one in variables if one.ndim == 3}
+    variables = stack.enter_context(opened).variables
+    if not opened.encoding.get("unlimited_dims"):  # else they lie frame by frame
+        # One variable after another up to the end: a place in the header that is damaged shows.
+        content = np.memmap(path, "u1", "r")
+        kinds = [one.encoding.get("dtype", one.dtype) for one in variables.values()]
+        sizes = [
+            -(-one.size * kind.itemsize // 4) * 4
+            for one, kind in zip(variables.values(), kinds, strict=True)
+        ]
+        start = len(content) - sum(sizes)
+        for name, kind, size in zip(variables, kinds, sizes, strict=True):
+            one, start = variables[name], start + size
+            if one.ndim == 3 and one.dtype.kind == "u":
+                there = content[start - size :][: one[0].size * kind.itemsize].view(">u2")
+                if not np.array_equal(one[0].values.ravel(), there):
+                    raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
+    return {
+        str(name): (one, [*map(str, one.dims)]) for name, one in variables.items() if one.ndim == 3
+    }
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, tuple[Any, list[str]]]:

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _text as texts
+from dbthermal._arrays import Array, Mask
 from dbthermal.readers import _flir_records as container
 from dbthermal.readers import _recording as recordings
 from dbthermal.readers._decoding import MEMORY
 from dbthermal.readers._flir_records import Content, Frame
-from dbthermal.readers._recording import Clock, Counts, FileFlag, Mask, Paths
+from dbthermal.readers._recording import Clock, Counts, FileFlag, Paths
 
 # Place in the camera's record [byte], type, and limits beyond which a value is implausible.
 _FIELDS: Final = {
@@ -78,16 +78,14 @@ def flir(
 ) -> xr.Dataset:
     """Counts of a FLIR recording or radiometric picture: .fff, .seq, .csq or .jpg.
 
-    The counts are those of the file. Emissivity, distance, reflected and atmospheric temperature
-    that somebody entered into the camera are shown as attributes and never applied;
-    `calibration.maker_response` makes a response of the maker's Planck constants.
+    Emissivity, distance, reflected and atmospheric temperature that somebody entered into the
+    camera are shown as attributes and never applied; `calibration.maker_response` makes a response
+    of the maker's Planck constants.
 
     The bytes of an image are in the order that its header states; in a PNG FLIR's cameras have
-    swapped them, against its standard. In the right order an image is smoother: that decides for
-    PNG, and is held against the header.
-
-    A record with a checksum (JPEG) must fit it. FLIR's sequences have none: a damaged pixel or, in
-    JPEG-LS, one flipped bit in ten changes counts without complaint, as it would in any copy.
+    swapped them. In the right order an image is smoother: that decides for PNG, and is held against
+    the header. A record with a checksum (JPEG) must fit it. FLIR's sequences have none: a damaged
+    pixel or, in JPEG-LS, one flipped bit in ten changes counts without complaint.
 
     Parameters
     ----------
@@ -107,17 +105,16 @@ def flir(
     Dataset
         `counts` (time, y, x) [count], uint16; `exposure_time` (time) [s] since the first frame, by
         the camera's clock (milliseconds), NaN where it stands; `frame_flags` (time), which mark
-        lost frames, by gaps of the clock, and images that are not of their frame's time. Attributes: ``start`` (UTC), ``source``, ``format``,
-        ``byte_order`` and ``byte_order_by``, ``implausible`` (values of the file that no
-        thermographer means), and the camera's record as ``file_...``, temperatures in K, distance
-        in m, rate in Hz.
+        lost frames, by gaps of the clock, and images that are not of their frame's time.
+        Attributes: ``start`` (UTC), ``source``, ``format``, ``byte_order``, ``byte_order_by``,
+        ``implausible`` (values that no thermographer means), and the camera's record as
+        ``file_...``, temperatures in K, distance in m, rate in Hz.
 
     Raises
     ------
-    FileNotFoundError
-        If a file does not exist.
-    ImportError
-        If an image is compressed and PyAV, the extra ``recordings``, is not installed.
+    OSError, ImportError
+        If a file cannot be opened, or an image is compressed and PyAV, the extra ``recordings``, is
+        not installed.
     ValueError
         If a file is no FLIR recording, damaged or truncated, or takes too much memory; frames
         differ in size or in the maker's constants; the byte order is unclear or contradicts the
@@ -260,7 +257,7 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     return "little" if swap else "big", "caller" if stated else "smoothness"
 
 
-def _cameras(listed: Sequence[_Found]) -> tuple[npt.NDArray[np.float64], Mask, dict[str, Any]]:
+def _cameras(listed: Sequence[_Found]) -> tuple[Array, Mask, dict[str, Any]]:
     """Times (time) [s], agreement of the numbers (time), attributes, of the camera's records.
 
     Image and camera begin with the same 32 bytes, of which two number the frame: different ones

@@ -12,9 +12,10 @@ import xarray as xr
 
 from dbthermal import _text as texts
 from dbthermal import schema
+from dbthermal._arrays import Array
 
 Counts = npt.NDArray[np.uint16]
-Mask = npt.NDArray[np.bool_]
+
 Paths = str | Path | Sequence[str | Path]
 Clock = float | npt.ArrayLike
 
@@ -25,8 +26,7 @@ _REFUSED: Final = {
     **dict.fromkeys((".mp4", ".avi", ".mov", ".mkv", ".webm", ".wmv", ".png", ".gif"), _RECORD),
 }
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
-# A step of the clock longer than this many frame periods tells of a lost frame.
-_GAP: Final = 1.5
+_GAP: Final = 1.5  # a step of the clock longer than this many frame periods tells of a lost frame
 # An image is smoother than with its bytes swapped, by this factor, or the order is not known.
 _SMOOTHER: Final = 2.0
 
@@ -105,7 +105,7 @@ def byte_order(name: str, value: str) -> str:
     return "<" if value == "little" else ">"
 
 
-def stamps(clock: Clock, frames: int, name: str) -> npt.NDArray[np.float64]:
+def stamps(clock: Clock, frames: int, name: str) -> Array:
     """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s]."""
     values = np.asarray(clock, dtype=np.float64)
     if values.ndim == 0:
@@ -120,7 +120,7 @@ def stamps(clock: Clock, frames: int, name: str) -> npt.NDArray[np.float64]:
 
 def recording(
     counts: Counts,
-    seconds: npt.NDArray[np.float64],
+    seconds: Array,
     name: str,
     attrs: Mapping[str, Any],
     flags: npt.NDArray[np.uint16] | None = None,
@@ -162,7 +162,13 @@ def recording(
     return xr.Dataset(variables, {"time": coordinate}, {"origin": "measured", **attrs})
 
 
-def filled(exposed: npt.NDArray[np.float64], period: float) -> npt.NDArray[np.float64]:
+def clocked(counts: Counts, clock: Clock, name: str, **attrs: str) -> xr.Dataset:
+    """Dataset of one band of a file that tells no times, from a rate [Hz] or times [s]."""
+    seconds = stamps(clock, len(counts), name)
+    return recording(counts, seconds, name, {"source": name, **attrs})
+
+
+def filled(exposed: Array, period: float) -> Array:
     """Times [s] of all frames, unknown ones (NaN) on the line between their neighbours."""
     slots, (known,) = np.arange(exposed.size), np.nonzero(np.isfinite(exposed))
     outside = slots - np.clip(slots, known[0], known[-1])

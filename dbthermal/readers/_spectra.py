@@ -15,12 +15,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from dbthermal import _text as texts
 from dbthermal import schema
-
-Floats = NDArray[np.float64]
+from dbthermal._arrays import Array
 
 NOTES: Final = MappingProxyType(
     {
@@ -65,8 +63,8 @@ def ecostress(path: str | Path) -> xr.Dataset:
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
+    OSError
+        If the file cannot be opened.
     ValueError
         If it is truncated or longer than declared, is no hemispherical reflectance in percent over
         micrometres, an emissivity is outside `schema.EMISSIVITY_LIMITS`, or a wavelength is outside
@@ -121,11 +119,9 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If the columns are not these, a row is short, missing or added, the last line has no end,
-        the table does not reach so far, or a value is refused as by `ecostress`.
+    OSError, ValueError
+        As `ecostress`, or if the columns are not these, a row is short, missing or added, or the
+        table does not reach so far.
 
     References
     ----------
@@ -159,7 +155,7 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
 
 
 def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
-    r"""Spectrum of the MODIS UCSB emissivity library, converted to comma-separated columns.
+    r"""Spectrum, as `ecostress`, of the MODIS UCSB emissivity library in comma-separated columns.
 
     Parameters
     ----------
@@ -169,18 +165,10 @@ def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.
     reach : tuple of float
         Wavelengths that the table must reach [micrometre], as for `slum`.
 
-    Returns
-    -------
-    Dataset
-        A spectrum as `ecostress`.
-
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If the columns are not these, wavelength and wavenumber disagree by more than 0.1 %, or the
-        table or a value is refused as by `slum`.
+    OSError, ValueError
+        As `slum`, or if wavelength and wavenumber disagree by more than 0.1 %.
 
     Examples
     --------
@@ -232,7 +220,7 @@ def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
     return header
 
 
-def _check_extent(header: Mapping[str, str], wavelength: Floats, path: Path) -> None:
+def _check_extent(header: Mapping[str, str], wavelength: Array, path: Path) -> None:
     """Compare the values with the number and the ends that the header declares."""
     actual = {
         "Number of X Values": wavelength.size,
@@ -254,7 +242,7 @@ def _table(path: Path) -> tuple[list[str], list[texts.Row]]:
     return titles, rows
 
 
-def _check_reach(wavelength: Floats, reach: tuple[float, float], file: _File) -> None:
+def _check_reach(wavelength: Array, reach: tuple[float, float], file: _File) -> None:
     """Raise ValueError if rows are missing, at the ends or between two others."""
     (low, high), (least, most) = (wavelength.min(), wavelength.max()), reach
     if low > least or high < most:
@@ -273,7 +261,7 @@ def _check_reach(wavelength: Floats, reach: tuple[float, float], file: _File) ->
 
 
 def _spectrum(
-    wavelength: Floats, emissivity: Floats, notes: Mapping[str, str], file: _File
+    wavelength: Array, emissivity: Array, notes: Mapping[str, str], file: _File
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
     name, (low, high) = f"'{notes['name']}' of '{file.name}'", schema.EMISSIVITY_LIMITS
@@ -295,10 +283,9 @@ def _spectrum(
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
     unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))
     attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
-    variable = schema.STAGES["spectrum"]["emissivity"]
-    coordinate = schema.COORDINATES["wavelength"]
+    coordinate = ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)
     return xr.Dataset(
-        {"emissivity": ("wavelength", emissivity, variable.attrs)},
-        {"wavelength": ("wavelength", wavelength * 1e-6, coordinate.attrs)},
+        schema.variables("spectrum", {"emissivity": emissivity}),
+        {"wavelength": coordinate},
         {**attrs, "unphysical_values": unphysical},
     )

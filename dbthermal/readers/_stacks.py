@@ -5,7 +5,9 @@ import logging
 import math
 import re
 import struct
+from logging.handlers import QueueHandler
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -59,10 +61,8 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
 
     Raises
     ------
-    FileNotFoundError
-        If a file does not exist.
-    ImportError
-        If tifffile, the extra ``recordings``, is not installed.
+    OSError, ImportError
+        If a file cannot be opened, or tifffile, the extra ``recordings``, is not installed.
     ValueError
         If the unit is another one; a file is no TIFF, damaged, or has fewer pages than it states;
         a page is compressed, in tiles, in colours or not of 16 bits, or differs in size; the counts
@@ -97,9 +97,8 @@ def tiff(path: Paths, *, unit: str, clock: Clock, memory: float = MEMORY) -> xr.
             values[at : at + length // 2] = np.fromfile(page.path, form, length // 2, offset=offset)
             at += length // 2
     order = " and ".join(sorted({_ORDERS[page.order] for page in pages}))
-    seconds = recordings.stamps(clock, len(counts), name)
-    attrs = {"source": name, "format": "TIFF", "byte_order": order, "byte_order_by": "header"}
-    return recordings.recording(counts, seconds, name, attrs)
+    decided = {"byte_order": order, "byte_order_by": "header"}
+    return recordings.clocked(counts, clock, name, format="TIFF", **decided)
 
 
 def raw(
@@ -115,8 +114,9 @@ def raw(
 ) -> xr.Dataset:
     """Counts of a file of bare 16-bit numbers, frame after frame.
 
-    Nothing in such a file tells its form: what is stated must fit its size without remainder, and
-    an image that is smoother with its bytes swapped is refused.
+    Nothing in such a file tells its form. Result and errors are as from `tiff`; what is stated must
+    fit the size of the file without remainder, and an image that is smoother with its bytes swapped
+    is refused.
 
     Parameters
     ----------
@@ -130,19 +130,6 @@ def raw(
         As for `tiff`.
     header, frame_header : int
         Size of what precedes the first frame, and each frame [byte].
-
-    Returns
-    -------
-    Dataset
-        As from `tiff`.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If the size of the file is not that of a whole number of frames, or the byte order
-        contradicts the image; as `tiff` for unit, clock, memory and 8 bits.
 
     Examples
     --------
@@ -174,9 +161,8 @@ def raw(
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
     counts = np.memmap(one, form, "r", offset=header)["counts"].astype(np.uint16)
     recordings.check_order(counts, name)
-    seconds = recordings.stamps(clock, frames, name)
-    attrs = {"source": name, "format": "raw", "byte_order": byte_order, "byte_order_by": "caller"}
-    return recordings.recording(counts, seconds, name, attrs)
+    decided = {"byte_order": byte_order, "byte_order_by": "caller"}
+    return recordings.clocked(counts, clock, name, format="raw", **decided)
 
 
 class _Page(NamedTuple):
@@ -189,24 +175,14 @@ class _Page(NamedTuple):
     spans: list[tuple[int, int]]
 
 
-class _Complaints(logging.Handler):
-    """Errors that a library logs instead of raising them."""
-
-    def __init__(self, level: int) -> None:
-        super().__init__(level)
-        self.messages = list[str]()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep the message."""
-        self.messages.append(record.getMessage())
-
-
 def _pages(path: Path) -> list[_Page]:
     """Pages of a file, which must be as many as its description states."""
     tifffile = recordings.optional("tifffile", "recordings")
     size, pages, total = path.stat().st_size, list[_Page](), 0
-    complaints, log = _Complaints(logging.ERROR), logging.getLogger("tifffile")
-    log.addHandler(complaints)
+    complaints, log = SimpleQueue[logging.LogRecord](), logging.getLogger("tifffile")
+    handler = QueueHandler(complaints)
+    handler.setLevel(logging.ERROR)
+    log.addHandler(handler)
     try:
         with tifffile.TiffFile(path) as file:
             for number, page in enumerate(file.pages):
@@ -215,14 +191,14 @@ def _pages(path: Path) -> list[_Page]:
                 if total > size:  # as of a chain of pages that returns to itself
                     raise ValueError(f"{total} bytes of pixels. Must fit into its {size}.")
             stated = _stated(str(file.pages[0].description))
-            for message in complaints.messages:  # which tifffile logs, and goes on
-                raise ValueError(message)
+            if not complaints.empty():  # which tifffile logs, and goes on
+                raise ValueError(complaints.get().getMessage())
             _check_apart(file, pages)
     except _DAMAGE as error:
         rule = "" if "Must " in str(error) else ". Must be a whole TIFF or BigTIFF."
         raise ValueError(f"Invalid or damaged TIFF '{path.name}': {error}{rule}") from error
     finally:
-        log.removeHandler(complaints)
+        log.removeHandler(handler)
     if len(pages) == 1 and stated > 1:  # one page for a stack without gaps: ImageJ beyond 4 GB
         (start, length), *others = pages[0].spans
         if others or start + stated * length > size:

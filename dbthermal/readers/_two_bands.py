@@ -1,7 +1,6 @@
 """Two recordings as one capture of two bands."""
 
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -50,14 +49,9 @@ def two_bands(
     Examples
     --------
     >>> import numpy as np
-    >>> from tempfile import TemporaryDirectory
     >>> from dbthermal import readers
-    >>> counts = np.arange(18000, 18060, dtype="<u2").reshape(5, 3, 4)
-    >>> with TemporaryDirectory() as folder:
-    ...     counts.tofile(f"{folder}/a.raw")
-    ...     one = readers.raw(
-    ...         f"{folder}/a.raw", (3, 4), byte_order="little", unit="count", clock=30.0
-    ...     )
+    >>> counts = np.arange(18000, 18060, dtype=np.uint16).reshape(5, 3, 4)
+    >>> one = readers.array(counts, unit="count", clock=30.0)
     >>> capture = two_bands(one, one.isel(time=slice(4)), bands=("8-14", "9.5"), offset=0.01)
     >>> capture.exposure_time.sel(band="9.5").values.round(3)  # [s]
     array([0.01 , 0.043, 0.077, 0.11 ,   nan])
@@ -75,9 +69,7 @@ def two_bands(
             "equal: resample the second recording, or crop the first."
         )
     late = _offset(first, second) if offset is None else float(offset)
-    starts, stops = zip(
-        *((one["time"].values[0], one["time"].values[-1]) for one in pair), strict=True
-    )
+    starts, stops = ([one["time"].values[place] for one in pair] for place in (0, -1))
     overlap = min(stops[0], stops[1] + late) - max(starts[0], starts[1] + late)
     if not overlap > 0 and max(one.sizes["time"] for one in pair) > 1:
         raise ValueError(
@@ -96,12 +88,8 @@ def two_bands(
         flags[place, :own] = one["frame_flags"].values
     longer = int(second.sizes["time"] > first.sizes["time"])
     clock = pair[longer]["time"].values + (0.0, late)[longer]
-    stage = schema.STAGES["capture"]
-    variables: dict[str, Any] = {
-        "counts": (stage["counts"].dims, counts, stage["counts"].attrs),
-        "exposure_time": (("band", "time"), times, schema.EXPOSURE_TIME.attrs),
-        "frame_flags": (("band", "time"), flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)),
-    }
+    variables = schema.variables("capture", {"counts": counts, "exposure_time": times})
+    variables["frame_flags"] = (("band", "time"), flags, FileFlag.cf_attrs(schema.FRAME_FLAGS))
     time = ("time", clock, schema.COORDINATES["time"].attrs)
     attrs = {
         "origin": "measured",

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dbthermal import schema
+from dbthermal._arrays import Array
 from dbthermal.readers._decoding import MEMORY, Film, decode
-
-Floats = NDArray[np.float64]
 
 # Palettes in which thermal pictures are drawn, compared in so many pixels; another is better only
 # if it is nearer by a step of 8 bit.
@@ -43,11 +42,9 @@ def palette_video(
     """Video drawn in a palette, as positions in the palette.
 
     Each pixel gets the position of the nearest point on the line through the palette's colours in
-    Y'CbCr, finer than its steps. Luma counts whole and chroma half: in these videos four pixels
-    share a chroma sample. Measured on synthetic H.264 videos, the RMS error is 6-28 % (plasma) and
-    7-15 % (turbo) below that of the nearest of 256 colours in RGB. Luma alone is no better, and not
-    unique in turbo. A palette and its reverse fit alike and cannot be told apart.
-
+    Y'CbCr, finer than its steps; luma counts whole and chroma half, of which four pixels share a
+    sample. Measured on synthetic H.264 videos, the RMS error is 6-28 % (plasma) and 7-15 % (turbo)
+    below that of the nearest of 256 colours in RGB. A palette and its reverse cannot be told apart.
     Noise takes pixels off the palette: how far is stated, and only a video that another common
     palette fits better is refused.
 
@@ -78,8 +75,8 @@ def palette_video(
 
     Raises
     ------
-    FileNotFoundError
-        If the file does not exist.
+    OSError
+        If the file cannot be opened.
     ValueError
         If the palette is unknown or another fits better; the file is of another container or
         checksum, takes more than `memory`, cannot be decoded to its end or has a damaged frame; its
@@ -188,8 +185,8 @@ def masked_palette_video(
 class _Video:
     """Frames as `index` (time, y, x) into their distinct `colours` (n, 3), and each one's share."""
 
-    colours: Floats
-    share: Floats
+    colours: Array
+    share: Array
     index: NDArray[np.uint32]
     coords: dict[str, Any]
 
@@ -215,7 +212,7 @@ def _distinct(film: Film) -> _Video:
     return _Video(colours, count / count.sum(), codes, coords)
 
 
-def _palette(name: str) -> Floats:
+def _palette(name: str) -> Array:
     """Colours (n, 3) [0-255] along a palette, `_SUBSTEPS` to each of its steps."""
     from matplotlib import colormaps  # noqa: PLC0415  (drawing is not needed to read a spectrum)
 
@@ -227,12 +224,12 @@ def _palette(name: str) -> Floats:
     return np.stack([np.interp(fine, steps, channel) for channel in colours.T], axis=1)
 
 
-def _ycc(colours: Floats) -> Floats:
-    ycc: Floats = colours @ _YCC.T
+def _ycc(colours: Array) -> Array:
+    ycc: Array = colours @ _YCC.T
     return ycc
 
 
-def _nearest(colours: Floats, palette: Floats) -> tuple[NDArray[np.float32], Floats, Floats]:
+def _nearest(colours: Array, palette: Array) -> tuple[NDArray[np.float32], Array, Array]:
     """Position in the palette, distance from it in the measure, and in RGB [0-255]."""
     distance, nearest = KDTree(_ycc(palette)).query(_ycc(colours))
     position = (nearest / (len(palette) - 1)).astype(np.float32)
@@ -240,7 +237,7 @@ def _nearest(colours: Floats, palette: Floats) -> tuple[NDArray[np.float32], Flo
 
 
 def _attrs(
-    path: Path, palette: str, residual: float, colours: Floats, share: Floats
+    path: Path, palette: str, residual: float, colours: Array, share: Array
 ) -> dict[str, Any]:
     """Attributes of positions in a palette; ValueError if another fits the colours better."""
     summed = np.cumsum(share)

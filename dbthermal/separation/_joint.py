@@ -17,8 +17,10 @@ Both fail for a gray body alone. Errors of single pixels are averaged along the 
 with the weights :math:`(1 - g) g^j`.
 """
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -29,6 +31,7 @@ from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gau
 from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._arrays import Array as Signal
+from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _equations as system
 from dbthermal.separation import _neighbours as neighbours
@@ -137,52 +140,28 @@ def solve(
         )
         raw = system.first_emissivity(inputs, result)
         solved = np.all(np.isfinite(raw), axis=0) & np.isfinite(np.fmax.reduce(film, axis=0))
-        emissivity = system.inside(raw)
-        equations = system.equations(inputs, emissivity, solved)
+        equations = system.equations(inputs, system.inside(raw), solved)
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
         first, steps, change, variance = _first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
-        shares = system.coefficients(inputs, raw, solved)
-        told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
-
-        @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread it runs in
-        def both(alone: Array, change: Array) -> tuple[Array, Array, Array]:
-            signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
-            signal = np.ascontiguousarray(signal.T, dtype=np.float32)
-            target = shares[0][:, np.newaxis] * signal + equations.other_bands(shares[1:], signal)
-            return equations.solve(target, signal, change)
-
-        looked_at = _bridge(film[some], solved)
-        here, beside, _ = both(looked_at, change[:, some])
+        both = partial(_both, curve, solved, system.coefficients(inputs, raw, solved))
+        looked_at = partial(both, _bridge(film[some], solved), change[:, some])
+        here, beside, _ = looked_at(equations)
         # In units of the deviation or, of a method without one, of the noise.
         std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
         share = np.abs(equations.shares[1:].sum(axis=0) * (beside - here).T) / std
         if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
-        of_slope, noise = np.zeros(solved.size), inputs.noise[inputs.bands[0]]
-        for _ in range(0 if pooled or inputs.method.knows_emissivity else _ROUNDS):
-            slope, of_slope, known = _emission((here, beside), (first, steps), emissivity[0], noise)
-            likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
-            known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
-            error = np.where(known & (of_slope > 0), of_slope, np.inf)
-            slope = np.where(known, slope, emissivity[0])
-            slope = neighbours.shared(slope, error, result["status"].shape)
-            before, emissivity = (
-                emissivity,
-                system.inside(1.0 - system.ratio_of(raw) * (1.0 - slope)),
+        emissivity, of_slope = system.inside(raw), np.zeros(solved.size)
+        if not (pooled or inputs.method.knows_emissivity):
+            equations, emissivity, of_slope = _emissivities(
+                inputs, result, raw, solved, equations, looked_at, (first, steps)
             )
-            equations = replace(
-                equations,
-                first=np.where(solved, emissivity[0], 1.0),
-                shares=system.coefficients(inputs, emissivity, solved),
-            )
-            here, beside, _ = both(looked_at, change[:, some])
-            if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
-                break
+            here, beside, _ = looked_at(equations)
         _bridge(film, solved)
         unsettled = np.zeros(solved.size, dtype=bool)
         parts = [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
-        results = threads.map(lambda part: both(film[part], change[:, part]), parts)
+        results = threads.map(lambda part: both(film[part], change[:, part], equations), parts)
         for part, (*pair, step) in zip(parts, results, strict=True):
             film[part], there[part] = (
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
@@ -193,8 +172,53 @@ def solve(
         off = weight**2 * of_slope * np.mean((beside - here) ** 2, 1)
         size = np.where(solved, np.sqrt(np.nan_to_num([np.mean(std**2, axis=0), off])), 0.0)
         factor = _factor(inputs, equations, size, variance, blur)
-        unsettled |= np.isnan(factor)
-    return Joint(inputs, result, emissivity, factor, unsettled)
+    return Joint(inputs, result, emissivity, factor, unsettled | np.isnan(factor))
+
+
+def _both(
+    curve: Curve,
+    solved: Mask,
+    shares: Array,
+    alone: Array,
+    change: Array,
+    equations: system.Equations,
+) -> tuple[Array, Array, Array]:
+    """Object's signals at both places and the last step, of films (frame, pixel) by some shares."""
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread it runs in
+        signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
+        signal = np.ascontiguousarray(signal.T, dtype=np.float32)
+        target = shares[0][:, np.newaxis] * signal + equations.other_bands(shares[1:], signal)
+        return equations.solve(target, signal, change)
+
+
+def _emissivities(
+    inputs: Inputs,
+    result: xr.Dataset,
+    raw: Array,
+    solved: Mask,
+    equations: system.Equations,
+    looked_at: Callable[[system.Equations], tuple[Array, Array, Array]],
+    band: tuple[Signal, Signal],
+) -> tuple[system.Equations, Array, Array]:
+    """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
+    emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
+    told = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
+    for _ in range(_ROUNDS):
+        here, beside, _ = looked_at(equations)
+        slope, variance, known = _emission((here, beside), band, emissivity[0], noise)
+        likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
+        known &= told & np.all((likely > 0.0) & (likely < 1.0), axis=0)
+        slope, known = np.where(known, slope, emissivity[0]), known & (variance > 0)
+        slope, variance = neighbours.shared(slope, variance, known, result["status"].shape)
+        before, emissivity = emissivity, system.inside(1.0 - system.ratio_of(raw) * (1.0 - slope))
+        equations = replace(
+            equations,
+            first=np.where(solved, emissivity[0], 1.0),
+            shares=system.coefficients(inputs, emissivity, solved),
+        )
+        if np.nanquantile(np.abs(emissivity - before), _MOST) < _SETTLED:
+            break
+    return equations, emissivity, variance
 
 
 def _emission(

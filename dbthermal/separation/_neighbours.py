@@ -13,10 +13,11 @@ from typing import Final
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, median_filter
+from scipy.special import chdtri
 
 from dbthermal.schema import Status
-from dbthermal.separation._equations import Array
+from dbthermal.separation._equations import Array, Mask
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._tiles import Material
 
@@ -76,18 +77,34 @@ def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
     )
 
 
-def shared(value: Array, variance: Array, shape: tuple[int, ...]) -> Array:
+def shared(
+    value: Array, variance: Array, known: Mask, shape: tuple[int, ...]
+) -> tuple[Array, Array]:
     """
-    Values (pixel) [1] that lean on those around, the more the less they are known.
+    Values (pixel) [1] that lean on those around, the more the less they are known; and variances.
 
     The mean of their posterior, of a normal prior with the mean and variance of the neighbourhood.
+    The variances are times the reduced chi-square about the median of those around, for a slow
+    change of what is mirrored is no noise. To lean does not lessen them: neighbours share such
+    errors. One that is not known has the neighbourhood's.
     """
-    value, weight = value.reshape(shape), 1.0 / variance.reshape(shape)
-    wide = _AROUND * min(shape)
+    value, variance = (one.reshape(shape) for one in (value, variance))
+    known = known.reshape(shape)
+    weight = np.divide(1.0, variance, out=np.zeros(shape), where=known)
+    square = (value - _median(value, weight)) ** 2 * weight
+    chi = np.maximum(_median(square, weight) / chdtri(1, 0.5), 1.0)
+    weight, wide = weight / chi, _AROUND * min(shape)
     mean = _mean(value, weight, wide)
     mean = np.where(np.isfinite(mean), mean, value)
-    own = weight * np.nan_to_num(_mean((value - mean) ** 2, weight, wide))
-    return np.asarray((own * value + mean) / (own + 1.0)).ravel()
+    prior = np.nan_to_num(_mean((value - mean) ** 2, weight, wide))
+    variance = np.where(known, variance * chi, np.where(prior > 0, prior, variance))
+    return ((prior * weight * value + mean) / (prior * weight + 1.0)).ravel(), variance.ravel()
+
+
+def _median(part: Array, weight: Array) -> Array:
+    """Median (y, x) of the pixels around; one without weight counts as their mean."""
+    filled = np.where(weight > 0, part, np.nan_to_num(_mean(part, weight, _WIDE)))
+    return np.asarray(median_filter(filled, 1 + 2 * round(_WIDE), mode="nearest"))
 
 
 def _mean(part: Array, weight: Array, deviation: float) -> Array:

@@ -340,7 +340,11 @@ def _tile(
 def of_one_noise(
     frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
 ) -> Iterator[tuple[Mask, Mask, Tile]]:
-    """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise."""
+    """
+    Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
+
+    The residual pattern, as independent from pixel to pixel, is lessened as the noise is.
+    """
     order = np.rint(np.log(gain[1, pixels]) / _NOISE_STEP).astype(np.intp)
     for level in np.unique(order):
         alike = np.flatnonzero(order == level)
@@ -349,6 +353,8 @@ def of_one_noise(
             part = np.zeros_like(pixels)
             part[np.flatnonzero(pixels)[chosen]] = True
             factor = np.exp(np.log(gain[:, part]).mean(axis=1))
-            factors = [factor[0]] + [factor[1]] * (len(tile.noise) - 1)
-            noise = tuple(float(std * it) for std, it in zip(tile.noise, factors, strict=True))
-            yield frames, part, replace(tile.select_pixels(chosen), noise=noise)
+            factors = np.append(factor[0], np.repeat(factor[1], len(tile.noise) - 1))
+            one = replace(tile.select_pixels(chosen), noise=tuple((factors * tile.noise).tolist()))
+            if tile.pattern is not None:
+                one = replace(one, pattern=tuple((factors * tile.pattern).tolist()))
+            yield frames, part, one

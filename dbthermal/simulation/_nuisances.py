@@ -15,6 +15,8 @@ from dbthermal.simulation._rig import observe
 SPOILED: Final = ("good", "noisy", "blinking", "stuck")
 """Kinds of pixel of `spoil_pixels`, by their number."""
 
+# Of bad pixels: noise and step [count], and mean time between steps [s].
+_NOISE, _STEP, _DWELL = 15.0, 60.0, 3.0
 _STAMP: Final = {"units": "s", "long_name": "time of exposure"}
 
 
@@ -29,9 +31,7 @@ def expose(
 ) -> xr.Dataset:
     r"""Capture of bands that expose at times of their own: the stage `corrected`, with time stamps.
 
-    The scene is on a fine clock. Frame n of band m is exposed at its step
-
-    .. math:: o_m + n \, q_m
+    The scene is on a fine clock; frame n of band m is exposed at its step :math:`o_m + n \, q_m`.
 
     Parameters
     ----------
@@ -93,14 +93,12 @@ def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
     corrected : Dataset
         Capture of stage `corrected`; the result has no `exposure_time`.
     lost : Mask
-        Lost frames (band, time).
-
-    Raises
-    ------
-    ValueError
-        If a band's first frame is lost.
+        Lost frames (band, time), none of them a band's first, or a ValueError.
     """
-    _check_lost(corrected, lost)
+    expected = corrected["counts"].shape[:2]
+    if lost.shape != expected or lost.dtype != bool:
+        found = f"{lost.shape} of {lost.dtype}"
+        raise ValueError(f"Invalid lost frames {found}. Must be {expected} of bool.")
     if lost[:, 0].any():
         raise ValueError("Invalid lost frames: a first one. Must have one before to be repeated.")
     counts = corrected["counts"].values.copy()
@@ -114,6 +112,8 @@ def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
     """Lose frames at random in each band: each is replaced by the one before (`repeat_frames`).
 
+    The result has `repeated` (band, time), bool, beside the counts.
+
     Parameters
     ----------
     corrected : Dataset
@@ -122,11 +122,6 @@ def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -
         Share of frames that are lost, in [0, 1).
     rng : Generator
         Source of the losses.
-
-    Returns
-    -------
-    Dataset
-        The capture with frames repeated, and `repeated` (band, time), bool.
     """
     counts = schema.check(corrected, "corrected")["counts"]
     if not 0 <= share < 1:
@@ -153,7 +148,7 @@ def fire_shutter(
     corrected : Dataset
         Stage `corrected` of `schema`.
     times : array_like, shape (event,)
-        Times at which the shutter closes [s]; the last frame taken by then is repeated.
+        Times in the capture at which the shutter closes [s]; the frame before is repeated.
     rng : Generator
         Source of the offsets.
     duration : float
@@ -162,12 +157,6 @@ def fire_shutter(
         Standard deviation of a pixel's step [count].
     bands : tuple of str, optional
         Bands whose cameras close; by default all.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not as `schema` has it, a time does not lie in it, the duration is not
-        positive, or a band is missing.
 
     Examples
     --------
@@ -181,7 +170,7 @@ def fire_shutter(
     >>> closed["counts"].values.ravel().tolist()
     [0.0, 1.0, 2.0, 2.0, 2.0, 5.0]
     """
-    counts = _floating(corrected).copy(deep=True)
+    counts = _floating(corrected)
     planck.require_positive("duration [s]", duration)
     clock = counts["time"].values.astype(np.float64)
     names = [str(name) for name in counts["band"].values] if bands is None else list(bands)
@@ -199,16 +188,13 @@ def fire_shutter(
     return corrected.assign(counts=counts)
 
 
-def spoil_pixels(
-    corrected: xr.Dataset,
-    share: float,
-    rng: np.random.Generator,
-    *,
-    noise_std: float = 15.0,
-    amplitude: float = 60.0,
-    dwell: float = 3.0,
-) -> xr.Dataset:
+def spoil_pixels(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
     """Bad pixels: noisy, blinking between two levels (random telegraph signal), or stuck.
+
+    Noise of 15 counts is added to a noisy pixel; a blinking one steps by 60, every 3 s on average
+    and once at least.
+
+    The result has `spoiled` (band, y, x), int8, the position in `SPOILED`, beside the counts.
 
     Parameters
     ----------
@@ -218,22 +204,10 @@ def spoil_pixels(
         Share of pixels that are bad in a band, a third of each kind on average, in [0, 1).
     rng : Generator
         Source of the pixels and of their signals.
-    noise_std : float
-        Noise added to a noisy pixel [count].
-    amplitude : float
-        Step of a blinking pixel [count].
-    dwell : float
-        Mean time between its steps [s]; there is at least one step.
-
-    Returns
-    -------
-    Dataset
-        The capture with bad pixels, and `spoiled` (band, y, x), int8: position in `SPOILED`.
     """
-    counts = _floating(corrected).copy(deep=True)
+    counts = _floating(corrected)
     if not 0 <= share < 1:
         raise ValueError(f"Invalid share {share} of bad pixels. Must lie in [0, 1).")
-    planck.require_positive("dwell [s]", dwell)
     shape = (counts.sizes["band"], counts.sizes["y"], counts.sizes["x"])
     kind = np.where(rng.random(shape) < share, rng.integers(1, len(SPOILED), shape), 0)
     frames, time = counts.sizes["time"], counts["time"].values.astype(np.float64)
@@ -241,9 +215,9 @@ def spoil_pixels(
         signal = counts.values[band, :, row, column]
         match SPOILED[kind[band, row, column]]:
             case "noisy":
-                signal += rng.normal(0.0, noise_std, frames).astype(signal.dtype)
+                signal += rng.normal(0.0, _NOISE, frames).astype(signal.dtype)
             case "blinking":
-                signal += (amplitude * _telegraph(time, dwell, rng)).astype(signal.dtype)
+                signal += (_STEP * _telegraph(time, _DWELL, rng)).astype(signal.dtype)
             case "stuck":
                 signal[:] = signal[0]
     numbers = np.arange(len(SPOILED), dtype=np.int8)
@@ -257,8 +231,7 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
 
     .. math:: I_n = a_n I_{n-1} + (1 - a_n) z_n, \quad a_n = e^{-(t_n - t_{n-1}) / \tau}
 
-    the exact solution of :math:`\tau \dot I = z - I` for a signal z held from each frame to the
-    next, at rest before the first; `correction.undo_lag` is the inverse.
+    at rest before the first frame; `correction.undo_lag` is the inverse.
 
     Parameters
     ----------
@@ -279,7 +252,7 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
     >>> lag(capture, 0.1)["counts"].values.round().ravel().tolist()
     [0.0, 0.0, 63.0, 86.0, 95.0]
     """
-    counts = _floating(corrected).copy(deep=True)
+    counts = _floating(corrected)
     _, new = lag_coefficients(time_constant, counts)
     for movie, weight in zip(counts.values, new, strict=True):
         for frame in range(1, movie.shape[0]):
@@ -290,11 +263,8 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
 
 
 def _floating(corrected: xr.Dataset) -> xr.DataArray:
-    """Counts of a capture, which whole numbers would round and wrap around."""
-    counts = schema.check(corrected, "corrected")["counts"]
-    if counts.dtype.kind != "f":
-        raise TypeError(f"Invalid dtype {counts.dtype} of the counts. Must be floating.")
-    return counts
+    """Copy of the counts of a capture, which whole numbers would round and wrap around."""
+    return schema.check_corrected(corrected)["counts"].copy(deep=True)
 
 
 def _telegraph(time: Array, dwell: float, rng: np.random.Generator) -> Array:
@@ -306,12 +276,3 @@ def _telegraph(time: Array, dwell: float, rng: np.random.Generator) -> Array:
     level = np.zeros(time.size)
     level[steps + 1] = 1.0
     return np.asarray(np.cumsum(level) % 2)
-
-
-def _check_lost(corrected: xr.Dataset, lost: Mask) -> None:
-    """Refuse a mask that is not of bool, (band, time)."""
-    expected = corrected["counts"].shape[:2]
-    if lost.shape != expected or lost.dtype != bool:
-        raise ValueError(
-            f"Invalid lost frames {lost.shape} of {lost.dtype}. Must be {expected} of bool."
-        )

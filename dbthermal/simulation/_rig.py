@@ -19,9 +19,8 @@ _SLOPE_TEMPERATURE: Final = 300.0
 class Rig:
     """Simulated cameras, one a band: response, noise and fixed pattern.
 
-    The defaults are round figures for the camera of the paper: a 16-bit 640x512 microbolometer,
-    about 115 counts/K near 300 K and NETD 20-40 mK without a filter; behind a filter the counts
-    shrink with the band's share of dB/dT while the noise in counts stays.
+    The defaults are round figures for the camera of the paper, a 16-bit 640x512 microbolometer.
+    Behind a filter the counts shrink with the band's share of dB/dT; their noise stays.
 
     Attributes
     ----------
@@ -84,11 +83,8 @@ class Rig:
         noiseless = calibration.fit_response(counts)
         # Noise in counts: NETD times the slope of the response near 25 degrees Celsius.
         slopes = [responses.curve(noiseless, name).reference_slope for name in self.bands]
-        noise = xr.DataArray(
-            np.array(self.noise) * slopes, dims="band", coords={"band": list(self.bands)}
-        )
-        result = calibration.fit_response(counts, noise)
-        return result.assign_attrs(origin="simulated")
+        noise = xr.DataArray(np.array(self.noise) * slopes, {"band": list(self.bands)}, "band")
+        return calibration.fit_response(counts, noise).assign_attrs(origin="simulated")
 
 
 def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
@@ -99,11 +95,10 @@ def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarr
         places = schema.band_positions(temperature, names, str(temperature.name))
         parts = [temperature.isel(band=place) for place in places]
     curves = [responses.curve(response, name) for name in names]
-    checked = [
-        require_range(part.values, curve, str(temperature.name))
+    return [
+        curve.counts(require_range(part.values, curve, str(temperature.name)))
         for part, curve in zip(parts, curves, strict=True)
     ]
-    return [curve.counts(values) for curve, values in zip(curves, checked, strict=True)]
 
 
 def observe(
@@ -113,11 +108,12 @@ def observe(
 
     .. math:: I_m = e_m U_m(x) + (1 - e_m) U_m(y) + \mathrm{noise}
 
+    ValueError if a temperature lies outside the response, or a band is missing.
+
     Parameters
     ----------
     scene : Dataset
-        As from `scene`: object and background temperature (time, y, x) [K], emissivity
-        (band, y, x) [1]. The background may be one for each band, (band, time, y, x), as two
+        As from `scene`; the background may be one for each band, (band, time, y, x) [K], as two
         cameras see it that stand side by side.
     response : Dataset
         With `noise`, e.g. from `Rig.response`.
@@ -126,20 +122,8 @@ def observe(
     dtype : str
         Floating dtype of the counts.
 
-    Returns
-    -------
-    Dataset
-        `counts` (band, time, y, x) [count], `origin = "simulated"`, and of a twin its `twin`.
-
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the response, or a band is missing.
-
     Examples
     --------
-    >>> import numpy as np
-    >>> import xarray as xr
     >>> from dbthermal import simulation
     >>> glass = xr.DataArray([0.86, 0.72], coords={"band": ["8-14", "9.5"]}, dims="band")
     >>> time, still = np.arange(100) / 10.0, np.full((100, 1, 1), 300.0)
@@ -160,11 +144,10 @@ def observe(
         noise = float(response["noise"].sel(band=name))
         movie[index] = clean + rng.normal(0.0, noise, clean.shape)
     twin = {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
-    return xr.Dataset(
-        {"counts": (schema.STAGES["corrected"]["counts"].dims, movie)},
-        coords={"band": names, **{name: scene[name] for name in ("time", "y", "x")}},
-        attrs={"origin": "simulated", **twin},
-    ).pipe(_described, "corrected")
+    coords = {"band": names, **{name: scene[name] for name in ("time", "y", "x")}}
+    variables = schema.variables("corrected", {"counts": movie})
+    result = xr.Dataset(variables, coords, {"origin": "simulated", **twin})
+    return schema.check(result, "corrected")
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
@@ -210,22 +193,14 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
 def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     """Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
 
+    ValueError if the detector lacks a band, or a count does not fit into 16 bits.
+
     Parameters
     ----------
     corrected : Dataset
         From `observe`.
     detector : Dataset
         From `pattern`, with the same bands and shape.
-
-    Returns
-    -------
-    Dataset
-        Stage `capture`: `counts` uint16 (band, time, y, x).
-
-    Raises
-    ------
-    ValueError
-        If the detector lacks a band, or a count does not fit into 16 bits (no silent saturation).
 
     Examples
     --------
@@ -242,13 +217,14 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
         counts[index] = digitise(movie.values, _of_band(detector, str(movie["band"].item())))
-    return corrected.assign(counts=(corrected["counts"].dims, counts)).pipe(_described, "capture")
+    raw = corrected.assign(schema.variables("capture", {"counts": counts}))
+    return schema.check(raw, "capture")
 
 
 def blackbody_movies(
     rig: Rig, temperatures: np.ndarray, frames: int, detector: xr.Dataset, rng: np.random.Generator
 ) -> xr.Dataset:
-    """Raw movies of a blackbody that fills the view, at several temperatures.
+    """Raw movies of a blackbody that fills the view: the stage `blackbody_movies`.
 
     Parameters
     ----------
@@ -262,11 +238,6 @@ def blackbody_movies(
         From `pattern`.
     rng : Generator
         Source of the noise.
-
-    Returns
-    -------
-    Dataset
-        `counts` uint16 (band, temperature, frame, y, x) [count].
 
     Examples
     --------
@@ -287,14 +258,9 @@ def blackbody_movies(
         noise, of_band = float(response["noise"][index]), _of_band(detector, rig.bands[index])
         for place, mean in enumerate(counts):
             movies[index, place] = digitise(mean + rng.normal(0.0, noise, shape), of_band)
-    return xr.Dataset(
-        {"counts": (("band", "temperature", "frame", "y", "x"), movies, {"units": "count"})},
-        coords={
-            "band": list(rig.bands),
-            "temperature": ("temperature", temperatures, {"units": "K"}),
-        },
-        attrs={"origin": "simulated"},
-    )
+    coords = {"band": list(rig.bands), "temperature": ("temperature", temperatures, {"units": "K"})}
+    variables = schema.variables("blackbody_movies", {"counts": movies})
+    return xr.Dataset(variables, coords, {"origin": "simulated"})
 
 
 def contact_measurements(
@@ -306,6 +272,8 @@ def contact_measurements(
     rng: np.random.Generator,
 ) -> xr.Dataset:
     """Readings for the calibration of an emissivity: thermocouple, blackbody and counts.
+
+    ValueError if a temperature lies outside the response, or the emissivity lacks a band.
 
     Parameters
     ----------
@@ -326,17 +294,11 @@ def contact_measurements(
         `counts` (band, measurement) [count]; `object_temperature`, `background_temperature`
         (measurement) [K], as read.
 
-    Raises
-    ------
-    ValueError
-        If a temperature lies outside the response, or the emissivity lacks a band.
     """
     names = [str(name) for name in response["band"].values]
     places = schema.band_positions(emissivity, names, "the emissivity")
-    true = {
-        "object_temperature": object_temperature,
-        "background_temperature": background_temperature,
-    }
+    levels = (object_temperature, background_temperature)
+    true = dict(zip(("object_temperature", "background_temperature"), levels, strict=True))
     emitted, reflected = (
         np.stack(_blackbody(response, xr.DataArray(level, dims="measurement", name="temperature")))
         for level in true.values()
@@ -357,14 +319,9 @@ def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
     Parameters
     ----------
     counts : array
-        Corrected counts (..., y, x) [count].
+        Corrected counts (..., y, x) [count]; ValueError if one does not fit into 16 bits.
     detector : Dataset
         The `pattern` (y, x) of this band.
-
-    Raises
-    ------
-    ValueError
-        If a count does not fit into 16 bits.
     """
     raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
     if not (raw.min() >= 0 and raw.max() <= correction.DETECTOR_MAXIMUM):  # a NaN fails it, too
@@ -379,10 +336,3 @@ def _of_band(detector: xr.Dataset, band: str) -> xr.Dataset:
     """Pattern (y, x) of one band."""
     schema.band_positions(detector, [band], "the detector")
     return detector.sel(band=band)
-
-
-def _described(dataset: xr.Dataset, stage: str) -> xr.Dataset:
-    """Dataset with the attributes of a stage, checked."""
-    dataset["counts"].attrs.update(schema.STAGES[stage]["counts"].attrs)
-    dataset["time"].attrs.setdefault("units", "s")
-    return schema.check(dataset, stage)

@@ -91,7 +91,7 @@ class Background:
 
 
 def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike) -> Array:
-    r"""Temperature of a body that relaxes exponentially, from start to stop over the capture.
+    r"""Temperature (time, ...) [K] of a body that relaxes exponentially, over the capture.
 
     .. math:: T(t) = T_0 + (T_1 - T_0) \frac{1 - e^{-t / \tau}}{1 - e^{-t_1 / \tau}}
 
@@ -106,11 +106,6 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
         First and last temperature [K].
     time_constant : array_like, shape (...)
         Time constants, positive [s].
-
-    Returns
-    -------
-    ndarray, shape (time, ...)
-        Temperature [K].
 
     Examples
     --------
@@ -132,7 +127,7 @@ def scene(
     Parameters
     ----------
     time : Array
-        Times (time,) [s].
+        Times (time,) [s], two or more, increasing.
     object_temperature, background_temperature : Array
         Temperatures (time, y, x) [K].
     emissivity : DataArray
@@ -142,31 +137,21 @@ def scene(
     -------
     Dataset
         Names, dims and units of the stage `separated` without its deviations.
-
-    Raises
-    ------
-    ValueError
-        Unless the times are two or more and increase.
     """
     increasing(time, "a scene")
-    stage = schema.STAGES["separated"]
     height, width = object_temperature.shape[1:]
     values = emissivity.values.reshape(emissivity.shape[0], *emissivity.shape[1:] or (1, 1))
-    values = np.broadcast_to(values, (emissivity.shape[0], height, width))
+    parts = {
+        "object_temperature": object_temperature,
+        "background_temperature": background_temperature,
+        "emissivity": np.broadcast_to(values, (emissivity.shape[0], height, width)),
+    }
+    coords = {"time": ("time", time, {"units": "s"}), "y": np.arange(height), "x": np.arange(width)}
     return xr.Dataset(
-        {
-            "object_temperature": (("time", "y", "x"), object_temperature),
-            "background_temperature": (("time", "y", "x"), background_temperature),
-            "emissivity": (("band", "y", "x"), values),
-        },
-        coords={
-            "band": emissivity["band"].values,
-            "time": ("time", time, {"units": "s"}),
-            "y": np.arange(height),
-            "x": np.arange(width),
-        },
-        attrs={"origin": "simulated"},
-    ).map(lambda variable: variable.assign_attrs(stage[str(variable.name)].attrs))
+        schema.variables("separated", parts),
+        {"band": emissivity["band"].values, **coords},
+        {"origin": "simulated"},
+    )
 
 
 def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArray:
@@ -200,7 +185,7 @@ def independent_pixels(
     stop: float,
     time_constant: tuple[float, float] = (8.0, 20.0),
 ) -> xr.Dataset:
-    """Scene of many pixels of one material, each with its own heating curve and background.
+    """Scene one row high of many pixels of one material, each with its own heating and background.
 
     Parameters
     ----------
@@ -218,11 +203,6 @@ def independent_pixels(
         First and last object temperature [K].
     time_constant : tuple of float
         Range of the heating's time constant [s].
-
-    Returns
-    -------
-    Dataset
-        A scene one row high, see `scene`.
     """
     constants = rng.uniform(*time_constant, pixels)
     warm = heating(time, start, stop, constants)

@@ -307,9 +307,8 @@ def figure(times: Times) -> Figure:
     for axis, name in zip(axes[0], ("pixels", "frames"), strict=True):
         for number, method in enumerate(separation.METHODS):
             found = times[method, name]
-            color = drawing.COLORS[number % len(drawing.COLORS)]
-            marker = drawing.MARKERS[number % len(drawing.MARKERS)]
-            axis.loglog(list(found), list(found.values()), marker + "-", color=color, label=method)
+            line = drawing.marked_line(number)
+            axis.loglog(list(found), list(found.values()), label=method, **line)
         axis.set_xlabel(f"number of {name}")
         axis.set_ylabel("processor time [s]")
     handles, labels = axes[0, 1].get_legend_handles_labels()

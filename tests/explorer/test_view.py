@@ -2,6 +2,7 @@
 
 import csv
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -266,6 +267,14 @@ def test_explorer_has_a_picture_for_who_has_no_browser() -> None:
     state = explorer.get_state()
     assert all(len(str(one)) < 100 for key, one in state.items() if key not in {"_esm", "_css"})
     explorer.close()
+
+
+def test_without_the_extra_its_name_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line says what to install."""
+    monkeypatch.delitem(sys.modules, "dbthermal.explorer._widget")
+    monkeypatch.setitem(sys.modules, "anywidget", None)
+    with pytest.raises(ImportError, match=r"pip install dbthermal\[explorer\]"):
+        dbthermal.explore(separated())
 
 
 def test_no_room_for_a_film_is_an_error(

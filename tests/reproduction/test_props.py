@@ -1,14 +1,13 @@
 """Moving bodies around the twins: writing, cups, hands, routes, and invalid settings."""
 
 import numpy as np
-import pytest
 
 from reproduction.twins import surfaces
 from reproduction.twins.panes import pointing
 from reproduction.twins.people import FINGERS, Route, imprint, pacing
 from reproduction.twins.props import Writing, board, cup
 from reproduction.twins.stage import AMBIENT, clock
-from reproduction.twins.surroundings import Actor, Pose, gliding
+from reproduction.twins.surroundings import Pose
 
 PLATE = surfaces.plate(0.1, 0.1, 0.1)
 
@@ -68,21 +67,3 @@ def test_a_hand_touches_under_palm_and_fingers() -> None:
     """The print is 1 at the palm and on a finger, 0 between the fingers and beyond."""
     share = imprint([(0.0, 0.0), (-0.010, 0.10), (-0.06, 0.06), (0.0, 0.2)])
     np.testing.assert_allclose(share, [1, 1, 0, 0], rtol=0, atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        (lambda: Writing("X"), "Unknown letter 'X'"),
-        (lambda: gliding([0.0], [(0, 0, 0)]), "of a motion. Must be two or more"),
-        (lambda: gliding([0.0, np.nan], np.zeros((2, 3))), "Invalid time nan s of a motion"),
-        (lambda: gliding([0.0, 1.0], np.full((2, 3), np.nan)), "of a motion. Must be finite, .2,"),
-        (lambda: Actor(PLATE, np.zeros(2)), "Invalid temperature of shape .2,. of an actor"),
-        (lambda: Actor(PLATE, np.full(4, np.nan)), "Must be finite, .4,."),
-        (lambda: Actor(PLATE, lambda time: np.full(3, time)).warmth(1.0), "Must be finite, .4,."),
-    ],
-)
-def test_refusals(wrong: object, message: str) -> None:
-    """Invalid letters, motions and temperatures raise a ValueError with the rule."""
-    with pytest.raises(ValueError, match=message):
-        wrong()  # type: ignore[operator]

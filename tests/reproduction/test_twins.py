@@ -382,8 +382,6 @@ def vessel(**changes: object) -> Vessel:
     ("wrong", "message"),
     [
         (lambda: twins.twin("teapot", SHORT, rng()), "Unknown twin 'teapot'"),
-        (lambda: vessel(level=0.05), "Invalid level 0.05 m. Must be above"),
-        (lambda: vessel(duration=0.0), "Invalid duration 0.0 s of pouring"),
         (lambda: Capture(GLASS[:1], baseline=0.04), "Must be two"),
         (lambda: Capture(GLASS.rename(band="filter")), "Must be .band,."),
         (lambda: Capture(GLASS, blur=0.0), "Invalid blur 0.0"),

@@ -88,3 +88,19 @@ def test_ratios_are_as_certain_as_neighbours_agree(noise: xr.Dataset) -> None:
     np.testing.assert_allclose(material.ratio[1].reshape(SHAPE)[24, 32], true, rtol=0, atol=said)
     assert np.isnan(material.ratio[1].reshape(SHAPE)[24, 40])  # another flag: none
     assert neighbours.blurred(checked) is not None
+
+
+def test_emissivities_are_as_certain_as_neighbours_agree() -> None:
+    """Scattered by three times what is said: said so; what is not known takes those around."""
+    rng, said, true = np.random.default_rng(2), 0.002, 0.86
+    value, known = rng.normal(true, 3.0 * said, SHAPE[0] * SHAPE[1]), np.ones(SHAPE, dtype=bool)
+    known[20, 30] = False
+    hidden = ~known.ravel()
+    value[hidden] = 0.4
+    got, variance = neighbours.shared(value, np.full(value.size, said**2), known.ravel(), SHAPE)
+    ratio = np.sqrt(variance[~hidden]) / (3.0 * said)
+    print(f"stated over true: {ratio.mean():.3f}, from {ratio.min():.2f} to {ratio.max():.2f}")
+    assert abs(ratio.mean() - 1.0) < 0.05
+    np.testing.assert_allclose(got[hidden], true, rtol=0, atol=3.0 * said)
+    np.testing.assert_allclose(variance[hidden], (3.0 * said) ** 2, rtol=0.3)
+    assert got[~hidden].std() < 0.8 * value[~hidden].std()

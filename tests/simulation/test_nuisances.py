@@ -52,5 +52,5 @@ def test_whole_numbers_are_refused(name: str) -> None:
         "spoil_pixels": (0.1, rng),
         "lag": (0.05,),
     }
-    with pytest.raises(TypeError, match="uint16 of the counts"):
+    with pytest.raises(TypeError, match="uint16 of 'counts'"):
         getattr(simulation, name)(raw, *arguments[name])

@@ -115,7 +115,7 @@ class Block(NamedTuple):
 
 
 class Result(NamedTuple):
-    """Temperatures of the frames, and scratch rows, apart from one another."""
+    """Temperatures of the frames, and scratch rows; separate, so that none is taken to overlap."""
 
     status: npt.NDArray[np.uint32]  # (y, x)
     films: Planes  # object, deviation, background, deviation (film, frame, y, x) [K]
@@ -123,7 +123,8 @@ class Result(NamedTuple):
     out: tuple[Planes, ...]  # films of a frame, and if they are out of range
 
 
-ROWS: Final = (18, 5)  # numbers of the scratch rows
+ROWS: Final = (18, 5)
+"""Numbers of the scratch rows."""
 
 
 @compiled
@@ -138,7 +139,11 @@ def _add(one: Any, two: Any, total: Any, other: Any, number: Any) -> None:
 
 @compiled
 def _absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
-    """Means (band, y, x) of frames (band, frame, y, x) [count] in both, NaN of less than half."""
+    """
+    Means (band, y, x) of frames (band, frame, y, x) [count], in place; NaN of less than half.
+
+    A sample counts if it is a number in both bands.
+    """
     width = frames.shape[3]
     total, other = np.empty(width, np.float32), np.empty(width, np.float32)
     number = np.empty(width, np.float32)
@@ -176,56 +181,36 @@ def _bridge(means: Any) -> bool:
 
 
 @compiled
-def _gather(mean: Any, count: float, here: Any, lost: Any) -> None:
-    """Row of a mean less the reference [count], in place; and how many of its pixels' are lost."""
-    for x in range(here.size):
-        here[x] = mean[x] - count
-        lost[x] += 0 if here[x] == here[x] else 1
-
-
-@compiled
-def _weigh(here: Any, value: float, slope: float, total: Any, steepness: Any) -> None:
-    """Add a row of a mean to the value and the slope of a local polynomial."""
-    for x in range(here.size):
-        total[x] += value * here[x]
-        steepness[x] += slope * here[x]
-
-
-@compiled
 def _fitted(
-    block: Block, fit: Fit, camera: Camera, y: int, here: Any, lost: Any, fits: Any
-) -> None:
-    """Values and slopes (fit, 2 band, x) [count] of all fits to a row of means, in place."""
-    lost[:], fits[:] = 0, 0.0
-    for band in range(2):
-        for i in range(block.order.size):
-            _gather(block.means[block.order[i], band, y], camera.counts[band], here[band, i], lost)
-    for x in range(lost.size):
-        if lost[x] > 0 and not _bridge(here[:, :, x]):
-            here[:, :, x] = np.nan
-    for j in range(fit.variance.size):
-        for i in range(fit.ends[j, 0], fit.ends[j, 1]):
-            for band in range(2):
-                value, slope = fit.weights[j, 0, i], fit.weights[j, 1, i]
-                _weigh(here[band, i], value, slope, fits[j, 2 * band], fits[j, 2 * band + 1])
-
-
-@compiled
-def _widest(fits: Any, slopes: Any, share: Any, w: Any, null: float, found: Any) -> float:
+    means: Any,
+    slopes: tuple[float, float],
+    fit: Fit,
+    w: tuple[float, float],
+    null: float,
+    found: Any,
+) -> float:
     """Value and slope (band, 2) [K] of the widest fit that agrees with all narrower ones, in place.
 
-    The variance of the null combination's value, of a share of a frame's; see `_frames`.
+    Of means less the reference (band, mean) [count]. The variance of the null combination's value;
+    see `_frames`.
     """
     low, high, variance = -np.inf, np.inf, np.nan
-    for j in range(share.size):
-        combined = w[0] / slopes[0] * fits[j, 0] + w[1] / slopes[1] * fits[j, 2]
-        within = _AGREE * sqrt(null * share[j])
+    for j in range(fit.variance.size):
+        one0, one1, two0, two1 = 0.0, 0.0, 0.0, 0.0
+        for i in range(fit.ends[j, 0], fit.ends[j, 1]):
+            value, slope = fit.weights[j, 0, i], fit.weights[j, 1, i]
+            one0 += value * means[0, i]
+            one1 += slope * means[0, i]
+            two0 += value * means[1, i]
+            two1 += slope * means[1, i]
+        combined = w[0] / slopes[0] * one0 + w[1] / slopes[1] * two0
+        within = _AGREE * sqrt(null * fit.variance[j])
         low, high = max(low, combined - within), min(high, combined + within)
         if j > 0 and low > high:
             break
-        found[0, 0], found[0, 1] = fits[j, 0] / slopes[0], fits[j, 1] / slopes[0]
-        found[1, 0], found[1, 1] = fits[j, 2] / slopes[1], fits[j, 3] / slopes[1]
-        variance = null * share[j]
+        found[0, 0], found[0, 1] = one0 / slopes[0], one1 / slopes[0]
+        found[1, 0], found[1, 1] = two0 / slopes[1], two1 / slopes[1]
+        variance = null * fit.variance[j]
     return variance
 
 
@@ -301,8 +286,10 @@ def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -
         z0 = (one[x] - camera.counts[0]) / camera.slopes[0]
         z1 = (two[x] - camera.counts[1]) / camera.slopes[1]
         valid = _ZERO * (z0 + z1)  # NaN where one is none
-        r0 = line[3][x] * (z0 - line[5][x] - line[6][x] * dt)
-        r1 = line[4][x] * (z1 - line[7][x] - line[8][x] * dt)
+        r0, r1 = (
+            line[3][x] * (z0 - line[5][x] - line[6][x] * dt),
+            line[4][x] * (z1 - line[7][x] - line[8][x] * dt),
+        )
         guess = (r0 + r1 - table.middle_signal) / table.half_signal
         t = kernels.polynomial(table.inverse, guess)
         # One Gauss-Newton step of eq. 9.
@@ -328,8 +315,16 @@ def _frame(one: Any, two: Any, line: Any, camera: Camera, dt: float, out: Any) -
 @compiled
 def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, work: Any) -> None:
     """Terms of one pixel of a row, NaN where the object is not defined; see `_object`."""
-    line, fits, found, pixel = work
-    if (status & _UNDEFINED) != 0 or (status & _AMBIGUOUS) == _AMBIGUOUS:
+    line, here, found, pixel = work
+    defined = (status & _UNDEFINED) == 0 and (status & _AMBIGUOUS) != _AMBIGUOUS
+    if defined:
+        missing = 0
+        for i in range(block.order.size):
+            one, two = block.means[block.order[i], 0, y, x], block.means[block.order[i], 1, y, x]
+            here[0, i], here[1, i] = one - camera.counts[0], two - camera.counts[1]
+            missing += np.isnan(one) or np.isnan(two)
+        defined = missing == 0 or _bridge(here)
+    if not defined:
         for row in line:
             row[x] = np.nan
         return
@@ -343,7 +338,7 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, 
         last = 1.0 - k * (1.0 - first)
     w = -k / (1.0 - k), 1.0 / (1.0 - k)
     null = (w[0] * noise[0]) ** 2 + (w[1] * noise[1]) ** 2
-    variance = _widest(fits[:, :, x], camera.slopes, fit.variance, w, null, found)
+    variance = _fitted(here, camera.slopes, fit, w, null, found)
     _object(camera, found, pixel, noise, variance, (first, last), line, x)
 
 
@@ -351,14 +346,13 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, status: int, x: int, 
 def _emit(
     block: Block, fit: Fit, camera: Camera, fine: Camera, result: Result, top: int, stop: int
 ) -> None:
-    """Films of the frames of one mean, and in the status the calibrated range, in place."""
+    """Films of the frames of one mean, and in the status the calibrated range, in place.
+
+    With the camera's numbers in double and in single precision.
+    """
     line, out, films = result.line, result.out, result.films
-    width = films.shape[3]
-    here, lost = np.empty((2, block.order.size, width)), np.empty(width, np.int64)
-    fits = np.empty((fit.variance.size, 4, width))
-    work = line, fits, np.empty((2, 2)), np.empty(7)
+    work = line, np.empty((2, block.order.size)), np.empty((2, 2)), np.empty(7)
     for y in range(top, stop):
-        _fitted(block, fit, camera, y, here, lost, fits)
         for x in range(films.shape[3]):
             _terms(block, fit, camera, y, result.status[y, x], x, work)
         out[4][:] = 0.0

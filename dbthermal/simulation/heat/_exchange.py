@@ -45,7 +45,7 @@ class Exchange(ABC):
     def balance(self, time: float, vertices: int) -> tuple[Array, Array, Array]:
         """Terms a, b, s of `Balance` at a time [s] for a number of vertices.
 
-        Raises a ValueError if an attribute does not fit the vertices or is not physical.
+        ValueError if an attribute does not fit the vertices or is not physical.
         """
 
 

@@ -39,7 +39,7 @@ def simulate(
     step: float | None = None,
     tolerance: float = TOLERANCE,
 ) -> Array:
-    r"""Transient temperature (time, vertex) [K] of a thin shell.
+    r"""Transient temperature (time, vertex) [K] of a thin shell, insulated at an edge of the mesh.
 
     .. math:: \rho c d \, \dot T = \nabla \cdot (k d \, \nabla T) + \sum_i h_i (T_i - T)
               + \sum_j \varepsilon_j \sigma (T_j^4 - T^4) + q
@@ -47,8 +47,7 @@ def simulate(
     In space, the intrinsic Laplacian with a lumped mass (`Shell`): second order in the edge
     length. In time, Alexander's stiffly accurate two-stage scheme (SDIRK2) [1]_, L-stable and of
     second order in the step; where a function of time jumps within a step, of first. Both stages
-    share one sparse factorisation, which is reused for all steps of one length. An edge of the
-    mesh is insulated.
+    share one sparse factorisation, which is reused for all steps of one length.
 
     Parameters
     ----------
@@ -65,11 +64,6 @@ def simulate(
         this allows. One step an interval if left out.
     tolerance : float
         Largest error of the iteration in a stage [K].
-
-    Returns
-    -------
-    ndarray, shape (time, vertex)
-        Temperature [K].
 
     Raises
     ------
@@ -128,7 +122,6 @@ class _Stepper:
     """
 
     def __init__(self, shell: Shell, exchanges: Sequence[Exchange], tolerance: float) -> None:
-        """Keep the problem, and the tolerance [K]."""
         self.shell, self.exchanges, self.tolerance = shell, exchanges, tolerance
         self.weight = 0.0
         self.slope = np.zeros(len(shell.vertices))

@@ -16,66 +16,24 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import calibration, mixing, planck
+from dbthermal import calibration, mixing, schema
 from dbthermal import response as responses
 from dbthermal.emissivity import embedded_table
 from dbthermal.response import Curve, require_range
 
 Array = npt.NDArray[np.float64]
 
-_POSITIVE: Final = (
-    "object_temperatures",
-    "blackbody_temperatures",
-    "air_temperature",
-    "reading_std",
-    "blackbody_std",
-    "foil_std",
-)
-"""Attributes of a bench that are finite and positive [K]."""
-_LIMITS: Final = {
-    "probe_tolerance": np.inf,
-    "logger_tolerance": np.inf,
-    "blackbody_tolerance": np.inf,
-    "foil_emissivity": 1.0,
-    "foil_warming": 1.0,
-    "least_excess": np.inf,
-}
-"""Attributes that are not negative, and their upper limits: [K] or [1]."""
-_RANGES: Final = {"contact": (0.0, 1.0), "mirrored_excess": (-np.inf, np.inf)}
-"""Attributes that are ranges, and their limits: [1] and [K]."""
 _CAMERA_BAND: Final = "8-14"
 
 
 @dataclass(frozen=True)
 class Sample:
-    """An object on the bench.
-
-    Attributes
-    ----------
-    name : str
-        Name.
-    emissivity : float
-        Emissivity in the band 8-14 um, in (0, 1).
-    kin : str
-        Material of `emissivity.embedded_table` after which the other bands are scaled.
-    stray : float
-        Largest share of its reflection that is not mirror-like but comes from the whole room, in
-        [0, 1].
-    """
+    """An object on the bench."""
 
     name: str
-    emissivity: float
-    kin: str
-    stray: float
-
-    def __post_init__(self) -> None:
-        """Check emissivity and share."""
-        if not 0 < self.emissivity < 1:
-            raise ValueError(
-                f"Invalid emissivity {self.emissivity} of '{self.name}'. Must lie in (0, 1)."
-            )
-        if not 0 <= self.stray <= 1:
-            raise ValueError(f"Invalid stray {self.stray} of '{self.name}'. Must lie in [0, 1].")
+    emissivity: float  # in the band 8-14 um, in (0, 1)
+    kin: str  # material of `emissivity.embedded_table` after which the other bands are scaled
+    stray: float  # largest share of its reflection that is of the whole room, not mirror-like
 
 
 OBJECTS: Final = (
@@ -109,74 +67,31 @@ def band_emissivity(sample: Sample, names: list[str]) -> xr.DataArray:
 class Bench:
     """Steps and errors of the bench; each `tolerance` is the half width of a uniform error.
 
-    Attributes
-    ----------
-    object_temperatures, blackbody_temperatures : tuple of float
-        Steps [K]; every pair is measured.
-    air_temperature : float
-        Temperature of the room: of its air, and of its walls as a mean [K].
-    reading_std : float
-        Scatter of a thermocouple's reading [K].
-    probe_tolerance : float
-        Offset of the probe [K]: type T, class 1 of IEC 60584-1:2013 up to 125 C.
-    logger_tolerance : float
-        Offset of the logger [K]: data sheet of the paper's, a Pico TC-08. The 0.2 % of the reading
-        that it states beside, at most 0.13 K here, is left out.
-    contact : tuple of float
-        Least and largest fraction of the object's excess over the air that the thermocouple misses.
-    blackbody_std, blackbody_tolerance : float
-        Scatter and offset of the blackbody's temperature [K].
-    foil_emissivity : float
-        Emissivity of crumpled aluminium foil [1].
-    foil_warming : float
-        Fraction of the object's excess over the air that the foil before it takes on [1].
-    foil_std : float
-        Scatter of the foil's signal from one part of it to another [K].
-    mirrored_excess : tuple of float
-        Least and largest excess, over the mean of the room, of what a smooth object reflects [K]:
-        the camera, and who stands beside it, fill part of that direction. 11 K is a direction
-        nearly filled by skin. The failure at low emissivity is this assumption: with a room of one
-        temperature, (0, 0), the method is right within 0.01; with (0, 5) and (0, 11) a chrome ball
-        of 0.10 seems to have 0.15 and 0.21.
-    least_excess : float
-        Excess over the air from which the reflector method takes a step [K]; ASTM E1933 asks for
-        10 K.
+    The mirrored excess, over the mean of the room, is that of what a smooth object reflects: the
+    camera, and who stands beside it, fill part of that direction. 11 K is a direction nearly filled
+    by skin. The reflector method's failure at low emissivity is this assumption: with a room of one
+    temperature, (0, 0), it is right within 0.01; with (0, 5) and (0, 11) a chrome ball of 0.10
+    seems to have 0.15 and 0.21.
     """
 
+    # Steps [K], of which every pair is measured, and the room: its air, and its walls as a mean.
     object_temperatures: tuple[float, ...] = (300.15, 313.15, 325.15, 338.15)
     blackbody_temperatures: tuple[float, ...] = (288.15, 318.15, 348.15)
     air_temperature: float = 295.15
-    reading_std: float = 0.2
-    probe_tolerance: float = 0.5
+    reading_std: float = 0.2  # of a thermocouple's reading [K]
+    probe_tolerance: float = 0.5  # [K]: type T, class 1 of IEC 60584-1:2013 up to 125 C
+    # [K]: data sheet of the paper's Pico TC-08, but for 0.2 % of the reading, at most 0.13 K here.
     logger_tolerance: float = 0.5
+    # Least and largest fraction of the object's excess over the air that the thermocouple misses.
     contact: tuple[float, float] = (0.0, 0.05)
-    blackbody_std: float = 0.05
-    blackbody_tolerance: float = 0.3
-    foil_emissivity: float = 0.04
-    foil_warming: float = 0.2
-    foil_std: float = 0.3
-    mirrored_excess: tuple[float, float] = (0.0, 11.0)
+    blackbody_std: float = 0.05  # [K]
+    blackbody_tolerance: float = 0.3  # [K]
+    foil_emissivity: float = 0.04  # of crumpled aluminium foil [1]
+    foil_warming: float = 0.2  # fraction of the object's excess that the foil before it takes on
+    foil_std: float = 0.3  # of the foil's signal from one part of it to another [K]
+    mirrored_excess: tuple[float, float] = (0.0, 11.0)  # least and largest [K]
+    # Excess over the air from which the reflector method takes a step [K]; ASTM E1933: 10 K.
     least_excess: float = 10.0
-
-    def __post_init__(self) -> None:
-        """Check steps, tolerances and ranges."""
-        for name in ("object_temperatures", "blackbody_temperatures"):
-            if not getattr(self, name):
-                raise ValueError(f"Invalid {name} () of the bench. Must be one or more.")
-        for name in _POSITIVE:
-            planck.require_positive(f"{name} [K] of the bench", getattr(self, name))
-        for name, limit in _LIMITS.items():
-            if not 0 <= getattr(self, name) < limit:  # a NaN fails it, too
-                raise ValueError(
-                    f"Invalid {name} {getattr(self, name)} of the bench. Must lie in [0, {limit})."
-                )
-        for name, (lowest, highest) in _RANGES.items():
-            least, largest = getattr(self, name)
-            if not (np.isfinite(least) and lowest <= least <= largest < highest):
-                raise ValueError(
-                    f"Invalid {name} ({least}, {largest}) of the bench. Must be least and largest, "
-                    f"finite, in [{lowest}, {highest})."
-                )
 
     def bias(self, sample: Sample) -> calibration.Bias:
         """Common errors that an experimenter would state, for `calibration.fit_emissivity`."""
@@ -231,8 +146,9 @@ def bench_series(
     read = {
         "object_temperature": _thermocouple(warm, bench, rng),
         "background_temperature": shown + rng.normal(0, bench.blackbody_std, cold.size),
+        "counts": _noisy(response, counts, rng),
     }
-    return _dataset(response, {"counts": _noisy(response, counts, rng)}, read)
+    return _series(response, "contact", read)
 
 
 def reflector_series(
@@ -275,11 +191,12 @@ def reflector_series(
     uneven = _blackbody(curves, air + rng.normal(0, bench.foil_std, air.size))
     emitted = _blackbody(curves, air + bench.foil_warming * (warm - air))
     foil = mixing.leaving(bench.foil_emissivity, emitted, uneven)
-    return _dataset(
-        response,
-        {"counts": _noisy(response, counts, rng), "reflected_counts": _noisy(response, foil, rng)},
-        {"object_temperature": _thermocouple(warm, bench, rng)},
-    )
+    read = {
+        "counts": _noisy(response, counts, rng),
+        "reflected_counts": _noisy(response, foil, rng),
+        "object_temperature": _thermocouple(warm, bench, rng),
+    }
+    return _series(response, "reflector", read)
 
 
 def _curves(response: xr.Dataset) -> list[Curve]:
@@ -310,12 +227,7 @@ def _thermocouple(temperature: Array, bench: Bench, rng: np.random.Generator) ->
     return np.asarray(temperature + offset - missed + scatter)
 
 
-def _dataset(
-    response: xr.Dataset, counts: dict[str, Array], temperatures: dict[str, Array]
-) -> xr.Dataset:
-    """Series of counts (band, measurement) and temperatures (measurement)."""
-    dims, units = ("band", "measurement"), {"units": "count"}
-    parts = {name: xr.DataArray(value, dims=dims, attrs=units) for name, value in counts.items()}
-    for name, value in temperatures.items():
-        parts[name] = xr.DataArray(value, dims="measurement", attrs={"units": "K"})
-    return xr.Dataset(parts, {"band": response["band"].values}, {"origin": "simulated"})
+def _series(response: xr.Dataset, stage: str, read: dict[str, Array]) -> xr.Dataset:
+    """Readings by name as a series of a stage."""
+    variables = schema.variables(stage, read)
+    return xr.Dataset(variables, {"band": response["band"].values}, {"origin": "simulated"})

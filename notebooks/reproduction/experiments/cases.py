@@ -18,6 +18,7 @@ Case = Mapping[str, Any]
 STEPS: Final = 20
 """Steps of the finer clock in a frame, on which bands that are not exposed together are drawn."""
 
+_ORDER: Final = 5  # of the smooth subspace that the efficiency is of
 _NEEDED: Final = frozenset({"emissivity", "start", "stop"})
 _OPTIONAL: Final = frozenset(
     {"background", "case", "following", "frames", "jump", "noise", "noise_known", "offset"}
@@ -27,21 +28,11 @@ _OPTIONAL: Final = frozenset(
 
 @dataclass(frozen=True)
 class Jump:
-    """Change of the object that is not a smooth curve, as when a palm is laid on a bulb.
+    """Change of the object that is not a smooth curve, as when a palm is laid on a bulb."""
 
-    Attributes
-    ----------
-    height : float
-        Permanent change [K].
-    between : tuple of float
-        Earliest and latest beginning, drawn for each pixel [s].
-    duration : float
-        Time in which it is reached, linearly; 0 is sudden [s].
-    """
-
-    height: float = 6.0
-    between: tuple[float, float] = (10.0, 25.0)
-    duration: float = 0.0
+    height: float = 6.0  # permanent change [K]
+    between: tuple[float, float] = (10.0, 25.0)  # earliest and latest beginning of a pixel [s]
+    duration: float = 0.0  # time in which it is reached, linearly; 0 is sudden [s]
 
     def __post_init__(self) -> None:
         """Check beginning and duration."""
@@ -225,15 +216,13 @@ def _draw(
     )
 
 
-def sweep(
-    cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: int, *, order: int = 5
-) -> xr.Dataset:
+def sweep(cases: Iterable[Case], rig: Rig, time: np.ndarray, pixels: int, seed: int) -> xr.Dataset:
     """Scores (see `score`) and `efficiency` [1] over `case`, all with the same seed."""
     rows, names = [], []
     for case in cases:
         scene, result = run_case(case, rig, time, pixels, seed)
         first, second = case.get("noise", rig.noise)
-        scatter = efficiency(scene, result, (first, second), order)
+        scatter = efficiency(scene, result, (first, second), _ORDER)
         rows.append(score(scene, result).assign(efficiency=scatter))
         names.append(str(case["case"]))
     together = xr.concat(rows, dim=xr.DataArray(names, dims="case", name="case"))

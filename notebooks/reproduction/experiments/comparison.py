@@ -80,10 +80,9 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     """
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     of_emissivity = abs(result["emissivity"] - truth["emissivity"])
+    rmse = squared.mean("time", skipna=False) ** 0.5
     errors = {
-        "object_temperature_rmse": (squared.mean("time", skipna=False) ** 0.5).assign_attrs(
-            units="K"
-        ),
+        "object_temperature_rmse": rmse.assign_attrs(units="K"),
         "emissivity_error": of_emissivity.assign_attrs(units="1"),
         "status": result["status"],
     }

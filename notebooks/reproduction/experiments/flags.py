@@ -16,7 +16,7 @@ from reproduction.experiments.pictures import Picture, smooth_shift
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-Change = Callable[[xr.Dataset, Mask, np.random.Generator], xr.Dataset]
+Change = Callable[[npt.NDArray[Any], Mask, np.random.Generator], None]
 
 FAR: Final = 5.0
 """Standard deviations of error from which a value is wrong [1]."""
@@ -121,7 +121,9 @@ def _solved(
     holds: Mask = np.ones((1, pixels), dtype=bool)
     if flag in FAULTS:
         holds[:, ::2] = False
-        capture = FAULTS[flag](capture, holds, rng)
+        counts = capture["counts"].copy(deep=True)
+        FAULTS[flag](counts.values, holds, rng)
+        capture = capture.assign(counts=counts)
     elif flag == Status.OBJECT_NOT_SMOOTH.label:
         walk = simulation.Background(kind="random walk", correlation_time=1.0, amplitude=_FLICKER)
         flicker = walk.draw(time, pixels, rng)[:, np.newaxis] - walk.level
@@ -188,43 +190,37 @@ def _unpaired(shift: Array) -> Mask:
     return np.asarray(((place < -0.5) | (place > size - 0.5)).any(axis=0))
 
 
-def _invalid(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
+def _invalid(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> None:
     """Most samples of a band no numbers."""
-    counts = capture["counts"].copy(deep=True)
-    lost = (rng.random(counts.shape[1:]) < _INVALID) & pixels
-    counts.values[0][lost] = np.nan
-    return capture.assign(counts=counts)
+    counts[0][(rng.random(counts.shape[1:]) < _INVALID) & pixels] = np.nan
 
 
-def _constant(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
+def _constant(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> None:
     """The signal of a band, drawn for each pixel, the same in all frames."""
-    counts = capture["counts"].copy(deep=True)
-    band = rng.integers(0, counts.sizes["band"], pixels.shape)
-    stuck = (band == np.arange(counts.sizes["band"])[:, np.newaxis, np.newaxis]) & pixels
-    counts.values[...] = np.where(stuck[:, np.newaxis], counts.values[:, :1], counts.values)
-    return capture.assign(counts=counts)
+    stuck = _in_one_band(counts, pixels, rng)
+    counts[...] = np.where(stuck, counts[:, :1], counts)
 
 
-def _saturated(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
+def _saturated(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> None:
     """The highest samples of a band, drawn for each pixel, at one level."""
-    counts = capture["counts"].copy(deep=True)
-    limit = np.quantile(counts.values, 1.0 - _CLIPPED, axis=1, keepdims=True)
-    band = rng.integers(0, counts.sizes["band"], pixels.shape)
-    clipped = (band == np.arange(counts.sizes["band"])[:, np.newaxis, np.newaxis]) & pixels
-    values = np.where(clipped[:, np.newaxis], np.minimum(counts.values, limit), counts.values)
-    counts.values[...] = values
-    return capture.assign(counts=counts)
+    limit = np.quantile(counts, 1.0 - _CLIPPED, axis=1, keepdims=True)
+    clipped = _in_one_band(counts, pixels, rng)
+    counts[...] = np.where(clipped, np.minimum(counts, limit), counts)
 
 
-def _frozen(capture: xr.Dataset, pixels: Mask, rng: np.random.Generator) -> xr.Dataset:
+def _in_one_band(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> Mask:
+    """Samples (band, 1, y, x) of one band, drawn for each of the pixels."""
+    chosen = rng.integers(0, len(counts), pixels.shape)
+    bands = np.arange(len(counts))[:, np.newaxis, np.newaxis]
+    return np.asarray((chosen == bands) & pixels)[:, np.newaxis]
+
+
+def _frozen(counts: npt.NDArray[Any], pixels: Mask, rng: np.random.Generator) -> None:
     """Runs of frames in which all bands repeat the frame before."""
-    counts = capture["counts"].copy(deep=True)
-    frames = counts.sizes["time"]
+    frames = counts.shape[1]
     for start in rng.choice(frames // _RUN, int(_FROZEN * frames / _RUN), replace=False) * _RUN:
-        held = counts.values[:, start : start + 1]
-        part = counts.values[:, start : start + _RUN]
-        part[...] = np.where(pixels, held, part)
-    return capture.assign(counts=counts)
+        part = counts[:, start : start + _RUN]
+        part[...] = np.where(pixels, part[:, :1], part)
 
 
 FAULTS: Final[Mapping[str, Change]] = {

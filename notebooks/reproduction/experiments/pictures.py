@@ -18,40 +18,22 @@ Array = npt.NDArray[np.float64]
 
 ROOM: Final = 295.15
 """Temperature of the room [K]."""
-# Logistic steps from 10 to 90 % take so many of their scales.
-_RISE: Final = 2.0 * np.log(9.0)
+_RISE: Final = 2.0 * np.log(9.0)  # logistic steps from 10 to 90 % take so many of their scales
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What is drawn.
+    """What is drawn."""
 
-    Attributes
-    ----------
-    shape : tuple of int
-        Rows and columns.
-    walkers : int
-        People who walk by in the capture; each of a size, height, speed and temperature of its own.
-    warmer : tuple of float
-        By how much the people are warmer than the room, from and to [K].
-    sharpness : float
-        Width of a silhouette's edge, a logistic step's scale [pixel].
-    hottest : float
-        Object at its hottest [K].
-    rise : tuple of float, optional
-        Times from 10 to 90 % of the heating by a front that climbs from the lowest row to the
-        highest, drawn for each column [s]; if not given, the object is heated smoothly.
-    still : float
-        Share of the columns, from the left, in which nothing moves in the reflection [1].
-    """
-
-    shape: tuple[int, int] = (72, 96)
-    walkers: int = 9
-    warmer: tuple[float, float] = (3.0, 8.0)
-    sharpness: float = 0.7
-    hottest: float = 333.15
+    shape: tuple[int, int] = (72, 96)  # rows and columns
+    walkers: int = 9  # who walk by; each of a size, height, speed and temperature of its own
+    warmer: tuple[float, float] = (3.0, 8.0)  # than the room are they, from and to [K]
+    sharpness: float = 0.7  # width of a silhouette's edge, a logistic step's scale [pixel]
+    hottest: float = 333.15  # object at its hottest [K]
+    # Times from 10 to 90 % of the heating by a front that climbs from the lowest row to the
+    # highest, drawn for each column [s]; if not given, the object is heated smoothly.
     rise: tuple[float, float] | None = None
-    still: float = 0.0
+    still: float = 0.0  # share of the columns, from the left, without motion in the reflection [1]
 
     def draw(
         self,

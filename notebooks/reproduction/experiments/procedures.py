@@ -24,12 +24,7 @@ thermocouple's. ("Method" is a word of xarray's own.)"""
 
 
 def compare_procedures(
-    response: xr.Dataset,
-    rng: np.random.Generator,
-    *,
-    bench: Bench | None = None,
-    samples: tuple[Sample, ...] = OBJECTS,
-    repeats: int = 100,
+    response: xr.Dataset, rng: np.random.Generator, *, repeats: int = 100
 ) -> xr.Dataset:
     """Statistics of many measurements of objects on the bench and by the reflector method.
 
@@ -39,9 +34,9 @@ def compare_procedures(
     standard deviations, and `coverage`, the share of errors within one, 0.68 for a calibrated
     uncertainty [1].
     """
-    true, here = _true(response, samples, repeats), Bench() if bench is None else bench
+    true, bench = _true(response, repeats), Bench()
     estimates = np.array(
-        [[_measured(response, sample, here, rng) for _ in range(repeats)] for sample in samples]
+        [[_measured(response, sample, bench, rng) for _ in range(repeats)] for sample in OBJECTS]
     )  # (object, repeat, value or deviation, procedure, band)
     value, std = estimates[:, :, 0], estimates[:, :, 1]
     error = value - true.values[:, np.newaxis, np.newaxis]
@@ -53,15 +48,9 @@ def compare_procedures(
         "stated": np.sqrt(np.mean(std**2, axis=1)),
         "coverage": np.mean(np.abs(error) < std, axis=1),
     }
-    unit = {"units": "1"}
+    dims, unit = ("object", "procedure", "band"), {"units": "1"}
     return xr.Dataset(
-        {
-            "true": true,
-            **{
-                name: (("object", "procedure", "band"), part, unit)
-                for name, part in statistics.items()
-            },
-        },
+        {"true": true, **{name: (dims, part, unit) for name, part in statistics.items()}},
         coords={"procedure": list(PROCEDURES)},
         attrs={"origin": "simulated twin", "repeats": repeats},
     )
@@ -71,7 +60,6 @@ def reflector_sensitivity(
     response: xr.Dataset,
     rng: np.random.Generator,
     excesses: Sequence[float] = (0.0, 5.0, 11.0),
-    samples: tuple[Sample, ...] = OBJECTS,
     repeats: int = 100,
 ) -> xr.Dataset:
     """Emissivity by the reflector method over the excess of the reflected direction over the room.
@@ -81,14 +69,14 @@ def reflector_sensitivity(
     foil gives what the object reflects, and the method is right; beyond, its error is the
     emissivity's share in the excess, whatever the foil.
     """
-    true = _true(response, samples, repeats)
+    true = _true(response, repeats)
     benches = [replace(Bench(), mirrored_excess=(0.0, float(excess))) for excess in excesses]
     mean = [
         [
             np.mean([_by_reflector(response, it, bench, rng)[0] for _ in range(repeats)], axis=0)
             for bench in benches
         ]
-        for it in samples
+        for it in OBJECTS
     ]
     return xr.Dataset(
         {"true": true, "mean": (("object", "excess", "band"), np.array(mean), {"units": "1"})},
@@ -97,17 +85,16 @@ def reflector_sensitivity(
     )
 
 
-def _true(response: xr.Dataset, samples: tuple[Sample, ...], repeats: int) -> xr.DataArray:
-    """True emissivity (object, band) of samples that can be compared."""
-    if not samples or repeats < 2:
+def _true(response: xr.Dataset, repeats: int) -> xr.DataArray:
+    """True emissivity (object, band) of the objects."""
+    if repeats < 2:
         raise ValueError(
-            f"Invalid comparison of {len(samples)} samples, {repeats} times. Must be at least one, "
-            "twice."
+            f"Invalid comparison of {len(OBJECTS)} samples, {repeats} times. Must be twice or more."
         )
     names = [str(name) for name in response["band"].values]
     return xr.DataArray(
-        [band_emissivity(sample, names).values for sample in samples],
-        coords={"object": [sample.name for sample in samples], "band": names},
+        [band_emissivity(sample, names).values for sample in OBJECTS],
+        coords={"object": [sample.name for sample in OBJECTS], "band": names},
         attrs={"units": "1"},
     )
 

@@ -7,15 +7,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dbthermal.figures.drawing import (
-    COLORS,
-    MARKERS,
-    band_label,
-    canvas,
-    draw_image,
-    limits_of,
-    provenance_note,
-)
+from dbthermal.figures import drawing
+from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
 
 
 def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
@@ -45,7 +38,7 @@ def error_over_noise(errors: xr.DataArray, *, title: str) -> Figure:
         axis.set_xlabel("noise of the quieter band [K]")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=8)
-    figure.suptitle(title + provenance_note(errors))
+    figure.suptitle(title + drawing.provenance_note(errors))
     return figure
 
 
@@ -58,20 +51,9 @@ def _decades(errors: xr.DataArray) -> tuple[float, float]:
 def _lines(axis: Axes, errors: xr.DataArray) -> None:
     """One line a variant, over the noise."""
     for index, name in enumerate(errors["variant"].values):
-        axis.loglog(
-            errors["noise"],
-            errors.sel(variant=name),
-            color=COLORS[index % len(COLORS)],
-            marker=MARKERS[index % len(MARKERS)],
-            markersize=4,
-            linewidth=1,
-            linestyle="-" if index < len(COLORS) else "--",
-            label=str(name),
-        )
-    axis.grid(visible=True, which="major", color="0.9")
-    levels = errors["noise"].values
-    axis.set_xticks(levels, [f"{level:g}" for level in levels], fontsize=8)
-    axis.set_xticks([], minor=True)
+        style = drawing.marked_line(index) | {"linestyle": "-" if index < len(COLORS) else "--"}
+        axis.loglog(errors["noise"], errors.sel(variant=name), label=str(name), **style)
+    drawing.plain_ticks(axis, errors["noise"])
 
 
 def emissivity_errors(errors: xr.DataArray, *, title: str) -> Figure:
@@ -94,7 +76,7 @@ def emissivity_errors(errors: xr.DataArray, *, title: str) -> Figure:
         axis.set_yticks(range(image.sizes["emissivity"]), rows)
         axis.set(xlabel="noise of the quieter band [K]")
     axes[0, 0].set_ylabel(f"emissivity, {band_label('8-14')} [1]")
-    figure.suptitle(title + provenance_note(errors))
+    figure.suptitle(title + drawing.provenance_note(errors))
     return figure
 
 
@@ -113,7 +95,7 @@ def reductions(reduction: xr.DataArray, published: Sequence[float]) -> Figure:
     axis.set_xticks(place, [str(name) for name in reduction["term"].values])
     axis.set_ylabel("reduction of the error by the term [%]")
     axis.legend(frameon=False, fontsize=8)
-    axis.set_title("Error saved by each loss term" + provenance_note(reduction))
+    axis.set_title("Error saved by each loss term" + drawing.provenance_note(reduction))
     return figure
 
 
@@ -127,7 +109,9 @@ def sensitivity(errors: xr.DataArray, base: float) -> Figure:
     axis.invert_yaxis()
     axis.set_xlabel("median error of the object temperature [K]")
     axis.legend(frameon=False, fontsize=8)
-    axis.set_title("Settings of the optimiser, one changed at a time" + provenance_note(errors))
+    axis.set_title(
+        "Settings of the optimiser, one changed at a time" + drawing.provenance_note(errors)
+    )
     return figure
 
 
@@ -165,7 +149,7 @@ def emissivity_procedures(
     axis.set_xticks(place, list(objects))
     axis.set(ylabel=f"emissivity, {band_label(band)} [1]", ylim=(0, 1.05))
     axis.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
-    axis.set_title("Emissivity by each procedure" + provenance_note(compared))
+    axis.set_title("Emissivity by each procedure" + drawing.provenance_note(compared))
     return figure
 
 
@@ -183,16 +167,9 @@ def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.Da
             (axes[0, index], ours, "ours"),
             (axes[1, index], theirs, "published"),
         ):
-            image = movie.isel(time=index)
-            draw_image(
-                figure,
-                axis,
-                image,
-                f"{name}, {moment}",
-                "own unit",
-                cmap="magma",
-                limits=limits_of(image),
-            )
+            image, title = movie.isel(time=index), f"{name}, {moment}"
+            scale = limits_of(image)
+            draw_image(figure, axis, image, title, "own unit", cmap="magma", limits=scale)
     grid = axes[2, 0].get_gridspec()
     for axis in axes[2]:
         axis.remove()
@@ -201,5 +178,5 @@ def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.Da
     bottom.axhline(float(scores.median()), color="0.5", linewidth=1)
     bottom.set(xlabel="time [s]", ylabel="correlation [1]", ylim=(min(0.0, float(scores.min())), 1))
     bottom.set_title(f"{scores.size} frames, median {float(scores.median()):.2f}", fontsize=9)
-    figure.suptitle("Magnitude of the reflection" + provenance_note(ours))
+    figure.suptitle("Magnitude of the reflection" + drawing.provenance_note(ours))
     return figure

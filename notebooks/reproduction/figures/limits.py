@@ -6,16 +6,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from dbthermal.figures.drawing import (
-    COLORS,
-    MARKERS,
-    canvas,
-    draw_image,
-    limits_of,
-    plain_decades,
-    plain_ticks,
-    provenance_note,
-)
+from dbthermal.figures import drawing
+from dbthermal.figures.drawing import COLORS, canvas, draw_image, limits_of
 
 _MICRO: Final = "\N{MICRO SIGN}m"
 
@@ -36,24 +28,27 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
     ):
         once = "case" not in cases[f"{name}_error"].dims
         for index, case in enumerate(cases["case"].values):
-            here, color = cases.sel(case=case), COLORS[index % len(COLORS)]
+            here, mark = cases.sel(case=case), drawing.marked_line(index)
             error, bound = here[f"{name}_error"], here[f"{name}_bound"]
-            mark = {"color": color, "marker": MARKERS[index % len(MARKERS)], "markersize": 5}
             label = f"{case}, " if str(case) else ""
-            above.plot(here["noise"], bound, color=color, linewidth=1, label=f"{label}bound")
-            below.plot(here["noise"], error / bound, linewidth=1, **mark)
+            line = {"color": mark["color"], "linewidth": 1, "label": f"{label}bound"}
+            above.plot(here["noise"], bound, **line)
+            below.plot(here["noise"], error / bound, **mark)
             if not once:
-                above.plot(here["noise"], error, linestyle="", label=f"{label}measured", **mark)
+                above.plot(
+                    here["noise"], error, label=f"{label}measured", **mark | {"linewidth": 0}
+                )
         if once:
             above.plot(cases["noise"], cases[f"{name}_error"], "ko", markersize=4, label="measured")
-        above.set(xscale="log", yscale="log", ylabel=f"error of the {_words(name)} [{unit}]")
+        label = f"error of the {name.replace('_', ' ')} [{unit}]"
+        above.set(xscale="log", yscale="log", ylabel=label)
         below.set(xscale="log", ylabel="error / bound [1]", xlabel="noise of the quieter band [K]")
         below.axhline(1.0, color="black", linewidth=0.6)
-        plain_decades(above)
+        drawing.plain_decades(above)
         for axis in (above, below):
-            plain_ticks(axis, cases["noise"])
+            drawing.plain_ticks(axis, cases["noise"])
     axes[0, 0].legend(frameon=False, fontsize=8)
-    figure.suptitle("Errors at the statistical limit" + provenance_note(measured))
+    figure.suptitle("Errors at the statistical limit" + drawing.provenance_note(measured))
     return figure
 
 
@@ -74,10 +69,10 @@ def pooling(measured: xr.Dataset) -> Figure:
     right.set(ylabel="error of the object temperature [K]")
     for axis in (left, right):
         axis.set(xscale="log", yscale="log", xlabel="pixels of one material [1]")
-        plain_ticks(axis, size)
-        plain_decades(axis)
+        drawing.plain_ticks(axis, size)
+        drawing.plain_decades(axis)
     left.legend(frameon=False, fontsize=8)
-    figure.suptitle("Pixels that share a material" + provenance_note(measured))
+    figure.suptitle("Pixels that share a material" + drawing.provenance_note(measured))
     return figure
 
 
@@ -91,9 +86,8 @@ def error_over_bands(measured: xr.Dataset) -> Figure:
     error, place = measured["object_temperature_error"], np.arange(measured.sizes["bands"])
     for index, case in enumerate(measured["case"].values):
         bound = measured["object_temperature_bound"].sel(case=case)
-        mark = {"color": COLORS[index], "marker": MARKERS[index], "markersize": 5, "linewidth": 1}
         left.plot(place, bound, color=COLORS[index], linewidth=1, label=f"{case}, bound")
-        right.plot(place, error / bound, **mark)
+        right.plot(place, error / bound, **drawing.marked_line(index))
     left.plot(place, error, "ko", markersize=5, label="measured")
     left.set(ylabel="error of the object temperature [K]")
     left.set_ylim(bottom=0)
@@ -105,7 +99,7 @@ def error_over_bands(measured: xr.Dataset) -> Figure:
         axis.set_xticks(place, names, fontsize=8)
         axis.grid(visible=True, color="0.9")
     left.legend(frameon=False, fontsize=8)
-    figure.suptitle("More bands" + provenance_note(measured))
+    figure.suptitle("More bands" + drawing.provenance_note(measured))
     return figure
 
 
@@ -121,9 +115,8 @@ def pooled_materials(
     figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.4))
     limits = limits_of(single)
     for axis, ratio, title in ((left, single, "pixel by pixel"), (middle, pooled, "pooled")):
-        draw_image(
-            figure, axis, ratio, title, "reflection ratio [1]", cmap="viridis", limits=limits
-        )
+        label = "reflection ratio [1]"
+        draw_image(figure, axis, ratio, title, label, cmap="viridis", limits=limits)
     labelled = labels.where(labels >= 0)
     title = f"materials found: {np.unique(labelled.values[labelled.notnull().values]).size}"
     right.imshow(labelled % 10, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
@@ -133,9 +126,5 @@ def pooled_materials(
         for one in np.unique(panels.values)[1:]:
             axis.contour(panels.values >= one, levels=[0.5], colors="white", linewidths=0.8)
         axis.set(xticks=[], yticks=[])
-    figure.suptitle("Pixels of one material share their ratio" + provenance_note(single))
+    figure.suptitle("Pixels of one material share their ratio" + drawing.provenance_note(single))
     return figure
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")

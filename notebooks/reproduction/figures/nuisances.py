@@ -6,9 +6,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-from dbthermal.figures.drawing import COLORS, MARKERS, canvas, provenance_note
+from dbthermal.figures.drawing import COLORS, canvas, marked_line, plain_decades, provenance_note
 
 _RMSE: Final = "object_temperature_rmse"
 _RMSE_LABEL: Final = "RMSE of the object temperature [K]"
@@ -84,20 +83,11 @@ def parallax(measured: xr.Dataset) -> Figure:
 def _lines(axis: Axes, values: xr.DataArray, over: str) -> None:
     """A line a treatment."""
     for index, treatment in enumerate(values["treatment"].values):
-        axis.plot(
-            values[over],
-            values.sel(treatment=treatment),
-            color=COLORS[index % len(COLORS)],
-            marker=MARKERS[index % len(MARKERS)],
-            markersize=4,
-            linewidth=1,
-            label=treatment,
-        )
+        line = values.sel(treatment=treatment)
+        axis.plot(values[over], line, label=treatment, **marked_line(index))
 
 
 def _kelvin(axis: Axes) -> None:
     """A logarithmic axis of errors, with plain numbers."""
     axis.set(yscale="log", ylabel=_RMSE_LABEL)
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.yaxis.set_minor_locator(NullLocator())
+    plain_decades(axis)

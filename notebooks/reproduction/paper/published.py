@@ -40,43 +40,24 @@ _ON_A_TWIN: Final = ", on a twin"
 class Row:
     """One published number, or one figure without a number.
 
-    Attributes
-    ----------
-    place, quantity : str
-        Where in the paper, and of what.
-    stem, names : str, tuple of str
-        Notebook that measures it here, and the names of its numbers there.
-    data : str
-        Data that ours is measured on.
-    published, unit : float, optional, and str
-        The paper's number and its unit.
-    judged : {"error", "value", "distance", "lowest", "alike", "no"}
-        As an error (lower is better), as a value (near the paper's is agreement, within `within`),
-        by the distance from `reference` (lower is better), as the "lowest" being the one that
-        `note` names, as the second being within `within` times the first ("alike"), or not at all,
-        for the reason in `note`.
-    within : float
-        Largest difference that is agreement.
-    note : str
-        Verdict where none is computed.
-    labels : tuple of str
-        Labels of several numbers.
-    reference : float, optional
-        True value for the paper and for ours.
+    It is judged as an "error" (lower is better), as a "value" (near the paper's is agreement,
+    within `within`), by the "distance" from `reference` (lower is better), as the "lowest" being
+    the one that `note` names, as the second being within `within` times the first ("alike"), or
+    "no", not at all, for the reason in `note`.
     """
 
-    place: str
+    place: str  # in the paper
     quantity: str
-    stem: str = ""
-    names: tuple[str, ...] = ()
-    data: str = ""
+    stem: str = ""  # of the notebook that measures it here
+    names: tuple[str, ...] = ()  # of its numbers there
+    data: str = ""  # that ours is measured on
     published: float | None = None
     unit: str = "1"
     judged: str = "no"
-    within: float = 0.0
-    note: str = "no number published"
-    labels: tuple[str, ...] = ()
-    reference: float | None = None
+    within: float = 0.0  # largest difference that is agreement
+    note: str = "no number published"  # verdict where none is computed
+    labels: tuple[str, ...] = ()  # of several numbers
+    reference: float | None = None  # true value for the paper and for ours
 
     def ours(self, numbers: Numbers) -> dict[str, float]:
         """Numbers measured here, by label or name; without those that were not measured."""

@@ -43,10 +43,6 @@ TWINS: Final[MappingProxyType[str, Callable[..., Stage]]] = MappingProxyType(
 """Name -> function that sets the stage."""
 
 
-def __dir__() -> list[str]:
-    return __all__
-
-
 def twin(name: str, capture: Capture, rng: np.random.Generator, **options: Any) -> xr.Dataset:
     """Scene (see `take`) of a twin of `TWINS`, with attribute `twin`.
 

@@ -75,41 +75,31 @@ def pacing(
     return Route(np.array(times), np.array(places))
 
 
-@dataclass(frozen=True)
-class Build:
-    """Measures and temperatures of a person, who stands with the feet at z = 0 and walks along x.
-
-    Heights of shoulder, hip and crown, and breadth from shoulder to shoulder [m]; temperatures of
-    face, hands and clothes [K]; largest angle of legs and arms [rad].
-    """
-
-    shoulder: float = 1.42
-    hip: float = 0.90
-    crown: float = 1.75
-    breadth: float = 0.42
-    skin: float = 307.15
-    hand: float = 305.15
-    clothes: float = 302.65
-    swing: float = 0.45
+SHOULDER, HIP, CROWN, BREADTH = 1.42, 0.90, 1.75, 0.42
+"""Heights of shoulder, hip and crown, and breadth from shoulder to shoulder, of a person who stands
+with the feet at z = 0 and walks along x [m]."""
+SKIN, HAND, CLOTHES = 307.15, 305.15, 302.65
+"""Temperatures of face, hands and clothes [K]."""
+SWING: Final = 0.45
+"""Largest angle of legs and arms [rad]."""
 
 
 def person(route: Route, *, height: float = 0.0) -> list[Actor]:
     """Adult who walks a route on a floor of a height [m]: trunk with head, two legs, two arms."""
-    build = Build()
-    middle, half = (build.hip + build.shoulder) / 2, (build.shoulder - build.hip) / 2 + 0.06
-    trunk = ellipsoid((0.13, build.breadth / 2, half), (0, 0, middle), _SPACING)
-    head = ellipsoid((0.10, 0.08, 0.13), (0, 0, build.crown - 0.13), _SPACING)
-    upper = painted([(trunk, build.clothes), (head, build.skin)])
+    middle, half = (HIP + SHOULDER) / 2, (SHOULDER - HIP) / 2 + 0.06
+    trunk = ellipsoid((0.13, BREADTH / 2, half), (0, 0, middle), _SPACING)
+    head = ellipsoid((0.10, 0.08, 0.13), (0, 0, CROWN - 0.13), _SPACING)
+    upper = painted([(trunk, CLOTHES), (head, SKIN)])
     actors = [_walking(upper, route, height, 0.0, 0.0)]
     for side in (-1.0, 1.0):
         x = side * 0.1
-        leg = painted([(capsule((0, x, build.hip), (0, x, 0.08), 0.08, _SPACING), build.clothes)])
-        y = side * (build.breadth / 2 + 0.02)
-        sleeve = capsule((0, y, build.shoulder), (0, y, build.hip - 0.02), 0.05, _SPACING)
-        fist = ellipsoid((0.05, 0.03, 0.08), (0, y, build.hip - 0.12), _SPACING)
-        arm = painted([(sleeve, build.clothes), (fist, build.hand)])
-        actors.append(_walking(leg, route, height, build.hip, side * build.swing))
-        actors.append(_walking(arm, route, height, build.shoulder, -side * build.swing))
+        leg = painted([(capsule((0, x, HIP), (0, x, 0.08), 0.08, _SPACING), CLOTHES)])
+        y = side * (BREADTH / 2 + 0.02)
+        sleeve = capsule((0, y, SHOULDER), (0, y, HIP - 0.02), 0.05, _SPACING)
+        fist = ellipsoid((0.05, 0.03, 0.08), (0, y, HIP - 0.12), _SPACING)
+        arm = painted([(sleeve, CLOTHES), (fist, HAND)])
+        actors.append(_walking(leg, route, height, HIP, side * SWING))
+        actors.append(_walking(arm, route, height, SHOULDER, -side * SWING))
     return actors
 
 

@@ -15,9 +15,6 @@ import numpy.typing as npt
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-__all__ = ["MISSED", "Camera", "Caster", "Hits", "mirror", "unit", "vertex_normals"]
-__dir__ = __all__.copy
-
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Point = tuple[float, float, float]
@@ -29,8 +26,7 @@ _UP: Final = (0.0, 0.0, 1.0)
 # A reflected ray starts this far off the surface, in units of the mesh's size: well above the
 # rounding of single precision, well below what can be seen.
 _LIFT: Final = 1e-4
-# Two points on a surface are one within this, in units of the mesh's size.
-_SAME: Final = 1e-3
+_SAME: Final = 1e-3  # two points on a surface are one within this, in units of the mesh's size
 
 
 @dataclass(frozen=True)

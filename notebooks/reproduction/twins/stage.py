@@ -23,16 +23,12 @@ TABLE: Final = 0.75
 STEP: Final = 0.1
 """Longest step of the heat transport [s]."""
 
-# Share of a pixel's light from which it shows nothing but the object [1].
-_WHOLE: Final = 0.99
-# Standard deviations of the blur beyond which a lens sends no light.
-_TAIL: Final = 4.0
-# Frames that are ray-traced at once, for the memory.
-_FRAMES: Final = 25
+_WHOLE: Final = 0.99  # share of a pixel's light from which it shows nothing but the object [1]
+_TAIL: Final = 4.0  # standard deviations of the blur beyond which a lens sends no light
+_FRAMES: Final = 25  # frames that are ray-traced at once, for the memory
 # Newton's method: steps, length of a difference, longest step, and last step [pixel].
 _NEWTON, _SLOPE, _LARGEST, _CONVERGED = 30, 0.05, 3.0, 3e-3
-# Share of the squared slopes that is added to them.
-_DAMPING: Final = 1e-3
+_DAMPING: Final = 1e-3  # share of the squared slopes that is added to them
 
 
 def clock(frames: int = 350, rate: float = 10.0) -> Array:
@@ -44,30 +40,17 @@ def clock(frames: int = 350, rate: float = 10.0) -> Array:
 class Capture:
     """Recording conditions of a twin: emissivity, image size, times, baseline and sharpness.
 
-    Attributes
-    ----------
-    emissivity : DataArray
-        Emissivity of the object (band) [1], the band of the first camera first.
-    shape : tuple of int
-        Rows and columns.
-    time : ndarray, shape (time,)
-        Times [s], two or more; 350 frames at 10 Hz.
-    baseline : float
-        How far the second camera is to the right of the first [m]. With 0 both are one.
-    blur : float
-        Standard deviation of the lens's blur [pixel], taken as Gaussian. Diffraction alone gives
-        0.42 wavelengths times the f-number: 0.35 pixel of 12 um at 10 um and f/1; with aberrations
-        and the focus of a real lens 0.5 to 0.7.
-    rays : int
-        Rays for each pixel along either side. At 3 a body's outline is drawn to 0.05 pixel.
+    The lens's blur is taken as Gaussian. Diffraction alone gives 0.42 wavelengths times the
+    f-number: 0.35 pixel of 12 um at 10 um and f/1; with aberrations and the focus of a real lens
+    0.5 to 0.7. With three rays a pixel along either side a body's outline is drawn to 0.05 pixel.
     """
 
-    emissivity: xr.DataArray
-    shape: tuple[int, int] = (144, 192)
-    time: Array = field(default_factory=clock)
-    baseline: float = 0.0
-    blur: float = 0.6
-    rays: int = 3
+    emissivity: xr.DataArray  # of the object (band) [1], the band of the first camera first
+    shape: tuple[int, int] = (144, 192)  # rows and columns
+    time: Array = field(default_factory=clock)  # (time,) [s]
+    baseline: float = 0.0  # how far the second camera is to the right of the first [m]
+    blur: float = 0.6  # standard deviation [pixel]
+    rays: int = 3  # for each pixel along either side
 
     def __post_init__(self) -> None:
         """Check bands, baseline and rays."""

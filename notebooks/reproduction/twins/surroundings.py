@@ -16,9 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from reproduction.twins.rays import Array, Caster, Hits
 
-__all__ = ["Actor", "Pose", "gliding", "hinged", "incident", "painted"]
-__dir__ = __all__.copy
-
 
 @dataclass(frozen=True)
 class Pose:
@@ -54,20 +51,9 @@ def hinged(joint: npt.ArrayLike, rotation: Rotation) -> Pose:
 def gliding(times: npt.ArrayLike, places: npt.ArrayLike) -> Motion:
     """Motion in straight lines between places (stop, 3) [m] at times (stop,) [s], without turning.
 
-    Before and after, the pose is that of the nearest stop. Raises a ValueError if the times do not
-    increase, or the places are not finite, one for each time.
+    Before and after, the pose is that of the nearest stop.
     """
     times, places = np.asarray(times, dtype=np.float64), np.asarray(places, dtype=np.float64)
-    if times.ndim != 1 or times.size < 2:
-        raise ValueError(f"Invalid times of shape {times.shape} of a motion. Must be two or more.")
-    wrong = times[~np.isfinite(times) | ~(np.diff(times, prepend=-np.inf) > 0)]
-    if wrong.size:
-        raise ValueError(f"Invalid time {wrong[0]} s of a motion. Must be finite, and increase.")
-    if places.shape != (times.size, 3) or not np.all(np.isfinite(places)):
-        raise ValueError(
-            f"Invalid places of shape {places.shape} of a motion. Must be finite, "
-            f"({times.size}, 3)."
-        )
     return lambda now: Pose(translation=[np.interp(now, times, along) for along in places.T])
 
 
@@ -83,26 +69,9 @@ class Actor:
     temperature: Array | Warmth
     motion: Motion | None = None
 
-    def __post_init__(self) -> None:
-        """Check a constant temperature."""
-        if not callable(self.temperature):
-            self._checked(self.temperature)
-
     def warmth(self, time: float) -> Array:
         """Temperature of each vertex (vertex,) [K] at a time [s]."""
-        if not callable(self.temperature):
-            return self.temperature
-        return self._checked(self.temperature(time))
-
-    def _checked(self, temperature: Array) -> Array:
-        """Temperatures that are finite, one for each vertex."""
-        expected = (len(self.mesh.vertices),)
-        if np.shape(temperature) != expected or not np.all(np.isfinite(temperature)):
-            raise ValueError(
-                f"Invalid temperature of shape {np.shape(temperature)} of an actor. "
-                f"Must be finite, {expected}."
-            )
-        return temperature
+        return self.temperature(time) if callable(self.temperature) else self.temperature
 
 
 def painted(parts: Sequence[tuple[trimesh.Trimesh, float]], motion: Motion | None = None) -> Actor:

@@ -20,59 +20,27 @@ class Vessel:
     of the wall to its middle, :math:`1 / h = 1 / h_\mathrm{drink} + d / 2k`; above it from warm,
     moist air; outside it goes to air and by radiation to the room.
 
-    Attributes
-    ----------
-    drink : float
-        Temperature of the drink when it is poured [K]. Those of the two vessels below are chosen
-        so that the thermocouple peaks where the paper's did: 63.6 and 63.1 degrees Celsius.
-    bottom, level : float
-        Heights of the bottom and of the drink's surface when all is poured [m].
-    thickness : float
-        Thickness of the wall [m].
-    solid : heat.Solid
-        Material of the wall.
-    probe : tuple of float
-        Height [m] of the thermocouple, and its angle about the axis from the camera [degrees].
-    start, duration : float
-        Beginning and length of the pouring [s].
-    ripple : float
-        Height over which the rising surface laps the wall [m].
-    cooling : float
-        Time constant of the drink's cooling towards the room [s]; a cup loses some 1 K a minute.
-    wet : float
-        Coefficient from the drink to the wall [W m^-2 K^-1]; 50 to 1000 for free convection in
-        liquids, table 1.1 of Bergman et al. (2011), Fundamentals of Heat and Mass Transfer.
-    moist, moist_temperature : float
-        Coefficient [W m^-2 K^-1] and temperature [K] of the air inside, above the drink.
-    air : float
-        Coefficient to still air outside [W m^-2 K^-1]; 2 to 25 for free convection in gases, same
-        table.
-    emissivity : float
-        Total hemispherical emissivity of glass [1], for its radiation alone: about 0.9.
     """
 
+    # Temperature of the drink when it is poured [K]; those of the two vessels below are chosen so
+    # that the thermocouple peaks where the paper's did: 63.6 and 63.1 degrees Celsius.
     drink: float
-    bottom: float
-    level: float
-    thickness: float
-    solid: heat.Solid
-    probe: tuple[float, float]
-    start: float = -3.0
-    duration: float = 8.0
-    ripple: float = 0.012
-    cooling: float = 2000.0
-    wet: float = 400.0
-    moist: float = 10.0
-    moist_temperature: float = 308.15
-    air: float = 6.0
-    emissivity: float = 0.9
-
-    def __post_init__(self) -> None:
-        """Check levels and duration."""
-        if not self.bottom < self.level:
-            raise ValueError(f"Invalid level {self.level} m. Must be above {self.bottom} m.")
-        if not self.duration > 0:
-            raise ValueError(f"Invalid duration {self.duration} s of pouring. Must be positive.")
+    bottom: float  # height of the bottom [m]
+    level: float  # height of the drink's surface when all is poured [m]
+    thickness: float  # of the wall [m]
+    solid: heat.Solid  # of the wall
+    probe: tuple[float, float]  # of the thermocouple: height [m], angle from the camera [degrees]
+    start: float = -3.0  # of the pouring [s]
+    duration: float = 8.0  # of the pouring [s]
+    ripple: float = 0.012  # height over which the rising surface laps the wall [m]
+    cooling: float = 2000.0  # time constant of the drink [s]; a cup loses some 1 K a minute
+    # Coefficients [W m^-2 K^-1], by table 1.1 of Bergman et al. (2011), Fundamentals of Heat and
+    # Mass Transfer: free convection in liquids 50 to 1000, in gases 2 to 25.
+    wet: float = 400.0  # from the drink to the wall
+    moist: float = 10.0  # from the air inside, above the drink
+    moist_temperature: float = 308.15  # of that air [K]
+    air: float = 6.0  # to still air outside
+    emissivity: float = 0.9  # total hemispherical, of glass, for its radiation alone [1]
 
     def _poured(self, time: float) -> float:
         """Share of the drink that is poured at a time [s]."""

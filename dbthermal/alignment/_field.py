@@ -1,0 +1,140 @@
+r"""Smooth displacement field over an image: a grid of cubic B-splines with nodes c.
+
+Data with information A about it, the penalty of the second differences q of neighbouring nodes, and
+a wide prior make
+
+.. math:: (A + \lambda Q^T W Q + R) c = A c_0 + b
+
+whose inverse matrix is the covariance. The penalty has the largest marginal likelihood (Patterson,
+Thompson 1971, doi:10.1093/biomet/58.3.545); W lets the field bend sharply in few places, as from
+one body to the next: differences follow Student's distribution, not a normal one.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from scipy import sparse
+from scipy.interpolate import BSpline
+from scipy.linalg import block_diag, cho_factor, cho_solve
+
+from dbthermal._arrays import Array
+
+# Pixels between two nodes, at least, and nodes along the longer side, at most.
+_SPACING: Final = 6.0
+_NODES: Final = 18
+_FREEDOM: Final = 3.0  # degrees of freedom of a bending's distribution
+# Penalties that are tried, over the mean information of a node; and over the last one.
+_PENALTIES: Final = 10.0 ** np.arange(-3.0, 5.0)
+_STEPS: Final = np.array([0.4, 1.0, 2.5])
+
+
+@dataclass(frozen=True)
+class Information:
+    """Information on a step of a field: A as its three numbers (3, y, x), and b (2, y, x)."""
+
+    tensor: Array  # of rows, of rows with columns, of columns [1/pixel^2]
+    gradient: Array  # [1/pixel]
+
+
+@dataclass(frozen=True)
+class Spline:
+    """Grid of nodes over an image of so many rows and columns, and its wide prior [pixel]."""
+
+    shape: tuple[int, int]
+    prior: float
+
+    @cached_property
+    def nodes(self) -> tuple[int, int]:
+        """Nodes along either side."""
+        spacing = max(_SPACING, max(self.shape) / _NODES)
+        rows, columns = (max(2, int(np.ceil((size - 1) / spacing)) + 1) + 2 for size in self.shape)
+        return rows, columns
+
+    @cached_property
+    def bending(self) -> sparse.csr_array:
+        """Second differences of the nodes: down, right, and twice the mixed one."""
+        (row, *rows), (column, *columns) = (
+            [np.diff(np.eye(n), order, axis=0) for order in (0, 1, 2)] for n in self.nodes
+        )
+        mixed = np.sqrt(2.0) * np.kron(rows[0], columns[0])
+        parts = [np.kron(rows[1], column), np.kron(row, columns[1]), mixed]
+        return sparse.csr_array(np.concatenate(parts))
+
+    def values(self, centres: list[Array]) -> list[Array]:
+        """Splines (place, node) at rows and at columns."""
+        return [
+            BSpline.design_matrix(
+                place / (size - 1) * (count - 3), np.arange(count + 4) - 3.0, 3
+            ).toarray()
+            for place, size, count in zip(centres, self.shape, self.nodes, strict=True)
+        ]
+
+    def fitted(
+        self, data: Information, centres: list[Array], around: "Field | None" = None
+    ) -> "Field":
+        """Field of information at places, which is on steps from another field, or from 0."""
+        rows, columns = self.values(centres)
+        matrix = _normal(data.tensor, rows, columns)
+        target = np.concatenate([(rows.T @ part @ columns).ravel() for part in data.gradient])
+        bends = self.bending
+        sharp, trials = np.ones((2, bends.shape[0])), np.trace(matrix) / len(matrix) * _PENALTIES
+        if around is not None:
+            target += matrix @ around.nodes
+            sharp, trials = around.sharpness, around.penalty * _STEPS
+        ridge = np.eye(len(matrix)) / self.prior**2
+        blocks = [(bends.T @ (bends * part[:, np.newaxis])).toarray() for part in sharp]
+        bending, best = block_diag(*blocks), -np.inf
+        for trial in trials:
+            # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
+            trial_factor = cho_factor(matrix + trial * bending + ridge)
+            trial_nodes = cho_solve(trial_factor, target)
+            before = np.linalg.cholesky(trial * bending + ridge)
+            logs = [2.0 * np.sum(np.log(np.diag(part))) for part in (before, trial_factor[0])]
+            likelihood = logs[0] - logs[1] + target @ trial_nodes
+            if likelihood > best:
+                best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
+        squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])
+        sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
+        covariance = cho_solve(factor, np.eye(len(matrix)))
+        return Field(self, nodes, covariance, float(penalty), sharp)
+
+
+@dataclass(frozen=True)
+class Field:
+    """Nodes (rows', then columns') [pixel] of a displacement field, and their covariance."""
+
+    spline: Spline
+    nodes: Array
+    covariance: Array
+    penalty: float
+    sharpness: Array  # weight of each bending (2, bending) [1]
+
+    def on(self, centres: list[Array]) -> Array:
+        """Displacement (2, y, x) [pixel] at rows and columns."""
+        rows, columns = self.spline.values(centres)
+        parts = self.nodes.reshape(2, *self.spline.nodes)
+        return np.stack([rows @ part @ columns.T for part in parts])
+
+    def variances(self, centres: list[Array]) -> Array:
+        """Variance (2, y, x) of the displacement at each place [pixel^2]."""
+        rows, columns = (_pairs(part) for part in self.spline.values(centres))
+        height, width = self.spline.nodes
+        blocks = self.covariance.reshape(2, height, width, 2, height, width)
+        parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
+        return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in parts])
+
+
+def _pairs(values: Array) -> Array:
+    """Products of all pairs of splines (place, node * node)."""
+    return (values[:, :, np.newaxis] * values[:, np.newaxis]).reshape(len(values), -1)
+
+
+def _normal(tensor: Array, rows: Array, columns: Array) -> Array:
+    """Normal matrix of the nodes, of rows and then of columns, from the tensors of the pixels."""
+    (height, width), blocks = (rows.shape[1], columns.shape[1]), []
+    for part in tensor:
+        sums = (_pairs(rows).T @ part @ _pairs(columns)).reshape(height, height, width, width)
+        blocks.append(sums.transpose(0, 2, 1, 3).reshape(height * width, -1))
+    return np.block([[blocks[0], blocks[1]], [blocks[1], blocks[2]]])

@@ -1,0 +1,34 @@
+"""Band emissivities of materials, and the two bands that tell emission from reflection best.
+
+Spectra become a table of Planck-weighted band averages (`band_table`; `embedded_table` holds 25
+common materials). From a table follow the condition number of the mixing matrix for each pair of
+bands and the filter to set beside the camera's own band (`rank_filters`), by the criteria of the
+supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334, and by the noise.
+"""
+
+from dbthermal.emissivity._filters import (
+    condition_numbers,
+    filter_noise,
+    pair_summary,
+    rank_filters,
+)
+from dbthermal.emissivity._tables import (
+    CAMERA_BAND,
+    MINIMUM_COVERAGE,
+    band_table,
+    embedded_table,
+    library_mixture,
+)
+
+__all__ = [
+    "CAMERA_BAND",
+    "MINIMUM_COVERAGE",
+    "band_table",
+    "condition_numbers",
+    "embedded_table",
+    "filter_noise",
+    "library_mixture",
+    "pair_summary",
+    "rank_filters",
+]
+__dir__ = __all__.copy

@@ -1,0 +1,205 @@
+"""Choice of a filter by condition number and noise, from a table of band emissivities."""
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import mixing, planck, schema
+from dbthermal.emissivity._tables import CAMERA_BAND, Bands, chosen_bands
+
+_TEMPERATURE = 300.0  # of the object, at which a noise is stated [K]
+
+
+def condition_numbers(table: xr.Dataset) -> xr.DataArray:
+    """Condition number of the mixing matrix for each material and pair of bands.
+
+    Parameters
+    ----------
+    table : Dataset
+        Stage `emissivity_table` of `schema`, of at least two bands, or a ValueError.
+
+    Returns
+    -------
+    DataArray
+        Condition numbers (material, first, second) [1], symmetric; infinite on the diagonal and
+        where the two emissivities are equal. See `mixing.condition_number`.
+
+    Examples
+    --------
+    >>> from dbthermal.emissivity import embedded_table
+    >>> numbers = condition_numbers(embedded_table()).sel(first="8-14", second="9.5")
+    >>> numbers.sel(material=["plate window glass", "water"]).values.round(1).tolist()
+    [9.4, 649.2]
+    """
+    values = schema.check(table, "emissivity_table")["emissivity"]
+    names = values["band"].values
+    if len(names) < 2:
+        raise ValueError(f"Invalid bands {names.tolist()} of the table. Must be at least two.")
+    first, second = np.broadcast_arrays(values.values[:, :, None], values.values[:, None, :])
+    return xr.DataArray(
+        mixing.condition_number(np.stack([first, second], axis=-1)),
+        coords={"material": values["material"].values, "first": names, "second": names},
+        dims=("material", "first", "second"),
+        name="condition_number",
+        attrs={"units": "1", "long_name": "condition number of the mixing matrix"},
+    )
+
+
+def pair_summary(numbers: xr.DataArray) -> xr.Dataset:
+    """Condition number of each pair of bands, over the materials.
+
+    Parameters
+    ----------
+    numbers : DataArray
+        Condition numbers (material, first, second) [1], from `condition_numbers`.
+
+    Returns
+    -------
+    Dataset
+        `median` and `mean` (first, second) [1], and `finite` (first, second), the number of
+        materials in the mean. A gray material counts in the median as infinite and not in the mean,
+        which a few nearly gray ones govern: choose by the median. Both are infinite where every
+        material is gray, as on the diagonal.
+
+    Examples
+    --------
+    >>> from dbthermal.emissivity import embedded_table
+    >>> summary = pair_summary(condition_numbers(embedded_table()))
+    >>> summary["median"].sel(first="8-14", second=["9.5", "10.6"]).values.round(1).tolist()
+    [110.7, 342.3]
+    """
+    finite = numbers.copy(data=np.isfinite(numbers.values))
+    count = finite.sum("material")
+    total = numbers.where(finite, 0.0).sum("material")
+    parts = {
+        "median": (numbers.median("material", skipna=False), "condition number, median"),
+        "mean": ((total / count.where(count > 0, 1)).where(count > 0, np.inf), "its finite mean"),
+        "finite": (count, "materials with a finite condition number"),
+    }
+    return xr.Dataset(
+        {
+            name: part.assign_attrs(units="1", long_name=meaning)
+            for name, (part, meaning) in parts.items()
+        }
+    )
+
+
+def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
+    r"""Noise (band) [K] of a camera behind filters, from its noise without one.
+
+    The noise in counts is the camera's own and does not change, a kelvin at 300 K gives fewer:
+
+    .. math:: s_m = s_1 \frac{dB_1 / dT}{dB_m / dT}
+
+    with the first of the bands as the camera's own. A filter's emission and losses are left out.
+
+    Parameters
+    ----------
+    netd : float
+        Noise-equivalent temperature difference in the first band [K].
+    bands : mapping or iterable of Band or str
+        Bands, or names of `bands.FILTERS`, each once; the first is the one that `netd` belongs to.
+
+    Examples
+    --------
+    >>> filter_noise(0.04, ["8-14", "9.5", "10.6"]).values.round(3).tolist()  # [K]
+    [0.04, 0.398, 0.15]
+    """
+    chosen = chosen_bands(bands)
+    netd = float(planck.require_positive("netd [K]", netd))
+    slopes = np.array([float(band.slope(_TEMPERATURE)) for band in chosen])
+    return xr.DataArray(
+        netd * slopes[0] / slopes,
+        coords={"band": [band.name for band in chosen]},
+        dims="band",
+        name="noise",
+        attrs={"units": "K", "long_name": "noise-equivalent temperature difference"},
+    )
+
+
+def rank_filters(
+    table: xr.Dataset, noise: xr.DataArray, *, beside: str = CAMERA_BAND
+) -> xr.Dataset:
+    """Filters to set beside a band, best conditioned first, by two criteria.
+
+    The paper takes the filter of the lowest condition number (its section 5 says highest, a slip;
+    its supplement says lowest) and notes the trade-off with the noise that a narrow filter brings.
+    The second criterion settles it: the standard deviation of the object temperature from one
+    frame. Both are medians over the materials, for a few nearly gray materials govern any mean.
+
+    Parameters
+    ----------
+    table : Dataset
+        Stage `emissivity_table`.
+    noise : DataArray
+        Noise (band) [K] of every band of the table, such as from `filter_noise`.
+    beside : str
+        Name of the camera's own band.
+
+    Returns
+    -------
+    Dataset
+        Each (band), in the order of the first: `condition_number` [1]; `condition_number_mean` [1],
+        over the materials where it is finite; `object_temperature_std` [K]; `noise` [K]. Attributes
+        `lowest_condition_number` and `lowest_std` name the filter of each criterion.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the table is not as `schema` has it or has no band `beside` and another, or the noise
+        lacks a band, is in another unit, or is not finite and positive.
+
+    Examples
+    --------
+    >>> from dbthermal.emissivity import embedded_table
+    >>> table = embedded_table()
+    >>> ranked = rank_filters(table, filter_noise(0.04, table["band"].values.tolist()))
+    >>> ranked.band.values.tolist()
+    ['9.5', '12.1', '8.5', '10.6']
+    >>> ranked.object_temperature_std.values.round(2).tolist()  # [K]
+    [1.26, 2.34, 1.85, 2.25]
+    """
+    std = _single_frame_std(table, noise, beside).median("material", skipna=False)
+    pairs = pair_summary(condition_numbers(table)).sel(first=beside, drop=True)
+    pairs = pairs.rename(second="band").sel(band=std["band"])
+    result = xr.Dataset(
+        {
+            "condition_number": pairs["median"],
+            "condition_number_mean": pairs["mean"],
+            "object_temperature_std": std.assign_attrs(units="K", long_name="median of its std"),
+            "noise": noise.sel(band=std["band"]).assign_attrs(units="K"),
+        }
+    ).sortby("condition_number")
+    names = [str(name) for name in result["band"].values]
+    return result.assign_attrs(
+        beside=beside,
+        lowest_condition_number=names[0],
+        lowest_std=names[int(np.argmin(result["object_temperature_std"].values))],
+    )
+
+
+def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, beside: str) -> xr.DataArray:
+    r"""Standard deviation [K] of the object temperature from one frame (material, band).
+
+    For each band m beside band 1, emissivities known, in the linear approximation,
+    :math:`\mathrm{var}(x) = [(1 - e_m)^2 s_1^2 + (1 - e_1)^2 s_m^2] / (e_1 - e_m)^2`; infinite for
+    equal emissivities.
+    """
+    values = schema.check(table, "emissivity_table")["emissivity"]
+    names = [str(name) for name in values["band"].values]
+    if beside not in names or len(names) < 2:
+        raise ValueError(f"Invalid bands {names}. Must hold '{beside}' and at least one more.")
+    if np.any(np.isinf(values)):
+        raise ValueError("Invalid emissivity of the table: infinite. Must be finite, or NaN.")
+    std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
+    others = [name for name in names if name != beside]
+    camera, filtered = values.sel(band=beside).values[:, np.newaxis], values.sel(band=others).values
+    noises = std[names.index(beside)], std[[names.index(name) for name in others]]
+    error = np.hypot((1 - filtered) * noises[0], (1 - camera) * noises[1])
+    contrast = np.abs(camera - filtered)
+    return xr.DataArray(
+        np.divide(error, contrast, out=np.full_like(error, np.inf), where=contrast > 0),
+        coords={"material": values["material"].values, "band": others},
+        dims=("material", "band"),
+        name="object_temperature_std",
+        attrs={"units": "K", "long_name": "standard deviation of the object temperature"},
+    )

@@ -1,0 +1,271 @@
+"""Band emissivities of materials: averages of spectra, a table of common ones, a prior."""
+
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from dbthermal import _text as texts
+from dbthermal import planck, schema
+from dbthermal._arrays import Array
+from dbthermal.bands import FILTERS, Band, get
+
+Bands = Mapping[str, Band] | Iterable[Band | str]
+
+CAMERA_BAND: Final = "8-14"
+"""Name of the band of the camera without a filter."""
+
+MINIMUM_COVERAGE: Final = 0.98
+"""Share of a band's blackbody radiance that a spectrum must cover [1].
+
+Of 993 library spectra 27 stop at 13.86 or 13.9 um, 0.981 to 0.986 of the band 8-14 um at 300 K,
+where what is missing can change the average by 0.019 of its own difference from it; 22 stop at
+12.5 um (0.781), whose average would be that of another band."""
+
+_TABLE = "emissivity_table.csv"
+_MIXTURE = "emissivity_mixture.csv"
+# Share of the materials that are none of the libraries' [1], and what is known of them: mean and
+# standard deviation of an emissivity, and its correlation between two bands.
+_OTHERS = (0.05, 0.7, 0.25, 0.9)
+# Steps on which Planck's law is integrated beside those of the spectrum, and nodes in each.
+_STEPS = 64
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+
+
+def band_table(
+    spectra: Mapping[str, xr.Dataset],
+    bands: Bands,
+    temperature: float = 300.0,
+    *,
+    minimum_coverage: float = MINIMUM_COVERAGE,
+) -> xr.Dataset:
+    r"""Planck-weighted band emissivities of materials.
+
+    .. math:: e_m = \frac{\int_m e(\lambda) L(\lambda, T) d\lambda}{\int_m L(\lambda, T) d\lambda}
+
+    over the band's top hat, the spectrum taken as linear between its values. Where the spectrum
+    does not cover the whole band both integrals run over the covered part, whose share is
+    `coverage`; nothing is extrapolated.
+
+    Parameters
+    ----------
+    spectra : mapping of str to Dataset
+        Material to stage `spectrum` of `schema`: `emissivity` (wavelength) [1], wavelength [m].
+    bands : mapping or iterable of Band or str
+        Bands, or names of `bands.FILTERS`.
+    temperature : float
+        Temperature of the material [K].
+    minimum_coverage : float
+        Share of the band's blackbody radiance that each spectrum must cover, in (0, 1].
+
+    Returns
+    -------
+    Dataset
+        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]. Values of the
+        libraries' spectra outside (0, 1] are averaged as they are.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If there is no spectrum or no band, a band is unknown or repeats, a spectrum is not as
+        `schema` has it or holds NaN, the temperature is outside `bands.TEMPERATURE_RANGE`, or a
+        spectrum covers less of a band than `minimum_coverage`.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> wavelength = ("wavelength", [7e-6, 9e-6, 15e-6], {"units": "m"})
+    >>> spectrum = xr.Dataset(
+    ...     {"emissivity": ("wavelength", [0.9, 0.6, 0.9])}, {"wavelength": wavelength}
+    ... )
+    >>> table = band_table({"quartz": spectrum}, ["8-14", "9.5"])
+    >>> table.emissivity.sel(material="quartz").values.round(3).tolist()
+    [0.711, 0.625]
+    """
+    chosen = chosen_bands(bands)
+    if not isinstance(spectra, Mapping):
+        raise TypeError(
+            f"Invalid spectra of type {type(spectra).__name__}. Must map material to spectrum."
+        )
+    if not spectra:
+        raise ValueError("Empty spectra. Must hold at least one material.")
+    if not 0 < minimum_coverage <= 1:
+        raise ValueError(f"Invalid minimum_coverage {minimum_coverage}. Must lie in (0, 1].")
+    whole = [float(band.radiance(temperature)) for band in chosen]
+    rows = np.empty((2, len(spectra), len(chosen)))
+    for row, (material, spectrum) in enumerate(spectra.items()):
+        wavelength, emissivity = _values(spectrum, material)
+        for column, band in enumerate(chosen):
+            mean, covered = _average(wavelength, emissivity, band, temperature, whole[column])
+            if covered < minimum_coverage:
+                reach = f"{wavelength[0]:.4g} to {wavelength[-1]:.4g} m"
+                raise ValueError(
+                    f"Invalid coverage {covered:.4f} of band '{band.name}' by the spectrum of "
+                    f"'{material}', {reach}. Must be at least {minimum_coverage}; "
+                    "a lower minimum_coverage averages over the covered part."
+                )
+            rows[:, row, column] = mean, covered
+    table = _dataset(list(spectra), [band.name for band in chosen], *rows)
+    return table.assign_attrs(temperature=float(temperature), minimum_coverage=minimum_coverage)
+
+
+def embedded_table() -> xr.Dataset:
+    """Table of 25 common materials that comes with the package.
+
+    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
+    [1]_ [2]_ [3]_, whose spectra are not redistributed.
+
+    Returns
+    -------
+    Dataset
+        Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]; some metals and
+        tiles were measured up to 12.5 um only. Coordinates `library` and `source` (material) name
+        the library, and the file or sample in it.
+
+    References
+    ----------
+    .. [1] Baldridge et al. (2009), doi:10.1016/j.rse.2008.11.007
+    .. [2] Meerdink et al. (2019), doi:10.1016/j.rse.2019.05.015
+    .. [3] Kotthaus et al. (2014), doi:10.1016/j.isprsjprs.2014.05.005
+
+    Examples
+    --------
+    >>> embedded_table().emissivity.sel(material="plate window glass", band="9.5").item()
+    0.718
+    """
+    with resources.as_file(resources.files("dbthermal.emissivity").joinpath(_TABLE)) as path:
+        rows = texts.table_rows(texts.read_text(path), _TABLE, comment="#")
+    (_, titles), *rows = rows
+    names = ["material", "library", "source"]
+    if titles != [*names, *FILTERS, "coverage_8_14"]:
+        raise ValueError(f"Invalid columns {titles} of '{_TABLE}'. Must be those of the filters.")
+    values = texts.numbers([(line, row[3:]) for line, row in rows], len(FILTERS) + 1, _TABLE)
+    # The four filters end at 12.35 um: every spectrum of the table covers them whole.
+    coverage = np.ones_like(values[:, :-1])
+    coverage[:, list(FILTERS).index(CAMERA_BAND)] = values[:, -1]
+    table = _dataset([row[0] for _, row in rows], list(FILTERS), values[:, :-1], coverage)
+    notes = {name: ("material", [row[i] for _, row in rows]) for i, name in enumerate(names) if i}
+    return table.assign_coords(notes).assign_attrs(temperature=300.0)
+
+
+def library_mixture(bands: Iterable[str]) -> xr.Dataset:
+    r"""Joint distribution of the band emissivities of materials, where nothing is known of them.
+
+    A mixture of normal distributions over the 993 spectra of the libraries of `embedded_table`,
+    with a wide component for the one material in twenty that is assumed to be none of theirs,
+
+    .. math:: p(e) = \sum_k w_k N(e; \mu_k, C_k)
+
+    Parameters
+    ----------
+    bands : iterable of str
+        Names of `bands.FILTERS`, each once, in the order that is wanted; else a ValueError.
+
+    Returns
+    -------
+    Dataset
+        `weight` (component) [1], `mean` (component, band) [1], `covariance` (component, band,
+        other) [1].
+
+    Examples
+    --------
+    >>> mixture = library_mixture(["8-14", "9.5"])
+    >>> float((mixture["weight"] * mixture["mean"].sel(band="9.5")).sum().round(2))
+    0.87
+    """
+    names = [str(band) for band in bands]
+    unknown = [name for name in names if name not in FILTERS]
+    if unknown or len(set(names)) < len(names):
+        raise ValueError(
+            f"Invalid bands {names} of the library's emissivities. Must be of {list(FILTERS)}, "
+            "each once; of other bands give a prior on the emissivities."
+        )
+    with resources.as_file(resources.files("dbthermal.emissivity").joinpath(_MIXTURE)) as path:
+        (_, titles), *rows = texts.table_rows(texts.read_text(path), _MIXTURE, comment="#")
+    count = len(FILTERS)
+    values = texts.numbers(rows, len(titles), _MIXTURE)
+    covariance = np.zeros((len(values), count, count))
+    i, j = np.tril_indices(count)
+    covariance[:, i, j] = covariance[:, j, i] = values[:, 1 + count :]
+    places = [list(FILTERS).index(name) for name in names]
+    share, mean, std, shared = _OTHERS
+    wide = std**2 * (shared + (1.0 - shared) * np.eye(len(names)))
+    means = values[:, 1 : 1 + count][:, places]
+    weight = np.append(values[:, 0] / values[:, 0].sum() * (1.0 - share), share)
+    known = covariance[:, places][:, :, places]
+    variables = {
+        "weight": ("component", weight),
+        "mean": (("component", "band"), np.vstack([means, np.full(len(names), mean)])),
+        "covariance": (("component", "band", "other"), np.concatenate([known, wide[np.newaxis]])),
+    }
+    return xr.Dataset(variables, {"band": names, "other": names})
+
+
+def chosen_bands(bands: Bands) -> list[Band]:
+    """Bands, each once, from bands or names of `bands.FILTERS`; of a mapping, its values."""
+    if isinstance(bands, (str, Band)):
+        bands = [bands]
+    listed = list(bands.values()) if isinstance(bands, Mapping) else list(bands)
+    odd = [band for band in listed if not isinstance(band, (str, Band))]
+    if odd:
+        raise TypeError(f"Invalid band {odd[0]!r}. Must be a Band, or the name of a filter.")
+    chosen = [get(band) if isinstance(band, str) else band for band in listed]
+    names = [band.name for band in chosen]
+    if not chosen or len(set(names)) < len(names):
+        raise ValueError(f"Invalid bands {names}. Must be at least one, each once.")
+    return chosen
+
+
+def _values(spectrum: xr.Dataset, material: str) -> tuple[Array, Array]:
+    """Wavelength [m] and emissivity [1] of a spectrum, all finite."""
+    try:
+        values = schema.check(spectrum, "spectrum")["emissivity"]
+    except (TypeError, ValueError) as error:
+        error.add_note(f"In the spectrum of '{material}'.")
+        raise
+    emissivity = values.values.astype(np.float64)
+    wavelength = values["wavelength"].values.astype(np.float64)
+    bad = ~np.isfinite(emissivity)
+    if bad.any():
+        raise ValueError(
+            f"Invalid emissivity {emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m. "
+            "Must be finite."
+        )
+    lowest, highest = schema.EMISSIVITY_LIMITS
+    bad = (emissivity < lowest) | (emissivity > highest)
+    if bad.any():
+        raise ValueError(
+            f"Invalid emissivity {emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m. "
+            f"Must lie in [{lowest}, {highest}]; it is a fraction, not per cent."
+        )
+    return wavelength, emissivity
+
+
+def _average(
+    wavelength: Array, emissivity: Array, band: Band, temperature: float, whole: float
+) -> tuple[float, float]:
+    """Planck-weighted mean [1] of a piecewise linear spectrum, by Gauss's rule on each piece.
+
+    And the share [1] that it covers of the `whole` blackbody's radiance of the band.
+    """
+    lower = max(band.lower, float(wavelength[0]))
+    upper = min(band.upper, float(wavelength[-1]))
+    if upper <= lower:
+        return np.nan, 0.0
+    inside = wavelength[(wavelength > lower) & (wavelength < upper)]
+    knots = np.union1d(np.linspace(lower, upper, _STEPS + 1), inside)
+    half = 0.5 * np.diff(knots)[:, np.newaxis]
+    nodes = knots[:-1, np.newaxis] + half * (1.0 + _NODES)
+    weights = half * _WEIGHTS * planck.spectral_radiance(nodes, temperature)
+    mean = float(np.sum(weights * np.interp(nodes, wavelength, emissivity)) / np.sum(weights))
+    if (lower, upper) == (band.lower, band.upper):
+        return mean, 1.0
+    return mean, float(Band(band.name, lower, upper).radiance(temperature)) / whole
+
+
+def _dataset(materials: list[str], names: list[str], values: Array, coverage: Array) -> xr.Dataset:
+    """Table in the stage's form."""
+    variables = schema.variables("emissivity_table", {"emissivity": values, "coverage": coverage})
+    return xr.Dataset(variables, {"material": materials, "band": names})
