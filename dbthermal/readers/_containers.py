@@ -20,7 +20,7 @@ _DAMAGE: Final = (
 
 
 def kind_of(path: Path) -> str:
-    """Format of a container, by its first bytes; empty if it is none."""
+    """Format of a container, by its first bytes; empty for any other file."""
     if path.is_dir():
         return "zarr"
     with recordings.files([path])[0].open("rb") as stream:

@@ -244,7 +244,7 @@ def _blurred(
     status: Bits,
     gain: Array,
 ) -> tuple[Array, Mask, Bits, Array]:
-    """What `read` gives of the rows around, blurred alike over the pixels that are usable."""
+    """Rows around as `read` gives them, blurred alike over the pixels that are usable."""
     more, width = displacement.around(rows), displacement.shape[1]
     counts, known = quality.bridge(counts, valid, time)
     here = slice((rows.start - more.start) * width, (rows.stop - more.start) * width)
