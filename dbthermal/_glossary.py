@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -28,9 +29,9 @@ class Variable:
     long_name: str
     more: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
-    @property
+    @cached_property
     def attrs(self) -> dict[str, Any]:
-        """Attributes to write on the variable."""
+        """Attributes to write on the variable, of which xarray keeps a copy."""
         return {"units": self.units, "long_name": self.long_name, **self.more}
 
 

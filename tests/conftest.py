@@ -4,6 +4,7 @@ import os
 from collections.abc import Generator
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 import xarray as xr
@@ -11,6 +12,8 @@ import xarray as xr
 from dbthermal import simulation
 from dbthermal.simulation import Background, Rig
 
+hypothesis.settings.register_profile("untimed", deadline=None)  # a test measures no time
+hypothesis.settings.load_profile("untimed")
 os.environ["MPLBACKEND"] = "agg"  # a test opens no window
 
 

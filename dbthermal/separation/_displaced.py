@@ -224,9 +224,10 @@ def read(
             status[share @ holds > _NO_WEIGHT] |= np.uint32(bit)
     counts[:, :, quality.unusable(status)] = 0.0
     gain = np.sqrt(np.asarray((weights**2).sum(axis=1)).ravel())
-    if "noise_factor" in block and np.any(block["noise_factor"].values[others] < 1.0):
+    good = ~quality.unusable(flags)
+    if "noise_factor" in block and np.any(block["noise_factor"][others] < 1.0) and good.any():
         # Neighbours that a registration has interpolated share noise: measured, not computed.
-        usual = np.mean(_roughness(seen)[:, ~quality.unusable(flags)] ** 2, axis=1) ** 0.5
+        usual = np.mean(_roughness(seen)[:, good] ** 2, axis=1) ** 0.5
         found = (_roughness(counts[others]) / usual[:, np.newaxis]).mean(axis=0)
         shape = (-1, displacement.shape[1])
         ratio = np.divide(found, gain, out=np.zeros_like(gain), where=gain > 0.0).reshape(shape)

@@ -124,7 +124,7 @@ def test_noise_goes_by_the_band_s_name(two_bands: xr.Dataset) -> None:
     assert "noise" not in calibration.fit_response(blackbody())
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(gain=st.floats(0.05, 50.0), shift=st.floats(-2e4, 2e4))
 def test_gain_and_offset_of_the_camera(gain: float, shift: float) -> None:
     """Scaled and shifted counts change amplitude and offset alike, and no temperature."""

@@ -75,7 +75,7 @@ def test_drift_refuses_nonsense() -> None:
     assert undo_drift(capture.assign(status=status), patch()).attrs["drift_pixels"] == 99
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     steps=st.lists(st.floats(0.002, 0.2), min_size=1, max_size=20),
     constants=st.tuples(st.floats(0.001, 0.03), st.floats(0.001, 0.03)),

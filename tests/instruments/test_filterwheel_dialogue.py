@@ -86,7 +86,7 @@ def test_answers_of_others() -> None:
         assert wheel.status().position == 3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.binary(max_size=40), max_size=6))
 def test_arbitrary_answers(answers: list[bytes]) -> None:
     """Connecting ends with a documented error for arbitrary answers."""

@@ -238,7 +238,7 @@ def test_late_report_of_an_earlier_move() -> None:
     assert bench.world.wheel_position == 4
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.binary(max_size=12), st.integers(0, 3))
 def test_noise_on_the_line(noise: bytes, drop: int) -> None:
     """With any bytes before every answer, and some missing: the right slot, or a known error."""

@@ -192,7 +192,7 @@ def test_what_is_identifiable(
             assert bool(np.isfinite(found[f"{name}_std"].values).all()) == known
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     first=st.floats(0.1, 0.9),
     second=st.floats(0.1, 0.9),

@@ -69,7 +69,7 @@ def test_error_bars_are_true(number: int) -> None:
     assert float(abs(result["emissivity"] - scene["emissivity"]).median()) < 0.02
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(order=st.permutations(range(4)))
 def test_order_of_bands_does_not_matter(order: list[int]) -> None:
     """The quietest band leads, wherever it stands."""

@@ -20,7 +20,7 @@ FRAMES = separation.CalibratedSettings(smooth=False)
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     first=st.floats(0.05, 0.95),
     second=st.floats(0.05, 0.95),

@@ -95,7 +95,7 @@ def test_nothing_jumps_where_nothing_jumps(background: dict[str, Any]) -> None:
     assert share < 0.01
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     frames=st.integers(32, 120),
     rate=st.sampled_from([1.0, 10.0, 30.0, 60.0, 240.0]),

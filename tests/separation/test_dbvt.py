@@ -175,7 +175,7 @@ def test_slopes_match_finite_differences(name: str, along: str) -> None:
     assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(4, 30), st.floats(0.0, 1e6), st.integers(0, 10**6))
 def test_banded_solution_meets_its_equations(frames: int, stiffness: float, seed: int) -> None:
     """The recursion's solution satisfies the equations, from no stiffness to much."""

@@ -218,6 +218,10 @@ def test_noise_of_a_registration_is_not_taken_for_white() -> None:
     print(f"noise over what is said: {ratio.mean():.3f}")
     assert abs(ratio.mean() - 1.0) < 0.03
     assert ratio.std() < 0.1
+    outside = capture.assign(counts=capture["counts"].where(capture["band"] == "8-14"))
+    _, _, status, gain = displaced.read(outside, moved, slice(0, 4), whole, 1, grains)
+    assert quality.unusable(status).all()  # rows that the second camera does not see at all
+    assert np.isfinite(gain).all()
 
 
 FIELD = field(np.zeros((2, *SMALL.shape)))

@@ -280,7 +280,7 @@ def test_step_counts_in_standard_deviations() -> None:
     assert step((y[:12], x[:12]), np.zeros((1, 12)), np.array([0.01]), 6, 9.0) == np.inf
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10_000), name=st.sampled_from(list(SHAPES)))
 def test_labels_are_connected_and_ordered(seed: int, name: str) -> None:
     """Labels are ordered by size, and each is one connected region."""

@@ -101,7 +101,7 @@ def test_only_the_estimated_has_values(pair: Pair, method: str) -> None:
         assert bool(result[name].notnull().any()) == (name in estimated(result)), name
 
 
-@settings(max_examples=35, deadline=None)
+@settings(max_examples=35)
 @given(
     seed=st.integers(0, 10_000),
     frames=st.integers(32, 120),

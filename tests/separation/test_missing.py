@@ -200,7 +200,7 @@ def test_bad_masks_and_segments(case: Case, what: str) -> None:
         separation.solve(capture.assign(new), response, mask=mask)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 10_000),
     frames=st.integers(32, 120),

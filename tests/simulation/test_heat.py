@@ -305,7 +305,7 @@ def test_coefficient_that_jumps() -> None:
 
 
 @given(st.tuples(*[st.floats(0.0, 1e3)] * 2), st.floats(0.0, 1.0), st.floats(150.0, 900.0))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_slope_of_the_flux(terms: tuple[float, float], emissivity: float, kelvin: float) -> None:
     """The slope is the derivative of the flux with the temperature, sign changed."""
     balance = Balance(*(np.array([value]) for value in (*terms, SIGMA * emissivity)))
