@@ -29,6 +29,7 @@ from dbthermal.separation._tiles import Tile
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
 _TURNED: Final = 2**14
 _BLOCK: Final = 8
+_VECTOR: Final = 64  # numbers that a loop takes at once, at most
 _ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 _SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
 
@@ -350,7 +351,8 @@ def _work_space(functions: smooth.Subspace) -> Work:
     """Arrays for the signals and curves of one pixel."""
     frames, columns = functions.functions.shape
     rest: dict[str, Any] = {
-        "few": np.empty((6, frames), np.float32),
+        # Whole vectors of infinite values behind the last frame: a rank is of those before.
+        "few": np.full((6, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
         "coefficients": np.empty((2, columns)),
         "columns": np.empty(columns),
         "spectra": np.empty((2, functions.rising.shape[1])),

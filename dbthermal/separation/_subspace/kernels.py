@@ -384,12 +384,12 @@ _moments, _reweighted = _of(np.float32)
 def _started(x: Array, y: Array, noise: float, residual: Array, few: Any) -> None:
     """Residual from the best of three starts, in place; see `residuals.regress`."""
     middle, centre = mean(x), mean(y)
-    step = max(1, x.size // residuals.STARTING_POINTS)
-    count = (x.size + step - 1) // step
+    count = min(x.size, residuals.STARTING_POINTS)
     xs, ys, rest = few[0, :count], few[1, :count], few[2, :count]
     weights, plain, magnitude = few[3, :count], few[4, :count], few[5, :count]
     for i in range(count):
-        xs[i], ys[i], weights[i] = x[i * step] - middle, y[i * step] - centre, 1.0
+        t = i if count == x.size else i * x.size // residuals.STARTING_POINTS
+        xs[i], ys[i], weights[i] = x[t] - middle, y[t] - centre, 1.0
     slope, intercept, _ = _moments(xs, ys, weights)
     for i in range(count):
         plain[i] = ys[i] - intercept - slope * xs[i]
