@@ -10,7 +10,15 @@ import xarray as xr
 from dbthermal import _smooth as smooth
 from dbthermal import response, simulation
 from dbthermal.response import Curve
-from dbthermal.separation._subspace import division, fused, kernels, method, pieces, steps
+from dbthermal.separation._subspace import (
+    division,
+    fused,
+    kernels,
+    method,
+    pieces,
+    regression,
+    steps,
+)
 from dbthermal.separation._tiles import Material, Tile
 
 RIG = simulation.Rig()
@@ -129,7 +137,7 @@ def test_flags_and_films_are_the_same(
 
 @pytest.mark.parametrize("kind", response.KINDS)
 def test_response_of_the_kernels(kind: str) -> None:
-    """Signal and slope are the curve's within 1e-6 K, far outside too; a step from the inverse is."""
+    """Signal and slope are the curve's within 1e-6 K, far outside too, and a step from the inverse."""
     for name in RIG.bands:
         curve: Curve = response.curve(RIG.response(), name, kind)
         temperature = np.linspace(150.0, 900.0, 2000)
@@ -152,7 +160,7 @@ def test_rank_without_sorting() -> None:
     for values in (rng.exponential(size=117), np.ones(50), rng.integers(0, 4, 60), np.zeros(9)):
         single = values.astype(np.float32)
         for rank, guess in product((0, len(single) // 3, len(single) - 1), (1e-3, 0.5, 100.0)):
-            value = kernels.ranked(single, rank, guess)
+            value = regression.ranked(single, rank, guess)
             assert value == pytest.approx(np.sort(single)[rank], rel=1e-6)
 
 

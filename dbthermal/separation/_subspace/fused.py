@@ -20,7 +20,7 @@ from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace.kernels import compiled
+from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Ratio
 from dbthermal.separation._subspace.shared import Model, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
@@ -34,7 +34,7 @@ _ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 _SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
 
 
-@compiled
+@inlined
 def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
     """Autocorrelation, delay of the bands, and whether the residual is noise; see `residuals`."""
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
@@ -72,7 +72,7 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
     )
 
 
-@compiled
+@inlined
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
     """As `residuals.unexplained`."""
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
@@ -104,7 +104,7 @@ def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool
     return False
 
 
-@compiled
+@inlined
 def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
 ) -> tuple[Any, Any, Any]:
@@ -153,7 +153,7 @@ class Solved(NamedTuple):
     sums: Array  # (pixel, 2, block) [K]
 
 
-@compiled
+@inlined
 def _energy(bend: Array, removed: Array) -> float:
     """Energy about the mean of what a bend has changed."""
     total, square = 0.0, 0.0
@@ -164,7 +164,7 @@ def _energy(bend: Array, removed: Array) -> float:
     return square - total**2 / bend.size
 
 
-@compiled
+@inlined
 def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums: Array) -> None:
     """Steps 1 to 4, on the exact model where it matters, and all that the flags need."""
     kernels.copy(work.second, work.straight)
@@ -199,7 +199,7 @@ def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums
     _write_symmetric(deviations.covariance, record.emissivity_covariance)
 
 
-@compiled
+@inlined
 def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> None:
     """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
@@ -221,7 +221,7 @@ def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) ->
         sums[0, block], sums[1, block] = one, other
 
 
-@compiled
+@inlined
 def _write_ratio(model: Model, ratios: Ratio, level: float, record: Any) -> None:
     record.ratio[0], record.ratio[1] = 1.0, ratios.ratio
     error = model.noise[1] ** 2 + (ratios.ratio * model.noise[0]) ** 2  # eq. 4
@@ -232,7 +232,7 @@ def _write_ratio(model: Model, ratios: Ratio, level: float, record: Any) -> None
     record.contrast, record.reduced_chi2 = ratios.contrast, ratios.reduced_chi2
 
 
-@compiled
+@inlined
 def _write_scatter(model: Model, ratios: Ratio, scatter: Array, record: Any) -> None:
     """Scatter less noise, at the order of the pixel and at `reflection_ratio.rapid_orders`."""
     _write_symmetric(ratios.scatter, record.scatter)
@@ -244,14 +244,14 @@ def _write_scatter(model: Model, ratios: Ratio, scatter: Array, record: Any) -> 
         _write_symmetric((a - free, b, d - free), record.rapid_scatter[place])
 
 
-@compiled
+@inlined
 def _write_symmetric(elements: tuple[float, float, float], matrix: Any) -> None:
     """First, mixed and last element of a symmetric matrix, in place."""
     matrix[0, 0], matrix[0, 1], matrix[1, 0] = elements[0], elements[1], elements[1]
     matrix[1, 1] = elements[2]
 
 
-@compiled
+@inlined
 def _turn(samples: Any, start: int, size: int, turned: Any) -> None:
     """Samples (kind, time, pixel) of a few pixels as (pixel, kind, time), in place."""
     for kind in range(turned.shape[1]):
@@ -261,7 +261,7 @@ def _turn(samples: Any, start: int, size: int, turned: Any) -> None:
                 turned[p, kind, t] = row[p]
 
 
-@compiled
+@inlined
 def _return(turned: Any, start: int, size: int, samples: Any) -> None:
     """The reverse of `_turn`, in place."""
     for kind in range(turned.shape[1]):

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels, reflection_ratio
-from dbthermal.separation._subspace.kernels import compiled
+from dbthermal.separation._subspace import kernels, reflection_ratio, regression
+from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.shared import Model, Work
 
 CHANCE: Final = float(chi2.isf(reflection_ratio.CHANCE, 1))
@@ -43,7 +43,7 @@ class Line(NamedTuple):
     known: bool  # the emissivity is the material's
 
 
-@compiled
+@inlined
 def ratios(model: Model, work: Work) -> Ratio:
     """Step 1; coefficients (2, column) in place."""
     curves = work.first, work.straight
@@ -87,7 +87,7 @@ def ratios(model: Model, work: Work) -> Ratio:
     )
 
 
-@compiled
+@inlined
 def _scatter(model: Model, work: Work) -> None:
     """Scatter (order, 3) of the whitened signals outside the functions of each order (eq. 3)."""
     z, s, coefficients, steps = work.first, work.straight, work.coefficients, model.steps
@@ -103,7 +103,7 @@ def _scatter(model: Model, work: Work) -> None:
             scatter[0], scatter[1], scatter[2] = a * one * one, b * one * two, d * two * two
 
 
-@compiled
+@inlined
 def _null_combination(
     ratio: float, noise: tuple[float, float]
 ) -> tuple[tuple[float, float], float]:
@@ -115,7 +115,7 @@ def _null_combination(
     return (off0 * variance * one, off1 * variance * two), variance
 
 
-@compiled
+@inlined
 def _energies(
     a: float, b: float, d: float, axis: tuple[float, float], known: float
 ) -> tuple[float, float]:
@@ -127,7 +127,7 @@ def _energies(
     return along, a + d - along
 
 
-@compiled
+@inlined
 def _order(scatter: Array, axis: tuple[float, float], known: float, frames: int) -> int:
     """Order less one of the lowest information criterion, see `reflection_ratio.choose_order`."""
     lowest = min(reflection_ratio.LOWEST_ORDER, len(scatter) - 1) - 1
@@ -142,7 +142,7 @@ def _order(scatter: Array, axis: tuple[float, float], known: float, frames: int)
     return best + 1 if scatter.shape[0] > 1 else 0
 
 
-@compiled
+@inlined
 def may_be_gray(model: Model, ratios: Ratio) -> bool:
     """As `reflection_ratio.may_be_gray`: in two bands the part across the axis is one number."""
     noise = model.noise
@@ -160,16 +160,16 @@ def may_be_gray(model: Model, ratios: Ratio) -> bool:
     return nearest < _GRAY_LIMIT and chance > reflection_ratio.GRAY_CHANCE
 
 
-@compiled
+@inlined
 def weights(ratios: Ratio, emissivity: float) -> tuple[float, float]:
     """Weights w_m e_m of the bands' signals in h (eq. 6)."""
     last = 1.0 - ratios.ratio * (1.0 - emissivity)
     return ratios.weights[0] * emissivity, ratios.weights[1] * last
 
 
-@compiled
+@inlined
 def _approach(model: Model, ratios: Ratio, emissivity: float, work: Work, emitted: Array) -> None:
-    """A step of Newton towards h(x) = q (eq. 6), with h' and q - h before it; u_1 after, in place."""
+    """A step of Newton towards h(x) = q (eq. 6); h' and q - h before it, u_1 after, in place."""
     first, second, now, after = model.first, model.second, work.temperature, work.spare
     target, middle, scale, outside = work.target, first.middle, 1.0 / first.half, 0.0
     one, two = weights(ratios, emissivity)
@@ -194,7 +194,7 @@ def _approach(model: Model, ratios: Ratio, emissivity: float, work: Work, emitte
     kernels.copy(after, now)
 
 
-@compiled
+@inlined
 def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     """Steps 2 and 3 in turns: the object (eq. 5, 6) and the first emissivity (eq. 7), in place."""
     z, weights, temperature = work.first, work.weights, work.temperature
@@ -208,14 +208,14 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
     kernels.blackbody(model.first, temperature, work.emitted, work.spare)
     kernels.fill(work.lack, 1.0)
-    guess = kernels.moments(work.emitted, z, work.lack)[0]
+    guess = regression.moments(work.emitted, z, work.lack)[0]
     emissivity = guess if 0 < guess < 1 else middle
     known = ratios.pooled and not np.isnan(material[2])
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
     for turn in range(emissions.ROUNDS):
         _approach(model, ratios, emissivity, work, work.emitted)
-        slope, variance, scale, energy = kernels.regress(
+        slope, variance, scale, energy = regression.regress(
             work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
         )
         constant = energy < emissions.OBJECT_TO_NOISE * count * ratios.null_variance and not known
@@ -225,7 +225,7 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     return Line((emissivity, other), variance, scale, energy, constant, known)
 
 
-@compiled
+@inlined
 def background(model: Model, line: Line, work: Work) -> None:
     """Step 4 (eq. 9), and the bend of the reflections (eq. 11), in place."""
     z, other, mean, result, bend = work.first, work.second, work.mean, work.background, work.bend
