@@ -28,6 +28,9 @@ SLOW: Final = "dbvt"
 REACH: Final = 5
 """Pixels around a bead that it gets: of some shifts, by which it pairs the pixels."""
 
+RESTING: Final = 0.1
+"""Standard deviation over time [K] below which an object counts as at rest."""
+
 _STRAY: Final = 0.01
 
 
@@ -128,17 +131,21 @@ def over_the_image(scene: xr.Dataset, separated: xr.Dataset) -> xr.Dataset:
     """Errors of a separation over the object's pixels in which the background moves.
 
     `good` [1], the share without a flag; of these `object_temperature_rmse` [K], root mean square
-    over time, median; and `covered` [1], the share of samples whose 95 % interval holds the truth.
+    over time, median; `covered` [1], the share of samples whose 95 % interval holds the truth; and
+    `resting` [1], the share whose object changes by less than `RESTING`, where two bands leave
+    the emissivity open.
     """
     background, status = scene["background_temperature"], separated["status"]
     moving = (background.std("time") > MOVING) & scene["on_object"]
     good = moving & (status == 0)
     error = (separated["object_temperature"] - scene["object_temperature"]).where(good)
     inside = abs(error) < INTERVAL * separated["object_temperature_std"]
+    resting = moving & (scene["object_temperature"].std("time") < RESTING)
     values = {
         "good": (good.sum() / moving.sum(), "1"),
         "object_temperature_rmse": (((error**2).mean("time") ** 0.5).median(), "K"),
         "covered": (inside.where(good).mean(), "1"),
+        "resting": (resting.sum() / moving.sum(), "1"),
     }
     return xr.Dataset({name: ((), float(part), {"units": u}) for name, (part, u) in values.items()})
 
