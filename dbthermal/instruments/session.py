@@ -51,15 +51,22 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from dbthermal import _text as texts
-from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments import filterwheel, telemetry
 from dbthermal.instruments.camera import FFC_READING, FPA_READING, camera_kind
+from dbthermal.instruments.transport import parse
 
 __all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
 __dir__ = __all__.copy
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
+# Scheme of the hardware's address of each use.
+_SCHEMES: Final = {
+    "video": "v4l2",
+    "control": "serial",
+    "filter_wheel": "serial",
+    "thermocouples": "tc08",
+}
 BLACKBODY: Final = "blackbody"  # name of its thermocouple
 
 
@@ -99,12 +106,19 @@ class Device:
         Addresses.
     """
 
-    simulated: Annotated[str, _by(partial(addresses.parse, schemes=("sim", "pty")))]
-    hardware: Annotated[str, _by(partial(addresses.parse, schemes=("v4l2", "serial", "tc08")))]
+    simulated: Annotated[str, _by(partial(parse, schemes=("sim",)))]
+    hardware: Annotated[str, _by(partial(parse, schemes=("v4l2", "serial", "tc08")))]
 
 
 def _check_schemes(name: str, device: Device) -> None:
-    addresses.check_schemes(name, device.simulated, device.hardware)
+    """ValueError unless a device's addresses are of its schemes, by the name of its use."""
+    url = parse(device.simulated, ("sim",))
+    parse(device.hardware, (_SCHEMES[name],))
+    emulator = {"filter_wheel": "apt", "thermocouples": "tc08"}.get(name, url.target)
+    if url.target != emulator or (emulator == "tc08" and url.name):
+        raise ValueError(
+            f"Invalid address '{device.simulated}' of {name}. Must be sim://{emulator}"
+        )
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -133,8 +147,7 @@ class Camera:
             return
         if kind.open_control is None:
             raise ValueError(f"Invalid control of kind '{self.kind}', which has none")
-        url, video = addresses.parse(self.control.simulated), addresses.parse(simulated)
-        if url.scheme == "sim" and url[:3] != video[:3]:
+        if self.control.simulated != simulated:
             rule = "Must be the same camera"
             raise ValueError(f"Invalid control '{self.control.simulated}' of '{simulated}'. {rule}")
 

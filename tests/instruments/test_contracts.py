@@ -108,7 +108,7 @@ def test_a_device_is_a_context_manager(opened: Opened) -> None:
         ask(opened.device)
 
 
-@opens(*CAMERAS[2:], *WHEELS[2:], *LOGGERS)
+@opens(*CAMERAS[3:], *WHEELS[3:], *LOGGERS)
 def test_a_device_has_one_client(opened: Opened) -> None:
     """A second client gets an error with a remedy, and the first is not disturbed."""
     assert opened.again is not None

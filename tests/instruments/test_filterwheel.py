@@ -3,11 +3,11 @@
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from device_benches import FILTERS, QUICK, WheelBench
-from loopback import Loop
+from device_benches import FILTERS, WheelBench
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.emulated.apt import EmulatedApt, start
+from dbthermal.instruments.emulated.apt import EmulatedApt
+from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
@@ -18,7 +18,6 @@ from dbthermal.instruments.filterwheel import (
     WrongDeviceError,
 )
 from dbthermal.instruments.filterwheel._settings import BSC10X, BSC20X
-from dbthermal.instruments.transport import TransportError
 
 SETTINGS = Settings(filters=FILTERS)
 
@@ -117,7 +116,7 @@ def test_a_controller_that_was_homed_before_is_taken_over() -> None:
     """A new program need not home the wheel again if the controller kept its power."""
     bench = WheelBench()
     bench.homed().move_to(5)
-    loop = Loop(bench.device, clock=bench.clock, sleep=bench.clock.sleep)
+    loop = Line(bench.device, clock=bench.clock, sleep=bench.clock.sleep)
     with FilterWheel(loop, SETTINGS, clock=bench.clock, sleep=bench.clock.sleep) as wheel:
         wheel.connect()
         assert wheel.band() == "LW"
@@ -189,32 +188,16 @@ def test_settings_are_checked(options: dict[str, object], error: str) -> None:
         WheelBench().homed().move_to(0)
 
 
-def test_over_a_pseudo_terminal() -> None:
-    """Through a serial port, which here has no RTS to raise, in real time but a fast wheel."""
-    with start({"model": "BSC101", "sn": "40000123"}, None) as port:
-        wheel = FilterWheel.from_url(f"pty://{port.path}", QUICK)
-        wheel.home()
-        wheel.select("LW")
-        assert wheel.band() == "LW"
-        assert wheel.identity()["serial_number"] == "40000123"
-        port.close()
-        with pytest.raises(TransportError, match=f"'pty://{port.path}'"):
-            wheel.status()
-        wheel.close()
-
-
 def test_by_name_of_an_emulator() -> None:
     """A wheel in a world is opened by its name, and turns what the world's camera sees."""
     world = World(filters=FILTERS, wheel_position=3)
     chosen = Settings(filters=FILTERS, reply_timeout=0.3, velocity=50.0, acceleration=500.0)
-    with FilterWheel.from_url("sim://apt?offset=0", chosen, world=world) as wheel:
+    with FilterWheel.from_url("sim://apt/wheel", chosen, world=world) as wheel:
         assert wheel.is_simulated
         with pytest.raises(NotHomedError):
             wheel.select("LW")
-    with pytest.raises(ValueError, match="Unknown option 'colour'"):
-        FilterWheel.from_url("sim://apt?colour=red", chosen)
     with pytest.raises(ValueError, match="Invalid model 'X'"):
-        FilterWheel.from_url("sim://apt?model=X", chosen)
+        EmulatedApt(world, model="X")
 
 
 def test_the_largest_number_of_a_controller() -> None:

@@ -5,7 +5,6 @@ and the wheel is where it should be. Neither is enough alone. Bits were seen to 
 an earlier move may come late, and before a move starts the bits are clear too.
 """
 
-import logging
 import time as system_time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +23,6 @@ from dbthermal.instruments.filterwheel._settings import FAULTS, Settings
 from dbthermal.instruments.transport import Closing, Transport, open_serial
 
 BAUDRATE: Final = 115_200  # [bit/s]
-SETTLING: Final = 0.05  # [s] between taking RTS down and up, as in the maker's example
 
 MOVING: Final = (
     apt.StatusBits.MOVING_FORWARD | apt.StatusBits.MOVING_REVERSE | apt.StatusBits.HOMING
@@ -32,8 +30,6 @@ MOVING: Final = (
 """Bits of a wheel that moves. The jogging bits are left out: they were seen to stick."""
 
 CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
-
-_LOGGER = logging.getLogger(__name__)
 
 
 class FilterWheel(Closing):
@@ -56,14 +52,8 @@ class FilterWheel(Closing):
     @classmethod
     def from_url(cls, url: str, settings: Settings, *, world: object | None = None) -> Self:
         """Open the line as `transport.open_serial`, and `connect`; the wheel does not move."""
-        transport = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
-        wheel = cls(transport, settings)
+        wheel = cls(open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world), settings)
         try:
-            # Take RTS down and up again, where the line has one; a pseudo-terminal has none.
-            transport.set_rts(level=False)
-            system_time.sleep(SETTLING)
-            if not transport.set_rts(level=True):
-                _LOGGER.info("The line %s has no RTS.", url)
             wheel.connect()
         except BaseException:
             wheel.close()
