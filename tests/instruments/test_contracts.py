@@ -211,5 +211,5 @@ def test_silence_is_no_loss(opened: Opened) -> None:
 def test_the_rig_is_found() -> None:
     """The inventory lists the whole rig without a warning."""
     found = inventory.find()
-    assert [device.kind.key for device in found] == ["boson", "boson", "apt", "tc08"]
+    assert [device.kind for device in found] == [inventory.BOSON, *inventory.KINDS]
     assert [device.warnings for device in found] == [()] * 4
