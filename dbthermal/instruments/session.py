@@ -46,16 +46,16 @@ from pydantic import (
     StrictBool,
     TypeAdapter,
     ValidationError,
-    field_validator,
 )
 from pydantic.dataclasses import dataclass
 
 from dbthermal import _text as texts
-from dbthermal.instruments import filterwheel, telemetry
+from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import FFC_READING, FPA_READING, camera_kind
+from dbthermal.instruments.filterwheel import Settings
 from dbthermal.instruments.transport import parse
 
-__all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
+__all__ = ["Blackbody", "Camera", "Device", "Session"]
 __dir__ = __all__.copy
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
@@ -92,7 +92,6 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=
 Label = Annotated[str, Field(min_length=1, max_length=64), _by(_check_printable)]
 Slot = Annotated[int, Field(strict=True, ge=1, le=6)]
 Channel = Annotated[int, Field(strict=True, ge=1, le=8)]
-Byte = Annotated[int, Field(strict=True, ge=0, le=255)]
 DeviceName = Literal["filter_wheel", "thermocouples"]
 
 
@@ -179,27 +178,6 @@ class Blackbody:
 
 
 @dataclass(frozen=True, config=_CHECKED)
-class Wheel(filterwheel.Settings):
-    """Settings of the wheel but its filters, see `dbthermal.instruments.filterwheel.Settings`.
-
-    Attributes
-    ----------
-    filters, addresses : mapping, tuple
-        Empty: those of the session are taken; as in `Settings`.
-    """
-
-    filters: Mapping[int, str] = field(default_factory=dict, init=False)
-    addresses: tuple[tuple[Byte, Byte], ...] = filterwheel.Settings.addresses
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _check_number(cls, value: Any) -> Any:
-        if isinstance(value, bool | str):
-            raise ValueError("Must be a number")
-        return value
-
-
-@dataclass(frozen=True, config=_CHECKED)
 class Session:
     """Description of a recording: devices, procedure and duration; see the module.
 
@@ -220,7 +198,7 @@ class Session:
         Cameras by band, in the order of the recording; other devices by name.
     shape, telemetry_rows : tuple of int, int
         Rows and columns; rows of telemetry in a frame, 0 or 2.
-    filters, wheel, sweep : dict of int to str, Wheel, tuple of str
+    filters, wheel, sweep : dict of int to str, filterwheel.Settings, tuple of str
         Slot of the wheel to band; its settings; filters at each temperature, see `swept`.
     thermocouples : dict of int to str
         Channel to measured object.
@@ -244,7 +222,7 @@ class Session:
     telemetry_rows: Literal[0, 2] = 0
     devices: dict[DeviceName, Device] = field(default_factory=dict)
     filters: dict[Slot, Name] = field(default_factory=dict)
-    wheel: Wheel = field(default_factory=Wheel)
+    wheel: Settings = field(default_factory=Settings)
     sweep: tuple[Name, ...] = ()
     thermocouples: dict[Channel, Label] = field(default_factory=dict)
     blackbody: Blackbody | None = None

@@ -16,14 +16,7 @@ from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 
 FILTERS = {1: "open", 3: "9.5", 5: "LW"}
-QUICK = Settings(
-    filters=FILTERS,
-    reply_timeout=5.0,
-    poll_interval=0.005,
-    velocity=50.0,
-    home_velocity=20.0,
-    acceleration=1e3,
-)
+QUICK = Settings(velocity=50.0, home_velocity=20.0, acceleration=1e3)
 """A wheel that turns in no time."""
 
 
@@ -85,8 +78,8 @@ class WheelBench:
         self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
         self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
         loop = Line(self.device, clock=self.clock, sleep=self.clock.sleep)
-        chosen = Settings(filters=FILTERS, **options)  # type: ignore[arg-type]
-        self.wheel = FilterWheel(loop, chosen, clock=self.clock, sleep=self.clock.sleep)
+        chosen = Settings(**options)  # type: ignore[arg-type]
+        self.wheel = FilterWheel(loop, FILTERS, chosen, clock=self.clock, sleep=self.clock.sleep)
 
     def homed(self) -> FilterWheel:
         """Connect and home the wheel."""

@@ -18,7 +18,7 @@ from dbthermal.instruments.camera import Stream, camera_kind
 from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.filterwheel import FilterWheel, Settings
+from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
 
@@ -63,7 +63,7 @@ def real_camera(_: ExitStack) -> Opened:
 def stub_wheel(_: ExitStack) -> Opened:
     """A wheel's driver on a controller that takes no time."""
     clock = Clock()
-    wheel = FilterWheel(StubController(), QUICK, clock=clock, sleep=clock.sleep)
+    wheel = FilterWheel(StubController(), FILTERS, QUICK, clock=clock, sleep=clock.sleep)
     wheel.connect()
     return Opened(wheel, True)
 
@@ -77,14 +77,14 @@ def loop_wheel(_: ExitStack) -> Opened:
 
 def named_wheel(_: ExitStack) -> Opened:
     """A wheel's driver on the emulator, by its address, in real time, but a fast wheel."""
-    return Opened(FilterWheel.from_url("sim://apt/wheel", QUICK), True)
+    return Opened(FilterWheel.from_url("sim://apt/wheel", FILTERS, QUICK), True)
 
 
 def real_wheel(_: ExitStack) -> Opened:
     """A wheel."""
-    url, settings = address("DBTHERMAL_WHEEL"), Settings(filters=FILTERS)
-    opened = FilterWheel.from_url(url, settings)
-    return Opened(opened, False, lambda: FilterWheel.from_url(url, settings))
+    url = address("DBTHERMAL_WHEEL")
+    opened = FilterWheel.from_url(url, FILTERS)
+    return Opened(opened, False, lambda: FilterWheel.from_url(url, FILTERS))
 
 
 def stub_logger(_: ExitStack) -> Opened:

@@ -90,10 +90,10 @@ def test_requests_agree(protocol: ModuleType) -> None:
 def test_replies_agree(protocol: ModuleType) -> None:
     """thorlabs-apt-protocol reads the same out of what a controller answers."""
     unpacker = protocol.Unpacker()
-    status = apt.Status(1, -68_267, 0, apt.StatusBits.REVERSE_LIMIT | apt.StatusBits.HOMED)
+    status = apt.Status(1, -68_267, 0, apt.StatusBits(2) | apt.StatusBits.HOMED)
     answers = [
         (Id.MOT_GET_STATUSUPDATE, status.pack()),
-        (Id.HW_GET_INFO, apt.Info(94_000_009, "BSC201", 45, "57.1.2", 1, 3, 1).pack()),
+        (Id.HW_GET_INFO, apt.Info(94_000_009, "BSC201", "57.1.2").pack()),
         (Id.MOT_GET_HOMEPARAMS, HOME.pack()),
         (Id.MOT_GET_VELPARAMS, SPEEDS.pack()),
     ]

@@ -93,7 +93,7 @@ class EmulatedApt:
         if model not in MODELS:
             raise ValueError(f"Invalid model '{model}'. Must be one of {sorted(MODELS)}.")
         self.plugged = True
-        self.info = apt.Info(serial_number, model, 45, "1.0.0", 1, 0, 1, NOTES)
+        self.info = apt.Info(serial_number, model, "1.0.0", NOTES)
         self.model = MODELS[model]
         self.unit = apt.RACK if self.model.is_rack else apt.UNIT
         self.address = apt.BAY_1 if self.model.is_rack else apt.UNIT
