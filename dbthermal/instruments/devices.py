@@ -10,11 +10,10 @@ import threading
 import time as system_time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
-from dbthermal.instruments import filterwheel
 from dbthermal.instruments.camera import (
     FFC_READING,
     FPA_READING,
@@ -269,9 +268,8 @@ def _frames(
 
 
 def _wheel(session: Session, world: Any) -> FilterWheel:
-    chosen = {entry.name: getattr(session.wheel, entry.name) for entry in fields(session.wheel)}
-    settings = filterwheel.Settings(**{**chosen, "filters": session.filters})
-    return FilterWheel.from_url(session.url(session.devices[WHEEL]), settings, world=world)
+    url = session.url(session.devices[WHEEL])
+    return FilterWheel.from_url(url, session.filters, session.wheel, world=world)
 
 
 def _logger(session: Session, world: Any) -> TC08:

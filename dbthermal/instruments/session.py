@@ -46,20 +46,27 @@ from pydantic import (
     StrictBool,
     TypeAdapter,
     ValidationError,
-    field_validator,
 )
 from pydantic.dataclasses import dataclass
 
 from dbthermal import _text as texts
-from dbthermal.instruments import _addresses as addresses
-from dbthermal.instruments import filterwheel, telemetry
+from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import FFC_READING, FPA_READING, camera_kind
+from dbthermal.instruments.filterwheel import Settings
+from dbthermal.instruments.transport import parse
 
-__all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
+__all__ = ["Blackbody", "Camera", "Device", "Session"]
 __dir__ = __all__.copy
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
+# Scheme of the hardware's address of each use.
+_SCHEMES: Final = {
+    "video": "v4l2",
+    "control": "serial",
+    "filter_wheel": "serial",
+    "thermocouples": "tc08",
+}
 BLACKBODY: Final = "blackbody"  # name of its thermocouple
 
 
@@ -85,7 +92,6 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=
 Label = Annotated[str, Field(min_length=1, max_length=64), _by(_check_printable)]
 Slot = Annotated[int, Field(strict=True, ge=1, le=6)]
 Channel = Annotated[int, Field(strict=True, ge=1, le=8)]
-Byte = Annotated[int, Field(strict=True, ge=0, le=255)]
 DeviceName = Literal["filter_wheel", "thermocouples"]
 
 
@@ -99,12 +105,19 @@ class Device:
         Addresses.
     """
 
-    simulated: Annotated[str, _by(partial(addresses.parse, schemes=("sim", "pty")))]
-    hardware: Annotated[str, _by(partial(addresses.parse, schemes=("v4l2", "serial", "tc08")))]
+    simulated: Annotated[str, _by(partial(parse, schemes=("sim",)))]
+    hardware: Annotated[str, _by(partial(parse, schemes=("v4l2", "serial", "tc08")))]
 
 
 def _check_schemes(name: str, device: Device) -> None:
-    addresses.check_schemes(name, device.simulated, device.hardware)
+    """ValueError unless a device's addresses are of its schemes, by the name of its use."""
+    url = parse(device.simulated, ("sim",))
+    parse(device.hardware, (_SCHEMES[name],))
+    emulator = {"filter_wheel": "apt", "thermocouples": "tc08"}.get(name, url.target)
+    if url.target != emulator or (emulator == "tc08" and url.name):
+        raise ValueError(
+            f"Invalid address '{device.simulated}' of {name}. Must be sim://{emulator}"
+        )
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -133,8 +146,7 @@ class Camera:
             return
         if kind.open_control is None:
             raise ValueError(f"Invalid control of kind '{self.kind}', which has none")
-        url, video = addresses.parse(self.control.simulated), addresses.parse(simulated)
-        if url.scheme == "sim" and url[:3] != video[:3]:
+        if self.control.simulated != simulated:
             rule = "Must be the same camera"
             raise ValueError(f"Invalid control '{self.control.simulated}' of '{simulated}'. {rule}")
 
@@ -166,27 +178,6 @@ class Blackbody:
 
 
 @dataclass(frozen=True, config=_CHECKED)
-class Wheel(filterwheel.Settings):
-    """Settings of the wheel but its filters, see `dbthermal.instruments.filterwheel.Settings`.
-
-    Attributes
-    ----------
-    filters, addresses : mapping, tuple
-        Empty: those of the session are taken; as in `Settings`.
-    """
-
-    filters: Mapping[int, str] = field(default_factory=dict, init=False)
-    addresses: tuple[tuple[Byte, Byte], ...] = filterwheel.Settings.addresses
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _check_number(cls, value: Any) -> Any:
-        if isinstance(value, bool | str):
-            raise ValueError("Must be a number")
-        return value
-
-
-@dataclass(frozen=True, config=_CHECKED)
 class Session:
     """Description of a recording: devices, procedure and duration; see the module.
 
@@ -207,7 +198,7 @@ class Session:
         Cameras by band, in the order of the recording; other devices by name.
     shape, telemetry_rows : tuple of int, int
         Rows and columns; rows of telemetry in a frame, 0 or 2.
-    filters, wheel, sweep : dict of int to str, Wheel, tuple of str
+    filters, wheel, sweep : dict of int to str, filterwheel.Settings, tuple of str
         Slot of the wheel to band; its settings; filters at each temperature, see `swept`.
     thermocouples : dict of int to str
         Channel to measured object.
@@ -231,7 +222,7 @@ class Session:
     telemetry_rows: Literal[0, 2] = 0
     devices: dict[DeviceName, Device] = field(default_factory=dict)
     filters: dict[Slot, Name] = field(default_factory=dict)
-    wheel: Wheel = field(default_factory=Wheel)
+    wheel: Settings = field(default_factory=Settings)
     sweep: tuple[Name, ...] = ()
     thermocouples: dict[Channel, Label] = field(default_factory=dict)
     blackbody: Blackbody | None = None

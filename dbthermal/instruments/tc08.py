@@ -25,9 +25,8 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.camera import Identity
-from dbthermal.instruments.transport import Closing
+from dbthermal.instruments.transport import Closing, parse
 
 __all__ = ["ERRORS", "TC08", "Flag", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
@@ -171,7 +170,7 @@ class TC08(Closing):
         if world is not None:
             module = importlib.import_module("dbthermal.instruments.emulated.tc08")
             return cls(module.EmulatedTC08.from_world(world)).open()
-        addresses.parse(url, ("tc08",))
+        parse(url, ("tc08",))
         return cls(load()).open()
 
     @property

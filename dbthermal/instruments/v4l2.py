@@ -20,7 +20,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.camera import (
     DAMAGED,
     FRAME_TIMEOUT,
@@ -33,7 +32,7 @@ from dbthermal.instruments.camera import (
     SourceLostError,
     Stream,
 )
-from dbthermal.instruments.transport import Closing
+from dbthermal.instruments.transport import Closing, parse
 
 try:
     import fcntl
@@ -272,7 +271,7 @@ class Capture(Closing):
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
     """Open the node of an address ``v4l2:///dev/video0``; ValueError if it is of another kind."""
-    return Capture.open(addresses.parse(url, ("v4l2",)).target, stream, decode=decode)
+    return Capture.open(parse(url, ("v4l2",)).target, stream, decode=decode)
 
 
 def _capability(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:

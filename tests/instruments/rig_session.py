@@ -40,7 +40,7 @@ devices:
   filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
   thermocouples: {simulated: "sim://tc08", hardware: "tc08:"}
 filters: {1: 9.5, 3: "11"}
-wheel: {velocity: 50.0, home_velocity: 50.0, acceleration: 2000.0, addresses: [[17, 33]]}
+wheel: {velocity: 50.0, home_velocity: 50.0, acceleration: 2000.0}
 sweep: [9.5, 11]
 thermocouples: {1: blackbody, 4: plate}
 blackbody: {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, timeout: 20}

@@ -87,7 +87,7 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
         (
             TEXT.replace("sim://apt/wheel", "sim://apt?sn=x"),
             1,
-            "dbthermal record: Invalid option sn=x",
+            "Invalid address 'sim://apt?sn=x'. Must be sim://<emulator>/<name>",
         ),
     ],
 )

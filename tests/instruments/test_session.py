@@ -82,8 +82,8 @@ def test_session_is_read(tmp_path: Path) -> None:
         ("sim://tc08", "tc08:", "thermocouples.simulated: Invalid address 'tc08:'. Must be sim://"),
         (
             "v4l2:///dev/video0",
-            "pty://a",
-            "8-14.video.hardware: Invalid address 'pty://a'. Must be",
+            "file://a",
+            "8-14.video.hardware: Invalid address 'file://a'. Must be",
         ),
         (
             '{simulated: "sim://apt/wheel", ',

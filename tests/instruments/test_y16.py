@@ -62,9 +62,13 @@ def test_it_has_neither_telemetry_nor_command_port() -> None:
         replace(plain.cameras["8-14"], control=control)
 
 
-def test_its_shutter_is_told_by_frozen_images(tmp_path: Path) -> None:
+def test_its_shutter_is_told_by_frozen_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A correction of its own is flagged from the third copy on, and found whole afterwards."""
-    video = {"simulated": "sim://y16/wide?ffc=1", "hardware": "v4l2:///dev/video0"}
+    models = {"y16": ("emulated Y16 camera", 1.0)}  # corrects its offsets every second
+    monkeypatch.setattr("dbthermal.instruments.emulated.camera.MODELS", models)
+    video = {"simulated": "sim://y16/wide", "hardware": "v4l2:///dev/video0"}
     camera = {"kind": "y16", "video": video}
     short = session(cameras={"8-14": camera}, duration=1.8, frame_rate=50.0)
     with open_devices(short) as devices:

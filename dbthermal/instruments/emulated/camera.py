@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 
-from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import (
     FRAME_TIMEOUT,
@@ -26,9 +25,8 @@ from dbthermal.instruments.camera import (
     SourceLostError,
     Stream,
 )
-from dbthermal.instruments.emulated.port import number, require_known
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.transport import Closing
+from dbthermal.instruments.transport import Closing, parse
 
 Picture = Callable[[float], Counts]
 
@@ -38,13 +36,11 @@ BUFFERS: Final = 32
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
 
-MODELS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = MappingProxyType(
-    {"boson": ("emulated Boson", ()), "y16": ("emulated Y16 camera", ("ffc",))}
+MODELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
+    {"boson": ("emulated Boson", math.inf), "y16": ("emulated Y16 camera", 120.0)}
 )
-"""Kind of camera, as in ``sim://boson/wide``, to its model and to the options of its address."""
-
-FFC_PERIODS: Final = (1.0, math.inf)
-"""Shortest and longest time between corrections that a camera starts by itself [s]."""
+"""Kind of camera, as in ``sim://boson/wide``, to its model, and the time between the flat-field
+corrections that it starts by itself [s]."""
 
 
 @dataclass
@@ -63,7 +59,6 @@ class EmulatedCamera(Closing):
     telemetry_rows: int = 0
     sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
     kind: str = "boson"  # of `MODELS`
-    ffc_period: float = math.inf  # between corrections that the camera starts by itself [s]
 
     is_simulated: Final = True
 
@@ -115,7 +110,7 @@ class EmulatedCamera(Closing):
         """Frame of a number, exposed at a time since the world began [s]."""
         with self.world.lock:
             self._state.frame_count = number
-            if due >= max(self._state.ffc_until, 0.0) + self.ffc_period:
+            if due >= max(self._state.ffc_until, 0.0) + MODELS[self.kind][1]:
                 self.world.start_ffc(self.name)
             frozen = self.world.ffc_in_progress(self.name)
         if not frozen:
@@ -157,17 +152,13 @@ class EmulatedCamera(Closing):
 def open_frames(
     url: str, world: World, pictures: Mapping[str, Picture], band: str | None, stream: Stream
 ) -> EmulatedCamera:
-    """Open ``sim://<kind>/<name>``, a camera of the world; `band` None is behind the wheel.
-
-    The option ``ffc`` of ``sim://y16/<name>?ffc=120`` is `EmulatedCamera.ffc_period` [s].
-    """
-    address = addresses.parse(url, ("sim",))
+    """Open ``sim://<kind>/<name>``, a camera of the world; `band` None is behind the wheel."""
+    address = parse(url, ("sim",))
     if address.target not in MODELS:
         raise ValueError(
             f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
             f"one of {sorted(MODELS)}."
         )
-    require_known(address.options, MODELS[address.target][1])
     return EmulatedCamera(
         world,
         address.name,
@@ -177,5 +168,4 @@ def open_frames(
         stream.frame_rate,
         stream.telemetry_rows,
         kind=address.target,
-        ffc_period=number(address.options, "ffc", math.inf, FFC_PERIODS),
     )

@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.session import Session
+from dbthermal.instruments.transport import parse
 
 POSITIONS: Final = 6  # slots of the wheel, numbered from 1
 ROOM: Final = 296.15  # default temperature of the room [K]
@@ -141,7 +141,7 @@ class World:
         """Put the cameras and thermocouples of an emulated session on the bench."""
         self.thermocouples.update(session.thermocouples)
         for number, camera in enumerate(session.cameras.values()):
-            name = addresses.parse(camera.video.simulated).name
+            name = parse(camera.video.simulated, ("sim",)).name
             self.add_camera(name, SERIAL_NUMBERS + number)
 
     def start_ffc(self, name: str, duration: float = FFC_DURATION) -> None:
