@@ -162,8 +162,8 @@ class Explorer(anywidget.AnyWidget):
         ranges = {name: limit or self._range(name) for name, limit in limits}
         lined = [name for name in names if level is not None and self.view.panes[name].absolute]
         sides = [
-            np.where(schema.measured(one), 1 + (one > level), 0).astype(np.uint8)
-            for one in map(frames.get, lined)
+            np.where(schema.measured(frames[name]), 1 + (frames[name] > level), 0).astype(np.uint8)
+            for name in lined
         ]
         self._state["index"] = asked["index"]
         answer = {"index": asked["index"], "panes": names, "lined": lined}
