@@ -210,15 +210,15 @@ def test_exported_files(tmp_path: Path) -> None:
         _export.save(view, tmp_path / "a.csv", names, 1, {}, celsius=True, limits={})
 
 
-def test_codes_keep_the_values() -> None:
-    """Codes of 16 bits give a frame back within half a step, and 0 for what is no number."""
+def test_codes_are_places_in_a_palette() -> None:
+    """A code gives a value back within half a step of 255, its ends beyond them, 0 no number."""
     frame = np.array([[280.0, 300.5, np.nan], [np.inf, 320.0, 1e30]], dtype=np.float32)
-    codes, low, high = quantised(frame)
-    assert (low, high) == (280.0, 320.0)
+    codes = quantised(frame, 280.0, 320.0)
     assert codes[~schema.measured(frame)].tolist() == [0, 0, 0]
-    back = low + (codes - 1.0) / 65534 * (high - low)
     known = schema.measured(frame)
-    np.testing.assert_allclose(back[known], frame[known], rtol=0, atol=4e-4)  # [K]
+    back = 280.0 + (codes[known] - 0.5) / 255 * 40.0
+    np.testing.assert_allclose(back, frame[known], rtol=0, atol=0.5 * 40 / 255 + 1e-4)  # [K]
+    assert quantised(frame, 290.0, 310.0)[known].tolist() == [1, 134, 255]
 
 
 @pytest.mark.parametrize(
