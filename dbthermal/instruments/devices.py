@@ -41,7 +41,6 @@ FLUSH_TIMEOUT: Final = 2.0
 """Longest time in which the frames that a driver holds are read and discarded [s]."""
 
 WHEEL: Final = "filter_wheel"  # name of the wheel, and of the reading of its slot
-THERMOCOUPLE: Final = "T"  # letter of the rig's thermocouples
 
 
 class ReadingError(RuntimeError):
@@ -228,7 +227,7 @@ def open_devices(
         if world is None:
             world = _emulated("world").emulated_world(session, waits=True)
             if pictures is None:
-                pictures = _emulated("blackbody").pictures(session, world)
+                pictures = _emulated("camera").blackbody_pictures(session, world)
     elif world is not None or pictures:
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:
@@ -275,7 +274,7 @@ def _wheel(session: Session, world: Any) -> FilterWheel:
 def _logger(session: Session, world: Any) -> TC08:
     logger = TC08.from_url(session.url(session.devices["thermocouples"]), world=world)
     try:
-        logger.set_channels(dict.fromkeys(session.thermocouples, THERMOCOUPLE))
+        logger.set_channels(session.thermocouples)
     except BaseException:
         logger.close()
         raise

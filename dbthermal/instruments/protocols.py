@@ -20,8 +20,13 @@ from dbthermal import store
 from dbthermal.instruments.camera import Identity, SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary, record
-from dbthermal.instruments.recording._capture import mean_reading
-from dbthermal.instruments.recording._sweep import BLACKBODY, is_complete, require_filter, step_path
+from dbthermal.instruments.recording._reader import (
+    BLACKBODY,
+    is_complete,
+    mean_reading,
+    require_filter,
+    step_path,
+)
 from dbthermal.instruments.session import Session
 
 __all__ = ["Step", "ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]

@@ -112,5 +112,5 @@ class LoggerBench:
 
     def ready(self) -> TC08:
         """Open the unit with two thermocouples of type T."""
-        self.driver.open().set_channels({1: "T", 2: "T"})
+        self.driver.open().set_channels([1, 2])
         return self.driver

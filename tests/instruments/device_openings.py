@@ -109,7 +109,7 @@ def stub_video(_: ExitStack) -> Opened:
     """The V4L2 driver on a stand-in for the kernel's calls."""
     answers = [(BYTES, GOOD, 1000 * number, number) for number in range(10)]
     kernel = Driver(answers=answers).kernel()
-    return Opened(v4l2.Capture.open("/dev/video0", STREAM, kernel), False)
+    return Opened(v4l2.Capture("/dev/video0", STREAM, kernel), False)
 
 
 def emulated_video(_: ExitStack) -> Opened:

@@ -170,7 +170,7 @@ def test_a_wheel_goes_to_every_slot(opened: Opened) -> None:
 def test_a_logger_reads_a_room(opened: Opened) -> None:
     """Cold junction and tip have temperatures that rooms have; a socket that is off has none."""
     logger: TC08 = opened.device
-    logger.set_channels({1: "T"})
+    logger.set_channels([1])
     scan = logger.single()
     assert 273.0 < scan.temperature[0] < 320.0
     assert 200.0 < scan.temperature[1] < 400.0
@@ -182,7 +182,7 @@ def test_a_logger_reads_a_room(opened: Opened) -> None:
 def test_a_logger_has_eight_sockets(opened: Opened) -> None:
     """Channel 9 raises a ValueError."""
     with pytest.raises(ValueError, match=r"Invalid channel 9\. Must lie in 1 to 8"):
-        opened.device.set_channels({9: "T"})
+        opened.device.set_channels([9])
 
 
 @opens(*VIDEOS)

@@ -23,7 +23,7 @@ from dbthermal.instruments.recording import (
 )
 from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 from dbthermal.instruments.session import Camera, Device, Session
-from dbthermal.store import _durable as durable
+from dbthermal.store import _recording as durable
 
 SHAPE, RATE, CHUNK = (32, 40), 200.0, 6
 BANDS = ("8-14", "9.5")

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from dbthermal import store
-from dbthermal.store import _datasets, _provenance
+from dbthermal.store import _datasets, _results
 
 RECORD: dict[str, Any] = {"parameters": {"frames": 3}, "commit": "unknown", "inputs": {}}
 DTYPES = st.sampled_from(["uint16", "float32", "float64", "int64", "bool"])
@@ -279,8 +279,8 @@ def test_checksum_of_a_folder(tmp_path: Path) -> None:
 
 def test_commit_is_unknown_without_git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A package outside a work tree has no commit."""
-    monkeypatch.setattr(_provenance, "__file__", str(tmp_path / "provenance.py"))
-    assert _provenance.commit() == "unknown"
+    monkeypatch.setattr(_results, "__file__", str(tmp_path / "results.py"))
+    assert _results.commit() == "unknown"
 
 
 def film(*shapes: tuple[int, int]) -> list[np.ndarray]:

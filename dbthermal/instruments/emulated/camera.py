@@ -15,6 +15,9 @@ from typing import Final
 
 import numpy as np
 
+from dbthermal import response as responses
+from dbthermal import simulation
+from dbthermal.bands import FILTERS
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import (
     FRAME_TIMEOUT,
@@ -26,9 +29,11 @@ from dbthermal.instruments.camera import (
     Stream,
 )
 from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Closing, parse
 
 Picture = Callable[[float], Counts]
+NETD: Final = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
 
 BUFFERS: Final = 32
 """Frames that are held while no program reads, as by the V4L2 driver; beyond, they are dropped."""
@@ -169,3 +174,32 @@ def open_frames(
         stream.telemetry_rows,
         kind=address.target,
     )
+
+
+def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
+    """Raw frames, by band, of the world's blackbody as the cameras of a session see it.
+
+    Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise of `NETD`,
+    a fixed pattern (see `dbthermal.simulation.pattern`) and 16 bits. Bands that are not in
+    `dbthermal.bands.FILTERS` get no picture.
+    """
+    names = dict.fromkeys((*session.bands, *session.filters.values()))
+    bands = tuple(name for name in names if name in FILTERS)
+    if not bands:
+        return {}
+    rig = simulation.Rig(bands=bands, noise=(NETD,) * len(bands))
+    detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
+    response = rig.response()
+
+    def of_band(number: int, band: str) -> Picture:
+        curve, pattern = responses.curve(response, band), detector.sel(band=band)
+        noise = float(response["noise"].sel(band=band))
+        rng = np.random.default_rng([0, number])
+
+        def picture(_: float) -> Counts:
+            level = float(curve.counts(np.array(world.blackbody_temperature)))
+            return simulation.digitise(level + rng.normal(0.0, noise, session.shape), pattern)
+
+        return picture
+
+    return {band: of_band(number, band) for number, band in enumerate(bands)}
