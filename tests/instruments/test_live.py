@@ -22,7 +22,7 @@ from dbthermal.instruments import live, telemetry
 from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag, Metadata
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Preview, Reading, Summary, record
-from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.session import Camera, Session
 from dbthermal.separation import Stream
 from dbthermal.simulation import Rig
 
@@ -92,7 +92,7 @@ def recording(path: Path, view: live.View) -> Summary:
         if "plate" in shown.readings and min(one.frames for one in view.status.values()) > 9:
             stop.set()
 
-    camera = Camera(Device("sim://boson/any", "v4l2:///dev/video0"))
+    camera = Camera("v4l2:///dev/video0")
     cameras = dict.fromkeys(BANDS, camera)
     session = Session("test", True, "scene", 60.0, cameras, 100.0, wide.shape, telemetry.ROWS)
     limits = Limits(reserve=0, preview_period=0.0, reading_period=0.05)
