@@ -222,8 +222,8 @@ def record_scene(
     Examples
     --------
     >>> from dbthermal.instruments.devices import open_devices
-    >>> from dbthermal.instruments.session import Camera, Device, Session
-    >>> camera = Camera(Device("sim://boson/wide", "v4l2:///dev/video0"))
+    >>> from dbthermal.instruments.session import Camera, Session
+    >>> camera = Camera("v4l2:///dev/video0")
     >>> session = Session("demo", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
     >>> folder, small = getfixture("tmp_path"), Limits(reserve=0)
     >>> with open_devices(session) as devices:

@@ -225,7 +225,7 @@ def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
         assert devices.world is not None
         world, form = devices.world, (devices.session.shape, 100.0, 2)
         faulty = FaultyCamera(
-            world, "wide", pictures(world), "8-14", *form, faults=Faults(unplugged=3)
+            world, "8-14", pictures(world), "8-14", *form, faults=Faults(unplugged=3)
         )
         devices = replace(devices, sources={**devices.sources, "8-14": faulty})  # noqa: PLW2901
         with pytest.raises(SourceLostError, match=r"plate_00_9\.5\.zarr' ended: source lost"):

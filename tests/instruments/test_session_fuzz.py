@@ -84,7 +84,7 @@ def check(number: int) -> int:
         else:
             assert 0 < session.duration <= 1e6, (deed, key)
             assert all(2 <= size <= 8192 for size in session.shape), (deed, key)
-            hardware = [camera.video.hardware for camera in session.cameras.values()]
+            hardware = [camera.video for camera in session.cameras.values()]
             assert all(url.startswith("v4l2:///dev/") for url in hardware), (deed, key)
     return refused
 

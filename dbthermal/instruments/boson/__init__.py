@@ -278,8 +278,6 @@ def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource
 
 
 def _open_control(url: str, world: object | None) -> Boson:
-    if url.startswith("sim:") and not url.startswith("sim://boson/"):
-        raise ValueError(f"Invalid address '{url}' of a camera. Must be 'sim://boson/<name>'.")
     return Boson.from_url(url, world=world)
 
 

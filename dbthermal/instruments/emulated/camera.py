@@ -30,7 +30,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.session import Session
-from dbthermal.instruments.transport import Closing, parse
+from dbthermal.instruments.transport import Closing
 
 Picture = Callable[[float], Counts]
 NETD: Final = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
@@ -155,25 +155,18 @@ class EmulatedCamera(Closing):
 
 
 def open_frames(
-    url: str, world: World, pictures: Mapping[str, Picture], band: str | None, stream: Stream
+    kind: str,
+    name: str,
+    world: World,
+    pictures: Mapping[str, Picture],
+    band: str | None,
+    stream: Stream,
 ) -> EmulatedCamera:
-    """Open ``sim://<kind>/<name>``, a camera of the world; `band` None is behind the wheel."""
-    address = parse(url, ("sim",))
-    if address.target not in MODELS:
-        raise ValueError(
-            f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
-            f"one of {sorted(MODELS)}."
-        )
-    return EmulatedCamera(
-        world,
-        address.name,
-        pictures,
-        band,
-        stream.shape,
-        stream.frame_rate,
-        stream.telemetry_rows,
-        kind=address.target,
-    )
+    """Frames of a camera of the world, of a kind of `MODELS`; `band` None is behind the wheel."""
+    if kind not in MODELS:
+        raise ValueError(f"Unknown emulated camera '{kind}'. Must be one of {sorted(MODELS)}.")
+    form = stream.shape, stream.frame_rate, stream.telemetry_rows
+    return EmulatedCamera(world, name, pictures, band, *form, kind=kind)
 
 
 def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:

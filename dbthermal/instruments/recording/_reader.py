@@ -53,7 +53,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     Examples
     --------
     >>> from dbthermal.instruments import devices, protocols, recording, session
-    >>> camera = session.Camera(session.Device("sim://boson/wide", "v4l2:///dev/video0"))
+    >>> camera = session.Camera("v4l2:///dev/video0")
     >>> plan = session.Session("pot", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
     >>> path, limits = getfixture("tmp_path") / "pot.zarr", recording.Limits(reserve=0)
     >>> with devices.open_devices(plan) as rig:
