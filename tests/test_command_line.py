@@ -248,7 +248,7 @@ def test_record_names_the_devices(tmp_path: Path) -> None:
     session = ROOT / "params" / "sessions" / "scene.yaml"
     found = run(tmp_path, "record", str(session), "out", "--simulate", "--dry-run")
     assert found.returncode == 0, found.stderr
-    assert "8-14: device sim://boson/wide" in found.stdout
+    assert "8-14: device sim://boson/8-14" in found.stdout
     assert not (tmp_path / "out").exists()
 
 

@@ -6,11 +6,14 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import chi2
 
 from dbthermal._arrays import Array, Mask
 
 Kind = Literal["rectangle", "ellipse", "polygon"]
 
+_LEAST_PAIRS: Final = 12  # of neighbours, that tell what they share
+_MOST_OWN: Final = 2.0  # of a variance
 _LEAST: Final = {"rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
 
 
@@ -90,23 +93,45 @@ def _inside(corners: Array, rows: Array, columns: Array) -> Mask:
     return odd
 
 
-def common_gain(emissivity: Array, covariance: Array) -> tuple[Array, Array]:
-    r"""Deviation of object and background (pixel) by the emissivities, for a contrast of 1 K [1].
+def common_gain(emissivity: Array, covariance: Array) -> Array:
+    r"""Shared deviation of object and background (2, y, x) by emissivities, a contrast of 1 K [1].
 
     The image formation :math:`e_b x + (1 - e_b) y`, in linearised kelvin, is kept by errors
-    :math:`\delta e` of the emissivities (band, pixel), of a covariance (band, band, pixel), if
+    :math:`\delta e` of the emissivities (band, y, x), of a covariance (band, band, y, x), if
 
     .. math:: e_b\,\delta x + (1 - e_b)\,\delta y = -(x - y)\,\delta e_b
 
-    which two bands solve exactly and more by least squares. NaN where the emissivities are.
+    which two bands solve exactly and more by least squares, :math:`\delta x = -(x - y)\,g\,
+    \delta e` of variance :math:`v`. What each pixel errs alone parts neighbours i, j, what they
+    share does not: the share :math:`\rho` of the former is in the median over the region, of
+    normal errors,
+
+    .. math:: \operatorname{med} (g e_i - g e_j)^2 / (v_i + v_j) = 0.455 \rho
+
+    which is 0 for pooled or stated emissivities. It is not known, and 0, of few pairs, and of a
+    material that differs from pixel to pixel by more than the deviations allow. Gains are NaN where
+    the emissivities are.
     """
     known = np.isfinite(emissivity).all(axis=0) & np.isfinite(covariance).all(axis=(0, 1))
-    system = np.stack([emissivity, 1.0 - emissivity], axis=-1)[:, known]  # (band, pixel, 2)
-    gain = np.linalg.pinv(np.moveaxis(system, 1, 0))  # (pixel, 2, band)
-    variance = np.einsum("pib,bcp,pic->ip", gain, covariance[..., known], gain)
-    result = np.full((2, emissivity.shape[1]), np.nan)
-    result[:, known] = np.sqrt(np.maximum(variance, 0.0))
-    return result[0], result[1]
+    apart = np.linspace(0.4, 0.6, len(emissivity))[:, np.newaxis, np.newaxis]
+    value = np.where(known, emissivity, apart)
+    system = np.moveaxis(np.stack([value, 1.0 - value], axis=-1), 0, 2)  # (y, x, band, 2)
+    inverse = np.linalg.pinv(system)  # (y, x, 2, band)
+    variance = np.einsum("yxib,bcyx,yxic->iyx", inverse, covariance, inverse)
+    variance = np.where(known, np.maximum(variance, 0.0), np.nan)
+    ratios = []
+    for axis in (0, 1):
+        first, second = np.delete(inverse, -1, axis), np.delete(inverse, 0, axis)
+        step = np.einsum("yxib,byx->iyx", first + second, np.diff(value, axis=1 + axis)) / 2.0
+        total = np.delete(variance, -1, 1 + axis) + np.delete(variance, 0, 1 + axis)
+        ratios.append(np.reshape(step**2 / total, (2, -1)))
+    pairs = np.concatenate(ratios, axis=1)
+    pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
+    own = np.zeros(2)
+    if pairs.shape[1] >= _LEAST_PAIRS:
+        own = np.median(pairs, axis=1) / chi2.median(1)
+    shared = np.where(own < _MOST_OWN, 1.0 - np.minimum(own, 1.0), 1.0)
+    return np.asarray(np.sqrt(shared[:, np.newaxis, np.newaxis] * variance))
 
 
 def mean_std(std: Array, common: Array) -> Array:

@@ -262,9 +262,9 @@ class View:
         r"""Mean, least and greatest value of a region over time, with the deviation of the mean.
 
         An error that all pixels share is not lessened by their number (`std`): of object and
-        reflected temperature what the emissivities' deviations give through the image formation; of
-        emissivities, completed pixels and pixels of cameras that stand apart, all of it. What
-        remains is the noise of each pixel and frame,
+        reflected temperature what the emissivities' deviations give through the image formation,
+        less the part by which neighbours differ; of emissivities, completed pixels and pixels of
+        cameras that stand apart, all of it. What remains each pixel errs alone,
 
         .. math:: s^2 = \left(\frac1n \sum_i c_i\right)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
 
@@ -293,6 +293,10 @@ class View:
         -----
         In no deviation are the calibration of the cameras, and what interpolation between pixels
         makes neighbours share.
+
+        The reflected temperature's is mostly the prior of its own drift
+        (`SubspaceSettings.background_drift`), which all pixels share: where nothing drifts, the
+        mean is much closer.
         """
         pane, inside = self.pane(name), region.mask(self.shape)
         if pane.kind == "status":
@@ -323,15 +327,16 @@ class View:
         needed = {*FILMS, "emissivity", "emissivity_std"}
         if pane.name not in FILMS or apart or not needed <= set(data):
             return None
-        cut = data[["emissivity", "emissivity_std"]].isel(y=rows, x=columns)
+        cut = data[[name for name in data if str(name).startswith("emissivity")]]
+        cut = cut.isel(y=rows, x=columns)
         if "emissivity_covariance" in data:
-            covariance = data["emissivity_covariance"].isel(y=rows, x=columns).values[..., where]
+            covariance = cut["emissivity_covariance"].values
         else:
-            variance = cut["emissivity_std"].values[:, where] ** 2
-            covariance = np.eye(len(variance))[..., None] * variance
-        gains = common_gain(cut["emissivity"].values[:, where], covariance)
-        completed = ((self.status[box] & COMPLETED) != 0)[where]
-        return np.where(completed, np.nan, gains[list(FILMS).index(pane.name)])
+            variance = cut["emissivity_std"].values ** 2
+            covariance = np.eye(len(variance))[..., None, None] * variance
+        measured = where & ((self.status[box] & COMPLETED) == 0)
+        gains = common_gain(np.where(measured, cut["emissivity"].values, np.nan), covariance)
+        return np.asarray(gains[list(FILMS).index(pane.name)][where])
 
     def _part(
         self, pane: Pane, frames: slice, box: tuple[slice, ...], where: Mask, gain: Array | None

@@ -21,24 +21,16 @@ from dbthermal.explorer._view import COMPLETED, FILMS, View
 from dbthermal.figures import drawing
 
 PALETTES: Final = ("inferno", "cividis", "gray")
-_LEVELS: Final = 65534.0
 _DPI: Final = 80
 _HERE: Final = Path(__file__).parent
 _REFUSED: Final = (ArithmeticError, LookupError, MemoryError, OSError, TypeError, ValueError)
 
 
-def quantised(values: Values) -> tuple[npt.NDArray[np.uint16], float, float]:
-    """Values as 1 to 65535 from the least to the greatest, 0 without one; and these two."""
-    known = schema.measured(values)
-    if not known.any():
-        return np.zeros(values.shape, np.uint16), 0.0, 1.0
-    low = float(values.min(where=known, initial=np.inf))
-    high = float(values.max(where=known, initial=-np.inf))
-    high = high if high > low else low + 1.0
+def quantised(values: Values, low: float, high: float) -> npt.NDArray[np.uint8]:
+    """Places in a palette: 1 to 255 from the low end of a range to the high one, 0 without one."""
     with np.errstate(invalid="ignore", over="ignore"):
-        codes = (values - np.float32(low)) * np.float32(_LEVELS / (high - low)) + np.float32(1.5)
-        codes = np.clip(codes, 1.0, 65535.0)
-    return np.where(known, codes, 0.0).astype(np.uint16), low, high
+        codes = (values - np.float32(low)) * np.float32(255.0 / (high - low)) + np.float32(1.0)
+    return np.where(schema.measured(values), np.clip(codes, 1.0, 255.0), 0.0).astype(np.uint8)
 
 
 class Explorer(anywidget.AnyWidget):
@@ -163,17 +155,20 @@ class Explorer(anywidget.AnyWidget):
         }, [classes.astype(np.uint8), codes, *palettes]
 
     def _answer_frames(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
-        """Answer panes at a frame."""
-        names = asked["panes"]
-        parts = [quantised(self.view.frame(name, asked["index"])) for name in names]
-        scales = [
-            (low, high, *self._range(name))
-            for name, (_, low, high) in zip(names, parts, strict=True)
+        """Answer panes at a frame, and on which side of an isotherm their pixels are."""
+        names, level = asked["panes"], asked["isotherm"]
+        frames = {name: self.view.frame(name, asked["index"]) for name in names}
+        limits = zip(names, asked["limits"], strict=True)
+        ranges = {name: limit or self._range(name) for name, limit in limits}
+        lined = [name for name in names if level is not None and self.view.panes[name].absolute]
+        sides = [
+            np.where(schema.measured(frames[name]), 1 + (frames[name] > level), 0).astype(np.uint8)
+            for name in lined
         ]
         self._state["index"] = asked["index"]
-        return {"index": asked["index"], "panes": names, "scales": scales}, [
-            one[0] for one in parts
-        ]
+        answer = {"index": asked["index"], "panes": names, "lined": lined}
+        codes = [quantised(frames[name], *ranges[name]) for name in names]
+        return {**answer, "ranges": [*ranges.values()]}, [*codes, *sides]
 
     def _answer_probe(self, asked: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer values and flags of a pixel."""

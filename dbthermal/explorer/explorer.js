@@ -44,13 +44,13 @@ class Link {
   }
 }
 
-function isotherm(codes, width, level, place) {
-  // Edges between pixels of which one is above the level and the other one is not.
+function isotherm(sides, width, place) {
+  // Edges between pixels of which one is above the level (2) and the other one is not (1); 0 without a value.
   const path = new Path2D();
-  codes.forEach((code, at) => {
+  sides.forEach((side, at) => {
     const [row, column] = [Math.floor(at / width), at % width];
     for (const [next, from] of [[at + 1, [column + 1, row]], [at + width, [column, row + 1]]]) {
-      if (!code || !codes[next] || code > level === codes[next] > level || (next === at + 1 && column + 1 === width)) continue;
+      if (!side || !sides[next] || side === sides[next] || (next === at + 1 && column + 1 === width)) continue;
       path.moveTo(...place(...from));
       path.lineTo(...place(column + 1, row + 1));
     }
@@ -98,7 +98,7 @@ function hatch(kind, size) {
 
 class Picture {
   constructor(explorer, pane) {
-    Object.assign(this, { explorer, pane, codes: null, limits: null, own: null, table: new Uint32Array(65536) });
+    Object.assign(this, { explorer, pane, codes: null, limits: null, sides: null });
     this.box = make(null, "div", "dbt-picture");
     this.title = make(this.box, "button", "dbt-title", { type: "button", textContent: capital(pane.label), title: "plot the curves of this" });
     this.title.onclick = () => explorer.choose(pane);
@@ -123,39 +123,35 @@ class Picture {
     const number = (place, title) => make(this.foot, "input", "dbt-number", {
       type: "number", step: "any", title, ariaLabel: `${this.pane.label}: ${title}`,
       onchange: ({ target }) => {
-        const limits = this.limits.with(place, parseFloat(target.value) + this.explorer.offset(this.pane));
-        if (limits[0] < limits[1]) this.limits = limits;
-        this.paint();
+        const limits = this.range.with(place, parseFloat(target.value) + this.explorer.offset(this.pane));
+        this.rescale(limits[0] < limits[1] ? limits : this.limits);
       },
     });
     this.low = number(0, "colour range begins");
     this.bar = make(this.foot, "canvas", "dbt-bar", { width: 256, height: 1 });
     this.high = number(1, "colour range ends");
     this.unit = make(this.foot, "span");
-    const auto = () => { this.limits = this.own; this.paint(); };
-    make(this.foot, "button", "dbt-button", { type: "button", textContent: "auto", title: "range of the whole film", onclick: auto });
+    make(this.foot, "button", "dbt-button", { type: "button", textContent: "auto", title: "range of the whole film", onclick: () => this.rescale(null) });
   }
-  take(codes, [low, high, from, to]) {
-    Object.assign(this, { codes, scale: [low, high], own: [from, to] });
-    this.limits ??= this.own;
+  rescale(limits) {
+    Object.assign(this, { limits, codes: null });
+    this.explorer.goTo(this.explorer.index);
+  }
+  take(codes, range, sides) {
+    Object.assign(this, { codes, range, sides });
     this.paint();
   }
   paint() {
     if (!this.codes) return;
-    const { explorer, colors, codes, table } = this;
-    const hidden = explorer.hidden;
-    if (this.pane.kind === "status") table.set(explorer.statusColors);
-    else this.paintScale(explorer.palettes[explorer.palette]);
-    for (let at = 0; at < colors.length; at++) colors[at] = hidden[at] && this.pane.kind !== "status" ? 0 : table[codes[at]];
+    const { explorer, pane, colors, codes } = this;
+    const [hidden, table] = pane.kind === "status" ? [new Uint8Array(codes.length), explorer.statusColors] : [explorer.hidden, explorer.palettes[explorer.palette]];
+    for (let at = 0; at < colors.length; at++) colors[at] = hidden[at] ? 0 : table[codes[at]];
+    if (pane.kind !== "status") this.paintScale(table);
     this.image.putImageData(this.pixels, 0, 0);
     explorer.redraw([this]);
   }
   paintScale(palette) {
-    const { explorer, pane, table, limits: [from, to], scale: [low, high] } = this;
-    for (let code = 1; code < 65536; code++) {
-      const value = low + ((code - 1) / 65534) * (high - low);
-      table[code] = palette[clamp(Math.floor((256 * (value - from)) / (to - from)), 0, 255)];
-    }
+    const { explorer, pane, range: [from, to] } = this;
     const bar = new ImageData(256, 1);
     new Uint32Array(bar.data.buffer).set(palette);
     this.bar.getContext("2d").putImageData(bar, 0, 0);
@@ -175,10 +171,7 @@ class Picture {
     context.fillRect(0, 0, width, height);
     context.drawImage(this.image.canvas, ...place(0, 0), shape[1] * size, shape[0] * size);
     if (pane.kind !== "status") context.drawImage(explorer.hatching(width, height, size), 0, 0);
-    if (explorer.isotherm !== null && pane.absolute && this.codes) {
-      const share = (explorer.isotherm + explorer.offset(pane) - this.scale[0]) / (this.scale[1] - this.scale[0]);
-      stroke(context, isotherm(this.codes, shape[1], 1 + 65534 * share, place), ["black", 3], ["#7fffd4", 1.5]);
-    }
+    if (this.sides) stroke(context, isotherm(this.sides, shape[1], place), ["black", 3], ["#7fffd4", 1.5]);
     for (const [, region, color] of explorer.shownRegions()) stroke(context, outline(region, place), ["white", 4], [color, 2]);
     if (cursor) {
       const [across, down] = place(cursor[1] + 0.5, cursor[0] + 0.5);
@@ -222,7 +215,8 @@ class Explorer {
     ({
       start: () => this.panes || this.build(message, copy),
       frames: () => {
-        message.panes.forEach((name, i) => this.pictures.get(name).take(copy(i, Uint16Array), message.scales[i]));
+        const sides = (name) => (message.lined.includes(name) ? bytes(message.panes.length + message.lined.indexOf(name)) : null);
+        message.panes.forEach((name, i) => this.pictures.get(name).take(bytes(i), message.ranges[i], sides(name)));
         this.shownIndex = message.index;
       },
       probe: () => { this.probed = message.values; },
@@ -245,7 +239,7 @@ class Explorer {
   // The page
   build({ regions, palettes, ...setup }, copy) {
     Object.assign(this, setup, { paletteNames: palettes, classes: copy(0, Uint8Array) });
-    this.palettes = palettes.map((_, i) => copy(2 + i, Uint32Array));
+    this.palettes = palettes.map((_, i) => copy(2 + i, Uint32Array).fill(0, 0, 1)); // 0 is no value
     this.statusColors = setup.legend.map(([, color]) => parseInt(`ff${color.slice(5)}${color.slice(3, 5)}${color.slice(1, 3)}`, 16));
     for (const [name, kind, points] of regions) this.regions.set(name, { kind, points });
     this.number = regions.length + 1;
@@ -346,7 +340,7 @@ class Explorer {
       if (!this.pictures.has(name)) this.pictures.set(name, new Picture(this, this.panes.find((pane) => pane.name === name)));
       return this.pictures.get(name).box;
     }));
-    if (statusCodes) this.pictures.get("status")?.take(statusCodes, [0, 1, 0, 1]);
+    if (statusCodes) this.pictures.get("status")?.take(statusCodes);
     this.goTo(this.index);
   }
   showText(value) {
@@ -360,7 +354,9 @@ class Explorer {
   goTo(index) {
     this.index = this.slider.value = clamp(index, 0, this.time.length - 1);
     const panes = this.shown.filter((name) => this.pictures.get(name).pane.kind === "film" || !this.pictures.get(name).codes);
-    this.link.ask("frames", { index: this.index, panes });
+    const limits = panes.map((name) => this.pictures.get(name).limits);
+    const isotherm = this.isotherm === null ? null : this.isotherm + (this.celsius ? ZERO_CELSIUS : 0);
+    this.link.ask("frames", { index: this.index, panes, limits, isotherm });
     this.askProbe();
   }
   askProbe() {
@@ -372,7 +368,7 @@ class Explorer {
     this.link.ask("curves", { pane: this.chosen, pixels: this.counted(), regions });
   }
   askFor(kind, more = {}) {
-    const limits = Object.fromEntries([...this.pictures].filter(([name, one]) => one.limits && name !== "status").map(([name, one]) => [name, one.limits]));
+    const limits = Object.fromEntries([...this.pictures].filter(([name, one]) => one.range && name !== "status").map(([name, one]) => [name, one.range]));
     const panes = [this.chosen, ...this.shown.filter((name) => name !== this.chosen)];
     this.link.ask(kind, { panes, index: this.index, pixels: this.counted(), celsius: this.celsius, palette: this.paletteNames[this.palette], limits, ...more });
   }
@@ -389,7 +385,7 @@ class Explorer {
   setIsotherm(value) {
     this.isotherm = value;
     this.level.value = value === null ? "" : +value.toFixed(2);
-    this.redraw();
+    this.goTo(this.index);
   }
   play() {
     const starts = !this.player;

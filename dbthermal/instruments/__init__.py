@@ -3,12 +3,12 @@
 Begin with a `session`, a YAML file of the recording and its devices' addresses; `devices` opens
 them, `protocols` records a scene or a blackbody sweep, `live` shows it meanwhile, and `recording`
 opens it again. `inventory` lists what is on the USB bus. Below are the drivers: `boson` over
-`fslp`, `filterwheel` over `apt`, and `tc08`; `camera` is the interface of any camera, and
-`thermocouple` converts type T. Imported by name are ``v4l2`` (frames), ``telemetry``, ``transport``
-(serial lines), ``signals`` and ``emulated``: devices behind ``sim://`` addresses, below the same
-drivers; `_addresses` has the rules of all addresses. The drivers were written from public
-descriptions and tested against public byte vectors and emulators, never against hardware. They need
-the packages of ``dbthermal[instruments]``.
+`fslp`, `filterwheel` over `_controller` and `apt`, and `tc08`; `camera` is the interface of any
+camera, and `thermocouple` converts type T. Imported by name are ``v4l2`` (frames), ``telemetry``,
+``transport`` (addresses, serial lines), ``signals`` and ``emulated``: devices behind ``sim://``
+addresses, below the same drivers. The drivers were written from public descriptions and tested
+against public byte vectors and emulators, never against hardware. They need the packages of
+``dbthermal[instruments]``.
 """
 
 import importlib

@@ -10,11 +10,10 @@ import threading
 import time as system_time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
-from dbthermal.instruments import filterwheel
 from dbthermal.instruments.camera import (
     FFC_READING,
     FPA_READING,
@@ -42,7 +41,6 @@ FLUSH_TIMEOUT: Final = 2.0
 """Longest time in which the frames that a driver holds are read and discarded [s]."""
 
 WHEEL: Final = "filter_wheel"  # name of the wheel, and of the reading of its slot
-THERMOCOUPLE: Final = "T"  # letter of the rig's thermocouples
 
 
 class ReadingError(RuntimeError):
@@ -217,10 +215,9 @@ def open_devices(
 
     Examples
     --------
-    >>> from dbthermal.instruments.session import Camera, Device, Session
-    >>> port = Device("sim://boson/wide", "serial:///dev/ttyACM0")
-    >>> video = Device("sim://boson/wide", "v4l2:///dev/video0")
-    >>> session = Session("pot", True, "scene", 60.0, {"8-14": Camera(video, port)})
+    >>> from dbthermal.instruments.session import Camera, Session
+    >>> camera = Camera("v4l2:///dev/video0", "serial:///dev/ttyACM0")
+    >>> session = Session("pot", True, "scene", 60.0, {"8-14": camera})
     >>> with open_devices(session) as devices:
     ...     devices.identities()["8-14"]["model"], devices.readings()["fpa 8-14"].read()  # K
     ('emulated Boson', 308.15)
@@ -229,7 +226,7 @@ def open_devices(
         if world is None:
             world = _emulated("world").emulated_world(session, waits=True)
             if pictures is None:
-                pictures = _emulated("blackbody").pictures(session, world)
+                pictures = _emulated("camera").blackbody_pictures(session, world)
     elif world is not None or pictures:
         raise ValueError(f"Invalid world for the hardware of '{session.name}'. Must be None.")
     with ExitStack() as stack:
@@ -239,8 +236,8 @@ def open_devices(
             sources[band] = stack.enter_context(_frames(session, band, world, pictures or {}))
             open_control = camera_kind(camera.kind).open_control
             if camera.control is not None and open_control is not None:
-                control = open_control(session.url(camera.control), world)
-                cameras[band] = stack.enter_context(control)
+                url = f"sim://{camera.kind}/{band}" if session.simulated else camera.control
+                cameras[band] = stack.enter_context(open_control(url, world))
         wheel = stack.enter_context(_wheel(session, world)) if session.filters else None
         logger = stack.enter_context(_logger(session, world)) if session.thermocouples else None
         scans = None if logger is None else Thermocouples(logger, session.thermocouples)
@@ -257,27 +254,26 @@ def _frames(
 ) -> AbstractContextManager[FrameSource]:
     """Open the frames of a band's camera."""
     camera = session.cameras[band]
-    kind, url = camera_kind(camera.kind), session.url(camera.video)
     stream = Stream(session.shape, session.frame_rate, session.telemetry_rows)
     if world is None:
-        return kind.open_frames(url, stream)
+        return camera_kind(camera.kind).open_frames(camera.video, stream)
     unfiltered = None if band == session.filtered else band
     source: AbstractContextManager[FrameSource] = _emulated("camera").open_frames(
-        url, world, pictures, unfiltered, stream
+        camera.kind, band, world, pictures, unfiltered, stream
     )
     return source
 
 
 def _wheel(session: Session, world: Any) -> FilterWheel:
-    chosen = {entry.name: getattr(session.wheel, entry.name) for entry in fields(session.wheel)}
-    settings = filterwheel.Settings(**{**chosen, "filters": session.filters})
-    return FilterWheel.from_url(session.url(session.devices[WHEEL]), settings, world=world)
+    url = "sim://apt" if session.simulated else session.devices[WHEEL]
+    return FilterWheel.from_url(url, session.filters, session.wheel, world=world)
 
 
 def _logger(session: Session, world: Any) -> TC08:
-    logger = TC08.from_url(session.url(session.devices["thermocouples"]), world=world)
+    url = "sim://tc08" if session.simulated else session.devices["thermocouples"]
+    logger = TC08.from_url(url, world=world)
     try:
-        logger.set_channels(dict.fromkeys(session.thermocouples, THERMOCOUPLE))
+        logger.set_channels(session.thermocouples)
     except BaseException:
         logger.close()
         raise

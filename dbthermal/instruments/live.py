@@ -15,7 +15,7 @@ import io
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import xarray as xr
@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does
     from dbthermal.figures import LiveFigure, Panel
     from dbthermal.separation import Stream
 
-__all__ = ["Display", "Picture", "Separation", "Status", "View", "Watch"]
+__all__ = ["Picture", "Separation", "Status", "View", "Watch"]
 __dir__ = __all__.copy
 
 _WINDOW: Final = 3.0  # time over which a frame rate is measured [s]
@@ -100,12 +100,9 @@ def _at(share: float, counts: int, meaning: str) -> str:
 
 
 class Watch:
-    """Numbers of a recording, from its previews; `window` is the one of its rates [s]."""
+    """Numbers of a recording, from its previews."""
 
-    def __init__(self, window: float = _WINDOW) -> None:
-        if not 0 < window < math.inf:
-            raise ValueError(f"Invalid window {window} s. Must be positive.")
-        self._window = window
+    def __init__(self) -> None:
         self._last: Preview | None = None
         self._past: deque[tuple[float, dict[str, tuple[int, float]]]] = deque()
         self._ffc_seen: dict[str, float] = {}
@@ -125,7 +122,7 @@ class Watch:
             for band, frame in preview.frames.items()
         }
         self._past.append((preview.time, marks))
-        while len(self._past) > 1 and self._past[1][0] <= preview.time - self._window:
+        while len(self._past) > 1 and self._past[1][0] <= preview.time - _WINDOW:
             self._past.popleft()
         return before is None
 
@@ -154,7 +151,7 @@ class Watch:
         (before, start), (now, stop) = marks[0], marks[-1]
         if stop > start:
             return (now - before) / (stop - start)
-        is_old = self._past[-1][0] - self._past[0][0] >= self._window
+        is_old = self._past[-1][0] - self._past[0][0] >= _WINDOW
         return 0.0 if is_old else math.nan
 
 
@@ -209,14 +206,6 @@ def _levels(frame: Frame | None) -> dict[str, Any]:
     }
 
 
-class Display(Protocol):
-    """Display of a picture, such as IPython's ``DisplayHandle``: shown first, then replaced."""
-
-    def display(self, obj: Any, /) -> Any: ...  # noqa: D102
-
-    def update(self, obj: Any, /) -> Any: ...  # noqa: D102
-
-
 @dataclass(frozen=True, eq=False)
 class Picture:
     """Picture for a notebook (PNG) with the same in words for a terminal."""
@@ -260,10 +249,10 @@ class Separation:
 class View:
     """Live view: an instance is the `preview` of a recording, or of several.
 
-    It is shown on a `display`; without one the figure is only kept. An update of two bands of 640 x
-    512 takes a tenth of a second of one core. `title` is the recording's name, `period` the least
-    time from update to update, `window` that over which frame rates are measured [s].
-    With a `separation` it shows temperatures as well.
+    It is shown on a `display`, such as IPython's ``DisplayHandle``, first by its ``display``, then
+    by its ``update``; without one the figure is only kept. An update, once a second at most, of two
+    bands of 640 x 512 takes a tenth of a second of one core. `title` is the recording's name. With
+    a `separation` it shows temperatures as well.
 
     Examples
     --------
@@ -274,19 +263,15 @@ class View:
 
     def __init__(
         self,
-        display: Display | None = None,
+        display: Any = None,
         *,
         is_simulated: bool,
         title: str = "recording",
-        period: float = _PERIOD,
-        window: float = _WINDOW,
         separation: Separation | None = None,
     ) -> None:
-        if not 0 <= period < math.inf:
-            raise ValueError(f"Invalid period {period} s. Must be 0 or more.")
-        self._display, self._period = display, period
+        self._display = display
         self._title = f"{title} (emulated)" if is_simulated else title
-        self._watch = Watch(window)
+        self._watch = Watch()
         self._separation = separation
         self._separated: xr.Dataset | None = None
         self._drawn: LiveFigure | None = None
@@ -309,7 +294,7 @@ class View:
         if self._separation is not None:
             self._separated = self._separation(preview)
         # Nothing is drawn before the first frame: only a frame knows the size of a picture.
-        if preview.frames and preview.time - self._time >= self._period:
+        if preview.frames and preview.time - self._time >= _PERIOD:
             self._time = preview.time
             self._show(preview)
 

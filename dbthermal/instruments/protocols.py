@@ -20,8 +20,13 @@ from dbthermal import store
 from dbthermal.instruments.camera import Identity, SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary, record
-from dbthermal.instruments.recording._capture import mean_reading
-from dbthermal.instruments.recording._sweep import BLACKBODY, is_complete, require_filter, step_path
+from dbthermal.instruments.recording._reader import (
+    BLACKBODY,
+    is_complete,
+    mean_reading,
+    require_filter,
+    step_path,
+)
 from dbthermal.instruments.session import Session
 
 __all__ = ["Step", "ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
@@ -217,8 +222,8 @@ def record_scene(
     Examples
     --------
     >>> from dbthermal.instruments.devices import open_devices
-    >>> from dbthermal.instruments.session import Camera, Device, Session
-    >>> camera = Camera(Device("sim://boson/wide", "v4l2:///dev/video0"))
+    >>> from dbthermal.instruments.session import Camera, Session
+    >>> camera = Camera("v4l2:///dev/video0")
     >>> session = Session("demo", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
     >>> folder, small = getfixture("tmp_path"), Limits(reserve=0)
     >>> with open_devices(session) as devices:

@@ -1,6 +1,6 @@
 """A recording session: cameras, wheel, thermocouples and procedure, described in one YAML file.
 
-One key, ``simulated``, switches the whole rig; every device has an address for either case::
+Every device has its address; one key, ``simulated``, puts emulated ones in the place of all::
 
     name: plate
     simulated: true
@@ -11,14 +11,14 @@ One key, ``simulated``, switches the whole rig; every device has an address for 
     telemetry_rows: 2
     cameras:
       "8-14":
-        video: {simulated: "sim://boson/wide", hardware: "v4l2:///dev/video0"}
-        control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
+        video: v4l2:///dev/video0
+        control: serial:///dev/ttyACM0
       "9.5":
         kind: boson            # of dbthermal.instruments.camera.KINDS; boson by default
-        video: {simulated: "sim://boson/narrow", hardware: "v4l2:///dev/video2"}
+        video: v4l2:///dev/video2
     devices:                   # whatever else is connected
-      filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
-      thermocouples: {simulated: "sim://tc08", hardware: "tc08:"}
+      filter_wheel: serial:///dev/ttyUSB0
+      thermocouples: "tc08:"
     filters: {1: "9.5", 2: "11"}
     wheel: {home_offset: 12.5} # settings of this wheel, if it has any
     sweep: ["9.5", "11"]       # filters that the wheel goes through at each temperature
@@ -46,20 +46,21 @@ from pydantic import (
     StrictBool,
     TypeAdapter,
     ValidationError,
-    field_validator,
 )
 from pydantic.dataclasses import dataclass
 
 from dbthermal import _text as texts
-from dbthermal.instruments import _addresses as addresses
-from dbthermal.instruments import filterwheel, telemetry
+from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import FFC_READING, FPA_READING, camera_kind
+from dbthermal.instruments.filterwheel import Settings
+from dbthermal.instruments.transport import parse
 
-__all__ = ["Blackbody", "Camera", "Device", "Session", "Wheel"]
+__all__ = ["Blackbody", "Camera", "Session"]
 __dir__ = __all__.copy
 
 _CHECKED: Final = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
+_SCHEMES: Final = {"filter_wheel": "serial", "thermocouples": "tc08"}  # of their addresses
 BLACKBODY: Final = "blackbody"  # name of its thermocouple
 
 
@@ -85,26 +86,9 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=
 Label = Annotated[str, Field(min_length=1, max_length=64), _by(_check_printable)]
 Slot = Annotated[int, Field(strict=True, ge=1, le=6)]
 Channel = Annotated[int, Field(strict=True, ge=1, le=8)]
-Byte = Annotated[int, Field(strict=True, ge=0, le=255)]
 DeviceName = Literal["filter_wheel", "thermocouples"]
-
-
-@dataclass(frozen=True, config=_CHECKED)
-class Device:
-    """Addresses of one device, such as ``"sim://boson/wide"`` and ``"serial:///dev/ttyACM0"``.
-
-    Attributes
-    ----------
-    simulated, hardware : str
-        Addresses.
-    """
-
-    simulated: Annotated[str, _by(partial(addresses.parse, schemes=("sim", "pty")))]
-    hardware: Annotated[str, _by(partial(addresses.parse, schemes=("v4l2", "serial", "tc08")))]
-
-
-def _check_schemes(name: str, device: Device) -> None:
-    addresses.check_schemes(name, device.simulated, device.hardware)
+Video = Annotated[str, _by(partial(parse, schemes=("v4l2",)))]
+Port = Annotated[str, _by(partial(parse, schemes=("serial",)))]
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -113,30 +97,20 @@ class Camera:
 
     Attributes
     ----------
-    video, control : Device
-        Addresses of its frames, and of its command port, if it has one.
+    video, control : str
+        Addresses of its frames, ``"v4l2:///dev/video0"``, and of its command port, if it has one,
+        ``"serial:///dev/ttyACM0"``.
     kind : str
-        One of `dbthermal.instruments.camera.KINDS`, that of its simulated address.
+        One of `dbthermal.instruments.camera.KINDS`.
     """
 
-    video: Annotated[Device, _by(partial(_check_schemes, "video"))]
-    control: Annotated[Device, _by(partial(_check_schemes, "control"))] | None = None
+    video: Video
+    control: Port | None = None
     kind: str = "boson"
 
     def __post_init__(self) -> None:
-        kind, simulated = camera_kind(self.kind), self.video.simulated
-        if not simulated.startswith(f"sim://{self.kind}/"):
-            rule = f"Must be the kind in its simulated address '{simulated}'"
-            form = f"that of a {self.kind} is sim://{self.kind}/<name>"
-            raise ValueError(f"Invalid kind '{self.kind}'. {rule}: {form}")
-        if self.control is None:
-            return
-        if kind.open_control is None:
+        if camera_kind(self.kind).open_control is None and self.control is not None:
             raise ValueError(f"Invalid control of kind '{self.kind}', which has none")
-        url, video = addresses.parse(self.control.simulated), addresses.parse(simulated)
-        if url.scheme == "sim" and url[:3] != video[:3]:
-            rule = "Must be the same camera"
-            raise ValueError(f"Invalid control '{self.control.simulated}' of '{simulated}'. {rule}")
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -166,27 +140,6 @@ class Blackbody:
 
 
 @dataclass(frozen=True, config=_CHECKED)
-class Wheel(filterwheel.Settings):
-    """Settings of the wheel but its filters, see `dbthermal.instruments.filterwheel.Settings`.
-
-    Attributes
-    ----------
-    filters, addresses : mapping, tuple
-        Empty: those of the session are taken; as in `Settings`.
-    """
-
-    filters: Mapping[int, str] = field(default_factory=dict, init=False)
-    addresses: tuple[tuple[Byte, Byte], ...] = filterwheel.Settings.addresses
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _check_number(cls, value: Any) -> Any:
-        if isinstance(value, bool | str):
-            raise ValueError("Must be a number")
-        return value
-
-
-@dataclass(frozen=True, config=_CHECKED)
 class Session:
     """Description of a recording: devices, procedure and duration; see the module.
 
@@ -197,17 +150,17 @@ class Session:
     name : str
         Name, of the recordings too.
     simulated : bool
-        One switch for all devices.
+        One switch for all devices: True emulates them.
     protocol : str
         ``"gain_offset"``, ``"response"``, ``"emissivity_bench"``, which go through the blackbody's
         temperatures, or ``"scene"``.
     duration, frame_rate : float
         Duration of the recording, or of each of its steps [s]; frame rate [Hz].
     cameras, devices : dict
-        Cameras by band, in the order of the recording; other devices by name.
+        Cameras by band, in the order of the recording; addresses of other devices by name.
     shape, telemetry_rows : tuple of int, int
         Rows and columns; rows of telemetry in a frame, 0 or 2.
-    filters, wheel, sweep : dict of int to str, Wheel, tuple of str
+    filters, wheel, sweep : dict of int to str, filterwheel.Settings, tuple of str
         Slot of the wheel to band; its settings; filters at each temperature, see `swept`.
     thermocouples : dict of int to str
         Channel to measured object.
@@ -216,8 +169,7 @@ class Session:
 
     Examples
     --------
-    >>> video = Device("sim://boson/wide", "v4l2:///dev/video0")
-    >>> Session("pot", True, "scene", 60.0, {"8-14": Camera(video)}).bands
+    >>> Session("pot", True, "scene", 60.0, {"8-14": Camera("v4l2:///dev/video0")}).bands
     ('8-14',)
     """
 
@@ -229,9 +181,9 @@ class Session:
     frame_rate: Annotated[Positive, Field(le=1e4)] = 60.0
     shape: tuple[Pixels, Pixels] = (512, 640)
     telemetry_rows: Literal[0, 2] = 0
-    devices: dict[DeviceName, Device] = field(default_factory=dict)
+    devices: dict[DeviceName, str] = field(default_factory=dict)
     filters: dict[Slot, Name] = field(default_factory=dict)
-    wheel: Wheel = field(default_factory=Wheel)
+    wheel: Settings = field(default_factory=Settings)
     sweep: tuple[Name, ...] = ()
     thermocouples: dict[Channel, Label] = field(default_factory=dict)
     blackbody: Blackbody | None = None
@@ -265,12 +217,12 @@ class Session:
             raise ValueError(f"Invalid shape {list(self.shape)}. {rule}")
 
     def _check_addresses(self) -> None:
-        for name, device in self.devices.items():
-            _check_schemes(name, device)
-        if not self.simulated:  # emulated cameras are told apart by their world
+        for name, address in self.devices.items():
+            parse(address, (_SCHEMES[name],))
+        if not self.simulated:
             pairs = [(camera.video, camera.control) for camera in self.cameras.values()]
-            listed = [device for pair in pairs for device in pair if device is not None]
-            _check_unique("address", [one.hardware for one in (*listed, *self.devices.values())])
+            listed = [address for pair in pairs for address in pair if address is not None]
+            _check_unique("address", [*listed, *self.devices.values()])
 
     def _check_thermocouples(self) -> None:
         # The readings of a recording have one name each: of the cameras and the wheel, too.
@@ -310,10 +262,6 @@ class Session:
     def swept(self) -> tuple[str, ...]:
         """Filters that are recorded at each temperature: `sweep`, or the one of the camera."""
         return self.sweep or (() if self.filtered is None else (self.filtered,))
-
-    def url(self, device: Device) -> str:
-        """Address of a device in this session: the simulated one, or the hardware's."""
-        return device.simulated if self.simulated else device.hardware
 
     @classmethod
     def load(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> Self:

@@ -15,7 +15,7 @@ import ctypes.util
 import importlib
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from ctypes import POINTER, c_char, c_float, c_int8, c_int16
 from dataclasses import dataclass
 from enum import IntFlag
@@ -25,9 +25,8 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.camera import Identity
-from dbthermal.instruments.transport import Closing
+from dbthermal.instruments.transport import Closing, parse
 
 __all__ = ["ERRORS", "TC08", "Flag", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
@@ -40,7 +39,7 @@ Where C takes a pointer to one value, an array of length one is passed, which bo
 
 ENVIRONMENT: Final = "DBTHERMAL_USBTC08"  # variable with the path of the library
 CHANNELS: Final = 9  # 0 is the cold junction, 1 to 8 are the sockets
-KINDS: Final = "BEJKNRST"  # types of thermocouples that the library converts
+KIND: Final = "T"  # the library's letter of the rig's thermocouples
 KELVIN: Final = 2  # the library's number of the unit; 0 is °C, 1 °F, 3 °R
 OPEN_TIMEOUT: Final = 30.0  # [s] the library downloads the firmware first
 POLL: Final = 0.05  # [s] between two progress requests
@@ -129,7 +128,7 @@ class Scan:
 
 
 class TC08(Closing):
-    """A TC-08, for one thread at a time; opened by `from_url`, `open` or ``with``.
+    """A TC-08, for one thread at a time; opened by `from_url` or `open`.
 
     The `library` is from `load`, or an emulated one; `clock` [s] and `sleep` are the host's.
     """
@@ -160,7 +159,7 @@ class TC08(Closing):
         >>> bench = World(blackbody_temperature=310.0)
         >>> bench.thermocouples[1] = "blackbody"
         >>> with TC08.from_url("sim://tc08", world=bench) as logger:
-        ...     logger.set_channels({1: "T"})
+        ...     logger.set_channels([1])
         ...     print(f"{logger.single().temperature[1]:.2f} K")
         310.00 K
         """
@@ -171,7 +170,7 @@ class TC08(Closing):
         if world is not None:
             module = importlib.import_module("dbthermal.instruments.emulated.tc08")
             return cls(module.EmulatedTC08.from_world(world)).open()
-        addresses.parse(url, ("tc08",))
+        parse(url, ("tc08",))
         return cls(load()).open()
 
     @property
@@ -214,9 +213,6 @@ class TC08(Closing):
         if handle and not self._library.usb_tc08_close_unit(handle):
             raise TC08Error("close", self._library.usb_tc08_get_last_error(handle))
 
-    def __enter__(self) -> Self:
-        return self if self._handle else self.open()
-
     def identity(self) -> Identity:
         """Identity of the unit; TC08Error or RuntimeError if the library fails or it is closed."""
         unit = (UnitInfo * 1)()
@@ -234,26 +230,21 @@ class TC08(Closing):
             "is_simulated": self.is_simulated,
         }
 
-    def set_channels(self, kinds: Mapping[int, str]) -> None:
-        """Set the type of each thermocouple, a letter of B E J K N R S T by its channel, 1 to 8.
+    def set_channels(self, channels: Collection[int]) -> None:
+        """Set the channels that have a thermocouple, of type T: 1 to 8.
 
         All other sockets are switched off; the cold junction is always read. ValueError if a
-        channel or a letter is another one, or no channel is given; TC08Error or RuntimeError if the
-        library fails, or the unit is not open.
+        channel is another one, or none is given; TC08Error or RuntimeError if the library fails,
+        or the unit is not open.
         """
-        if not kinds:
-            raise ValueError("Invalid channels {}. Must be one at least.")
-        for channel, kind in kinds.items():
+        if not channels:
+            raise ValueError("Invalid channels. Must be one at least.")
+        for channel in channels:
             if channel not in range(1, CHANNELS):
                 raise ValueError(f"Invalid channel {channel}. Must lie in 1 to {CHANNELS - 1}.")
-            if len(kind) != 1 or kind not in KINDS:
-                raise ValueError(
-                    f"Invalid thermocouple '{kind}' of channel {channel}. Must be one of "
-                    f"{' '.join(KINDS)}."
-                )
         self._has_channels = False  # until all are set
         for channel in range(CHANNELS):
-            letter = kinds.get(channel, " ") if channel else "C"
+            letter = (KIND if channel in channels else " ") if channel else "C"
             if not self._library.usb_tc08_set_channel(self._open_handle(), channel, ord(letter)):
                 raise self._error(f"set channel {channel} to '{letter}'")
         self._has_channels = True

@@ -4,10 +4,10 @@ With telemetry on, the 640 x 512 image comes with two more rows on USB. The layo
 certain**: it is where public decoders that do not depend on one another agree (Elphel's
 ``Boson640Telemetry.java``, the Python class ``BosonWithTelemetry``, belivan/flir_stereo
 ``flir_ros_sync.cpp``), and none of them is the vendor's. So are the orders: each 16-bit word is
-little-endian, and of a longer number the high word comes first; the latter is an option of
-`decode`. Therefore a recording keeps the rows as they came. The meaning of the status bits is not
-public: the shutter follows from `last_ffc_frame` and the serial line, see `camera.next_shutter`.
-Tested against computed vectors and emulators, not against a camera.
+little-endian, and of a longer number the high word comes first. Therefore a recording keeps the
+rows as they came. The meaning of the status bits is not public: the shutter follows from
+`last_ffc_frame` and the serial line, see `camera.next_shutter`. Tested against computed vectors and
+emulators, not against a camera.
 """
 
 from collections.abc import Mapping
@@ -75,17 +75,16 @@ FIELDS: Final = MappingProxyType(
 """Rates in Hz, temperatures in kelvin, times in seconds; counters count frames."""
 
 
-def decode(rows: Counts, *, high_word_first: bool = True) -> dict[str, float]:
+def decode(rows: Counts) -> dict[str, float]:
     """Read the value of each of `FIELDS` from telemetry rows, uint16 (row, x) or (word,).
 
-    `high_word_first` is the order of the words of a longer number: likely, not certain. Any content
-    is read as if it were telemetry: there is no checksum. TypeError or ValueError if the rows are
-    not of uint16, or hold fewer than `WORDS` words.
+    Any content is read as if it were telemetry: there is no checksum. TypeError or ValueError if
+    the rows are not of uint16, or hold fewer than `WORDS` words.
     """
     words = _checked(rows)
     values: dict[str, float] = {}
     for name, field in FIELDS.items():
-        part = words[field.span][:: 1 if high_word_first else -1].astype(">u2")
+        part = words[field.span].astype(">u2")
         number = int.from_bytes(part.tobytes(), "big", signed=field.signed)
         values[name] = number / field.steps + field.zero if field.steps else number
     return values

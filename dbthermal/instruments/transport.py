@@ -1,36 +1,77 @@
-"""Byte streams to devices, each opened by its address.
+"""Addresses of devices, and byte streams to those on a serial line.
 
-``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``pty:///dev/pts/3`` a
-pseudo-terminal of an emulated device, and ``sim://boson?sn=7`` an emulator that is started for the
-caller and ends with the transport. Nothing is sent when one is opened. Tested on pseudo-terminals,
-not on hardware.
+``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows), ``sim://boson/wide`` an
+emulator that answers in memory; sessions and all drivers share the rules of `parse`. An address
+never names a program or a library: that of the TC-08 is told by an environment variable. Tested on
+pseudo-terminals, not on hardware.
 """
 
-import errno
 import importlib
-from collections.abc import Callable
+import re
+import time as system_time
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Final, Protocol, Self
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, Self
 
-from dbthermal.instruments import _addresses as addresses
+from dbthermal import _text as texts
 
 if TYPE_CHECKING:
     import serial
 
-__all__ = ["EMULATORS", "Closing", "SerialTransport", "Transport", "TransportError", "open_serial"]
+__all__ = [
+    "EMULATORS",
+    "Address",
+    "Closing",
+    "SerialTransport",
+    "Transport",
+    "TransportError",
+    "open_serial",
+    "parse",
+]
 __dir__ = __all__.copy
 
 WRITE_TIMEOUT: Final = 1.0  # longest wait until the operating system took the bytes to send [s]
+SETTLING: Final = 0.05  # time between taking RTS down and up, as in Thorlabs's example [s]
 
 EMULATORS: Final = MappingProxyType(
     {"boson": "dbthermal.instruments.emulated.boson", "apt": "dbthermal.instruments.emulated.apt"}
 )
-"""Module of each emulator, imported when it is started: its ``start(options, world)`` returns an
-object with `path` and `close`."""
+"""Module of each emulator, imported when it is started: its ``start(name, world)`` returns a
+`Transport`."""
 
-_SCHEMES = ("serial", "pty", "sim")
-_NO_LINE = (errno.ENOTTY, errno.EINVAL)
+_NODE = r"/dev/(?!\S*\.\.)[^\s?#\\]+"
+
+# Form of the addresses of each scheme, and its regular expression.
+_RULES: Final[Mapping[str, tuple[str, str]]] = {
+    "v4l2": ("v4l2:///dev/<node>", f"v4l2://(?P<target>{_NODE})"),
+    "serial": ("serial:///dev/<port>", f"serial://(?P<target>{_NODE}|COM[0-9]+)"),
+    "tc08": ("tc08:", "tc08:(?P<target>)"),
+    "sim": (
+        "sim://<emulator>/<name>",
+        "sim://(?P<target>[a-z0-9]+)(/(?P<name>[A-Za-z0-9][A-Za-z0-9._-]*))?",
+    ),
+}
+_LONGEST: Final = 200  # [character]
+
+
+class Address(NamedTuple):
+    """Parts of an address: `target` is the device's file, or the kind of emulator."""
+
+    scheme: str
+    target: str
+    name: str = ""
+
+
+def parse(url: str, schemes: tuple[str, ...]) -> Address:
+    """Parts of an address of one of the schemes; ValueError names it and their forms."""
+    scheme = url.partition(":")[0]
+    found = re.fullmatch(_RULES[scheme][1], url) if scheme in schemes else None
+    if found is None or len(url) > _LONGEST:
+        forms = " or ".join(_RULES[name][0] for name in schemes)
+        raise ValueError(f"Invalid address {texts.shown(url)}. Must be {forms}.")
+    return Address(scheme, **{name: text or "" for name, text in found.groupdict().items()})
 
 
 class Closing:
@@ -85,23 +126,13 @@ class Transport(Protocol):
 
 
 class SerialTransport(Closing):
-    """An open serial port of pyserial, or pseudo-terminal; see `open_serial`.
+    """An open serial port of pyserial, see `open_serial`; `url` is its name in messages."""
 
-    `url` is its name in messages; `after` is called once it is closed, to end an emulator.
-    """
+    is_simulated: Final = False
 
-    def __init__(
-        self,
-        port: "serial.Serial",
-        url: str,
-        *,
-        is_simulated: bool,
-        after: Callable[[], None] | None = None,
-    ) -> None:
+    def __init__(self, port: "serial.Serial", url: str) -> None:
         self.url = url
-        self.is_simulated = is_simulated
         self._port = port
-        self._after = after
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device takes none for `WRITE_TIMEOUT`."""
@@ -120,26 +151,21 @@ class SerialTransport(Closing):
         except OSError as error:
             raise self._lost("read from", error) from error
 
-    def set_rts(self, *, level: bool) -> bool:
-        """Set the line RTS; False if the port has none, as is true of every pseudo-terminal."""
+    def pulse_rts(self) -> None:
+        """Take the line RTS down and up again; `TransportError` if the device is gone."""
         try:
-            self._port.rts = level
+            self._port.rts = False
+            system_time.sleep(SETTLING)
+            self._port.rts = True
         except OSError as error:
-            if error.errno not in _NO_LINE:
-                raise self._lost("set RTS of", error) from error
-            return False
-        return True
+            raise self._lost("set RTS of", error) from error
 
     def close(self) -> None:
-        """Release the port and end its emulator, also if the port does not close."""
-        after, self._after = self._after, None
+        """Release the port."""
         try:
             self._port.close()
         except OSError as error:
             raise self._lost("close", error) from error
-        finally:
-            if after is not None:
-                after()
 
     def _lost(self, action: str, error: OSError) -> TransportError:
         return TransportError(
@@ -149,37 +175,39 @@ class SerialTransport(Closing):
 
 def open_serial(
     url: str, *, baudrate: int, rtscts: bool = False, world: object | None = None
-) -> SerialTransport:
+) -> Transport:
     """Open the line to a device by its address, for this program alone; nothing is sent.
 
-    ``sim://boson/wide`` is ``sim://boson?name=wide``. `baudrate` [bit/s] is the speed of the line,
-    `rtscts` its flow control by RTS and CTS, and `world` the emulated bench that a ``sim://``
-    device is part of; by default one of its own. ValueError for another address, unknown options,
-    or a pseudo-terminal as a serial port, which would let an emulator pass for hardware;
-    TransportError if the port cannot be opened.
+    `baudrate` [bit/s] is the speed of the line. With `rtscts` its flow is controlled by RTS and
+    CTS, and RTS is taken down and up once. `world` is the emulated bench that a ``sim://`` device
+    is part of; by default one of its own. ValueError for another address, or a pseudo-terminal,
+    which would let an emulator pass for hardware; TransportError if the port cannot be opened.
     """
-    import serial  # noqa: PLC0415 - an optional package, which drivers of other devices do without
-
-    address = addresses.parse(url, _SCHEMES)
-    path, after = address.target, None
+    address = parse(url, ("serial", "sim"))
+    path = address.target
     if address.scheme == "sim":
         if path not in EMULATORS:
             rule = f"Must be one of {sorted(EMULATORS)} after sim://"
             raise ValueError(f"Invalid address '{url}'. {rule}.")
-        options = {**address.options, **({"name": address.name} if address.name else {})}
-        emulated = importlib.import_module(EMULATORS[path]).start(options, world)
-        path, after = emulated.path, emulated.close
-    elif address.scheme == "serial" and Path(path).resolve().is_relative_to("/dev/pts"):
-        raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must begin with pty://.")
+        emulated: Transport = importlib.import_module(EMULATORS[path]).start(address.name, world)
+        return emulated
+    if Path(path).resolve().is_relative_to("/dev/pts"):
+        raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must be a device's port.")
+
+    import serial  # noqa: PLC0415 - an optional package, which drivers of other devices do without
+
     try:
         port = serial.Serial(
             path, baudrate, rtscts=rtscts, exclusive=True, write_timeout=WRITE_TIMEOUT
         )
     except OSError as error:
-        if after is not None:
-            after()
         raise TransportError(
             f"Could not open '{path}': {error}. It must exist, be yours to use, and in no "
             "other program's use."
         ) from error
-    return SerialTransport(port, url, is_simulated=address.scheme != "serial", after=after)
+    with ExitStack() as stack:
+        line = stack.enter_context(SerialTransport(port, url))
+        if rtscts:
+            line.pulse_rts()
+        stack.pop_all()
+    return line

@@ -8,6 +8,7 @@ a stand-in for the kernel's calls, not against a camera.
 """
 
 import errno
+import fcntl
 import mmap
 import os
 import select
@@ -16,11 +17,10 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
-from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.camera import (
     DAMAGED,
     FRAME_TIMEOUT,
@@ -33,12 +33,10 @@ from dbthermal.instruments.camera import (
     SourceLostError,
     Stream,
 )
-from dbthermal.instruments.transport import Closing
+from dbthermal.instruments.transport import Closing, parse
 
-try:
-    import fcntl
-except ImportError as missing:  # Windows
-    raise ImportError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.") from missing
+if not sys.platform.startswith("linux"):
+    raise ImportError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.")
 
 __all__ = ["BUFFERS", "Y16", "Capture", "Kernel", "open_url"]
 __dir__ = __all__.copy
@@ -96,7 +94,6 @@ class Kernel:
     )
     select: Callable[..., tuple[Sequence[Any], Sequence[Any], Sequence[Any]]] = select.select
     clock: Callable[[], float] = time.monotonic
-    platform: str = sys.platform
 
     def ask(self, file: int, number: int, argument: bytearray) -> None:
         """Call `ioctl`, again where a signal came between; OSError if the kernel refuses."""
@@ -107,19 +104,14 @@ class Kernel:
                 continue
             return
 
-    def open_node(self, path: str) -> int:
-        """Open a video node; OSError if it cannot be opened, or this is not Linux."""
-        if not self.platform.startswith("linux"):
-            message = f"No video on '{self.platform}'. Must be Linux, for V4L2"
-            raise OSError(errno.ENOSYS, message, path)
-        return self.open(path, os.O_RDWR | os.O_NONBLOCK)
-
 
 class Capture(Closing):
-    """A camera's node that streams Y16 frames, a `camera.FrameSource`; see `Capture.open`.
+    """A camera's node that streams Y16 frames, a `camera.FrameSource`; nothing is reset.
 
-    Its identity is the node, name and bus of the camera, and the driver with its version, on which
-    a stamp's meaning depends.
+    `decode` reads the metadata of a frame from its telemetry rows. Its identity is the node, name
+    and bus of the camera, and the driver with its version, on which a stamp's meaning depends.
+    OSError if the node cannot be opened or is busy; ValueError if it gives no Y16, or another
+    format or rate.
     """
 
     is_simulated: Final = False
@@ -130,35 +122,17 @@ class Capture(Closing):
         self.path, self.stream = path, stream
         self.shape, self.frame_rate = stream.shape, stream.frame_rate
         self.telemetry_rows = stream.telemetry_rows
-        self.identity: Mapping[str, str] = {"device": path}
         self._kernel = kernel or Kernel()
         self._decode = decode
-        self._file: int | None = None
         self._maps: list[Any] = []
-
-    @classmethod
-    def open(
-        cls,
-        path: str,
-        stream: Stream | None = None,
-        kernel: Kernel | None = None,
-        decode: Decode | None = None,
-    ) -> Self:
-        """Open a node, agree on format and rate, and start the stream; nothing is reset.
-
-        `decode` reads the metadata of a frame from its telemetry rows. OSError if the node cannot
-        be opened or is busy; ValueError if it gives no Y16, or another format or rate.
-        """
-        capture = cls(path, stream or Stream(), kernel, decode)
-        capture._file = file = capture._kernel.open_node(path)
+        self._file: int | None = self._kernel.open(path, os.O_RDWR | os.O_NONBLOCK)
         try:
-            capture.identity = {"device": path, **capture._agree(file)}
-            capture._map_buffers(file)
-            capture._kernel.ask(file, STREAMON, bytearray(_TYPE))
+            self.identity: Mapping[str, str] = {"device": path, **self._agree(self._file)}
+            self._map_buffers(self._file)
+            self._kernel.ask(self._file, STREAMON, bytearray(_TYPE))
         except BaseException:
-            capture.close()
+            self.close()
             raise
-        return capture
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """Wait for the next frame, a copy; see `camera.FrameSource.read`."""
@@ -272,7 +246,7 @@ class Capture(Closing):
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
     """Open the node of an address ``v4l2:///dev/video0``; ValueError if it is of another kind."""
-    return Capture.open(addresses.parse(url, ("v4l2",)).target, stream, decode=decode)
+    return Capture(parse(url, ("v4l2",)).target, stream, decode=decode)
 
 
 def _capability(file: int, kernel: Kernel) -> tuple[bool, dict[str, str]]:

@@ -1,6 +1,8 @@
 """Arrays in files of HDF5, NetCDF and zarr, which are left on disk."""
 
 import math
+import re
+import struct
 import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -13,6 +15,7 @@ import zarr
 
 from dbthermal.readers import _recording as recordings
 
+_CHUNK: Final = r"(c\.)?\d+(\.\d+)*"
 _DAMAGE: Final = (
     *(ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError),
     *(OSError, EOFError, RuntimeError, MemoryError, SystemError, RuntimeWarning, UserWarning),
@@ -51,6 +54,8 @@ def read(
         for scale in {"scale_factor", "add_offset"} & set(values.attrs):
             raise ValueError(f"Invalid '{scale}' of '{path.name}'. Must be counts as measured.")
         check(values)
+        if isinstance(values, zarr.Array):
+            _check_chunks(values, path)
         return values[...]
     except _DAMAGE as error:
         if isinstance(error, ValueError) and "Must " in str(error):
@@ -125,6 +130,32 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, tuple[Any, list[str]]]
     for name, one in arrays.items():
         recordings.check_memory(one.shards or one.chunks, 2.0**30, f"a chunk of '{name}'")
         if missing := one.nchunks - one.nchunks_initialized:
-            raise ValueError(f"Missing {missing} chunks of '{name}'. Must be a whole copy.")
+            raise ValueError(
+                f"Missing {missing} chunks of '{name}' of '{path.name}'. Must be whole."
+            )
     names = {name: getattr(one.metadata, "dimension_names", None) for name, one in arrays.items()}
     return {n: (one, [str(dim) for dim in names[n] or ()]) for n, one in arrays.items()}
+
+
+def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
+    """Refuse chunks of a false size, and a shape that leaves a part of them out, as if damaged."""
+    pieces = values.shards or values.chunks
+    grid = [-(-size // part) for size, part in zip(values.shape, pieces, strict=True)]
+    whole = tuple(number * part for number, part in zip(grid, pieces, strict=True))
+    keys = [one for one in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, one.name)]
+    keys = [key for key in keys if key.is_file()]
+    if values.shards is None and "Blosc" in str(values.compressors[-1:]):
+        for key in keys:  # Blosc reads as far as its header says, and past the end of the memory
+            with key.open("rb") as stream:
+                sizes = struct.unpack("<4xI4xI", stream.read(16).ljust(16, b"\0"))
+            if sizes != (values.dtype.itemsize * math.prod(pieces), key.stat().st_size):
+                raise ValueError(f"Damaged chunk '{key.name}' of '{path.name}'. Must be whole.")
+    metadata = values.metadata.update_shape(whole)
+    padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))  # type: ignore[type-var]
+    more = len(keys) > math.prod(grid)
+    for axis, size in enumerate(values.shape):  # what pads the last chunks is of one value
+        beyond = np.asarray(padded[(slice(None),) * axis + (slice(size, None),)])
+        more = more or bool(beyond.size and np.ptp(beyond))
+    if more:
+        rule = "Must be all that its chunks hold: there is more"
+        raise ValueError(f"Invalid shape {values.shape} of '{path.name}'. {rule}.")

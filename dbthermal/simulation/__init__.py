@@ -1,13 +1,9 @@
 """Simulated captures with known truth, to test a claim: scenes, cameras, nuisances.
 
 Begin with `walkers` and `observe`: a scene, and the counts that a `Rig` records of it. Nuisances
-of real cameras are added one by one (`fire_shutter`, `spoil_pixels`, `lag`, ...). For a scene of
-one's own there are transient temperatures (`heat`). Everything made here carries
-`origin = "simulated"`.
+of real cameras are added one by one (`fire_shutter`, `spoil_pixels`, `lag`, ...). Everything made
+here carries `origin = "simulated"`.
 """
-
-import importlib
-from types import ModuleType
 
 from dbthermal.simulation._nuisances import (
     SPOILED,
@@ -46,7 +42,6 @@ __all__ = [
     "digitise",
     "expose",
     "fire_shutter",
-    "heat",
     "heating",
     "independent_pixels",
     "lag",
@@ -60,10 +55,3 @@ __all__ = [
     "walkers",
 ]
 __dir__ = __all__.copy
-
-
-def __getattr__(name: str) -> ModuleType:
-    """Import `heat`, which needs an optional package, on first use."""
-    if name == "heat":
-        return importlib.import_module(f"{__name__}.{name}")
-    raise AttributeError(f"Unknown name {name!r} in {__name__}. Must be one of {__all__}.")

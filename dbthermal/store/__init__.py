@@ -8,11 +8,11 @@ record from `provenance`. `Recording` grows in chunks and survives a kill or a p
 """
 
 from dbthermal.store._datasets import join_parts, open_dataset, save, save_rows
-from dbthermal.store._durable import HeldFolder, to_disk
-from dbthermal.store._provenance import checksum, provenance
-from dbthermal.store._recording import Recording
+from dbthermal.store._recording import HeldFolder, Recording, to_disk
 from dbthermal.store._results import (
     Number,
+    checksum,
+    provenance,
     read_numbers,
     save_figure,
     save_numbers,

@@ -1,16 +1,20 @@
-"""Headline numbers as JSON, text, figures as PNG, films as MP4, each with its provenance.
+"""Results and their provenance: headline numbers as JSON, text, figures as PNG, films as MP4.
 
-Each function writes to a temporary place beside its path and renames at the end, so that a file
-under a result's name is always whole. Each result carries its provenance and nothing that differs
-between two runs of the same code on the same input.
+Each function that saves writes to a temporary place beside its path and renames at the end, so that
+a file under a result's name is always whole. Each result carries its provenance and nothing that
+differs between two runs of the same code on the same input: no date, no host and no folder.
 """
 
 import hashlib
 import json
 import math
+import os
+import platform
+import subprocess
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -18,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
+from dbthermal import __version__
 from dbthermal import _text as texts
 from dbthermal.store._integrity import AS_WRITTEN, warn_unchecked
 
@@ -25,12 +30,96 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Number = float | int | str | bool
+_PACKAGES = ("numpy", "scipy", "xarray", "zarr")
 
 # FFmpeg's encoder of each codec of a film, with its options.
 _ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str]]]] = {
     "vp9": ("libvpx-vp9", {"crf": "31", "b": "0", "cpu-used": "4"}),
     "h264": ("libx264", {}),
 }
+
+
+def provenance(
+    parameters: Mapping[str, object], inputs: Mapping[str, str | Path] | None = None
+) -> dict[str, Any]:
+    """Provenance of a result, for the functions that save it.
+
+    Parameters
+    ----------
+    parameters : mapping
+        Name to value, as in the notebook's parameters cell: finite numbers, strings, booleans,
+        None, and lists and mappings of these; TypeError or ValueError for any other.
+    inputs : mapping, optional
+        Name to path of each file, or folder such as a zarr store, that was read, for its checksum.
+
+    Returns
+    -------
+    dict
+        ``parameters``; ``versions`` of Python, dbthermal and its core dependencies; ``commit``, 40
+        hexadecimal digits, with ``-dirty`` if tracked files differ from it, or ``"unknown"``
+        outside a git work tree; and ``inputs``, name to sha256.
+
+    Examples
+    --------
+    >>> from dbthermal import store
+    >>> store.provenance({"frames": 350})["parameters"]
+    {'frames': 350}
+    """
+    return {
+        "parameters": {name: _plain(name, value) for name, value in parameters.items()},
+        "versions": {
+            "python": platform.python_version(),
+            "dbthermal": __version__,
+            **{package: version(package) for package in _PACKAGES},
+        },
+        "commit": commit(),
+        "inputs": {name: checksum(path) for name, path in (inputs or {}).items()},
+    }
+
+
+def checksum(path: str | Path) -> str:
+    """SHA-256 of a file, as of ``sha256sum``, or of a folder's file names and contents.
+
+    Parameters
+    ----------
+    path : str or Path
+        File or folder; FileNotFoundError if it does not exist.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    files = {file.relative_to(path).as_posix(): file for file in path.rglob("*") if file.is_file()}
+    lines = (f"{checksum(files[name])}  {name}\n" for name in sorted(files))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def commit() -> str:
+    """Commit of the code that runs, or ``"unknown"``; see `provenance`."""
+    folder = Path(__file__).parent
+    tracked = _git(folder, "ls-files", "--error-unmatch", Path(__file__).name)
+    described = _git(folder, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    return described.strip() if tracked and described else "unknown"
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    """Output of a git command in `folder`; empty if it fails or git is absent."""
+    command = ["git", "-C", str(folder), *arguments]
+    environment = {**os.environ, "GIT_OPTIONAL_LOCKS": "0"}
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    except FileNotFoundError:
+        return ""
+    return done.stdout if done.returncode == 0 else ""
+
+
+def _plain(name: str, value: object) -> Any:
+    """Value after a round trip through JSON: tuples are lists, keys are strings."""
+    try:
+        return json.loads(json.dumps(value, allow_nan=False))
+    except (TypeError, ValueError) as error:
+        rule = f"Must be JSON with finite numbers: {error}."
+        raise type(error)(f"Invalid parameter {name!r} = {value!r}. {rule}") from error
 
 
 def save_numbers(
@@ -119,16 +208,19 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
 def save_figure(
     figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
 ) -> None:
-    """Save a figure as PNG, the same bytes for the same figure.
+    """Save a figure as PNG, or as vectors in PDF or SVG; the same bytes for the same figure.
+
+    Text stays text, of fonts that PDF embeds; images are pixels within the vectors.
 
     Parameters
     ----------
     figure : Figure
         Of matplotlib; it stays open.
     path, provenance : str or Path, mapping
-        File ``*.png``; see `save`. The provenance becomes the text chunk ``Comment``, as JSON.
+        File ``*.png``, ``*.pdf`` or ``*.svg``; see `save`. The provenance becomes the text chunk
+        ``Comment``, the subject or the description, as JSON.
     dpi : int
-        Resolution [pixel/inch].
+        Resolution [pixel/inch], of the images in PDF and SVG.
 
     Examples
     --------
@@ -141,8 +233,19 @@ def save_figure(
     ...     Image.open(f"{folder}/wall.png").text["Comment"]
     '{"commit": "unknown"}'
     """
-    metadata = {"Software": "dbthermal", "Comment": as_json(provenance)}
-    with whole(path, ".png") as part:
+    from matplotlib import rc_context  # noqa: PLC0415 - loaded with the figure
+
+    text, suffix = as_json(provenance), Path(path).suffix
+    metadata: dict[str, Any] = {"Software": "dbthermal", "Comment": text}
+    if suffix == ".pdf":
+        metadata = {"Creator": "dbthermal", "Subject": text, "CreationDate": None}
+    elif suffix == ".svg":
+        metadata = {"Creator": "dbthermal", "Description": text, "Date": None}
+    kind = suffix if suffix in (".pdf", ".svg") else ".png"
+    with (
+        rc_context({"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "dbthermal"}),
+        whole(path, kind) as part,
+    ):
         figure.savefig(part, dpi=dpi, metadata=metadata)
 
 

@@ -315,14 +315,14 @@ shape: [4, 80]
 telemetry_rows: 2
 cameras:
   "8-14":
-    video: {simulated: "sim://boson/wide", hardware: "v4l2:///dev/video0"}
-    control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
+    video: "v4l2:///dev/video0"
+    control: "serial:///dev/ttyACM0"
   "9.5":
-    video: {simulated: "sim://boson/narrow", hardware: "v4l2:///dev/video2"}
-    control: {simulated: "sim://boson/narrow", hardware: "serial:///dev/ttyACM1"}
+    video: "v4l2:///dev/video2"
+    control: "serial:///dev/ttyACM1"
 devices:
-  filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
-  thermocouples: {simulated: "sim://tc08", hardware: "tc08:"}
+  filter_wheel: "serial:///dev/ttyUSB0"
+  thermocouples: "tc08:"
 filters: {1: "9.5", 3: "11"}
 wheel: {velocity: 50.0, home_velocity: 50.0, acceleration: 2000.0}
 sweep: ["9.5", "11"]

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from attack import arrays, files, kills, media, mirrored, stages, steps
+from attack import arrays, files, kills, media, mirrored, recordings, stages, steps
 from attack.oracle import BAD, GOOD, LIMIT, SECONDS, Attack, Outcome, carry_out
 
 Make = Callable[[np.random.Generator], Attack]
@@ -48,6 +48,7 @@ CLASSES: Final[Mapping[str, tuple[Make, int]]] = {
     "manifest": (files.manifests, 3),
     "spectra": (media.spectra, 8),
     "videos": (media.videos, 8),
+    "recordings": (recordings.recordings, 8),
     "kills": (kills.kills, 4),
 }
 """Class -> its generator, and its share of the inputs."""

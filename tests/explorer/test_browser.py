@@ -48,6 +48,18 @@ STEPS = """async () => {
 }"""
 
 
+SIDES = """async (level) => {
+    const explorer = document.querySelector('[data-testid=explorer]').explorer;
+    const picture = explorer.pictures.get('object_temperature');
+    explorer.setIsotherm(level);
+    for (let i = 0; !picture.sides; i++) {
+        if (i > 600) throw new Error(explorer.message.textContent);
+        await new Promise((done) => setTimeout(done, 5));
+    }
+    return Array.from(picture.sides);
+}"""
+
+
 class Lab:
     """JupyterLab on a free port in a folder, and a page of a browser that reaches nothing else."""
 
@@ -219,6 +231,10 @@ def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
         arg=start + 11,
     )
     assert int(slider.input_value()) == start + 11
+    frame = view.frame("object_temperature", start + 11)
+    level = float(np.nanmedian(frame))
+    sides = np.reshape(page.evaluate(SIDES, level - 273.15), view.shape)
+    np.testing.assert_array_equal(sides, np.where(np.isnan(frame), 0, 1 + (frame > level)))
     if folder := os.environ.get("DBTHERMAL_SCREENSHOTS"):
         page.locator("[data-testid=explorer]").screenshot(path=f"{folder}/explorer.png")
     assert (lab.outside, lab.errors) == ([], [])
@@ -281,6 +297,6 @@ def test_step_of_a_large_store(
     with capsys.disabled():
         print(f"\n{panes} pictures: median {median:.0f} ms, 95 % {high:.0f} ms, load {load:.1f}")
         print(f"opened in {opened:.0f} s; kernel: {', '.join(memory)}")
-    if load > (os.cpu_count() or 1):
+    if median >= 100 and load > (os.cpu_count() or 1):
         pytest.skip(f"the machine is loaded: {load:.1f}")
     assert median < 100

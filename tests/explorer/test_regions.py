@@ -79,7 +79,22 @@ def test_gain_is_the_derivative_of_the_inverse() -> None:
     signal = emissivity * warm + (1 - emissivity) * cold
     changed = emissivity + error
     moved = np.linalg.solve(np.column_stack([changed, 1 - changed]), signal) - [warm, cold]
-    covariance = np.multiply.outer(error, error)[..., np.newaxis]
-    gains = common_gain(emissivity[:, np.newaxis], covariance)
-    stated = np.concatenate(gains) * (warm - cold)
-    np.testing.assert_allclose(stated, np.abs(moved), rtol=1e-3)
+    covariance = np.multiply.outer(error, error)[..., np.newaxis, np.newaxis]
+    gains = common_gain(emissivity[:, np.newaxis, np.newaxis], covariance)
+    np.testing.assert_allclose(gains.ravel() * (warm - cold), np.abs(moved), rtol=1e-3)
+
+
+@pytest.mark.parametrize("shared", [0.0, 0.6, 1.0])
+def test_neighbours_tell_what_they_share(shared: float) -> None:
+    """Of emissivities with a shared and an own error, the shared part of the gain is found."""
+    rng, std = np.random.default_rng(8), 0.01
+    base = np.array([0.86, 0.72])[:, np.newaxis, np.newaxis] + np.zeros((2, 60, 60))
+    base += std * np.sqrt(shared) * rng.standard_normal((2, 1, 1))
+    value = base + std * np.sqrt(1.0 - shared) * rng.standard_normal(base.shape)
+    covariance = std**2 * np.eye(2)[:, :, np.newaxis, np.newaxis] * np.ones((1, 1, 60, 60))
+    whole = common_gain(base, covariance)  # alike: all of it is shared
+    part = np.median(common_gain(value, covariance) / whole, axis=(1, 2)) ** 2
+    print(f"shared {shared}: found {part.round(3)} of the variance of object and background")
+    np.testing.assert_allclose(part, shared, rtol=0, atol=0.08)
+    varied = base + 5 * std * rng.standard_normal(base.shape)  # a material, not errors
+    assert np.median(common_gain(varied, covariance) / whole) > 0.7

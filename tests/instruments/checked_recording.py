@@ -21,7 +21,7 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import Limits, Reading, notes, record
-from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.session import Camera, Session
 
 BANDS, SHAPE, RATE, MILLI = ("8-14", "9.5"), (16, 24), 100.0, 1e-3
 LIMITS = Limits(chunk=5, queue=10_000, reserve=0, reading_period=0.02)
@@ -38,7 +38,7 @@ def picture(time: float) -> Counts:
 
 def session(duration: float = 1.0) -> Session:
     """Two emulated cameras with small frames."""
-    camera = Camera(Device("sim://boson/any", "v4l2:///dev/video0"))
+    camera = Camera("v4l2:///dev/video0")
     return Session("faults", True, "scene", duration, dict.fromkeys(BANDS, camera), RATE, SHAPE)
 
 

@@ -7,23 +7,16 @@ import numpy as np
 from faulty_apt import FaultyApt
 from faulty_boson import Fault, FaultyBoson
 from faulty_tc08 import FaultyTC08
-from loopback import Loop
 
 from dbthermal.instruments import apt, fslp
 from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.filterwheel import FilterWheel, Settings
 from dbthermal.instruments.tc08 import TC08
 
 FILTERS = {1: "open", 3: "9.5", 5: "LW"}
-QUICK = Settings(
-    filters=FILTERS,
-    reply_timeout=5.0,
-    poll_interval=0.005,
-    velocity=50.0,
-    home_velocity=20.0,
-    acceleration=1e3,
-)
+QUICK = Settings(velocity=50.0, home_velocity=20.0, acceleration=1e3)
 """A wheel that turns in no time."""
 
 
@@ -64,7 +57,7 @@ class BosonBench:
         self.world = World(clock=self.clock)
         self.state = self.world.add_camera("boson", serial_number)
         self.device = FaultyBoson(self.world, "boson")
-        self.loop = Loop(self.device, clock=self.clock, sleep=self.clock.sleep)
+        self.loop = Line(self.device, clock=self.clock, sleep=self.clock.sleep)
         self.camera = Boson(self.loop, first_sequence=1, clock=self.clock, sleep=self.clock.sleep)
 
     def spoil(self, *faults: Fault | None) -> None:
@@ -84,9 +77,9 @@ class WheelBench:
         self.clock = Clock(0.0)
         self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
         self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
-        loop = Loop(self.device, clock=self.clock, sleep=self.clock.sleep)
-        chosen = Settings(filters=FILTERS, **options)  # type: ignore[arg-type]
-        self.wheel = FilterWheel(loop, chosen, clock=self.clock, sleep=self.clock.sleep)
+        loop = Line(self.device, clock=self.clock, sleep=self.clock.sleep)
+        chosen = Settings(**options)  # type: ignore[arg-type]
+        self.wheel = FilterWheel(loop, FILTERS, chosen, clock=self.clock, sleep=self.clock.sleep)
 
     def homed(self) -> FilterWheel:
         """Connect and home the wheel."""
@@ -119,5 +112,5 @@ class LoggerBench:
 
     def ready(self) -> TC08:
         """Open the unit with two thermocouples of type T."""
-        self.driver.open().set_channels({1: "T", 2: "T"})
+        self.driver.open().set_channels([1, 2])
         return self.driver

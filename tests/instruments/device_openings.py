@@ -16,11 +16,9 @@ from dbthermal.instruments import v4l2
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.camera import Stream, camera_kind
 from dbthermal.instruments.devices import open_devices
-from dbthermal.instruments.emulated.apt import start as start_wheel
-from dbthermal.instruments.emulated.boson import start as start_camera
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
-from dbthermal.instruments.filterwheel import FilterWheel, Settings
+from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
 
@@ -51,10 +49,9 @@ def loop_camera(_: ExitStack) -> Opened:
     return Opened(BosonBench().camera, True)
 
 
-def port_camera(stack: ExitStack) -> Opened:
-    """A Boson's driver on the emulator, on a pseudo-terminal."""
-    url = f"pty://{stack.enter_context(start_camera({'sn': '93588'}, None)).path}"
-    return Opened(Boson.from_url(url, timeout=5.0), True, lambda: Boson.from_url(url))
+def named_camera(_: ExitStack) -> Opened:
+    """A Boson's driver on the emulator, by its address and in real time."""
+    return Opened(Boson.from_url("sim://boson/wide"), True)
 
 
 def real_camera(_: ExitStack) -> Opened:
@@ -66,7 +63,7 @@ def real_camera(_: ExitStack) -> Opened:
 def stub_wheel(_: ExitStack) -> Opened:
     """A wheel's driver on a controller that takes no time."""
     clock = Clock()
-    wheel = FilterWheel(StubController(), QUICK, clock=clock, sleep=clock.sleep)
+    wheel = FilterWheel(StubController(), FILTERS, QUICK, clock=clock, sleep=clock.sleep)
     wheel.connect()
     return Opened(wheel, True)
 
@@ -78,17 +75,16 @@ def loop_wheel(_: ExitStack) -> Opened:
     return Opened(bench.wheel, True)
 
 
-def port_wheel(stack: ExitStack) -> Opened:
-    """A wheel's driver on the emulator, on a pseudo-terminal, a hundred times as fast."""
-    url = f"pty://{stack.enter_context(start_wheel({'model': 'BSC101'}, None)).path}"
-    return Opened(FilterWheel.from_url(url, QUICK), True, lambda: FilterWheel.from_url(url, QUICK))
+def named_wheel(_: ExitStack) -> Opened:
+    """A wheel's driver on the emulator, by its address, in real time, but a fast wheel."""
+    return Opened(FilterWheel.from_url("sim://apt/wheel", FILTERS, QUICK), True)
 
 
 def real_wheel(_: ExitStack) -> Opened:
     """A wheel."""
-    url, settings = address("DBTHERMAL_WHEEL"), Settings(filters=FILTERS)
-    opened = FilterWheel.from_url(url, settings)
-    return Opened(opened, False, lambda: FilterWheel.from_url(url, settings))
+    url = address("DBTHERMAL_WHEEL")
+    opened = FilterWheel.from_url(url, FILTERS)
+    return Opened(opened, False, lambda: FilterWheel.from_url(url, FILTERS))
 
 
 def stub_logger(_: ExitStack) -> Opened:
@@ -113,7 +109,7 @@ def stub_video(_: ExitStack) -> Opened:
     """The V4L2 driver on a stand-in for the kernel's calls."""
     answers = [(BYTES, GOOD, 1000 * number, number) for number in range(10)]
     kernel = Driver(answers=answers).kernel()
-    return Opened(v4l2.Capture.open("/dev/video0", STREAM, kernel), False)
+    return Opened(v4l2.Capture("/dev/video0", STREAM, kernel), False)
 
 
 def emulated_video(_: ExitStack) -> Opened:
@@ -148,7 +144,7 @@ def real_video(stack: ExitStack) -> Opened:
 
 Opening = Callable[[ExitStack], Opened]
 
-CAMERAS: list[Opening] = [stub_camera, loop_camera, port_camera, real_camera]
-WHEELS: list[Opening] = [stub_wheel, loop_wheel, port_wheel, real_wheel]
+CAMERAS: list[Opening] = [stub_camera, loop_camera, named_camera, real_camera]
+WHEELS: list[Opening] = [stub_wheel, loop_wheel, named_wheel, real_wheel]
 LOGGERS: list[Opening] = [stub_logger, emulated_logger, real_logger]
 VIDEOS: list[Opening] = [stub_video, emulated_video, y16_video, real_video]

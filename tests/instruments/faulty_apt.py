@@ -1,6 +1,7 @@
 """An emulated filter wheel with faults, each set by an attribute of `faults`."""
 
 import math
+import struct
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -114,9 +115,9 @@ class FaultyApt(EmulatedApt):
         if self.faults.silent or message.id in self.faults.deaf_to:
             return
         if self.faults.notice:
-            notice = apt.Notice(message.id, 1, self.faults.notice)
+            notice = struct.pack("<HH64s", message.id, 1, self.faults.notice.encode())
             self.faults.notice = ""
-            self.reply(Id.HW_RICHRESPONSE, notice.pack())
+            self.reply(Id.HW_RICHRESPONSE, notice)
         if message.id == Id.MOT_SET_VELPARAMS and self.faults.weak != 1.0:
             speeds = apt.VelocityParameters.parse(message)
             weak = [round(self.faults.weak * v) for v in (speeds.acceleration, speeds.maximum)]

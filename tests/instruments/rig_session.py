@@ -31,16 +31,16 @@ shape: [4, 80]
 telemetry_rows: 2
 cameras:
   "8-14":
-    video: {simulated: "sim://boson/wide", hardware: "v4l2:///dev/video0"}
-    control: {simulated: "sim://boson/wide", hardware: "serial:///dev/ttyACM0"}
+    video: "v4l2:///dev/video0"
+    control: "serial:///dev/ttyACM0"
   9.5:
-    video: {simulated: "sim://boson/narrow", hardware: "v4l2:///dev/video2"}
-    control: {simulated: "sim://boson/narrow", hardware: "serial:///dev/ttyACM1"}
+    video: "v4l2:///dev/video2"
+    control: "serial:///dev/ttyACM1"
 devices:
-  filter_wheel: {simulated: "sim://apt/wheel", hardware: "serial:///dev/ttyUSB0"}
-  thermocouples: {simulated: "sim://tc08", hardware: "tc08:"}
+  filter_wheel: "serial:///dev/ttyUSB0"
+  thermocouples: "tc08:"
 filters: {1: 9.5, 3: "11"}
-wheel: {velocity: 50.0, home_velocity: 50.0, acceleration: 2000.0, addresses: [[17, 33]]}
+wheel: {velocity: 50.0, home_velocity: 50.0, acceleration: 2000.0}
 sweep: [9.5, 11]
 thermocouples: {1: blackbody, 4: plate}
 blackbody: {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, timeout: 20}

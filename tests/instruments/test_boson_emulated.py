@@ -8,7 +8,6 @@ from device_benches import BosonBench, Clock
 from faulty_boson import Fault, FaultyBoson
 from hypothesis import given
 from hypothesis import strategies as st
-from loopback import Loop
 from test_boson import SERIAL, SET_GAIN
 from test_fslp import SERIAL_REQUEST
 
@@ -24,7 +23,7 @@ from dbthermal.instruments.boson import (
 from dbthermal.instruments.boson.commands import Setting
 from dbthermal.instruments.camera import FfcStatus, GainMode
 from dbthermal.instruments.emulated.boson import EmulatedBoson
-from dbthermal.instruments.emulated.port import EmulatedPort
+from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import FFC_DURATION, World
 from dbthermal.instruments.transport import TransportError
 
@@ -100,26 +99,24 @@ def test_the_emulator_takes_any_bytes(pieces: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "timeouts", "discarded", "damaged"),
+    ("fault", "timeouts"),
     [
-        (Fault.DROP, 1, 0, 0),
-        (Fault.LATE, 1, 1, 0),
-        (Fault.HOLD, 1, 1, 0),
-        (Fault.BAD_CHECKSUM, 1, 0, 1),
-        (Fault.ILLEGAL_ESCAPE, 1, 0, 1),
-        (Fault.CUT, 1, 0, 1),
-        (Fault.DEBUG_TEXT, 0, 1, 0),
+        (Fault.DROP, 1),
+        (Fault.LATE, 1),
+        (Fault.HOLD, 1),
+        (Fault.BAD_CHECKSUM, 1),
+        (Fault.ILLEGAL_ESCAPE, 1),
+        (Fault.CUT, 1),
+        (Fault.DEBUG_TEXT, 0),
     ],
 )
-def test_a_fault_of_the_line_is_overcome_and_counted(
-    bench: BosonBench, fault: Fault, timeouts: int, discarded: int, damaged: int
-) -> None:
-    """A fault of the line is counted, and this and the next reading are right."""
+def test_a_fault_of_the_line_is_overcome(bench: BosonBench, fault: Fault, timeouts: int) -> None:
+    """A fault costs at most the wait for a reply; this and the next reading are right."""
     bench.spoil(fault)
+    start = bench.clock.now
     assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
+    assert timeouts <= bench.clock.now - start < timeouts + 1.0  # [s]
     assert bench.camera.serial_number() == 93588
-    found = bench.camera.statistics
-    assert (found.timeouts, found.discarded, found.damaged) == (timeouts, discarded, damaged)
 
 
 @pytest.mark.parametrize(
@@ -173,7 +170,6 @@ def test_a_correction_that_stalls_past_the_timeout_shifts_no_reply(bench: BosonB
     bench.world.start_ffc("boson")
     assert bench.camera.read(commands.SERIAL_NUMBER, repeats=9) == 93588
     assert bench.camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
-    assert bench.camera.statistics.discarded == bench.camera.statistics.timeouts > 0
 
 
 def test_a_correction_that_takes_too_long_is_an_error(bench: BosonBench) -> None:
@@ -195,29 +191,21 @@ def test_frames_are_counted_once(has_frames: bool) -> None:
     world = World(clock=(clock := Clock()))
     state = world.add_camera("boson", 7)
     state.has_frames, state.frame_count = has_frames, 41
-    line = Loop(EmulatedBoson(world, "boson"), clock=clock, sleep=clock.sleep)
+    line = Line(EmulatedBoson(world, "boson"), clock=clock, sleep=clock.sleep)
     camera = Boson(line, clock=clock, sleep=clock.sleep)
     clock.sleep(5)
     assert camera.run_ffc() == (41 if has_frames else 300)
 
 
-def test_a_pseudo_terminal_brings_every_reply_until_it_hangs_up() -> None:
+def test_every_reply_comes_until_the_plug_is_pulled() -> None:
     """Byte by byte and with text between, a hundred replies are right; then the plug is pulled."""
     world = World()
-    world.add_camera("boson", 93588)
+    world.add_camera("boson", 2**32 - 1)
     device = FaultyBoson(world, "boson")
     device.faults.single_bytes = True
     device.faults.once = deque([Fault.DEBUG_TEXT, None] * 50)
-    with EmulatedPort(device) as port, Boson.from_url(f"pty://{port.path}") as camera:
-        assert {camera.serial_number() for _ in range(100)} == {93588}
-        assert camera.statistics.discarded == 50
+    with Boson(Line(device)) as camera:
+        assert {camera.serial_number() for _ in range(100)} == {2**32 - 1}
         world.camera("boson").plugged = False
         with pytest.raises(TransportError, match="must stay connected"):
             camera.serial_number()
-
-
-def test_the_largest_numbers_are_said_as_they_are() -> None:
-    """The largest serial number and temperature have room in the emulator's answers."""
-    with Boson.from_url("sim://boson?sn=4294967295&fpa=655") as camera:
-        assert camera.serial_number() == 2**32 - 1
-        assert camera.fpa_temperature() == pytest.approx(655.0, abs=0.051)

@@ -8,9 +8,7 @@ from hypothesis import strategies as st
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.apt import Id, command
-from dbthermal.instruments.filterwheel import FilterWheel, Settings, WheelError, WrongDeviceError
-
-SETTINGS = Settings(filters=FILTERS)
+from dbthermal.instruments.filterwheel import FilterWheel, WheelError, WrongDeviceError
 
 
 def _greeting(unit: int) -> bytes:
@@ -24,11 +22,10 @@ def _reply(identifier: Id, data: bytes, *, source: int = apt.BAY_1) -> bytes:
 
 def _connection() -> list[Pair]:
     """Bytes between a driver and a BSC201 until it is connected."""
-    to, info = apt.BAY_1, apt.Info(40_000_000, "BSC201", 45, "1.0.0", 1, 0, 1)
+    to, info = apt.BAY_1, apt.Info(40_000_000, "BSC201", "1.0.0")
     speeds = apt.VelocityParameters(1, 0, 4506, 21_987_328)
     before, home = apt.HomeParameters(1, 2, 1, 0, 0), apt.HomeParameters(1, 2, 1, 4_397_466, 0)
     return [
-        (_greeting(apt.UNIT), None),
         (_greeting(apt.RACK), _reply(Id.HW_GET_INFO, info.pack(), source=apt.RACK)),
         (
             command(Id.MOT_SET_VELPARAMS, data=speeds.pack(), destination=to)
@@ -68,7 +65,7 @@ def test_dialogue_of_a_move() -> None:
         ]
     )
     with dialogue:
-        wheel = FilterWheel(dialogue, SETTINGS, clock=clock, sleep=clock.sleep)
+        wheel = FilterWheel(dialogue, FILTERS, clock=clock, sleep=clock.sleep)
         assert wheel.connect().model == "BSC201"
         wheel.move_to(2)
 
@@ -81,7 +78,7 @@ def test_answers_of_others() -> None:
     greeted = _connection()[-1]
     pairs = [*_connection()[:-1], (greeted[0], [bytes.fromhex("12 02 01 01 01 21"), old])]
     with Dialogue([*pairs, (ask, [other_bay + other_channel, answer])]) as dialogue:
-        wheel = FilterWheel(dialogue, SETTINGS)
+        wheel = FilterWheel(dialogue, FILTERS)
         wheel.connect()
         assert wheel.status().position == 3
 
@@ -100,23 +97,22 @@ def test_arbitrary_answers(answers: list[bytes]) -> None:
 
     babbler = Babbler([(None, answers)] if answers else [])
     with pytest.raises(WheelError):
-        FilterWheel(babbler, SETTINGS, clock=clock, sleep=clock.sleep).connect()
+        FilterWheel(babbler, FILTERS, clock=clock, sleep=clock.sleep).connect()
 
 
 @pytest.mark.parametrize("bits", [b"\x12\x02\x01\x00\x01\x21", b"\x12\x02\x01\x03\x01\x21"])
 def test_neither_enabled_nor_not(bits: bytes) -> None:
     """An invalid state of the channel raises an error of the wheel."""
     dialogue = Dialogue([*_connection()[:-1], (_connection()[-1][0], bits)])
-    with dialogue, pytest.raises(WheelError, match="Unknown state of the motor"):
-        FilterWheel(dialogue, SETTINGS).connect()
+    with dialogue, pytest.raises(WheelError, match=r"Unknown state . of the motor"):
+        FilterWheel(dialogue, FILTERS).connect()
 
 
 def test_another_language() -> None:
     """A device that answers in text, such as an FW102C, raises an error."""
     banner = b"Command error CMD_NOT_DEFINED\r\n> "
-    chosen = Settings(addresses=((apt.UNIT, apt.UNIT),))
     with (
-        Dialogue([(_greeting(apt.UNIT), banner)]) as device,
+        Dialogue([(_greeting(apt.RACK), banner), (_greeting(apt.UNIT), None)]) as device,
         pytest.raises(WrongDeviceError, match="33 bytes came that are no APT messages"),
     ):
-        FilterWheel(device, chosen).connect()
+        FilterWheel(device, FILTERS).connect()

@@ -3,22 +3,21 @@
 import logging
 
 import pytest
-from device_benches import Clock, WheelBench
+from device_benches import FILTERS, Clock, WheelBench
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal.instruments import apt
+from dbthermal.instruments._controller import MAXIMUM_UNSOLICITED
 from dbthermal.instruments.filterwheel import (
     FilterWheel,
     NoReplyError,
     NotHomedError,
-    Settings,
     StalledWheelError,
     WheelError,
     WheelTimeoutError,
     WrongDeviceError,
 )
-from dbthermal.instruments.filterwheel._controller import MAXIMUM_UNSOLICITED
 from dbthermal.instruments.transport import Closing, TransportError
 
 
@@ -136,15 +135,15 @@ def test_move_that_does_not_start() -> None:
 
 def test_slow_wheel() -> None:
     """A move or a search for home that takes too long is stopped, and says where it was."""
-    bench = WheelBench(move_timeout=5.0, home_timeout=10.0)
+    bench = WheelBench()
     wheel = bench.homed()
     bench.device.faults.slow = 30.0
-    with pytest.raises(WheelTimeoutError, match=r"still at .* deg after 5.0 s, and was stopped"):
+    with pytest.raises(WheelTimeoutError, match=r"still at .* deg after 20.0 s, and was stopped"):
         wheel.move_to(4)
     bench.device.faults.slow = 1.0
     wheel.move_to(4)
     bench.device.faults.slow = 30.0
-    with pytest.raises(WheelTimeoutError, match=r"Search for home: .* after 10.0 s"):
+    with pytest.raises(WheelTimeoutError, match=r"Search for home: .* after 60.0 s"):
         wheel.home()
     with pytest.raises(NotHomedError):
         wheel.move_to(1)
@@ -193,15 +192,16 @@ def test_an_overload_costs_the_position() -> None:
     assert bench.world.wheel_position == 3
 
 
-def test_answers_that_come_too_late() -> None:
+def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
     """Answers later than the limit may be those of an older question: never a wrong slot."""
-    bench, patient = WheelBench(), WheelBench(reply_timeout=1.5)
+    bench, patient = WheelBench(), WheelBench()
     wheel = bench.homed()
     bench.device.faults.late = patient.device.faults.late = 1.2
     wheel.move_to(3)
     assert bench.world.wheel_position == wheel.position() == 3
     with pytest.raises(StalledWheelError, match="did not start"):
         wheel.move_to(6)
+    monkeypatch.setattr("dbthermal.instruments._controller.REPLY_TIMEOUT", 1.5)
     patient.homed().move_to(6)
     assert patient.world.wheel_position == 6
 
@@ -279,7 +279,7 @@ def test_a_device_that_never_ends_is_another_one() -> None:
     """An endless stream of bytes ends the wait with an error."""
     clock = Clock()
     line = Endless(2 * MAXIMUM_UNSOLICITED)
-    wheel = FilterWheel(line, Settings(), clock=clock, sleep=clock.sleep)
+    wheel = FilterWheel(line, {}, clock=clock, sleep=clock.sleep)
     with pytest.raises(WrongDeviceError, match="More than 65536 unsolicited bytes came"):
         wheel.connect()
 
@@ -317,7 +317,7 @@ def test_unplugging_at_any_step(steps: int) -> None:
     """Unplugging at any step raises the documented error, and closing still works."""
     bench = WheelBench()
     line = Unplugged(bench.wheel._transport, steps)  # type: ignore[arg-type]
-    wheel = FilterWheel(line, bench.wheel.settings, clock=bench.clock, sleep=bench.clock.sleep)
+    wheel = FilterWheel(line, FILTERS, clock=bench.clock, sleep=bench.clock.sleep)
 
     def use() -> None:
         wheel.connect()
@@ -363,10 +363,10 @@ def test_a_speed_that_is_a_little_off_is_refused() -> None:
 
 def test_passing_a_target_is_no_arrival() -> None:
     """A wheel that still moves is not there, however near to its target it is seen twice."""
-    bench = WheelBench(stall_timeout=1.0)
+    bench = WheelBench()
     bench.homed()
     bench.device.faults.stands_after = 60.05
     bench.device.faults.unreported = True
-    with pytest.raises(StalledWheelError, match=r"stood at 60\.05 deg for 1\.0 s"):
+    with pytest.raises(StalledWheelError, match=r"stood at 60\.05 deg for 2\.0 s"):
         bench.wheel.move_to(3)
     assert bench.sent(apt.Id.MOT_MOVE_STOP)

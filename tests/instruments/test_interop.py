@@ -4,6 +4,12 @@ Each test runs where its package can be imported: flirpy 0.6.2 (MIT), thorlabs-a
 (MIT) and thermocouple-its90 1.0.2 (MIT). None of them is needed by the package.
 """
 
+import os
+import pty
+import threading
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 
 import numpy as np
@@ -14,7 +20,6 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments import apt, thermocouple
 from dbthermal.instruments.apt import Id, command
 from dbthermal.instruments.emulated.boson import EmulatedBoson
-from dbthermal.instruments.emulated.port import EmulatedPort
 from dbthermal.instruments.emulated.world import World
 
 TO = apt.BAY_1
@@ -85,10 +90,10 @@ def test_requests_agree(protocol: ModuleType) -> None:
 def test_replies_agree(protocol: ModuleType) -> None:
     """thorlabs-apt-protocol reads the same out of what a controller answers."""
     unpacker = protocol.Unpacker()
-    status = apt.Status(1, -68_267, 0, apt.StatusBits.REVERSE_LIMIT | apt.StatusBits.HOMED)
+    status = apt.Status(1, -68_267, 0, apt.StatusBits(2) | apt.StatusBits.HOMED)
     answers = [
         (Id.MOT_GET_STATUSUPDATE, status.pack()),
-        (Id.HW_GET_INFO, apt.Info(94_000_009, "BSC201", 45, "57.1.2", 1, 3, 1).pack()),
+        (Id.HW_GET_INFO, apt.Info(94_000_009, "BSC201", "57.1.2").pack()),
         (Id.MOT_GET_HOMEPARAMS, HOME.pack()),
         (Id.MOT_GET_VELPARAMS, SPEEDS.pack()),
     ]
@@ -104,14 +109,29 @@ def test_replies_agree(protocol: ModuleType) -> None:
     assert (speeds.acceleration, speeds.max_velocity) == (SPEEDS.acceleration, SPEEDS.maximum)
 
 
+@contextmanager
+def terminal(device: EmulatedBoson) -> Iterator[str]:
+    """Path of a raw pseudo-terminal on which an emulated camera answers."""
+    far, near = pty.openpty()
+    tty.setraw(near)
+
+    def serve() -> None:
+        while received := os.read(far, 4096):
+            device.receive(received)
+            os.write(far, b"".join(device.poll()))
+
+    threading.Thread(target=serve, daemon=True).start()
+    yield os.ttyname(near)
+
+
 def test_flirpy_understands_the_emulated_boson() -> None:
     """Flirpy, unchanged, reads and sets; its known error of the sign is seen, too."""
     flirpy = pytest.importorskip("flirpy.camera.boson")
     world = World()
     state = world.add_camera("boson", 93588)
     state.fpa_temperature = state.last_ffc_temperature = 273.15 + 43.1  # its checksum is escaped
-    with EmulatedPort(EmulatedBoson(world, "boson")) as port:
-        camera = flirpy.Boson(port=port.path)
+    with terminal(EmulatedBoson(world, "boson")) as path:
+        camera = flirpy.Boson(port=path)
         assert (camera.get_camera_serial(), camera.get_fpa_temperature()) == (93588, 43.1)
         assert camera.get_part_number().strip("\0 ") == "EMULATED-BOSON-640"
         camera.set_ffc_manual()

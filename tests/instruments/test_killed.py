@@ -22,8 +22,8 @@ from dbthermal.instruments.recording import (
     record,
 )
 from dbthermal.instruments.recording._capture_file import CaptureFile, Note
-from dbthermal.instruments.session import Camera, Device, Session
-from dbthermal.store import _durable as durable
+from dbthermal.instruments.session import Camera, Session
+from dbthermal.store import _recording as durable
 
 SHAPE, RATE, CHUNK = (32, 40), 200.0, 6
 BANDS = ("8-14", "9.5")
@@ -41,7 +41,7 @@ def record_until_killed(path: Path, duration: float, pipe: Connection) -> None:
     for number, band in enumerate(BANDS):
         world.add_camera(band, number)
         sources[band] = EmulatedCamera(world, band, {band: picture}, band, SHAPE, RATE)
-    camera = Camera(Device("sim://boson/any", "v4l2:///dev/video0"))
+    camera = Camera("v4l2:///dev/video0")
     cameras = dict.fromkeys(BANDS, camera)
     session = Session("killed", True, "scene", duration, cameras, RATE, SHAPE)
     limits = Limits(chunk=CHUNK, reserve=0, preview_period=0.0, reading_period=0.02)

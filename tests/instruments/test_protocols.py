@@ -27,7 +27,7 @@ from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.protocols import Step
-from dbthermal.instruments.recording import Preview, _sweep, notes, open_capture
+from dbthermal.instruments.recording import Preview, _reader, notes, open_capture
 
 QUICKLY = ("window: 3", "window: 0.02")
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)
@@ -165,7 +165,7 @@ def test_recordings_of_a_step_must_agree(
 ) -> None:
     """A blackbody that drifted between two filters has no one temperature."""
     values = iter([300.0, 300.2])
-    monkeypatch.setattr(_sweep, "mean_reading", lambda *_: next(values))
+    monkeypatch.setattr(_reader, "mean_reading", lambda *_: next(values))
     with pytest.raises(ValueError, match=r"Invalid readings \[300\.0, 300\.2\] K of 'blackbody'"):
         recording.open_sweep(recorded[0], "plate", frames=8)
 
@@ -225,7 +225,7 @@ def test_lost_camera_ends_the_sweep(tmp_path: Path) -> None:
         assert devices.world is not None
         world, form = devices.world, (devices.session.shape, 100.0, 2)
         faulty = FaultyCamera(
-            world, "wide", pictures(world), "8-14", *form, faults=Faults(unplugged=3)
+            world, "8-14", pictures(world), "8-14", *form, faults=Faults(unplugged=3)
         )
         devices = replace(devices, sources={**devices.sources, "8-14": faulty})  # noqa: PLW2901
         with pytest.raises(SourceLostError, match=r"plate_00_9\.5\.zarr' ended: source lost"):

@@ -3,7 +3,6 @@
 import errno
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +26,11 @@ from dbthermal.instruments.recording import (
     record,
 )
 from dbthermal.instruments.recording._capture_file import CaptureFile
-from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.session import Camera, Session
 
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
 BANDS = ("8-14", "9.5")
 SMALL = Limits(chunk=CHUNK, reserve=0, silence=0.1, reading_period=0.05, preview_period=0.0)
-VIDEO = Device("sim://boson/any", "v4l2:///dev/video0")
 PATTERN = np.random.default_rng(1).integers(5000, 6000, SHAPE).astype(np.uint16)
 
 
@@ -43,8 +41,7 @@ def picture(time: float) -> Counts:
 
 def session(duration: float = 0.3) -> Session:
     """Two emulated cameras with small frames."""
-    videos = [replace(VIDEO, hardware=f"v4l2:///dev/video{number}") for number in range(len(BANDS))]
-    cameras = dict(zip(BANDS, map(Camera, videos), strict=True))
+    cameras = {band: Camera(f"v4l2:///dev/video{place}") for place, band in enumerate(BANDS)}
     return Session("test", True, "scene", duration, cameras, RATE, SHAPE)
 
 
@@ -154,7 +151,7 @@ def test_duration_begins_with_the_first_frame(
 
     monkeypatch.setattr(_recorder, "monotonic", clock)
     monkeypatch.setattr(_recorder, "_new_file", slowly)
-    one = Session("test", True, "scene", 2.0, {"8-14": Camera(VIDEO)}, rate, SHAPE)
+    one = Session("test", True, "scene", 2.0, {"8-14": Camera("v4l2:///dev/video0")}, rate, SHAPE)
     limits = Limits(chunk=200, reserve=0, queue=200)
     summary = record(one, {"8-14": source}, tmp_path / "a.zarr", limits=limits)
     times = open_capture(tmp_path / "a.zarr")["exposure_time"][0]

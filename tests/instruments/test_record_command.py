@@ -74,7 +74,7 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
     arguments = ["record", written(tmp_path / "a.yaml", TEXT), str(tmp_path / "b"), "--dry-run"]
     assert main(arguments) == 0
     said = capsys.readouterr().out
-    assert "9.5: device sim://boson/narrow" in said
+    assert "9.5: device sim://boson/9.5" in said
     assert "Preparing" not in said
     assert not (tmp_path / "b").exists()
 
@@ -83,12 +83,8 @@ def test_dry_run_records_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ("text", "status", "message"),
     [
         ("name: plate", 1, "Missing 'simulated'. Must be set"),
-        (TEXT.replace("sim://tc08", "sim://tc09"), 1, "Invalid address 'sim://tc09' of thermo"),
-        (
-            TEXT.replace("sim://apt/wheel", "sim://apt?sn=x"),
-            1,
-            "dbthermal record: Invalid option sn=x",
-        ),
+        (TEXT.replace("tc08:", "tc09:"), 1, "Invalid address 'tc09:'. Must be tc08:"),
+        (TEXT.replace("v4l2:///dev/video0", "v4l2:///tmp/x"), 1, "Must be v4l2:///dev/<node>"),
     ],
 )
 def test_failures_have_a_status(

@@ -21,7 +21,7 @@ from faulty_camera import Movie
 from dbthermal.instruments.emulated.camera import EmulatedCamera
 from dbthermal.instruments.emulated.world import World
 from dbthermal.instruments.recording import record
-from dbthermal.instruments.session import Camera, Device, Session
+from dbthermal.instruments.session import Camera, Session
 
 SHAPE, RATE, MINUTE = (512, 640), 60.0, 60.0
 FASTER = (90.0, 120.0, 180.0, 240.0, 300.0)  # of two emulated cameras [Hz]; no Boson gives these
@@ -63,7 +63,7 @@ def measure(rate: float, seconds: float, path: Path) -> Measured:
         world.add_camera(band, number)
         movie = Movie(noise, rate, endless=True)
         sources[band] = EmulatedCamera(world, band, {band: movie}, band, SHAPE, rate, 2)
-    cameras = dict.fromkeys(sources, Camera(Device("sim://boson/any", "v4l2:///dev/video0")))
+    cameras = dict.fromkeys(sources, Camera("v4l2:///dev/video0"))
     session = Session("rate", True, "scene", seconds, cameras, rate, SHAPE, 2)
     start = time.process_time()
     totals = record(session, dict(sources), path).totals

@@ -84,7 +84,7 @@ def check(number: int) -> int:
         else:
             assert 0 < session.duration <= 1e6, (deed, key)
             assert all(2 <= size <= 8192 for size in session.shape), (deed, key)
-            hardware = [camera.video.hardware for camera in session.cameras.values()]
+            hardware = [camera.video for camera in session.cameras.values()]
             assert all(url.startswith("v4l2:///dev/") for url in hardware), (deed, key)
     return refused
 
@@ -114,12 +114,11 @@ def test_many_mutants_are_refused_in_words() -> None:
         ("duration: 0.15", "duration: 0.001", "Invalid duration 0.001 s. Must be one frame"),
         ("[300.0, 290.0", "[26.85, 290.0", "blackbody.temperatures.0 26.85. Must be greater than"),
         ("window: 3", "window: 20", "blackbody: Invalid window 20.0 s. Must be below the timeout"),
-        ("[[17, 33]]", "[[0, 0]]", "wheel: Invalid addresses ((0, 0),). Must be pairs of [17, 33"),
         ("velocity: 50.0, h", "speed: 50.0, h", "Unknown key 'wheel.speed'"),
         (
             "velocity: 50.0, h",
             'velocity: "50", h',
-            "Invalid wheel.velocity '50'. Must be a number",
+            "Invalid wheel.velocity '50'. Must be a valid number",
         ),
         ("wheel: {velocity", "wheel: {filters: {1: a}, velocity", "Unknown key 'wheel.filters'"),
         ('"tc08:"', '"tc08:///tmp/x.so"', "Invalid address 'tc08:///tmp/x.so'. Must be"),

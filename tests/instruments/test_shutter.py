@@ -22,11 +22,8 @@ RATE, SHAPE = 50.0, [16, 80]
 def recorded(path: Path, telemetry_rows: int) -> xr.Dataset:
     """A scene during which the narrow camera corrects its offsets, once, by its command port."""
     cameras = {
-        band: {
-            "video": {"simulated": f"sim://boson/{name}", "hardware": "v4l2:///dev/video0"},
-            "control": {"simulated": f"sim://boson/{name}", "hardware": "serial:///dev/ttyACM0"},
-        }
-        for band, name in (("8-14", "wide"), ("9.5", "narrow"))
+        band: {"video": "v4l2:///dev/video0", "control": "serial:///dev/ttyACM0"}
+        for band in ("8-14", "9.5")
     }
     changes = {"cameras": cameras, "shape": SHAPE, "frame_rate": RATE, "duration": 1.3}
     session = Session.load(SESSION, {**changes, "telemetry_rows": telemetry_rows})

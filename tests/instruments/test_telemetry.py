@@ -50,13 +50,6 @@ def test_fields_come_back(fields: dict[str, float]) -> None:
     assert found.fpa_temperature == pytest.approx(fields["fpa_temperature"], abs=1e-6)
 
 
-def test_the_order_of_the_words_may_be_the_other() -> None:
-    """With the low word first, a longer number is read the other way round."""
-    rows = telemetry.encode({"frame_counter": 0x00010002, "revision": 7}, COLUMNS)
-    found = telemetry.decode(rows, high_word_first=False)
-    assert (found["frame_counter"], found["revision"]) == (0x00020001, 7)
-
-
 @given(rows=arrays(np.uint16, (2, 80)))
 def test_anything_is_read(rows: npt.NDArray[np.uint16]) -> None:
     """Any words give a record, as the rows have no checksum."""

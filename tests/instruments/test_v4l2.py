@@ -1,7 +1,9 @@
 """Capture by Video4Linux2: calls to the kernel, and frames with its stamps and flags."""
 
 import errno
+import importlib
 import struct
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -47,7 +49,7 @@ class Driver:
     lost_at: tuple[int, ...] = (v4l2.DQBUF, v4l2.STREAMOFF)
     signals: int = 0
 
-    def kernel(self, platform: str = "linux") -> v4l2.Kernel:
+    def kernel(self) -> v4l2.Kernel:
         """Calls to this driver."""
         return v4l2.Kernel(
             open=self._open,
@@ -56,7 +58,6 @@ class Driver:
             map=self._map,
             select=lambda *_: ([3], [], []) if self.answers or self.lost else ([], [], []),
             clock=lambda: 12.5,
-            platform=platform,
         )
 
     def _open(self, path: str, flags: int) -> int:  # noqa: ARG002 - as os.open
@@ -137,7 +138,7 @@ REPLIES: dict[int, Callable[[Driver, bytearray], None]] = {
 def opened(driver: Driver, **changes: Any) -> v4l2.Capture:
     """Open the node of a driver."""
     stream = Stream(**{**STREAM.__dict__, **changes})
-    return v4l2.Capture.open("/dev/video0", stream, driver.kernel())
+    return v4l2.Capture("/dev/video0", stream, driver.kernel())
 
 
 def test_frame_comes_with_stamp_number_and_telemetry() -> None:
@@ -290,10 +291,12 @@ def test_other_streams_are_refused(driver: Driver, message: str) -> None:
     assert driver.open_files == 0
 
 
-def test_other_systems_are_refused() -> None:
+def test_other_systems_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Elsewhere than on Linux there is a clear error."""
-    with pytest.raises(OSError, match=r"No video on 'darwin'\. Must be Linux"):
-        v4l2.Capture.open("/dev/video0", STREAM, Driver().kernel("darwin"))
+    monkeypatch.delitem(sys.modules, "dbthermal.instruments.v4l2")
+    monkeypatch.setattr(sys, "platform", "darwin")
+    with pytest.raises(ImportError, match=r"No video on 'darwin'\. Must be Linux"):
+        importlib.import_module("dbthermal.instruments.v4l2")
 
 
 @given(

@@ -16,7 +16,7 @@ from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated.world import FFC_DURATION
 from dbthermal.instruments.protocols import record_scene
 from dbthermal.instruments.recording import Limits, open_capture
-from dbthermal.instruments.session import Device, Session
+from dbthermal.instruments.session import Session
 
 SESSION = Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml"
 
@@ -57,19 +57,21 @@ def test_it_has_neither_telemetry_nor_command_port() -> None:
     ):
         session(telemetry_rows=2)
     plain = session()
-    control = Device("sim://boson/wide", "serial:///dev/ttyACM0")
     with pytest.raises(ValueError, match="Invalid control of kind 'y16', which has none"):
-        replace(plain.cameras["8-14"], control=control)
+        replace(plain.cameras["8-14"], control="serial:///dev/ttyACM0")
 
 
-def test_its_shutter_is_told_by_frozen_images(tmp_path: Path) -> None:
+def test_its_shutter_is_told_by_frozen_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A correction of its own is flagged from the third copy on, and found whole afterwards."""
-    video = {"simulated": "sim://y16/wide?ffc=1", "hardware": "v4l2:///dev/video0"}
-    camera = {"kind": "y16", "video": video}
+    models = {"y16": ("emulated Y16 camera", 1.0)}  # corrects its offsets every second
+    monkeypatch.setattr("dbthermal.instruments.emulated.camera.MODELS", models)
+    camera = {"kind": "y16", "video": "v4l2:///dev/video0"}
     short = session(cameras={"8-14": camera}, duration=1.8, frame_rate=50.0)
     with open_devices(short) as devices:
         identity = devices.identities()["8-14"]
-        assert (identity["device"], identity["model"]) == ("sim://y16/wide", "emulated Y16 camera")
+        assert (identity["device"], identity["model"]) == ("sim://y16/8-14", "emulated Y16 camera")
         record_scene(devices, tmp_path / "a.zarr", limits=Limits(reserve=0))
     capture = open_capture(tmp_path / "a.zarr")
     repeated = (capture["frame_flags"] & int(FrameFlag.IMAGE_REPEATED)) != 0

@@ -116,6 +116,23 @@ def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
         read(tmp_path / "empty")
 
 
+@pytest.mark.parametrize("form", [2, 3])
+@pytest.mark.parametrize("chunks", [(1, 24, 32), (2, 10, 12)], ids=str)
+def test_a_smaller_shape_of_zarr_is_no_cropped_picture(
+    tmp_path: Path, form: Any, chunks: tuple[int, int, int]
+) -> None:
+    """A digit of the shape that is less leaves chunks, or parts of them, out: refused."""
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, data=scene(), chunks=chunks, zarr_format=form)
+    about = path / ("zarr.json" if form == 3 else ".zarray")
+    assert_array_equal(read(path).counts, scene())
+    content = json.loads(about.read_text())
+    for shape in ([2, 24, 32], [3, 20, 32], [3, 24, 31]):
+        about.write_text(json.dumps({**content, "shape": shape}))
+        with pytest.raises(ValueError, match=r"Invalid shape .* of 'a\.zarr'\. Must be all"):
+            read(path)
+
+
 def test_objects_are_not_loaded(tmp_path: Path) -> None:
     """A pickle is refused by its type, before it is read; so is a size beyond the memory."""
     path = tmp_path / "a.npy"

@@ -2,7 +2,7 @@
 
 A camera that is busy answers late, after its driver gave up; read naively, every later command then
 gets the reply of the one before (openmv/openmv, pull request 3265). Here each request has a
-sequence number of its own, and frames that do not carry it are discarded and counted. Connecting
+sequence number of its own, and frames that do not carry it are discarded. Connecting
 sends and resets nothing, and nothing is ever written to the camera's flash memory. Written from
 public descriptions, tested against public byte vectors and an emulator, not against hardware.
 """
@@ -11,7 +11,6 @@ import threading
 import time as system_time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, TypeVar
 
@@ -83,15 +82,6 @@ class BosonStatusError(BosonError):
         self.status = status
 
 
-@dataclass
-class Statistics:
-    """Irregularities of the line so far; all zero on a good one."""
-
-    discarded: int = 0  # undamaged frames of other channels or requests: debug text, late replies
-    damaged: int = 0  # frames cut short, with a wrong checksum or an illegal escape
-    timeouts: int = 0  # requests that were not answered in time
-
-
 class Boson(Closing):
     """One camera's command port, a `camera.CameraControl`; for any number of threads.
 
@@ -118,7 +108,6 @@ class Boson(Closing):
         # From the time of day: replies to a program that ended are not taken for this one's.
         first = system_time.time_ns() // 1000 if first_sequence is None else first_sequence
         self.is_simulated = transport.is_simulated
-        self.statistics = Statistics()
         self.timeout = timeout
         self._transport = transport
         self._clock = clock
@@ -268,17 +257,13 @@ class Boson(Closing):
                     "Must be a Boson's command port that no other program uses."
                 )
             key = (fslp.COMMAND_CHANNEL, self._sequence)
-            frames = self._decoder.feed(piece)
             replies = [
                 frame
-                for frame in frames
+                for frame in self._decoder.feed(piece)
                 if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
             ]
-            self.statistics.discarded += len(frames) - len(replies[:1])
-            self.statistics.damaged = self._decoder.damaged
             if replies:
                 return replies[0]
-        self.statistics.timeouts += 1
         raise BosonTimeoutError(
             f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
             "and the camera through with booting."
@@ -293,8 +278,6 @@ def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource
 
 
 def _open_control(url: str, world: object | None) -> Boson:
-    if url.startswith("sim:") and not url.startswith("sim://boson/"):
-        raise ValueError(f"Invalid address '{url}' of a camera. Must be 'sim://boson/<name>'.")
     return Boson.from_url(url, world=world)
 
 

@@ -9,14 +9,13 @@ AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as i
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.apt import Id, StatusBits
-from dbthermal.instruments.emulated.port import EmulatedPort, number, require_known
+from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import World
 
 SERIAL_NUMBER: Final = 40_000_000
@@ -76,7 +75,7 @@ class Drive:
 
 
 class EmulatedApt:
-    """A controller and a wheel, on the world's clock; a `Device` of `emulated.port`.
+    """A controller and a wheel, on the world's clock; a `Device` of `emulated.line`.
 
     It turns the world's wheel, whose slot 1 is `slot_offset` [deg] from the home switch. `position`
     counts the commanded steps, `wheel` is the place of the wheel from its home switch [count];
@@ -94,7 +93,7 @@ class EmulatedApt:
         if model not in MODELS:
             raise ValueError(f"Invalid model '{model}'. Must be one of {sorted(MODELS)}.")
         self.plugged = True
-        self.info = apt.Info(serial_number, model, 45, "1.0.0", 1, 0, 1, NOTES)
+        self.info = apt.Info(serial_number, model, "1.0.0", NOTES)
         self.model = MODELS[model]
         self.unit = apt.RACK if self.model.is_rack else apt.UNIT
         self.address = apt.BAY_1 if self.model.is_rack else apt.UNIT
@@ -232,17 +231,6 @@ class EmulatedApt:
         self.world.wheel_position = nearest % 6 + 1 if rests else None
 
 
-def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
-    """Start an emulated wheel for ``sim://apt``, on a pseudo-terminal of its own.
-
-    Options: ``model``, ``sn`` (serial number), ``offset`` (of slot 1 from the home switch [deg])
-    and ``name``, without effect; ValueError if one is unknown or invalid.
-    """
-    require_known(options, ("model", "sn", "offset", "name"))
-    device = EmulatedApt(
-        World() if world is None else world,
-        model=options.get("model", "BSC201"),
-        serial_number=number(options, "sn", SERIAL_NUMBER, (0, (1 << 32) - 1)),
-        slot_offset=number(options, "offset", 0.0, (-360.0, 360.0)),
-    )
-    return EmulatedPort(device)
+def start(_: str, world: World | None) -> Line:
+    """Line to the emulated wheel of a world, or of a new one."""
+    return Line(EmulatedApt(World() if world is None else world))

@@ -7,7 +7,6 @@ which the public descriptions leave open, are choices made here.
 
 import math
 import struct
-from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -16,8 +15,8 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments import fslp
 from dbthermal.instruments.boson import commands
 from dbthermal.instruments.camera import FfcMode, FfcStatus
-from dbthermal.instruments.emulated.port import EmulatedPort, number, require_known
-from dbthermal.instruments.emulated.world import FPA, SERIAL_NUMBERS, World
+from dbthermal.instruments.emulated.line import Line
+from dbthermal.instruments.emulated.world import SERIAL_NUMBERS, World
 
 FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source counts [Hz]
 
@@ -29,8 +28,6 @@ DEFAULTS: Final = MappingProxyType(
 )
 """Settings at power-on, by the identifier that sets them; not those of a real camera."""
 
-_SERIAL_NUMBER_LIMITS = (0, (1 << 32) - 1)
-_FPA_LIMITS = (0.0, 655.0)  # [K] which tenths in 16 bits hold
 _STATUS, _RANGE, _FEW, _MANY, _UNKNOWN = 0x162, 0x203, 0x17D, 0x17E, 0x161
 
 # Number of the states of each setting, which are numbered from 0.
@@ -38,7 +35,7 @@ _CHOICES = {setting.set_command: len(setting.kind.__members__) for setting in co
 
 
 class EmulatedBoson:
-    """One emulated camera of a world, as an `emulated.port.Device`.
+    """One emulated camera of a world, as an `emulated.line.Device`.
 
     Its clock is the world's; KeyError if the world has no camera of this name.
     """
@@ -124,21 +121,12 @@ class EmulatedBoson:
         return {one.command: struct.pack(one.layout, *value) for one, value in values.items()}
 
 
-def start(options: Mapping[str, str], world: World | None) -> EmulatedPort:
-    """Start an emulated camera for ``sim://boson``, on a pseudo-terminal of its own.
+def start(name: str, world: World | None) -> Line:
+    """Line to an emulated camera of a world; without one, to the only camera of a new one.
 
-    Options: ``name``, in the world (``"boson"`` by default), and without a world ``sn``, its serial
-    number, and ``fpa``, the temperature of its focal-plane array [K]. ValueError if one is not
-    known or disagrees with the world, KeyError if it has no such camera.
+    KeyError if the world has no camera of this name.
     """
-    require_known(options, ("name", "sn", "fpa"))
-    name = options.get("name", "boson")
-    serial_number = number(options, "sn", SERIAL_NUMBERS, _SERIAL_NUMBER_LIMITS)
-    fpa_temperature = number(options, "fpa", FPA, _FPA_LIMITS)
     if world is None:
         world = World()
-        camera = world.add_camera(name, serial_number)
-        camera.fpa_temperature = camera.last_ffc_temperature = fpa_temperature
-    elif {"sn", "fpa"} & options.keys():
-        raise ValueError(f"Invalid options sn, fpa of camera '{name}'. Must be set in its world.")
-    return EmulatedPort(EmulatedBoson(world, name))
+        world.add_camera(name, SERIAL_NUMBERS)
+    return Line(EmulatedBoson(world, name))

@@ -15,7 +15,9 @@ from typing import Final
 
 import numpy as np
 
-from dbthermal.instruments import _addresses as addresses
+from dbthermal import response as responses
+from dbthermal import simulation
+from dbthermal.bands import FILTERS
 from dbthermal.instruments import telemetry
 from dbthermal.instruments.camera import (
     FRAME_TIMEOUT,
@@ -26,11 +28,12 @@ from dbthermal.instruments.camera import (
     SourceLostError,
     Stream,
 )
-from dbthermal.instruments.emulated.port import number, require_known
 from dbthermal.instruments.emulated.world import World
+from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Closing
 
 Picture = Callable[[float], Counts]
+NETD: Final = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
 
 BUFFERS: Final = 32
 """Frames that are held while no program reads, as by the V4L2 driver; beyond, they are dropped."""
@@ -38,13 +41,11 @@ BUFFERS: Final = 32
 CLOSED: Final = 10_000
 """Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
 
-MODELS: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = MappingProxyType(
-    {"boson": ("emulated Boson", ()), "y16": ("emulated Y16 camera", ("ffc",))}
+MODELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
+    {"boson": ("emulated Boson", math.inf), "y16": ("emulated Y16 camera", 120.0)}
 )
-"""Kind of camera, as in ``sim://boson/wide``, to its model and to the options of its address."""
-
-FFC_PERIODS: Final = (1.0, math.inf)
-"""Shortest and longest time between corrections that a camera starts by itself [s]."""
+"""Kind of camera, as in ``sim://boson/wide``, to its model, and the time between the flat-field
+corrections that it starts by itself [s]."""
 
 
 @dataclass
@@ -63,7 +64,6 @@ class EmulatedCamera(Closing):
     telemetry_rows: int = 0
     sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
     kind: str = "boson"  # of `MODELS`
-    ffc_period: float = math.inf  # between corrections that the camera starts by itself [s]
 
     is_simulated: Final = True
 
@@ -115,7 +115,7 @@ class EmulatedCamera(Closing):
         """Frame of a number, exposed at a time since the world began [s]."""
         with self.world.lock:
             self._state.frame_count = number
-            if due >= max(self._state.ffc_until, 0.0) + self.ffc_period:
+            if due >= max(self._state.ffc_until, 0.0) + MODELS[self.kind][1]:
                 self.world.start_ffc(self.name)
             frozen = self.world.ffc_in_progress(self.name)
         if not frozen:
@@ -155,27 +155,44 @@ class EmulatedCamera(Closing):
 
 
 def open_frames(
-    url: str, world: World, pictures: Mapping[str, Picture], band: str | None, stream: Stream
+    kind: str,
+    name: str,
+    world: World,
+    pictures: Mapping[str, Picture],
+    band: str | None,
+    stream: Stream,
 ) -> EmulatedCamera:
-    """Open ``sim://<kind>/<name>``, a camera of the world; `band` None is behind the wheel.
+    """Frames of a camera of the world, of a kind of `MODELS`; `band` None is behind the wheel."""
+    if kind not in MODELS:
+        raise ValueError(f"Unknown emulated camera '{kind}'. Must be one of {sorted(MODELS)}.")
+    form = stream.shape, stream.frame_rate, stream.telemetry_rows
+    return EmulatedCamera(world, name, pictures, band, *form, kind=kind)
 
-    The option ``ffc`` of ``sim://y16/<name>?ffc=120`` is `EmulatedCamera.ffc_period` [s].
+
+def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
+    """Raw frames, by band, of the world's blackbody as the cameras of a session see it.
+
+    Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise of `NETD`,
+    a fixed pattern (see `dbthermal.simulation.pattern`) and 16 bits. Bands that are not in
+    `dbthermal.bands.FILTERS` get no picture.
     """
-    address = addresses.parse(url, ("sim",))
-    if address.target not in MODELS:
-        raise ValueError(
-            f"Invalid address '{url}' of an emulated camera. Must be 'sim://<kind>/<name>' with "
-            f"one of {sorted(MODELS)}."
-        )
-    require_known(address.options, MODELS[address.target][1])
-    return EmulatedCamera(
-        world,
-        address.name,
-        pictures,
-        band,
-        stream.shape,
-        stream.frame_rate,
-        stream.telemetry_rows,
-        kind=address.target,
-        ffc_period=number(address.options, "ffc", math.inf, FFC_PERIODS),
-    )
+    names = dict.fromkeys((*session.bands, *session.filters.values()))
+    bands = tuple(name for name in names if name in FILTERS)
+    if not bands:
+        return {}
+    rig = simulation.Rig(bands=bands, noise=(NETD,) * len(bands))
+    detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
+    response = rig.response()
+
+    def of_band(number: int, band: str) -> Picture:
+        curve, pattern = responses.curve(response, band), detector.sel(band=band)
+        noise = float(response["noise"].sel(band=band))
+        rng = np.random.default_rng([0, number])
+
+        def picture(_: float) -> Counts:
+            level = float(curve.counts(np.array(world.blackbody_temperature)))
+            return simulation.digitise(level + rng.normal(0.0, noise, session.shape), pattern)
+
+        return picture
+
+    return {band: of_band(number, band) for number, band in enumerate(bands)}

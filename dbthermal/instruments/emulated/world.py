@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from dbthermal.instruments import _addresses as addresses
 from dbthermal.instruments.session import Session
 
 POSITIONS: Final = 6  # slots of the wheel, numbered from 1
@@ -138,11 +137,10 @@ class World:
         return self.cameras[name]
 
     def furnish(self, session: Session) -> None:
-        """Put the cameras and thermocouples of an emulated session on the bench."""
+        """Put the cameras, by band, and thermocouples of an emulated session on the bench."""
         self.thermocouples.update(session.thermocouples)
-        for number, camera in enumerate(session.cameras.values()):
-            name = addresses.parse(camera.video.simulated).name
-            self.add_camera(name, SERIAL_NUMBERS + number)
+        for number, band in enumerate(session.bands):
+            self.add_camera(band, SERIAL_NUMBERS + number)
 
     def start_ffc(self, name: str, duration: float = FFC_DURATION) -> None:
         """Start a correction, maybe anew: the shutter closes, the image freezes until its end."""

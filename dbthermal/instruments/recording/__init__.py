@@ -5,10 +5,15 @@ recording as stage `capture`, `notes` its log, `overview` a folder of recordings
 and `bench_series` those of a blackbody. See `dbthermal.instruments.protocols` for whole procedures.
 """
 
-from dbthermal.instruments.recording._capture import notes, open_capture, overview
+from dbthermal.instruments.recording._reader import (
+    bench_series,
+    notes,
+    open_capture,
+    open_sweep,
+    overview,
+)
 from dbthermal.instruments.recording._recorder import record
 from dbthermal.instruments.recording._records import Limits, Preview, Reading, Summary
-from dbthermal.instruments.recording._sweep import bench_series, open_sweep
 
 __all__ = [
     "Limits",

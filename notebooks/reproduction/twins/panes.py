@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dbthermal.simulation import heat
+from reproduction import heat
 from reproduction.twins import surfaces
 from reproduction.twins.people import FINGERS, hand, imprint, pacing, person
 from reproduction.twins.props import Writing, board

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from dbthermal.simulation import heat
+from reproduction import heat
 from reproduction.twins import surfaces
 from reproduction.twins.panes import Touch
 from reproduction.twins.people import Route, hand, imprint, pacing, person

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.special import ndtr
 
 from dbthermal import schema, simulation
-from dbthermal.simulation import heat
+from reproduction import heat
 from reproduction.twins.people import pacing, person
 from reproduction.twins.rays import Array, Camera, Caster, unit
 from reproduction.twins.surroundings import Actor, incident, painted

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 import trimesh
 
-from dbthermal.simulation import heat
+from reproduction import heat
 from reproduction.twins import surfaces
 from reproduction.twins.rays import Array, Camera
 from reproduction.twins.stage import AMBIENT, Capture, Stage, passers_by, since, table

@@ -1,4 +1,4 @@
-"""Line to an APT controller: requests and replies, its identity, speeds and motor.
+"""APT stepper controller of a filter wheel: requests and replies, identity, speeds, one motor.
 
 APT has no sequence numbers, and a controller reports the end of a move at any time: the next
 message is not always the reply. Messages are told apart by identifier, source and channel.
@@ -6,20 +6,37 @@ message is not always the reply. Messages are told apart by identifier, source a
 A controller that is addressed wrongly says nothing, one that was just switched on may have speeds
 near 0 and a motor without current, and one that was sold under one name may give another. So the
 address is searched for, the model is checked, and each setting is read back.
+
+References
+----------
+pylablib 1.4.5, ``Thorlabs/kinesis.py`` (scales and units of speed); instrumentkit,
+``thorlabsapt.py`` (25600 counts for an FW103); thorlabs_apt_device 0.3.8, ``bsc.py`` (the same
+units, and addresses). Facts alone, no code.
 """
 
 import logging
 import threading
 import time as system_time
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Final
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Annotated, Final, Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from dbthermal.instruments import apt
 from dbthermal.instruments.apt import Id
-from dbthermal.instruments.filterwheel._settings import CHANNEL, MODELS, Scale, Settings
 from dbthermal.instruments.transport import Transport
 
+POSITIONS: Final = 6  # slots of the wheel, numbered from 1
+CHANNEL: Final = 1  # of the motor at its address
+
+ADDRESSES: Final = ((apt.RACK, apt.BAY_1), (apt.UNIT, apt.UNIT))
+"""Where a controller is looked for, in order: address of its identity, and of its motor. A BSC20x
+is a rack and silently ignores messages to a unit."""
+
+REPLY_TIMEOUT: Final = 1.0  # [s]
 ATTEMPTS: Final = 2  # number of times that a request is sent before its reply counts as missing
 READ_SIZE: Final = 256  # largest number of bytes that are read at once
 MAXIMUM_UNSOLICITED: Final = 65536  # [byte] an endless stream comes from another device
@@ -28,6 +45,85 @@ ACCURACY: Final = 0.01  # largest relative difference of a speed that is read ba
 _EVENTS = (Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED)
 _NOTICES = (Id.HW_RESPONSE, Id.HW_RICHRESPONSE)
 _LOGGER = logging.getLogger(__name__)
+
+# Speeds are whole numbers of 32 bits to the controllers, which is 97 turns/s in the finer units;
+# slower than the lowest a turn would take longer than the wheel is waited for.
+Speed = Annotated[float, Field(strict=True, ge=0.1, le=90.0)]
+
+
+@checked_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Settings:
+    """Properties of one wheel and its controller; ValueError if one is out of its range.
+
+    Which direction and switch a wheel needs for homing is uncertain: None keeps what the controller
+    has.
+
+    Attributes
+    ----------
+    serial_number : int or None
+        That of the controller; another one is then refused.
+    home_offset : float
+        From the home position to slot 1 [deg]; differs by wheel: look.
+    home_direction, home_limit_switch : int or None
+        1 forward, 2 reverse; 1 the reverse switch, 4 the forward one.
+    velocity, home_velocity, acceleration : float
+        Speeds of moves and of the search for home [turn/s], and acceleration [turn/s^2].
+    """
+
+    serial_number: Annotated[int, Field(strict=True, ge=1, lt=2**32)] | None = None
+    home_offset: Annotated[float, Field(strict=True, gt=-360.0, lt=360.0)] = 0.0
+    home_direction: Literal[1, 2] | None = None
+    home_limit_switch: Literal[1, 4] | None = None
+    velocity: Speed = 1.0
+    home_velocity: Speed = 0.2
+    acceleration: Annotated[float, Field(strict=True, ge=0.1, le=1e5)] = 1.0
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Units of a controller."""
+
+    turn: int  # counts of one turn of the wheel
+    velocity: float  # device units of one count/s
+    acceleration: float  # device units of one count/s^2
+
+    def target(self, position: int, offset: float = 0.0) -> int:
+        """Absolute place [count] of a slot, 1 to 6; `offset` [deg] is that of slot 1 after homing.
+
+        A sixth of a turn is not a whole number of counts. Each place is rounded by itself, so that
+        errors never add up. ValueError if the slot is another.
+        """
+        if position not in range(1, POSITIONS + 1):
+            raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
+        return round(((position - 1) / POSITIONS + offset / 360.0) * self.turn)
+
+    def position(self, count: int, tolerance: float, offset: float = 0.0) -> int | None:
+        """Slot within `tolerance` [deg] of a place [count] of any turn; None between two slots."""
+        sixths = (count / self.turn - offset / 360.0) * POSITIONS
+        nearest = round(sixths)
+        near = abs(sixths - nearest) * 360.0 / POSITIONS <= tolerance
+        return nearest % POSITIONS + 1 if near else None
+
+    def degrees(self, counts: int) -> float:
+        """Angle [deg] of a number of counts."""
+        return counts / self.turn * 360.0
+
+    def device_speeds(self, velocity: float, acceleration: float) -> tuple[int, int]:
+        """Velocity and acceleration in device units, of those in turns/s and turns/s^2."""
+        counts = velocity * self.turn, acceleration * self.turn
+        return round(counts[0] * self.velocity), round(counts[1] * self.acceleration)
+
+
+BSC20X: Final = Scale(turn=409_600, velocity=53.68, acceleration=53.68 * 204.94e-6)
+"""200 full steps of 2048 microsteps."""
+
+BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
+"""200 full steps of 128 microsteps."""
+
+MODELS: Final[Mapping[str, Scale]] = MappingProxyType(
+    {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
+)
+"""Beginnings of the model names that are accepted; some BSC201 call themselves SCC201."""
 
 
 class WheelError(RuntimeError):
@@ -69,7 +165,7 @@ class Controller:
         *,
         clock: Callable[[], float] = system_time.monotonic,
     ) -> None:
-        self.unit, self.motor = settings.addresses[0]
+        self.unit, self.motor = ADDRESSES[0]
         self._decoder = apt.Decoder((apt.HOST,), apt.CONTROLLERS)
         self._transport = transport
         self._settings = settings
@@ -99,7 +195,7 @@ class Controller:
 
         WrongDeviceError if the device is another one.
         """
-        for unit, motor in self._settings.addresses:
+        for unit, motor in ADDRESSES:
             try:
                 info = self._greet(unit)
             except NoReplyError:
@@ -113,7 +209,7 @@ class Controller:
             raise WrongDeviceError(
                 f"{dropped} bytes came that are no APT messages. Must be an APT controller."
             )
-        tried = ", ".join(f"0x{unit:02X}" for unit, _ in self._settings.addresses)
+        tried = ", ".join(f"0x{unit:02X}" for unit, _ in ADDRESSES)
         raise NoReplyError(f"No APT controller answered at {tried}. It must be on.")
 
     def prepare(self) -> None:
@@ -122,11 +218,9 @@ class Controller:
         self._set_home()
         self._send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
         reply = self._request(Id.MOD_REQ_CHANENABLESTATE, Id.MOD_GET_CHANENABLESTATE)
-        try:
-            enabled = apt.is_enabled(reply)
-        except ValueError as error:
-            raise WheelError(f"Unknown state of the motor: {error}") from error
-        if not enabled:
+        if reply.param2 not in {apt.YES, apt.NO}:
+            raise WheelError(f"Unknown state {reply.param2} of the motor. Must be 1 or 2.")
+        if reply.param2 == apt.NO:
             raise WheelError("The controller did not enable the motor. It must be connected.")
         self.raise_notice()
 
@@ -163,8 +257,7 @@ class Controller:
         """Begin as the maker's example does, and ask for the identity."""
         for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
             self._transport.write(apt.command(identifier, destination=unit))
-        request = apt.command(Id.HW_REQ_INFO, destination=unit)
-        return apt.Info.parse(self._exchange(request, Id.HW_GET_INFO, unit, attempts=1))
+        return apt.Info.parse(self._request(Id.HW_REQ_INFO, Id.HW_GET_INFO, unit=unit))
 
     def _scale_of(self, info: apt.Info) -> Scale:
         """Scale of a controller, if it is one that drives this wheel."""
@@ -180,8 +273,8 @@ class Controller:
         )
 
     def _set_velocity(self) -> None:
-        acceleration = self.scale.device_acceleration(self._settings.acceleration)
-        velocity = self.scale.device_velocity(self._settings.velocity)
+        wanted = self._settings.velocity, self._settings.acceleration
+        velocity, acceleration = self.scale.device_speeds(*wanted)
         speeds = apt.VelocityParameters(CHANNEL, 0, acceleration, velocity)
         self._send(Id.MOT_SET_VELPARAMS, data=speeds.pack())
         reply = self._request(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
@@ -197,7 +290,7 @@ class Controller:
             before,
             direction=settings.home_direction or before.direction,
             limit_switch=settings.home_limit_switch or before.limit_switch,
-            velocity=self.scale.device_velocity(settings.home_velocity),
+            velocity=self.scale.device_speeds(settings.home_velocity, 0.0)[0],
         )
         self._send(Id.MOT_SET_HOMEPARAMS, data=parameters.pack())
         actual = self._home_parameters()
@@ -214,54 +307,37 @@ class Controller:
         message = apt.command(identifier, channel, value, data=data, destination=self.motor)
         self._transport.write(message)
 
-    def _request(self, identifier: Id, reply: Id) -> apt.Message:
-        """Reply of the motor to a request."""
-        request = apt.command(identifier, CHANNEL, destination=self.motor)
-        return self._exchange(request, reply, self.motor, channel=CHANNEL)
-
-    def _exchange(
-        self,
-        request: bytes,
-        reply: Id,
-        source: int,
-        *,
-        channel: int | None = None,
-        attempts: int = ATTEMPTS,
-    ) -> apt.Message:
-        """Send a request and wait for its reply; events that come between are kept.
+    def _request(self, identifier: Id, reply: Id, *, unit: int | None = None) -> apt.Message:
+        """Reply of the motor to a request, or of a unit; events that come between are kept.
 
         Only requests are repeated, never what moves the wheel. Messages that came before the
         request are not its reply. A reply that comes after its limit may be taken for that of the
         repetition, and is then older than it seems, but replies never change their order.
         """
+        source, channel = (self.motor, CHANNEL) if unit is None else (unit, 0)
+        request = apt.command(identifier, channel, destination=source)
         with self._line:
-            for _ in range(attempts):
+            for _ in range(ATTEMPTS if unit is None else 1):
                 self._collect()
                 self._transport.write(request)
-                message = self._wait(reply, source, channel)
-                if message is not None:
+                if (message := self._wait(reply, source, channel)) is not None:
                     return message
                 self._decoder.discard()  # half a message whose rest did not come in time
         raise NoReplyError(
-            f"No answer {reply.name} from address 0x{source:02X} in "
-            f"{self._settings.reply_timeout} s. "
+            f"No answer {reply.name} from address 0x{source:02X} in {REPLY_TIMEOUT} s. "
             f"The controller must be on and in no other program's use.{self._reported()}"
         )
 
-    def _wait(self, reply: Id, source: int, channel: int | None) -> apt.Message | None:
-        """Read until the reply comes; None if it does not in time."""
-        deadline = self._clock() + self._settings.reply_timeout
+    def _wait(self, reply: Id, source: int, channel: int) -> apt.Message | None:
+        """Read until the reply comes, of a channel unless 0; None if it does not in time."""
+        deadline = self._clock() + REPLY_TIMEOUT
         while (remaining := deadline - self._clock()) > 0:
             if not (received := self._transport.read(READ_SIZE, remaining)):
                 return None
-            replies = [
-                message
-                for message in self._sorted(received)
-                if (message.id, message.source) == (reply, source)
-                and (channel is None or channel == _channel(message))
-            ]
-            if replies:
-                return replies[-1]
+            for message in reversed(self._sorted(received)):
+                is_reply = (message.id, message.source) == (reply, source)
+                if is_reply and channel in {0, _channel(message)}:
+                    return message
         return None
 
     def _collect(self) -> None:

@@ -1,30 +1,58 @@
-"""Filter wheel: homing, moves to six absolute places, and the band in the beam.
+"""Filter wheel FW103 of Thorlabs on an APT stepper controller: six slots, named by their band.
+
+`FilterWheel` is the driver, `Settings` the properties of one wheel and its controller. An FW103 is
+a bare stepper stage, not to be confused with the FW102C and FW212C, which speak ASCII. It has no
+encoder: its position is a count of commanded steps. A controller that stops short of its target, or
+never starts, is an error here; steps lost under way are not detected until `FilterWheel.home`.
 
 A motion is over when two things agree: the controller reports its end or the moving bits are clear,
 and the wheel is where it should be. Neither is enough alone. Bits were seen to stick, the report of
-an earlier move may come late, and before a move starts the bits are clear too.
+an earlier move may come late, and before a move starts the bits are clear too. Tested against
+public byte vectors and an emulator, not against hardware.
 """
 
-import logging
 import time as system_time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
 from dbthermal.instruments import apt
-from dbthermal.instruments.camera import Identity
-from dbthermal.instruments.filterwheel._controller import (
+from dbthermal.instruments._controller import (
     Controller,
+    NoReplyError,
     NotHomedError,
+    Settings,
     StalledWheelError,
     WheelError,
     WheelTimeoutError,
+    WrongDeviceError,
 )
-from dbthermal.instruments.filterwheel._settings import FAULTS, Settings
+from dbthermal.instruments.camera import Identity
 from dbthermal.instruments.transport import Closing, Transport, open_serial
 
+__all__ = [
+    "FilterWheel",
+    "NoReplyError",
+    "NotHomedError",
+    "Settings",
+    "StalledWheelError",
+    "WheelError",
+    "WheelTimeoutError",
+    "WrongDeviceError",
+]
+__dir__ = __all__.copy
+
+TOLERANCE: Final = 0.1  # largest distance of the wheel from a slot [deg]
+HOME_TIMEOUT: Final = 60.0  # longest search for the home switch [s]
+MOVE_TIMEOUT: Final = 20.0  # longest move [s]
+START_TIMEOUT: Final = 1.0  # until a move is seen to start [s]
+STALL_TIMEOUT: Final = 2.0  # for which the position may not change in a move [s]
+POLL_INTERVAL: Final = 0.05  # between two status requests [s]
+
+FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
+"""State that is an error; it is uncertain if a wheel's controller sets these bits."""
+
 BAUDRATE: Final = 115_200  # [bit/s]
-SETTLING: Final = 0.05  # [s] between taking RTS down and up, as in the maker's example
 
 MOVING: Final = (
     apt.StatusBits.MOVING_FORWARD | apt.StatusBits.MOVING_REVERSE | apt.StatusBits.HOMING
@@ -33,37 +61,41 @@ MOVING: Final = (
 
 CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
 
-_LOGGER = logging.getLogger(__name__)
-
 
 class FilterWheel(Closing):
-    """A filter wheel whose line is open, for one thread at a time; see `from_url`."""
+    """A filter wheel whose line is open, for one thread at a time; see `from_url`.
+
+    `filters` has the band in each slot, 1 to 6.
+    """
 
     def __init__(
         self,
         transport: Transport,
-        settings: Settings,
+        filters: Mapping[int, str],
+        settings: Settings | None = None,
         *,
         clock: Callable[[], float] = system_time.monotonic,
         sleep: Callable[[float], None] = system_time.sleep,
     ) -> None:
-        self.settings = settings
+        self.filters, self.settings = filters, settings or Settings()
         self._transport = transport
-        self._controller = Controller(transport, settings, clock=clock)
+        self._controller = Controller(transport, self.settings, clock=clock)
         self._clock, self._sleep = clock, sleep
         self._is_lost = False  # the counter may not be where the wheel is
 
     @classmethod
-    def from_url(cls, url: str, settings: Settings, *, world: object | None = None) -> Self:
+    def from_url(
+        cls,
+        url: str,
+        filters: Mapping[int, str],
+        settings: Settings | None = None,
+        *,
+        world: object | None = None,
+    ) -> Self:
         """Open the line as `transport.open_serial`, and `connect`; the wheel does not move."""
-        transport = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
-        wheel = cls(transport, settings)
+        line = open_serial(url, baudrate=BAUDRATE, rtscts=True, world=world)
+        wheel = cls(line, filters, settings)
         try:
-            # Take RTS down and up again, where the line has one; a pseudo-terminal has none.
-            transport.set_rts(level=False)
-            system_time.sleep(SETTLING)
-            if not transport.set_rts(level=True):
-                _LOGGER.info("The line %s has no RTS.", url)
             wheel.connect()
         except BaseException:
             wheel.close()
@@ -116,8 +148,8 @@ class FilterWheel(Closing):
         self._is_lost = True
         self._controller.start_home()
         # The counter may stand while a controller searches for the switch: no stall limit.
-        timeout = self.settings.home_timeout
-        self._follow(_Motion("Search for home", apt.Id.MOT_MOVE_HOMED, timeout, timeout), _is_home)
+        limits = HOME_TIMEOUT, HOME_TIMEOUT
+        self._follow(_Motion("Search for home", apt.Id.MOT_MOVE_HOMED, *limits), _is_home)
         self._is_lost = False
 
     def move_to(self, position: int) -> None:
@@ -129,16 +161,16 @@ class FilterWheel(Closing):
         WheelTimeoutError if it takes too long, and was stopped; WheelError if it is still moving,
         or the controller reports an error or falls silent; TransportError if the device is gone.
         """
-        scale, settings = self._controller.scale, self.settings
-        target = scale.target(position, settings.home_offset)
+        scale = self._controller.scale
+        target = scale.target(position, self.settings.home_offset)
         self._require_home(self._require_rest())
 
         def has_arrived(motion: _Motion, status: apt.Status) -> bool:
             distance = abs(scale.degrees(status.position - target))
-            return distance <= settings.tolerance and (motion.reported or motion.rests > 0)
+            return distance <= TOLERANCE and (motion.reported or motion.rests > 0)
 
         name = f"Move to {scale.degrees(target):.2f} deg"
-        limits = settings.move_timeout, settings.stall_timeout
+        limits = MOVE_TIMEOUT, STALL_TIMEOUT
         self._controller.start_move(target)
         try:
             self._follow(_Motion(name, apt.Id.MOT_MOVE_COMPLETED, *limits), has_arrived)
@@ -148,7 +180,10 @@ class FilterWheel(Closing):
 
     def select(self, band: str) -> None:
         """Turn a band's filter into the beam; ValueError if it has none, else as `move_to`."""
-        self.move_to(self.settings.position(band))
+        slots = {name: position for position, name in self.filters.items()}
+        if band not in slots:
+            raise ValueError(f"Invalid band '{band}' of the wheel. Must be one of {sorted(slots)}.")
+        self.move_to(slots[band])
 
     def position(self) -> int:
         """Slot in the beam, 1 to 6.
@@ -158,22 +193,22 @@ class FilterWheel(Closing):
         """
         status = self._require_rest()
         self._require_home(status)
-        scale, settings = self._controller.scale, self.settings
-        position = scale.position(status.position, settings.tolerance, settings.home_offset)
+        scale = self._controller.scale
+        position = scale.position(status.position, TOLERANCE, self.settings.home_offset)
         if position is None:
             raise WheelError(
                 f"The wheel is between two slots, at {scale.degrees(status.position):.2f} deg. "
-                f"Must be within {settings.tolerance} deg of one: move it."
+                f"Must be within {TOLERANCE} deg of one: move it."
             )
         return position
 
     def band(self) -> str:
         """Name of the filter in the beam; raises as `position`, and if this slot has no filter."""
         position = self.position()
-        if position not in self.settings.filters:
-            known = dict(self.settings.filters)
+        if position not in self.filters:
+            known = dict(self.filters)
             raise WheelError(f"No filter in slot {position}. Filters are in {known}.")
-        return self.settings.filters[position]
+        return self.filters[position]
 
     def stop(self) -> None:
         """Stop the wheel by a ramp; TransportError if the device is gone."""
@@ -207,7 +242,7 @@ class FilterWheel(Closing):
             confirmed = confirmed + 1 if is_over(motion, status) else 0
             if not confirmed:
                 self._check(motion, status)
-            self._sleep(self.settings.poll_interval)
+            self._sleep(POLL_INTERVAL)
 
     def _poll(self, motion: "_Motion") -> apt.Status:
         """Take in the motor's state."""
@@ -227,7 +262,7 @@ class FilterWheel(Closing):
         """Raise if the wheel rests where it should not, stands still, or takes too long."""
         place = f"at {self._controller.scale.degrees(status.position):.2f} deg"
         now = self._clock()
-        started = motion.moved or now - motion.began > self.settings.start_timeout
+        started = motion.moved or now - motion.began > START_TIMEOUT
         if started and motion.rests >= CONFIRMATIONS:
             action = "stopped" if motion.moved else "did not start and is"
             raise StalledWheelError(f"{motion.name}: the wheel {action} {place}. Must arrive.")

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from scipy.constants import Stefan_Boltzmann as SIGMA
 from scipy.special import erfc
 
-from dbthermal.simulation import heat
-from dbthermal.simulation.heat._exchange import Balance
+from reproduction import heat
+from reproduction.heat._exchange import Balance
 from reproduction.twins import surfaces
 
 Array = npt.NDArray[np.float64]

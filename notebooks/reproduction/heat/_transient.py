@@ -12,8 +12,8 @@ from scipy.sparse.linalg import splu
 
 from dbthermal._arrays import Array
 from dbthermal.planck import require_positive
-from dbthermal.simulation.heat._exchange import Balance, Exchange, combine
-from dbthermal.simulation.heat._shell import Shell
+from reproduction.heat._exchange import Balance, Exchange, combine
+from reproduction.heat._shell import Shell
 
 TOLERANCE: Final = 1e-6
 """Largest error of the iteration in a stage of a step [K]."""
@@ -83,7 +83,7 @@ def simulate(
     :math:`\rho c d / h`, here 562.5 s.
 
     >>> import numpy as np
-    >>> from dbthermal.simulation import heat
+    >>> from reproduction import heat
     >>> corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]])
     >>> plate = heat.Shell(corners, np.array([[0, 1, 2], [0, 2, 3]]), 0.003, heat.GLASS)
     >>> air = heat.Convection(10.0, 293.15)

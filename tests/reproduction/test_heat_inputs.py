@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 import trimesh
 
-from dbthermal.simulation import heat
+from reproduction import heat
 
 Array = npt.NDArray[np.float64]
 

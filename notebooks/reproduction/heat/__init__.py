@@ -4,9 +4,9 @@
 exchanges; `simulate` states the balance and steps it through time.
 """
 
-from dbthermal.simulation.heat._exchange import Convection, Exchange, Heating, Radiation
-from dbthermal.simulation.heat._shell import BOROSILICATE, CERAMIC, GLASS, Shell, Solid
-from dbthermal.simulation.heat._transient import TOLERANCE, simulate
+from reproduction.heat._exchange import Convection, Exchange, Heating, Radiation
+from reproduction.heat._shell import BOROSILICATE, CERAMIC, GLASS, Shell, Solid
+from reproduction.heat._transient import TOLERANCE, simulate
 
 __all__ = [
     "BOROSILICATE",

@@ -1,0 +1,400 @@
+"""Thorlabs APT, the binary protocol of stepper controllers: bytes to messages, and back.
+
+Pure functions and one `Decoder`, without input or output; `dbthermal.instruments.filterwheel`
+speaks it. A message is a header of six bytes, ``id, id, param1, param2, destination, source``, or
+``id, id, length, length, destination | 0x80, source`` followed by data; all little-endian, without
+checksum or start byte. A receiver therefore drops bytes until identifier, length and both addresses
+are possible. Data are records: `parse` reads a message, `pack` gives its data again; positions are
+in counts, speeds in the device's units, channels count from 1.
+
+This is what a filter wheel needs, and what a controller may send by itself. Tested against public
+byte vectors, against the release 29.0.0 of thorlabs-apt-protocol and against an emulator, not
+against hardware.
+
+References
+----------
+Facts alone were taken, no code: yaq-project/thorlabs-apt-protocol 29.0.0, moonshot-nagayama-pj/PnPQ
+(messages), Thorlabs/Motion_Control_Examples (commit bbdeca5, start of the line), pylablib 1.4.5
+(scale of the FW103 wheel), thorlabs_apt_device 0.3.8 (addresses of racks).
+"""
+
+import struct
+from collections.abc import Collection, Mapping
+from dataclasses import astuple, dataclass
+from enum import IntEnum, IntFlag
+from typing import Any, ClassVar, Final, Self
+
+__all__ = [
+    "BAY_1",
+    "CONTROLLERS",
+    "HOST",
+    "NO",
+    "RACK",
+    "UNIT",
+    "YES",
+    "Decoder",
+    "HomeParameters",
+    "Id",
+    "Info",
+    "Message",
+    "Notice",
+    "Position",
+    "Status",
+    "StatusBits",
+    "VelocityParameters",
+    "command",
+    "encode",
+]
+__dir__ = __all__.copy
+
+# Addresses: computer, a rack's own board (a BSC20x counts as a rack), the first of its ten bays,
+# and a controller that is not a rack.
+HOST: Final = 0x01
+RACK: Final = 0x11
+BAY_1: Final = 0x21
+UNIT: Final = 0x50
+CONTROLLERS: Final = frozenset({RACK, *range(BAY_1, BAY_1 + 10), UNIT})
+ADDRESSES: Final = CONTROLLERS | {HOST}
+
+YES: Final = 1
+NO: Final = 2
+
+_HEADER: Final = 6  # [byte]
+_SHORT = struct.Struct("<HBBBB")
+_LONG = struct.Struct("<HHBB")
+_HAS_DATA = 0x80
+_LONGEST = 0xFF  # data, as documented [byte]
+_RACK_TYPE = 45  # of a controller in its `Info`
+
+
+class Id(IntEnum):
+    """Identifiers of the messages that are known here, by the maker's names."""
+
+    HW_REQ_INFO = 0x0005
+    HW_GET_INFO = 0x0006
+    HW_STOP_UPDATEMSGS = 0x0012  # nothing starts them: some BSC then stop answering after 5 s
+    HW_NO_FLASH_PROGRAMMING = 0x0018  # first of all messages
+    HW_RESPONSE = 0x0080
+    HW_RICHRESPONSE = 0x0081
+    MOD_SET_CHANENABLESTATE = 0x0210
+    MOD_REQ_CHANENABLESTATE = 0x0211
+    MOD_GET_CHANENABLESTATE = 0x0212
+    MOT_SET_VELPARAMS = 0x0413
+    MOT_REQ_VELPARAMS = 0x0414
+    MOT_GET_VELPARAMS = 0x0415
+    MOT_SET_HOMEPARAMS = 0x0440
+    MOT_REQ_HOMEPARAMS = 0x0441
+    MOT_GET_HOMEPARAMS = 0x0442
+    MOT_MOVE_HOME = 0x0443
+    MOT_MOVE_HOMED = 0x0444
+    MOT_MOVE_ABSOLUTE = 0x0453
+    MOT_MOVE_COMPLETED = 0x0464
+    MOT_MOVE_STOP = 0x0465  # value 1 at once, 2 by a ramp
+    MOT_MOVE_STOPPED = 0x0466
+    MOT_REQ_STATUSUPDATE = 0x0480
+    MOT_GET_STATUSUPDATE = 0x0481
+    MOT_GET_DCSTATUSUPDATE = 0x0491
+
+
+LENGTHS: Final[Mapping[int, tuple[int, ...]]] = {
+    **dict.fromkeys(Id, (0,)),
+    Id.HW_GET_INFO: (84,),
+    Id.HW_RICHRESPONSE: (68,),
+    Id.MOT_SET_VELPARAMS: (14,),
+    Id.MOT_GET_VELPARAMS: (14,),
+    Id.MOT_SET_HOMEPARAMS: (14,),
+    Id.MOT_GET_HOMEPARAMS: (14,),
+    Id.MOT_MOVE_ABSOLUTE: (0, 6),
+    Id.MOT_MOVE_COMPLETED: (0, 14),
+    Id.MOT_MOVE_STOPPED: (0, 14),
+    Id.MOT_GET_STATUSUPDATE: (14, 28),
+    Id.MOT_GET_DCSTATUSUPDATE: (14,),
+}
+"""Lengths of data that each message can have [byte]; 0 is the form without data."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message: identifier, parameters (0 to 255, 0 if there are data), addresses and data."""
+
+    id: int
+    param1: int
+    param2: int
+    destination: int
+    source: int
+    data: bytes = b""
+
+
+def encode(message: Message) -> bytes:
+    """Bytes of a message to send; with data in the long form.
+
+    ValueError if a number is not whole, or does not fit its field, the data are too long, or there
+    are both data and parameters, which the long form does not have.
+    """
+    size = len(message.data)
+    if size > _LONGEST or message.destination & _HAS_DATA:
+        rule = f"Must have at most {_LONGEST} bytes of data, and a destination below {_HAS_DATA}"
+        raise ValueError(f"Invalid {message}. {rule}.")
+    if size and (message.param1 or message.param2):
+        raise ValueError(f"Invalid {message} with data. Its parameters must be 0.")
+    try:
+        if not size:
+            return _SHORT.pack(*astuple(message)[:-1])
+        destination = message.destination | _HAS_DATA
+        return _LONG.pack(message.id, size, destination, message.source) + message.data
+    except struct.error as error:
+        raise ValueError(f"Invalid {message}. Its fields must hold it: {error}.") from error
+
+
+def command(
+    identifier: Id, channel: int = 0, value: int = 0, *, data: bytes = b"", destination: int
+) -> bytes:
+    """Bytes of a message from the computer to a controller.
+
+    Short, it has two parameters, the `channel` from 1, which in a rack is 1 in every bay, and a
+    `value`; long, the `data` from the ``pack`` of a record. A controller silently ignores messages
+    to another `destination`. ValueError if a number does not fit its field, or the message never
+    has data of this length.
+    """
+    if len(data) not in LENGTHS[identifier]:
+        raise ValueError(
+            f"Invalid data of {len(data)} bytes of {identifier.name}. "
+            f"Must be one of {LENGTHS[identifier]}."
+        )
+    return encode(Message(identifier, channel, value, destination, HOST, data))
+
+
+class Decoder:
+    """Finds the messages in a stream of bytes, however it is cut into pieces.
+
+    A byte with which no possible message begins is dropped and counted, and the search goes on with
+    the next. Each received byte belongs to a message that was returned, is counted in `dropped`, or
+    is `pending`. The fewer `destinations` and `sources` are possible, the less noise passes for a
+    message; by default all are, so that a line is read in both directions.
+
+    Examples
+    --------
+    >>> decoder = Decoder()
+    >>> [message] = decoder.feed(bytes.fromhex("ff 44 04 01 00 01 21"))
+    >>> Id(message.id).name, decoder.dropped
+    ('MOT_MOVE_HOMED', 1)
+    """
+
+    def __init__(
+        self, destinations: Collection[int] = ADDRESSES, sources: Collection[int] = ADDRESSES
+    ) -> None:
+        self.dropped = 0
+        self.pending = bytearray()  # may begin a message whose end has not come
+        self._destinations, self._sources = frozenset(destinations), frozenset(sources)
+
+    def feed(self, received: bytes) -> list[Message]:
+        """Messages that the next bytes of the stream complete.
+
+        An unknown identifier, or one of `Id` with a length that it never has, is not a message.
+        """
+        self.pending += received
+        messages, start = [], 0
+        while len(self.pending) - start >= _HEADER:
+            length = self._data_length(start)
+            if length is None:
+                start, self.dropped = start + 1, self.dropped + 1
+            elif len(self.pending) - start < _HEADER + length:
+                break
+            else:
+                messages.append(self._message(start, length))
+                start += _HEADER + length
+        del self.pending[:start]
+        return messages
+
+    def discard(self) -> None:
+        """Drop and count the pending bytes: their end did not come in time."""
+        self.dropped += len(self.pending)
+        self.pending.clear()
+
+    def _data_length(self, start: int) -> int | None:
+        """Length of the data after a header [byte], None if the header is impossible."""
+        identifier, length, destination, source = _LONG.unpack_from(self.pending, start)
+        length = length if destination & _HAS_DATA else 0
+        possible = (
+            destination & ~_HAS_DATA in self._destinations
+            and source in self._sources
+            and length in LENGTHS.get(identifier, ())
+            and bool(length) == bool(destination & _HAS_DATA)
+        )
+        return length if possible else None
+
+    def _message(self, start: int, length: int) -> Message:
+        identifier, *params, destination, source = _SHORT.unpack_from(self.pending, start)
+        first, second = (0, 0) if length else params
+        data = bytes(self.pending[start + _HEADER : start + _HEADER + length])
+        return Message(identifier, first, second, destination & ~_HAS_DATA, source, data)
+
+
+class StatusBits(IntFlag):
+    """State of a motor: the bits that a filter wheel needs; others are kept as they come.
+
+    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here. The
+    jogging bits of one controller were seen to stick: nothing here relies on them.
+    """
+
+    MOVING_FORWARD = 1 << 4
+    MOVING_REVERSE = 1 << 5
+    JOGGING_FORWARD = 1 << 6
+    JOGGING_REVERSE = 1 << 7
+    CONNECTED = 1 << 8
+    HOMING = 1 << 9
+    HOMED = 1 << 10
+    POSITION_ERROR = 1 << 14
+    OVERLOAD = 1 << 24
+    ENABLED = 1 << 31
+
+
+@dataclass(frozen=True)
+class Record:
+    """Data of a message: numbers in the order of the record's fields."""
+
+    _FORMAT: ClassVar[struct.Struct]
+    _IDS: ClassVar[tuple[Id, ...]]
+    _MORE: ClassVar[bool] = False  # True if more data may follow, which are not read
+
+    @classmethod
+    def parse(cls, message: Message) -> Self:
+        """Record of a message; ValueError if it is another, or of another length."""
+        return cls(*cls._unpacked(message))
+
+    def pack(self) -> bytes:
+        """Data of the message; ValueError if a number or a text does not fit its field."""
+        try:
+            return self._FORMAT.pack(*self._fields())
+        except struct.error as error:
+            raise ValueError(f"Invalid {self}. Its fields must hold it: {error}.") from error
+
+    def _fields(self) -> tuple[Any, ...]:
+        return astuple(self)
+
+    @classmethod
+    def _unpacked(cls, message: Message) -> tuple[Any, ...]:
+        if message.id not in cls._IDS:
+            names = sorted(known.name for known in cls._IDS)
+            raise ValueError(f"Invalid message 0x{message.id:04X}. Must be one of {names}.")
+        number, size = len(message.data), cls._FORMAT.size
+        if number < size or (number > size and not cls._MORE):
+            raise ValueError(
+                f"Invalid data of {number} bytes of message 0x{message.id:04X}. Must be {size}."
+            )
+        return cls._FORMAT.unpack_from(message.data)
+
+
+@dataclass(frozen=True)
+class Position(Record):
+    """Absolute position [count]."""
+
+    _FORMAT = struct.Struct("<Hi")
+    _IDS = (Id.MOT_MOVE_ABSOLUTE,)
+
+    channel: int
+    position: int
+
+
+@dataclass(frozen=True)
+class VelocityParameters(Record):
+    """Speeds of a move; `maximum` is near 0 when some controllers are switched on."""
+
+    _FORMAT = struct.Struct("<Hiii")
+    _IDS = (Id.MOT_GET_VELPARAMS, Id.MOT_SET_VELPARAMS)
+
+    channel: int
+    minimum: int
+    acceleration: int
+    maximum: int
+
+
+@dataclass(frozen=True)
+class HomeParameters(Record):
+    """Search for the home switch.
+
+    `direction` is 1 forward, 2 reverse; `limit_switch` 1 the reverse one, 4 the forward one;
+    `offset` [count] is from the switch to the position 0. `velocity` is near 0 when some
+    controllers are switched on: homing then does nothing.
+    """
+
+    _FORMAT = struct.Struct("<HHHii")
+    _IDS = (Id.MOT_GET_HOMEPARAMS, Id.MOT_SET_HOMEPARAMS)
+
+    channel: int
+    direction: int
+    limit_switch: int
+    velocity: int
+    offset: int
+
+
+@dataclass(frozen=True)
+class Status(Record):
+    """Position counter, encoder counter (a filter wheel has none) [count] and state of a motor."""
+
+    _FORMAT = struct.Struct("<HiiI")
+    _IDS = (Id.MOT_GET_STATUSUPDATE,)
+    _MORE = True
+
+    channel: int
+    position: int
+    encoder: int
+    bits: StatusBits
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "bits", StatusBits(self.bits))
+
+
+@dataclass(frozen=True)
+class Info(Record):
+    """Identity of a controller.
+
+    `model` is such as ``BSC201``, or ``SCC201``, which some that were sold as BSC201 say;
+    `firmware` is ``major.interim.minor``; `notes` are 60 bytes that only the maker understands.
+    Versions of the hardware follow, which are not read, and are packed as those of a rack.
+    """
+
+    _FORMAT = struct.Struct("<I8sH4B60sHHH")
+    _IDS = (Id.HW_GET_INFO,)
+
+    serial_number: int
+    model: str
+    firmware: str
+    notes: bytes = bytes(60)
+
+    @classmethod
+    def parse(cls, message: Message) -> Self:
+        """Identity of HW_GET_INFO; bytes of the model that are not ASCII are spelled out."""
+        number, model, _, minor, interim, major, _, notes, *_ = cls._unpacked(message)
+        return cls(number, _text(model.rstrip(b"\0 ")), f"{major}.{interim}.{minor}", notes)
+
+    def _fields(self) -> tuple[Any, ...]:
+        if len(self.model) > 8 or not self.model.isascii():
+            raise ValueError(f"Invalid model '{self.model}'. Must be at most 8 ASCII characters.")
+        major, interim, minor = map(int, self.firmware.split("."))
+        identity = (self.serial_number, self.model.encode("ascii"), _RACK_TYPE)
+        return *identity, minor, interim, major, 0, self.notes, 1, 0, 1
+
+
+@dataclass(frozen=True)
+class Notice(Record):
+    """Error that the controller reports by itself: message that caused it (or 0), code, text."""
+
+    _FORMAT = struct.Struct("<HH64s")
+    _IDS = (Id.HW_RICHRESPONSE,)
+
+    id: int
+    code: int
+    notes: str
+
+    @classmethod
+    def parse(cls, message: Message) -> Self:
+        """Error of HW_RICHRESPONSE, or of HW_RESPONSE, which has no further data."""
+        if message.id == Id.HW_RESPONSE:
+            return cls(0, 0, "an error without a text")
+        cause, code, notes = cls._unpacked(message)
+        return cls(cause, code, _text(notes.split(b"\0")[0]))
+
+
+def _text(raw: bytes) -> str:
+    return raw.decode("ascii", errors="backslashreplace")
