@@ -137,7 +137,7 @@ def test_flags_and_films_are_the_same(
 
 @pytest.mark.parametrize("kind", response.KINDS)
 def test_response_of_the_kernels(kind: str) -> None:
-    """Signal and slope are the curve's within 1e-6 K, far outside too, and a step from the inverse."""
+    """Signal, slope, and the inverse after a step are exact to 1e-6 K, far outside too."""
     for name in RIG.bands:
         curve: Curve = response.curve(RIG.response(), name, kind)
         temperature = np.linspace(150.0, 900.0, 2000)
