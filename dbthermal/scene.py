@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dbthermal import schema, store
 from dbthermal.alignment import align, reflection_shift, register
+from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
 from dbthermal.separation import separate
@@ -30,8 +31,6 @@ _REGISTERED: Final = 200
 # Times that clock and shift of the reflections are estimated in turn, at most, the step of the
 # clock at which that ends [frame], and the least share of a delay that is taken to be seen [1].
 _ROUNDS, _LATE, _FLAT = 6, 0.02, 0.125
-# Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
-_SIGMAS, _LEAST_SHIFT = 3.0, 0.1
 # Memory of the rows that are separated together, what a sample of a pixel takes there [byte], and
 # fewest rows; rows around them, in multiples of the shift.
 _MEMORY, _SAMPLE, _FEWEST, _SHIFTS = 2_500_000_000, 220, 4, 4.0
@@ -43,7 +42,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     correction: xr.Dataset,
     response: xr.Dataset,
     *,
-    registration: Literal["translation", "affine", "homography"] | None = "homography",
+    registration: Literal["auto", "translation", "affine", "homography"] | None = "auto",
     correcting: Mapping[str, Any] = MappingProxyType({}),
     aligning: Mapping[str, Any] = MappingProxyType({}),
     separating: Mapping[str, Any] = MappingProxyType({}),
@@ -69,7 +68,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         From `correction.fit_correction`.
     response : Dataset
         From `calibration.fit_response`, with its `noise`.
-    registration : {"translation", "affine", "homography"}, optional
+    registration : {"auto", "translation", "affine", "homography"}, optional
         Kind of transform between the views, see `alignment.register`; None if they are on one grid
         already. A `transform` in `aligning` takes its place.
     correcting, aligning, separating : mapping, optional
@@ -169,11 +168,7 @@ def _aligned(
             field = _shift(aligned, response)
     if field is None:
         return aligned, None
-    shift, std = (
-        np.hypot(*field[name].values[:, field["known"].values]) for name in ("shift", "shift_std")
-    )
-    apart = np.median(shift) > max(_SIGMAS * np.median(std), _LEAST_SHIFT)
-    return aligned, field if apart else None
+    return aligned, field if seen_apart(field) else None
 
 
 def _shift(aligned: xr.Dataset, response: xr.Dataset) -> xr.Dataset | None:

@@ -39,6 +39,8 @@ _CLIP: Final = 3.0  # noise, to which the changes of a frame are clipped when fr
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
 _RIDGE: Final = 1e-6  # of the largest information, where there is none
+# Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
+_SIGMAS, _LEAST_SHIFT = 3.0, 0.1
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
 
@@ -102,6 +104,15 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
             times = corrected["time"].values[capture.frames[used]]
             late = matching.delay(level, field.on(level.centres()), times)
             return _result(corrected, capture, field, data, spread).assign_attrs(delay=late)
+
+
+def seen_apart(field: xr.Dataset) -> bool:
+    """Whether a shift is more than its deviation: that of cameras at one place is not."""
+    known = field["known"].values
+    if not known.any():
+        return False
+    shift, std = (np.hypot(*field[name].values[:, known]) for name in ("shift", "shift_std"))
+    return bool(np.median(shift) > max(_SIGMAS * np.median(std), _LEAST_SHIFT))
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,13 @@
 """Registration of several views of one object, by the enhanced correlation coefficient."""
 
-from contextlib import suppress
+from collections.abc import Sequence
 from operator import itemgetter
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import gaussian_filter, map_coordinates, median_filter, spline_filter
+from scipy.stats import chi2
 
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
@@ -27,13 +27,18 @@ _MEDIAN_WINDOW, _OUTLYING = 3, 6.0
 # Of smooth curves: most frames that they are fitted to, functions, steps of the weights, Tukey's
 # constant in standard deviations, and the least weight, which keeps a fit to few frames solvable.
 _FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
-# Numbers of a homography that each model changes, one matrix each.
-_FREE: Final = {
-    model: np.eye(9)[places].reshape(-1, 3, 3)
-    for model, places in (("translation", [2, 5]), ("affine", range(6)), ("homography", range(8)))
-}
-# Gauss-Newton: steps, length of a difference and of the last step, border left out [pixel].
-_NEWTON, _STEP, _CONVERGED, _MARGIN = 15, 1e-2, 1e-4, 3
+# Numbers of a homography that each model changes.
+_FREE: Final = {"translation": [2, 5], "affine": [0, 1, 2, 3, 4, 5], "homography": list(range(8))}
+# Gauss-Newton: steps, length of a difference and of the last step, border left out [pixel]; degree
+# of the polynomial from view to view, and scales of the residual from which a pixel does not count.
+_NEWTON, _STEP, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-3, 1e-4, 4, 2, 3.0
+_QUARTER: Final = 0.25  # of the texture, whose residual is the scale
+# Blocks of pixels along the shorter side whose residuals are taken for independent; probability of
+# chance above which more numbers of a transform are not supported; and its largest deviation, where
+# the object has texture [pixel].
+_BLOCKS, _CHANCE, _LARGEST_STD = 12, 1e-3, 0.25
+# A place, and half a pixel above, below, to the left and right of it.
+_AROUND: Final = np.array([[0, 0], [-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]])[..., np.newaxis]
 # Steps, and relative change of the correlation, at which the maximisation stops.
 _STEPS, _TOLERANCE = 200, 1e-7
 _LEAST_CORRELATION: Final = 0.5
@@ -42,15 +47,21 @@ _LEAST_OVERLAP: Final = 0.5
 
 
 def register(
-    corrected: xr.Dataset, *, model: Literal["translation", "affine", "homography"] = "homography"
+    corrected: xr.Dataset,
+    *,
+    model: Literal["auto", "translation", "affine", "homography"] = "auto",
 ) -> xr.DataArray:
     r"""Estimate the transform from the pixels of the first view to those of the others.
 
-    Compared are means over time of smooth curves fitted robustly to each pixel, in which what
-    passes by in the reflection hardly counts; and by how much each pixel rises steadily, as only a
-    heated object does. What correlates better is used. The transform maximises their correlation,
-    which neither gain nor offset of a view changes [1]_, at blurs from coarse to fine, and then
-    minimises their difference by splines, to some hundredths of a pixel.
+    Compared are smooth curves fitted robustly to each pixel, in which what passes by in the
+    reflection hardly counts. Their means are brought together by the translation of the highest
+    correlation [1]_, and then, to some hundredths of a pixel, the curves by robust least squares,
+
+    .. math:: \min \sum_p \varrho \Big(\sum_t [f(I_1(p, t)) + o(t) - I_2(H p, t)]^2 \Big)
+
+    with Tukey's bisquare :math:`\varrho`, so that pixels in which the views mirror different things
+    do not count, and a quadratic :math:`f`, for the bands' radiances bend against one another: a
+    warm spot would be narrower in the one than in the other.
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
@@ -63,15 +74,18 @@ def register(
     corrected : Dataset
         Stage `corrected` of `schema`: views of one object, displaced by at most about a tenth of
         the image. Of a capture with a `segment` the longest is used.
-    model : {"translation", "affine", "homography"}
-        Kind of transform. An affine one fits cameras that look the same way.
+    model : {"auto", "translation", "affine", "homography"}
+        Kind of transform. By default the simplest that the object's texture supports: what a richer
+        one adds differs from zero beyond chance (Wald's test, with the deviations of blocks of
+        pixels). An affine one fits cameras that look the same way.
 
     Returns
     -------
     DataArray
         (band, row, column) [1], for `align`: for each band H, which takes the homogeneous position
         (x, y, 1) of a pixel of the first view to that of the same point in this one. Pixels count
-        from 0 at the centre of the first; the identity in the first band.
+        from 0 at the centre of the first; the identity in the first band. Attributes: `model` of
+        each band, and `std` [pixel] of the places where the object has texture, root mean square.
 
     Raises
     ------
@@ -79,7 +93,8 @@ def register(
         If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
         If the image is smaller than 16 pixels either way, a mean is not finite, the correlation of
-        two views is below 0.5, or they share less than half the image.
+        two views is below 0.5, they share less than half the image, or the texture tells no
+        transform within 0.25 pixel.
 
     References
     ----------
@@ -102,8 +117,8 @@ def register(
     >>> transform.sel(band="9.5").values[:2, 2].round(1).tolist()  # [pixel]
     [3.0, 2.0]
     """
-    if model not in _MODELS:
-        raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")
+    if model not in ("auto", *_MODELS):
+        raise ValueError(f"Unknown model '{model}'. Must be one of {('auto', *_MODELS)}.")
     counts = schema.check(corrected, "corrected")["counts"]
     if "segment" in corrected:  # the longest: a new pattern would be detail that does not move
         numbers, frames = np.unique(corrected["segment"], return_counts=True)
@@ -115,24 +130,24 @@ def register(
             f"Must be at least {_SMALLEST} either way."
         )
     bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
-    (mean, rise), *others = [_object_images(view, bad) for view in counts]
-    matrices = [np.eye(3)]
-    for view, images in zip(counts[1:], others, strict=True):
-        found = [_transform(mean, images[0], model, str(view["band"].item()))]
-        with suppress(ValueError):  # where the object is constant
-            found.append(_transform(rise, images[1], model, str(view["band"].item())))
-        matrices.append(max(found, key=itemgetter(0))[1])
+    first, *others = [_curves(view, bad) for view in counts]
+    matrices, kinds, stds = [np.eye(3)], ["identity"], [0.0]
+    for band, other in zip(counts["band"].values[1:], others, strict=True):
+        matrix, kind, std = _transform(first, other, model, str(band))
+        matrices.append(matrix)
+        kinds.append(kind)
+        stds.append(std)
     return xr.DataArray(
         np.stack(matrices),
         dims=TRANSFORM.dims,
         coords={"band": counts["band"].values},
-        attrs={**TRANSFORM.attrs, "model": model},
+        attrs={**TRANSFORM.attrs, "model": kinds, "std": stds},
         name="transform",
     )
 
 
-def _object_images(view: xr.DataArray, bad: Mask | np.bool_) -> list[Array]:
-    """Mean over time of what changes smoothly, and its rise (y, x), see `_scaled`."""
+def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
+    """What changes smoothly at a few times (time, y, x), over its mean and standard deviation."""
     frames = np.asarray(view.values)
     present = np.flatnonzero(~clocks.missing(frames))
     chosen = np.unique(np.linspace(0, present.size - 1, min(present.size, _FRAMES)).astype(int))
@@ -143,124 +158,188 @@ def _object_images(view: xr.DataArray, bad: Mask | np.bool_) -> list[Array]:
             f"{np.sum(~np.isfinite(frames).all(axis=0))} pixels are not finite. Must be finite in "
             "every frame that is not missing."
         )
-    mean = np.stack([_smooth_mean(row) for row in frames.swapaxes(0, 1)])
-    line = polynomial_basis(np.arange(len(frames)), min(2, len(frames)))[:, -1]
-    rise = np.tensordot(line, frames, axes=1)
-    if not mean.std() > 0:
+    images = np.stack([_smooth(row) for row in frames.swapaxes(0, 1)], axis=1)
+    if not images.mean(axis=0).std() > 0:
         raise ValueError(
             f"Invalid view in band '{view['band'].item()}': all pixels are alike. Must show an "
             "object."
         )
-    return [_scaled(mean, bad), _scaled(rise, bad)]
+    for image in images:
+        around = median_filter(image, size=_MEDIAN_WINDOW)
+        away = abs(image - around)
+        # A bad pixel stays where it is in every view: it would pull the transform to the identity.
+        wrong = bad | (away > _OUTLYING * MAD * np.median(away))
+        image[wrong] = around[wrong]
+    return np.asarray((images - images.mean()) / images.std())
 
 
-def _scaled(image: Array, bad: Mask | np.bool_) -> Array:
-    """Image (y, x) of mean 0 and standard deviation 1, bad pixels as those around them."""
-    around = median_filter(image, size=_MEDIAN_WINDOW)
-    away = abs(image - around)
-    # A bad pixel stays where it is in every view, and would pull the transform to the identity.
-    image = np.where(bad | (away > _OUTLYING * MAD * np.median(away)), around, image)
-    return np.asarray((image - image.mean()) / (image.std() or 1.0))
-
-
-def _smooth_mean(signal: Array) -> Array:
-    """Mean (pixel,) of smooth curves through signals (time, pixel), with Tukey's bisquare weights.
+def _smooth(signal: Array) -> Array:
+    """Smooth curves through signals (time, pixel), by Tukey's bisquare weights, at a few times.
 
     What passes by in the reflection is an outlier: a plain mean holds some of it, in each band
     another share, and a warm spot without detail then seems displaced by 0.2 pixel.
     """
-    functions = polynomial_basis(np.arange(len(signal)), min(_ORDER, len(signal)))
+    order = min(_ORDER, len(signal))
+    functions = polynomial_basis(np.arange(len(signal)), order)
     products = np.einsum("ti,tj->tij", functions, functions).reshape(len(signal), -1)
     weights = np.ones_like(signal)
     for _ in range(_ROBUST_STEPS):
-        matrix = (weights.T @ products).reshape(-1, functions.shape[1], functions.shape[1])
+        matrix = (weights.T @ products).reshape(-1, order, order)
         right = (weights * signal).T @ functions
         curve = functions @ np.linalg.solve(matrix, right[..., np.newaxis])[..., 0].T
         residual = abs(signal - curve)
         scale = _TUKEY * MAD * np.median(residual, axis=0) + np.finfo(np.float32).tiny
         weights = (1.0 - np.minimum(residual / scale, 1.0) ** 2) ** 2 + _LEAST_WEIGHT
-    return np.asarray(curve.mean(axis=0))
+    return np.asarray(curve[((np.arange(order) + 0.5) * len(signal) / order).astype(int)])
 
 
-def _transform(first: Array, other: Array, model: str, band: str) -> tuple[float, Array]:
-    """Correlation of two images (y, x), by the homography (3, 3) from the first to the other."""
+def _transform(first: Array, other: Array, model: str, band: str) -> tuple[Array, str, float]:
+    """Homography (3, 3) from the first images (time, y, x) to others, its model and deviation."""
+    found, failures = [], []
+    # What rises steadily, as only a heated object does, tells the start where it correlates better.
+    for weights in (np.ones(len(first)), np.linspace(-1.0, 1.0, len(first))):
+        try:
+            pair = [np.tensordot(weights, images, axes=1) for images in (first, other)]
+            found.append(_start(pair, band))
+        except ValueError as error:
+            failures.append(error)
+    if not found:
+        raise failures[0]
+    matrix, kinds = max(found, key=itemgetter(0))[1], _MODELS if model == "auto" else (model,)
+    # The coarse images have little perspective.
+    for blur, some in ((_BLURS[-1] * first.shape[1], kinds[:2]), (_FINEST, kinds)):
+        pair = [gaussian_filter(images, blur, axes=(1, 2)) for images in (first, other)]
+        matrix, kind, std = _supported(pair, matrix, some, band)
+    if not std <= _LARGEST_STD:
+        raise ValueError(
+            f"Invalid view in band '{band}': its {kind} is known within {std:.2f} pixel. Must be "
+            f"within {_LARGEST_STD}: the object shows too little texture; register on an edge, or "
+            "a heated target."
+        )
+    return matrix, kind, std
+
+
+def _supported(
+    pair: list[Array], start: Array, kinds: Sequence[str], band: str
+) -> tuple[Array, str, float]:
+    """Transform, kind and deviation: of the last kind whose additional numbers are significant."""
+    matrix, result = start, None
+    for place, kind in enumerate(kinds):
+        try:
+            matrix, covariance, std = _fitted(pair, matrix, _FREE[kind], band)
+        except ValueError:  # more numbers than the texture tells leave the image
+            if result is None:
+                raise
+            break
+        # Wald: a^T C^-1 a of the numbers a that the simpler model lacks is chi-square by chance.
+        more = np.flatnonzero(~np.isin(_FREE[kind], _FREE[kinds[place - 1]]))
+        away = (matrix - np.eye(3)).ravel()[_FREE[kind]][more]
+        inverse = np.linalg.pinv(covariance[np.ix_(more, more)], hermitian=True)
+        if result is None or away @ inverse @ away > chi2.isf(_CHANCE, more.size):
+            result = matrix, kind, std
+    assert result is not None
+    return result
+
+
+def _fitted(
+    pair: list[Array], matrix: Array, free: list[int], band: str
+) -> tuple[Array, Array, float]:
+    """Transform that matches images best, covariance of its free numbers, deviation [pixel].
+
+    By Gauss-Newton steps, of splines: the enhanced correlation interpolates by lines, and is off by
+    some hundredths of a pixel.
+    """
+    shape = pair[0].shape[1:]
+    count, splines = len(pair[0]), [spline_filter(image) for image in pair[1]]
+    unit = np.array([1 / shape[1], 1 / shape[0], 1] * 2 + [shape[1] ** -2, shape[0] ** -2])[free]
+    steps = _STEP * unit[:, np.newaxis] * np.eye(9)[free]
+    row, column = np.indices(shape) // max(1, min(shape) // _BLOCKS)
+    weights = np.ones(shape)
+    for _ in range(_NEWTON):
+        places = positions(matrix, shape)
+        inside = _inside(places, band)
+        first, seen = pair[0][:, inside], places[:, inside]
+        values, *around = (
+            np.stack([map_coordinates(spline, seen + step, prefilter=False) for spline in splines])
+            for step in _AROUND
+        )
+        slopes = np.stack([around[1] - around[0], around[3] - around[2]])
+        motion = [
+            positions(matrix + step, shape)[:, inside] - positions(matrix - step, shape)[:, inside]
+            for step in steps.reshape(-1, 3, 3)
+        ]
+        # I_2(H p) + (dH p) grad I_2 = f(I_1) + o, linear in dH and the numbers of f and o.
+        design = np.concatenate(
+            [
+                np.einsum("atp,nap->ntp", slopes, np.array(motion) / (-2.0 * _STEP)),
+                [first**power for power in range(1, _DEGREE + 1)],
+                np.repeat(np.eye(count)[:, :, np.newaxis], first.shape[1], axis=2),
+            ]
+        )
+        weighted = design * weights[inside]
+        flat = weighted.reshape(len(design), -1)
+        inverse = np.linalg.pinv(flat @ design.reshape(len(design), -1).T, hermitian=True)
+        found = inverse @ flat @ values.ravel()
+        residual = values - np.tensordot(found, design, axes=1)
+        square, texture = np.sum(residual**2, axis=0), np.sum(slopes**2, axis=(0, 1))
+        scores = np.einsum("ntp,tp->np", weighted, residual)
+        # Scale of the residual of the texture's quarter that matches best: an edge is no outlier
+        # of what is flat, and much may mirror other things.
+        order = np.argsort(square)
+        quarter = np.searchsorted(np.cumsum(texture[order]), _QUARTER * texture.sum())
+        limit = _CUT**2 * square[order[quarter]] + np.finfo(np.float32).tiny
+        weights[inside] = (1.0 - np.minimum(square / limit, 1.0)) ** 2
+        matrix = matrix + (found[: len(free)] @ steps / _STEP).reshape(3, 3)
+        matrix = matrix / matrix[2, 2]
+        if np.max(np.abs(found[: len(free)])) < _CONVERGED:
+            break
+    # Residuals of neighbours are alike: N^-1 sum_b (s_b s_b^T) N^-1, with the sums s over blocks.
+    label = (row * shape[1] + column)[inside]
+    sums = np.stack([np.bincount(label, weights=score) for score in scores])
+    covariance = (inverse @ sums @ sums.T @ inverse)[: len(free), : len(free)]
+    moved = np.einsum("atp,nap->ntp", slopes, np.array(motion) / (2.0 * _STEP))
+    variance = np.einsum("ntp,nm,mtp->", moved, covariance, moved, optimize=True)
+    std = float(np.sqrt(variance / texture.sum()))
+    return matrix, np.asarray(covariance * np.outer(unit, unit)), std
+
+
+def _inside(places: Array, band: str) -> Mask:
+    """Pixels of the first view, not at the border, whose places (2, y, x) in the other are not."""
+    ends = np.reshape(places.shape[1:], (2, 1, 1)) - 1
+    shared = np.mean(np.all((places > -0.5) & (places < ends + 0.5), axis=0))
+    if not shared >= _LEAST_OVERLAP:
+        raise ValueError(
+            f"Invalid view in band '{band}': it shares {shared:.0%} of the image with the first. "
+            f"Must be at least {_LEAST_OVERLAP:.0%}."
+        )
+    own = np.indices(places.shape[1:])
+    lowest, highest = np.minimum(places, own), np.maximum(places, own)
+    return np.asarray(np.all((lowest >= _MARGIN) & (highest <= ends - _MARGIN), axis=0))
+
+
+def _start(pair: list[Array], band: str) -> tuple[float, Array]:
+    """Translation (3, 3) of the highest correlation of two images (y, x), and that before it."""
+    import cv2  # noqa: PLC0415  (optional: only registration needs it)
+
     matrix, correlation = np.eye(3), 0.0
-    stages = [(share * first.shape[0], "affine") for share in _BLURS]
-    stages[0] = (stages[0][0], "translation")
-    for blur, kind in [*stages, (_FINEST, model)]:
-        simpler = _MODELS[min(_MODELS.index(kind), _MODELS.index(model))]
-        pair = [gaussian_filter(image, blur).astype(np.float32) for image in (first, other)]
-        matrix, correlation = _maximise(pair, matrix, simpler, band)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _TOLERANCE)
+    everywhere = np.ones(pair[0].shape, dtype=np.uint8)
+    for share in _BLURS:
+        one, two = (gaussian_filter(it, share * it.shape[0]).astype(np.float32) for it in pair)
+        start = matrix[:2].astype(np.float32)
+        try:
+            correlation, matrix[:2] = cv2.findTransformECC(
+                one, two, start, cv2.MOTION_TRANSLATION, stop, everywhere, 1
+            )
+        except cv2.error as error:
+            raise ValueError(
+                f"Invalid view in band '{band}': no transform to the first is found ({error.err})."
+                " Must show the same object, displaced by at most a tenth of the image."
+            ) from error
     if not correlation >= _LEAST_CORRELATION:
         raise ValueError(
             f"Invalid view in band '{band}': its correlation with the first is {correlation:.2f}. "
             f"Must be at least {_LEAST_CORRELATION}; they do not show the same, or lie too far "
             "apart."
         )
-    y, x = positions(matrix, first.shape)
-    rows, columns = first.shape
-    shared = np.mean((y > -0.5) & (y < rows - 0.5) & (x > -0.5) & (x < columns - 0.5))
-    if not shared >= _LEAST_OVERLAP:
-        raise ValueError(
-            f"Invalid view in band '{band}': it shares {shared:.0%} of the image with the first. "
-            f"Must be at least {_LEAST_OVERLAP:.0%}."
-        )
-    pair = [gaussian_filter(image, _FINEST) for image in (first, other)]
-    return correlation, _refined(pair, matrix, model)
-
-
-def _refined(pair: list[Array], matrix: Array, model: str) -> Array:
-    r"""Transform that minimises :math:`\sum (g I_1(p) + o - I_2(H p))^2`, by Gauss-Newton steps.
-
-    Of :math:`I_2` over the mean and deviation of what is compared, for else places where it varies
-    little would be the best: the correlation is largest there, which :math:`g` and :math:`o` leave.
-    The enhanced correlation interpolates by lines, and is off by some hundredths of a pixel.
-    """
-    (rows, columns), spline = pair[0].shape, spline_filter(pair[1])
-    unit = np.array([1 / columns, 1 / rows, 1] * 2 + [columns**-2, rows**-2, 0]).reshape(3, 3)
-    for _ in range(_NEWTON):
-        places = positions(matrix, pair[0].shape)
-        inside = np.zeros(pair[0].shape, dtype=bool)
-        inside[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN] = True
-        inside &= np.all(places >= _MARGIN, axis=0)
-        inside &= (places[0] < rows - _MARGIN) & (places[1] < columns - _MARGIN)
-
-        def other(change: Array, inside: Mask = inside, start: Array = matrix) -> Array:
-            where = positions(start + change, pair[0].shape)[:, inside]
-            values = map_coordinates(spline, where, prefilter=False)
-            return np.asarray((values - values.mean()) / values.std())
-
-        steps = [place * unit * _STEP for place in _FREE[model]]
-        slopes = [(other(-step) - other(step)) / (2 * _STEP) for step in steps]
-        first = pair[0][inside]
-        design = np.stack([*slopes, first, np.ones_like(first)], axis=1)
-        found = np.linalg.lstsq(design, other(np.zeros((3, 3))), rcond=None)[0]
-        change = sum(part * place * unit for part, place in zip(found, _FREE[model], strict=False))
-        matrix = (matrix + change) / (matrix + change)[2, 2]
-        if np.max(np.abs(found[: len(slopes)])) < _CONVERGED:
-            break
-    return np.asarray(matrix)
-
-
-def _maximise(
-    pair: list[npt.NDArray[np.float32]], start: Array, kind: str, band: str
-) -> tuple[Array, float]:
-    """Transform of the highest correlation near a start, and that correlation."""
-    import cv2  # noqa: PLC0415  (optional: only registration needs it)
-
-    rows = 3 if kind == "homography" else 2
-    motion = getattr(cv2, f"MOTION_{kind.upper()}")
-    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _TOLERANCE)
-    everywhere = np.ones(pair[1].shape, dtype=np.uint8)
-    try:
-        correlation, estimate = cv2.findTransformECC(
-            pair[0], pair[1], start[:rows].astype(np.float32), motion, stop, everywhere, 1
-        )
-    except cv2.error as error:
-        raise ValueError(
-            f"Invalid view in band '{band}': no transform to the first is found ({error.err}). "
-            "Must show the same object, displaced by at most a tenth of the image."
-        ) from error
-    matrix = np.eye(3)
-    matrix[:rows] = estimate
-    return matrix / matrix[2, 2], float(correlation)
+    return float(correlation), matrix

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import alignment
+from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation._completion.complete import complete
 from dbthermal.separation._pooling import materials as pooling
@@ -98,7 +99,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         apart = _share_apart(solve(some, response, workers=workers))
         if apart > _APART:
             shift = alignment.reflection_shift(corrected, response)
-            if bool(shift["known"].any()):
+            if seen_apart(shift):
                 alone = one(reflection_shift=shift)
                 if _share_apart(alone) < apart:
                     reflection_shift, source = shift, "found"
