@@ -117,4 +117,5 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     return {str(options.output): f"opened by: jupyter lab {options.output}"}
 
 
-_WRITERS = {".csv": _curves, ".tif": _film, ".png": _picture, ".nc": _netcdf}
+_WRITERS = {".csv": _curves, ".tif": _film, ".nc": _netcdf}
+_WRITERS |= dict.fromkeys((".png", ".pdf", ".svg"), _picture)

@@ -3,6 +3,8 @@
 Nothing is computed here beyond units for display, nothing is saved. Temperatures are drawn in
 degrees Celsius. Every figure of data that are simulated or not radiometric says so in its title,
 from the `origin` and `radiometric` attributes of its data. `drawing` has the parts of a new figure.
+For a journal, draw with ``matplotlib.style.context("dbthermal.figures.publication")`` in force,
+which is as wide as a page at most, with letters of 7 points, and save as PDF (`store.save_figure`).
 """
 
 from dbthermal.figures import drawing

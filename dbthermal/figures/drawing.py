@@ -2,6 +2,7 @@
 
 from typing import Any, Final
 
+import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +26,9 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-COLORS: Final = ("#1b6ca8", "#d1495b", "#66a182", "#edae49", "#6c4f77")
-"""Colours of the bands, in their order."""
+COLORS: Final = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7")
+"""Colours of the bands, in their order, told apart by the colour-blind (Wong 2011,
+doi:10.1038/nmeth.1618)."""
 
 MARKERS: Final = "osD^vPX*"
 """Markers of lines, in their order."""
@@ -42,8 +44,11 @@ def canvas(
     rows, columns : int
         Numbers of axes.
     size : tuple of float
-        Width and height [inch].
+        Width and height [inch]; both less in proportion if a style in force is narrower.
     """
+    width = mpl.rcParams["figure.figsize"][0]
+    if width != mpl.rcParamsDefault["figure.figsize"][0] and width < size[0]:
+        size = width, size[1] * width / size[0]
     figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     plt.close(figure)
     return figure, axes
@@ -109,7 +114,7 @@ def draw_image(
     lowest, highest = limits or (None, None)
     drawn = axis.imshow(image.values, cmap=cmap, vmin=lowest, vmax=highest, interpolation="nearest")
     axis.set(facecolor="0.8", xticks=[], yticks=[])
-    axis.set_title(title, fontsize=9)
+    axis.set_title(title, fontsize=min(9.0, mpl.rcParams["font.size"]))
     figure.colorbar(drawn, ax=axis, label=label, shrink=0.85)
 
 

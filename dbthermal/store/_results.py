@@ -208,16 +208,19 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
 def save_figure(
     figure: "Figure", path: str | Path, provenance: Mapping[str, Any], *, dpi: int = 150
 ) -> None:
-    """Save a figure as PNG, the same bytes for the same figure.
+    """Save a figure as PNG, or as vectors in PDF or SVG; the same bytes for the same figure.
+
+    Text stays text, of fonts that PDF embeds; images are pixels within the vectors.
 
     Parameters
     ----------
     figure : Figure
         Of matplotlib; it stays open.
     path, provenance : str or Path, mapping
-        File ``*.png``; see `save`. The provenance becomes the text chunk ``Comment``, as JSON.
+        File ``*.png``, ``*.pdf`` or ``*.svg``; see `save`. The provenance becomes the text chunk
+        ``Comment``, the subject or the description, as JSON.
     dpi : int
-        Resolution [pixel/inch].
+        Resolution [pixel/inch], of the images in PDF and SVG.
 
     Examples
     --------
@@ -230,8 +233,19 @@ def save_figure(
     ...     Image.open(f"{folder}/wall.png").text["Comment"]
     '{"commit": "unknown"}'
     """
-    metadata = {"Software": "dbthermal", "Comment": as_json(provenance)}
-    with whole(path, ".png") as part:
+    from matplotlib import rc_context  # noqa: PLC0415 - loaded with the figure
+
+    text, suffix = as_json(provenance), Path(path).suffix
+    metadata: dict[str, Any] = {"Software": "dbthermal", "Comment": text}
+    if suffix == ".pdf":
+        metadata = {"Creator": "dbthermal", "Subject": text, "CreationDate": None}
+    elif suffix == ".svg":
+        metadata = {"Creator": "dbthermal", "Description": text, "Date": None}
+    kind = suffix if suffix in (".pdf", ".svg") else ".png"
+    with (
+        rc_context({"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "dbthermal"}),
+        whole(path, kind) as part,
+    ):
         figure.savefig(part, dpi=dpi, metadata=metadata)
 
 

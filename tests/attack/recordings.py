@@ -69,7 +69,8 @@ def recordings(rng: Rng) -> Attack:
     whole, path = _whole(form), workplace() / f"recording.{form}"
     shutil.rmtree(path, ignore_errors=True)
     (shutil.copytree if whole.is_dir() else shutil.copy)(whole, path)
-    parts = sorted(part for part in path.rglob("*") if part.is_file()) or [path]
+    every = [one for one in path.rglob("*") if one.is_file()] or [path]
+    parts = sorted(one for one in every if one.stat().st_size > 64)
     part = parts[int(rng.integers(len(parts)))]
     before = part.read_bytes()
     what, after = flir_files.damaged(before, int(rng.integers(2**31)))

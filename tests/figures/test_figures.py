@@ -1,14 +1,18 @@
 """Figures: each draws its arguments, labels them with a unit, and says what the data are."""
 
 from collections.abc import Callable
+from itertools import combinations
 
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib import style
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from sketches import BANDS, DEGREE, array, check_measured, titles
 
 from dbthermal import emissivity, figures, limits
+from dbthermal.figures import drawing
 
 
 def correction(fill: float = 1.0, **attrs: object) -> xr.Dataset:
@@ -219,3 +223,42 @@ def test_plan_frames_the_best_filter() -> None:
     framed = [text.get_text() for text in axes[0].texts if text.get_bbox_patch()]
     assert framed == [f"{v:.2g}" for v in expected["object_temperature_std"].min("filter")[::2]]
     assert len(axes[1].lines) == 1
+
+
+def test_style_of_a_journal() -> None:
+    """A wide figure is as wide as a page, a narrow one as it was, and letters are of 7 points."""
+    plain = drawing.canvas(1, 4, (13.2, 3.0))[0]
+    with style.context("dbthermal.figures.publication"):
+        wide, narrow = drawing.canvas(1, 4, (13.2, 3.0))[0], drawing.canvas(1, 1, (3.5, 2.6))[0]
+        letters = narrow.axes[0].xaxis.label.get_fontsize()
+    np.testing.assert_allclose(plain.get_size_inches(), (13.2, 3.0))
+    np.testing.assert_allclose(wide.get_size_inches(), (7.2, 3.0 * 7.2 / 13.2))
+    np.testing.assert_allclose(narrow.get_size_inches(), (3.5, 2.6))
+    assert letters == 7
+
+
+# Machado, Oliveira and Fernandes 2009, doi:10.1109/TVCG.2009.113: linear RGB as it is seen by
+# protanopes and deuteranopes.
+SEEN = {
+    "protanopia": [[0.1521, 1.0526, -0.2046], [0.1148, 0.7862, 0.0990], [-0.0039, -0.0481, 1.0520]],
+    "deuteranopia": [
+        [0.3673, 0.8606, -0.2280],
+        [0.2801, 0.6727, 0.0472],
+        [-0.0118, 0.0429, 0.9689],
+    ],
+}
+
+
+@pytest.mark.parametrize("matrix", SEEN.values(), ids=SEEN)
+def test_colours_are_told_apart_by_the_colour_blind(matrix: list[list[float]]) -> None:
+    """Any two colours of bands differ by ten just noticeable steps in CIELAB, as they are seen."""
+    color = pytest.importorskip("skimage.color")
+    rgb = np.array([to_rgb(one) for one in drawing.COLORS])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ np.transpose(matrix), 0.0, 1.0)
+    companded = np.where(seen <= 0.0031308, 12.92 * seen, 1.055 * seen ** (1 / 2.4) - 0.055)
+    lab = color.rgb2lab(companded)
+    pairs = combinations(range(len(lab)), 2)
+    steps = [float(np.linalg.norm(lab[one] - lab[other])) for one, other in pairs]
+    print(f"least distance {min(steps):.1f}")
+    assert min(steps) > 10

@@ -238,6 +238,26 @@ def test_figure_is_the_same_twice(tmp_path: Path) -> None:
         assert json.loads(image.info["Comment"]) == RECORD
 
 
+def test_figure_as_vectors(tmp_path: Path) -> None:
+    """PDF and SVG repeat bit for bit and keep text as text, images as pixels, and provenance."""
+    for name in ("a.pdf", "b.pdf", "a.svg", "b.svg"):
+        figure = Figure(figsize=(2, 1))
+        axes = figure.subplots()
+        axes.imshow([[293.15, 294.15]])
+        axes.set_title("wall")
+        store.save_figure(figure, tmp_path / name, RECORD)
+    for suffix in ("pdf", "svg"):
+        assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
+    vectors = (tmp_path / "a.svg").read_text()
+    assert ">wall</text>" in vectors
+    assert "<image" in vectors
+    assert all(key in vectors for key in RECORD)
+    content = (tmp_path / "a.pdf").read_bytes()
+    assert b"/FontFile2" in content  # TrueType, embedded
+    assert b"/Subtype /Image" in content
+    assert b"/Subject" in content
+
+
 @pytest.mark.parametrize("save", [store.save, store.save_numbers, store.save_figure])
 def test_suffix_tells_the_kind(save: Callable[..., None], tmp_path: Path) -> None:
     """A result's name ends in its format."""
