@@ -7,6 +7,7 @@ import pytest
 
 from dbthermal import _smooth as smooth
 from dbthermal import mixing, response
+from dbthermal.separation._subspace import background as backgrounds
 from dbthermal.separation._subspace import emission, reflection_ratio
 from dbthermal.separation._tiles import Tile
 from dbthermal.simulation import Rig
@@ -48,7 +49,7 @@ def test_everything_is_exact_without_noise(emissivity: tuple[float, ...]) -> Non
     """
     tile = tile_of(emissivity, 1, 0.0)
     ratios, found = solved(tile)
-    background, _ = emission.estimate_background(tile, found, ratios)
+    background, _ = backgrounds.estimate(tile, found, ratios)
     expected = (1.0 - np.array(emissivity)) / (1.0 - emissivity[0])
     np.testing.assert_allclose(ratios.ratio[:, 0], expected, rtol=2e-4)
     np.testing.assert_allclose(found.temperature[:, 0], WARM, rtol=0, atol=0.02)  # K
@@ -66,7 +67,7 @@ def test_background_inverts_the_image_formation() -> None:
         temperature=np.repeat(WARM[:, np.newaxis], 3, axis=1),
         emissivity=np.repeat([[0.86], [0.72]], 3, axis=1),
     )
-    background, _ = emission.estimate_background(tile, truth, ratios)
+    background, _ = backgrounds.estimate(tile, truth, ratios)
     np.testing.assert_allclose(background, COLD[:, np.newaxis] * np.ones(3), rtol=0, atol=1e-4)
 
 
@@ -75,12 +76,12 @@ def test_bend_is_the_difference_of_the_responses() -> None:
     linear, exact = tile_of((0.86, 0.72), 1, 0.0), tile_of((0.86, 0.72), 1, 0.0, "exact")
     cold = 293.0 + 12.0 * np.sin(TIME)[:, np.newaxis]  # K
     found = replace(solved(linear)[1], emissivity=np.array([[0.86], [0.72]]))
-    assert np.abs(emission.bend(linear, found, cold)).max() < 1e-9  # K
+    assert np.abs(backgrounds.bend(linear, found, cold)).max() < 1e-9  # K
     reflected = [0.14 * exact.blackbody(0, cold), 0.28 * exact.blackbody(1, cold)]
-    straight = reflected[1] - emission.bend(exact, found, cold)[0]
+    straight = reflected[1] - backgrounds.bend(exact, found, cold)[0]
     np.testing.assert_allclose(straight, 2.0 * reflected[0], rtol=0, atol=1e-9)  # K
     unknown = replace(found, emissivity=np.array([[1.1], [1.2]]))
-    np.testing.assert_array_equal(emission.bend(exact, unknown, cold), 0.0)
+    np.testing.assert_array_equal(backgrounds.bend(exact, unknown, cold), 0.0)
 
 
 def test_standard_deviations_are_those_of_the_scatter() -> None:
@@ -91,7 +92,7 @@ def test_standard_deviations_are_those_of_the_scatter() -> None:
     tile = tile_of((0.86, 0.72), 1500, 1.0)
     ratios, found = solved(tile)
     found = replace(found, drift_variance=np.zeros(1500))
-    background, variance = emission.estimate_background(tile, found, ratios)
+    background, variance = backgrounds.estimate(tile, found, ratios)
     covariance = emission._emissivity_covariance(
         found.emissivity[0], found.noise_variance, ratios, np.array(tile.noise), found.level_std
     )
@@ -141,7 +142,7 @@ def test_background_of_each_band_is_the_closed_form() -> None:
     """For linear responses the weighted mean of the bands' own backgrounds."""
     tile = tile_of((0.86, 0.72), 4, 1.0)
     ratios, found = solved(tile)
-    background, _ = emission.estimate_background(tile, found, ratios)
+    background, _ = backgrounds.estimate(tile, found, ratios)
     signals = [
         mixing.background(e, z, tile.blackbody(band, found.temperature))
         for band, (e, z) in enumerate(zip(found.emissivity, tile.signals, strict=True))

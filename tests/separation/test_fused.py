@@ -10,7 +10,15 @@ import xarray as xr
 from dbthermal import _smooth as smooth
 from dbthermal import response, simulation
 from dbthermal.response import Curve
-from dbthermal.separation._subspace import division, fused, kernels, method, pieces, steps
+from dbthermal.separation._subspace import (
+    division,
+    fused,
+    kernels,
+    method,
+    pieces,
+    regression,
+    steps,
+)
 from dbthermal.separation._tiles import Material, Tile
 
 RIG = simulation.Rig()
@@ -129,7 +137,7 @@ def test_flags_and_films_are_the_same(
 
 @pytest.mark.parametrize("kind", response.KINDS)
 def test_response_of_the_kernels(kind: str) -> None:
-    """Signal, slope and inverse are those of the curve within 1e-6 K, far outside its range too."""
+    """Signal, slope, and the inverse after a step are exact to 1e-6 K, far outside too."""
     for name in RIG.bands:
         curve: Curve = response.curve(RIG.response(), name, kind)
         temperature = np.linspace(150.0, 900.0, 2000)
@@ -140,6 +148,9 @@ def test_response_of_the_kernels(kind: str) -> None:
         np.testing.assert_allclose(signal, expected, rtol=1e-9, atol=1e-6)  # K
         np.testing.assert_allclose(slope, curve.slope(temperature), rtol=1e-9, atol=1e-6)
         kernels.temperature(table, expected, back)
+        np.testing.assert_allclose(back, temperature, rtol=0, atol=0.01)  # K
+        kernels.blackbody(table, back, signal, slope)
+        back -= (signal - expected) / slope
         np.testing.assert_allclose(back, temperature, rtol=1e-9, atol=1e-6)  # K
 
 
@@ -149,7 +160,7 @@ def test_rank_without_sorting() -> None:
     for values in (rng.exponential(size=117), np.ones(50), rng.integers(0, 4, 60), np.zeros(9)):
         single = values.astype(np.float32)
         for rank, guess in product((0, len(single) // 3, len(single) - 1), (1e-3, 0.5, 100.0)):
-            value = kernels.ranked(single, rank, guess)
+            value = regression.ranked(single, rank, guess)
             assert value == pytest.approx(np.sort(single)[rank], rel=1e-6)
 
 

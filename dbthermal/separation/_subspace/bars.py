@@ -7,9 +7,9 @@ import numpy as np
 
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels
-from dbthermal.separation._subspace.kernels import compiled
-from dbthermal.separation._subspace.pixel import Line, Ratio
+from dbthermal.separation._subspace import kernels, regression
+from dbthermal.separation._subspace.kernels import inlined
+from dbthermal.separation._subspace.pixel import Line, Ratio, weights
 from dbthermal.separation._subspace.shared import Model, Work
 
 
@@ -24,7 +24,7 @@ class Bars(NamedTuple):
     restless: bool
 
 
-@compiled
+@inlined
 def _curve_variance(model: Model, kernel: Array, count: int, variance: float, work: Work) -> float:
     """Variance of a kernel's sum over the object's smoothed noise."""
     part = work.columns[:count]
@@ -32,7 +32,7 @@ def _curve_variance(model: Model, kernel: Array, count: int, variance: float, wo
     return float(variance * kernels.dot(part, part))
 
 
-@compiled
+@inlined
 def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[float, float]:
     """Variance of the slope by a background that walks, and its bound; `emission.walk_variance`."""
     degrees, kept, (spectrum, curve) = len(model.rising), work.spare, work.spectra
@@ -58,14 +58,14 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
     return scale / energy**2 * expected, scale / energy**2 * upper
 
 
-@compiled
+@inlined
 def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -> float:
     """Variance of the slope by a linear drift, as `emission._linear_variance`."""
     drift, frames, count = model.rising[0], work.first.size, ratios.order + model.steps
     emitted, residual, weights = work.emitted, work.residual, work.weights
     kernel, again = work.kernel, work.spare
     kept, slope, size, length = weights, 0.0, 0.0, 0.0
-    slope, level, _ = kernels.moments(emitted, drift, kept)
+    slope, level, _ = regression.moments(emitted, drift, kept)
     for last in range(2):
         length, size = 0.0, 0.0
         for t in range(frames):
@@ -77,7 +77,7 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
             for t in range(frames):
                 again[t] = residual[t] - size * (drift[t] - level - slope * emitted[t])
             kept = work.variance
-            slope, level, _ = kernels.reweighted(emitted, drift, again, line.scale, kept)
+            slope, level, _ = regression.reweighted(emitted, drift, again, line.scale, kept)
     variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
     curve = _curve_variance(model, kernel, count, ratios.null_variance, work)
     variance = (variance + line.emissivity[0] ** 2 * curve) / length**2
@@ -86,7 +86,7 @@ def _linear(model: Model, ratios: Ratio, line: Line, limit: float, work: Work) -
     return float(slope**2 * share * (share * size**2 + variance))
 
 
-@compiled
+@inlined
 def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: Work) -> bool:
     """Variance of the object, and whether the background hardly rests; see `emission.estimate`."""
     count, null, noise = ratios.order + model.steps, ratios.null_variance, model.noise[0]
@@ -95,9 +95,14 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: 
     kernels.combined(model.object_part, model.spans, work.coefficients[0], count, sensitivity)
     resting, more, leverage = 0.0, 1.0 + log(work.first.size) / count, model.leverage
     beside = 1.0 / (1.0 - emissions.NORMAL95**2 * epsilon) ** 2
+    one, two = weights(ratios, first)
+    inverse = 1.0 / two
     for t in range(work.first.size):
         flat = 1.0 / work.steepness[t]
-        sensitivity[t] = (work.partial[t] - sensitivity[t]) * flat
+        # The second band's signal before the last step, of the value of h; see `emission._newton`.
+        other = (work.target[t] - work.lack[t] - one * work.emitted[t]) * inverse
+        partial = other + first * (work.emitted[t] - other)
+        sensitivity[t] = (partial - sensitivity[t]) * flat
         smooth_variance[t] = leverage[ratios.order - 1, t] * null * flat**2
         square = sensitivity[t] ** 2 * epsilon
         expected = noise**2 + first**2 * (square + smooth_variance[t] * more)
@@ -107,7 +112,7 @@ def _propagate(model: Model, ratios: Ratio, epsilon: float, first: float, work: 
     return resting < emissions.RESTING * work.first.size
 
 
-@compiled
+@inlined
 def bars(model: Model, ratios: Ratio, line: Line, work: Work) -> Bars:
     """Variances of emissivities, object and background, as `emission.estimate`; in place."""
     z, emitted, weights, kernel = work.first, work.emitted, work.weights, work.kernel
@@ -141,7 +146,7 @@ def bars(model: Model, ratios: Ratio, line: Line, work: Work) -> Bars:
     return Bars(covariance, epsilon, level, noise_variance, drift_variance, restless)
 
 
-@compiled
+@inlined
 def _covariance(
     model: Model, ratios: Ratio, first: float, slope_variance: float, level: float
 ) -> tuple[float, float, float]:
@@ -159,7 +164,7 @@ def _covariance(
     return a + by_level[0] ** 2, b + by_level[0] * by_level[1], d + by_level[1] ** 2
 
 
-@compiled
+@inlined
 def _background(
     model: Model, ratios: Ratio, line: Line, epsilon: float, slope: float, work: Work
 ) -> None:

@@ -20,7 +20,7 @@ from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio, residuals
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace.kernels import compiled
+from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.pixel import Ratio
 from dbthermal.separation._subspace.shared import Model, Work
 from dbthermal.separation._subspace.steps import FILMS, Solution
@@ -29,11 +29,12 @@ from dbthermal.separation._tiles import Tile
 # Samples that are turned at once, to stay in the cache, and the fewest pixels.
 _TURNED: Final = 2**14
 _BLOCK: Final = 8
+_VECTOR: Final = 64  # numbers that a loop takes at once, at most
 _ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 _SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
 
 
-@compiled
+@inlined
 def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bool]:
     """Autocorrelation, delay of the bands, and whether the residual is noise; see `residuals`."""
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
@@ -71,21 +72,22 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
     )
 
 
-@compiled
+@inlined
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
     """As `residuals.unexplained`."""
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
-    sums, together = np.zeros(blocks), 0.0
+    sums, together = work.sensitivity, 0.0
     leverage, products, squares = model.leverage[ratios.order - 1], work.kernel, work.mean
     for t in range(residual.size):
         products[t] = residual[t] * rapid[t] - common * (1.0 - leverage[t])
         squares[t] = rapid[t] ** 2
     for block in range(blocks):
-        product, square = 0.0, 0.0
+        total, product, square = 0.0, 0.0, 0.0
         for t in range(np.uintp(model.edges[block]), np.uintp(model.edges[block + 1])):
-            sums[block] += residual[t]
+            total += residual[t]
             product += products[t]
             square += squares[t]
+        sums[block] = total
         together += product**2 / square if square > 0 else 0.0
     if together / ratios.null_variance > model.limits[0]:
         return True
@@ -102,7 +104,7 @@ def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool
     return False
 
 
-@compiled
+@inlined
 def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
 ) -> tuple[Any, Any, Any]:
@@ -115,9 +117,10 @@ def _film(
         margin = _SIGMAS * (zero if np.isnan(deviation) else deviation)
         beyond += one if (kelvin < lowest - margin) | (kelvin > highest + margin) else zero
         useful = (abs(kelvin) < _USELESS) & (deviation < _USELESS)
-        lost += zero if useful else one
         value[t] = kelvin if useful else _NAN
         std[t] = deviation if useful else _NAN
+    for t in range(temperature.size):  # not above: it would not be taken many at once
+        lost += one if np.isnan(value[t]) else zero
     return lost, missing, beyond > zero
 
 
@@ -150,7 +153,7 @@ class Solved(NamedTuple):
     sums: Array  # (pixel, 2, block) [K]
 
 
-@compiled
+@inlined
 def _energy(bend: Array, removed: Array) -> float:
     """Energy about the mean of what a bend has changed."""
     total, square = 0.0, 0.0
@@ -161,11 +164,11 @@ def _energy(bend: Array, removed: Array) -> float:
     return square - total**2 / bend.size
 
 
-@compiled
+@inlined
 def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums: Array) -> None:
     """Steps 1 to 4, on the exact model where it matters, and all that the flags need."""
-    work.straight[:] = work.second
-    work.removed[:] = 0.0
+    kernels.copy(work.second, work.straight)
+    kernels.fill(work.removed, 0.0)
     gray, again = False, 0
     while True:
         ratios = pixel.ratios(model, work)
@@ -196,14 +199,15 @@ def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums
     _write_symmetric(deviations.covariance, record.emissivity_covariance)
 
 
-@compiled
+@inlined
 def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) -> None:
     """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
     count, w = ratios.order + model.steps, ratios.weights
-    combined = w[0] * coefficients[0] + w[1] * coefficients[1]
+    for j in range(count):
+        work.columns[j] = w[0] * coefficients[0, j] + w[1] * coefficients[1, j]
     kernels.combined(model.functions, model.spans, coefficients[0], count, rapid)
-    kernels.combined(model.functions, model.spans, combined, count, residual)
+    kernels.combined(model.functions, model.spans, work.columns, count, residual)
     for t in range(rapid.size):
         rapid[t] = work.first[t] - rapid[t]
         residual[t] = w[0] * work.first[t] + w[1] * work.straight[t] - residual[t]
@@ -217,7 +221,7 @@ def _judge(model: Model, ratios: Ratio, work: Work, record: Any, sums: Array) ->
         sums[0, block], sums[1, block] = one, other
 
 
-@compiled
+@inlined
 def _write_ratio(model: Model, ratios: Ratio, level: float, record: Any) -> None:
     record.ratio[0], record.ratio[1] = 1.0, ratios.ratio
     error = model.noise[1] ** 2 + (ratios.ratio * model.noise[0]) ** 2  # eq. 4
@@ -228,7 +232,7 @@ def _write_ratio(model: Model, ratios: Ratio, level: float, record: Any) -> None
     record.contrast, record.reduced_chi2 = ratios.contrast, ratios.reduced_chi2
 
 
-@compiled
+@inlined
 def _write_scatter(model: Model, ratios: Ratio, scatter: Array, record: Any) -> None:
     """Scatter less noise, at the order of the pixel and at `reflection_ratio.rapid_orders`."""
     _write_symmetric(ratios.scatter, record.scatter)
@@ -240,31 +244,31 @@ def _write_scatter(model: Model, ratios: Ratio, scatter: Array, record: Any) -> 
         _write_symmetric((a - free, b, d - free), record.rapid_scatter[place])
 
 
-@compiled
+@inlined
 def _write_symmetric(elements: tuple[float, float, float], matrix: Any) -> None:
     """First, mixed and last element of a symmetric matrix, in place."""
     matrix[0, 0], matrix[0, 1], matrix[1, 0] = elements[0], elements[1], elements[1]
     matrix[1, 1] = elements[2]
 
 
-@compiled
+@inlined
 def _turn(samples: Any, start: int, size: int, turned: Any) -> None:
-    """Samples (kind, time, pixel) of a few pixels as (kind, pixel, time), in place."""
-    for kind in range(turned.shape[0]):
+    """Samples (kind, time, pixel) of a few pixels as (pixel, kind, time), in place."""
+    for kind in range(turned.shape[1]):
         for t in range(turned.shape[2]):
             row = samples[kind, t, start : start + size]
             for p in range(size):
-                turned[kind, p, t] = row[p]
+                turned[p, kind, t] = row[p]
 
 
-@compiled
+@inlined
 def _return(turned: Any, start: int, size: int, samples: Any) -> None:
     """The reverse of `_turn`, in place."""
-    for kind in range(turned.shape[0]):
+    for kind in range(turned.shape[1]):
         for t in range(turned.shape[2]):
             row = samples[kind, t, start : start + size]
             for p in range(size):
-                row[p] = turned[kind, p, t]
+                row[p] = turned[p, kind, t]
 
 
 def _compiled(digest: str) -> Callable[..., None]:
@@ -278,15 +282,16 @@ def _compiled(digest: str) -> Callable[..., None]:
             return
         frames, pixels = signals.shape[1:]
         block = max(_BLOCK, _TURNED // frames)
-        inside, outside = np.empty((2, block, frames)), np.empty((4, block, frames), np.float32)
+        inside, outside = np.empty((block, 2, frames)), np.empty((block, 4, frames), np.float32)
         for start in range(0, pixels, block):
             size = min(block, pixels - start)
             _turn(signals, start, size, inside)
             for p in range(size):
                 here = start + p
-                work.first[:], work.second[:] = inside[0, p], inside[1, p]
-                work.material[:] = materials[here]
-                _pixel(model, least, work, outside[:, p], solved.record[here], solved.sums[here])
+                kernels.copy(inside[p, 0], work.first)
+                kernels.copy(inside[p, 1], work.second)
+                kernels.copy(materials[here], work.material)
+                _pixel(model, least, work, outside[p], solved.record[here], solved.sums[here])
             _return(outside, start, size, solved.films)
 
     with suppress(RuntimeError):  # without a folder that may be written each process compiles
@@ -346,7 +351,8 @@ def _work_space(functions: smooth.Subspace) -> Work:
     """Arrays for the signals and curves of one pixel."""
     frames, columns = functions.functions.shape
     rest: dict[str, Any] = {
-        "few": np.empty((6, frames), np.float32),
+        # Whole vectors of infinite values behind the last frame: a rank is of those before.
+        "few": np.full((6, -(-frames // _VECTOR) * _VECTOR), np.inf, np.float32),
         "coefficients": np.empty((2, columns)),
         "columns": np.empty(columns),
         "spectra": np.empty((2, functions.rising.shape[1])),

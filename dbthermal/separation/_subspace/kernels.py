@@ -1,7 +1,7 @@
-"""Compiled arithmetic of one pixel: responses as polynomials, sums over time, a robust line.
+"""Compiled arithmetic of one pixel: responses as polynomials, and sums over time.
 
 A pixel's curves stay in the processor's cache, and a step costs what its sums cost. What is stated
-for arrays in `response` and `residuals` is repeated within rounding.
+for arrays in `response` is repeated within rounding.
 """
 
 import hashlib
@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 from numpy.polynomial import Chebyshev
 
@@ -19,19 +18,16 @@ from dbthermal import planck
 from dbthermal._arrays import Array
 from dbthermal.response import Curve, LinearCurve
 from dbthermal.separation import _tiles as tiles
-from dbthermal.separation._subspace import residuals
 
-_ERROR: Final = 1e-7  # of a response's polynomials [K]
-_INVERSE_ERROR: Final = 5e-7  # [K]
+_ERROR: Final = 2e-7  # of a response's polynomials [K]
+_START_ERROR: Final = 0.01  # of the inverse, of which a step of Newton leaves less than 1e-6 [K]
 _MARGIN: Final = 0.25  # of the calibrated range, beside it, in which they hold
-_TERMS: Final = 12  # of a polynomial
+_TERMS: Final = 10  # of a polynomial
 # Degrees, and shares of the range: of a wide one, such as a maker's, the outer parts stay exact.
 _TRIED: Final = (
     *((degree, 1.0) for degree in range(1, _TERMS)),
     *((_TERMS - 1, 0.85**k) for k in range(1, 14)),
 )
-_NEWTON: Final = 4  # steps of the inverse, at most
-_GUESSES: Final = 60  # of the value of a rank, at most
 
 _SOURCES: Final = [*Path(__file__).parent.glob("*.py"), Path(planck.__file__), Path(tiles.__file__)]
 DIGEST: Final = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(_SOURCES))).hexdigest()
@@ -42,14 +38,19 @@ _FLAGS: Final = {"reassoc", "contract", "nsz", "arcp"}
 compiled: Final[Callable[..., Any]] = njit(nogil=True, fastmath=_FLAGS, error_model="numpy")
 """Decorator of functions that are compiled into those that call them."""
 
+_WITHIN: Final[dict[str, Any]] = {"forceinline": True, "no_cpython_wrapper": True}
+inlined: Final[Callable[..., Any]] = njit(
+    nogil=True, fastmath=_FLAGS, error_model="numpy", **_WITHIN
+)
+"""As `compiled`, for what has a work space: to hand over its some 300 numbers takes long."""
+
 
 class Table(NamedTuple):
     """Response of a band, as polynomials of (temperature - middle) / half; exact beside them."""
 
     signal: tuple[float, ...]  # coefficients of u(T) - T_r [K], rising
     slope: tuple[float, ...]  # of u'(T) [1]
-    inverse: tuple[float, ...]  # of T of (signal - middle_signal) / half_signal [K]
-    newton: int  # steps after which the inverse is exact
+    inverse: tuple[float, ...]  # of T of (signal - middle_signal) / half_signal, nearly [K]
     middle: float  # [K]
     half: float  # [K]
     middle_signal: float  # less the reference [K]
@@ -65,16 +66,18 @@ class Table(NamedTuple):
 def table(curve: Curve, *others: Curve) -> Table:
     """Polynomials of a response, of the least degree that keeps an error; of the others' range."""
     margin = _MARGIN * (curve.highest - curve.lowest)
-    widest = max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin
+    widest = np.array([max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin])
     for degree, share in _TRIED:
-        low, high = (np.mean(widest) + share * np.diff(widest) * np.array([-0.5, 0.5])).tolist()
+        low, high = (curve.reference + share * (widest - curve.reference)).tolist()
         dense = np.linspace(low, high, 1001)
-        errors = []
+        errors, starts = [], []
         for one in (*others, curve):
             u = Chebyshev.interpolate(_signal, degree, [low, high], args=(one,))
-            slope = u.deriv()
+            slope, ends = u.deriv(), _signal(np.array([low, high]), one)
             errors += [u(dense) - _signal(dense, one), slope(dense) - one.slope(dense)]
-        if np.abs(errors).max() < _ERROR:
+            inverse = Chebyshev.interpolate(_temperature, _TERMS - 1, ends, args=(one,))
+            starts += [inverse(_signal(dense, one)) - dense]
+        if np.abs(errors).max() < _ERROR and np.abs(starts).max() < _START_ERROR:
             break
     else:
         raise ValueError(
@@ -82,18 +85,11 @@ def table(curve: Curve, *others: Curve) -> Table:
             f"polynomial of degree {degree}. Must be smooth over its range, {curve.lowest} to "
             f"{curve.highest} K."
         )
-    ends, a = _signal(np.array([low, high]), curve), curve.reference_slope
-    inverse = Chebyshev.interpolate(
-        lambda s: curve.temperature(s + curve.reference), _TERMS - 1, ends
-    )
-    values, newton = inverse(_signal(dense, curve)), 0
-    while newton < _NEWTON and np.abs(values - dense).max() > _INVERSE_ERROR:
-        values, newton = values - (u(values) - _signal(dense, curve)) / slope(values), newton + 1
+    a = curve.reference_slope
     return Table(
         signal=_coefficients(u),
         slope=_coefficients(slope),
         inverse=_coefficients(inverse),
-        newton=newton,
         middle=0.5 * (low + high),
         half=0.5 * (high - low),
         middle_signal=float(ends.mean()),
@@ -108,6 +104,10 @@ def table(curve: Curve, *others: Curve) -> Table:
 
 def _signal(temperature: Array, curve: Curve) -> Array:
     return curve.signal(temperature) - curve.reference
+
+
+def _temperature(signal: Array, curve: Curve) -> Array:
+    return curve.temperature(signal + curve.reference)
 
 
 def _coefficients(series: Chebyshev) -> tuple[float, ...]:
@@ -130,18 +130,16 @@ def exact(table: Table, temperature: float) -> tuple[float, float]:
 
 @compiled
 def polynomial(c: tuple[float, ...], x: float) -> float:
-    """Polynomial of twelve rising coefficients (Horner's scheme), in registers."""
-    high = c[6] + x * (c[7] + x * (c[8] + x * (c[9] + x * (c[10] + x * c[11]))))
-    return c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * (c[5] + x * high)))))
+    """Polynomial of ten rising coefficients (Horner's scheme), in registers."""
+    high = c[5] + x * (c[6] + x * (c[7] + x * (c[8] + x * c[9])))
+    return c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * high))))
 
 
 @compiled
 def with_slope(c: tuple[float, ...], x: float) -> tuple[float, float]:
-    """Polynomial of twelve rising coefficients, and its derivative."""
-    value, slope = c[11], 0.0
-    slope, value = value, value * x + c[10]
-    slope, value = slope * x + value, value * x + c[9]
-    slope, value = slope * x + value, value * x + c[8]
+    """Polynomial of ten rising coefficients, and its derivative."""
+    value, slope = c[9], 0.0
+    slope, value = value, value * x + c[8]
     slope, value = slope * x + value, value * x + c[7]
     slope, value = slope * x + value, value * x + c[6]
     slope, value = slope * x + value, value * x + c[5]
@@ -154,12 +152,11 @@ def with_slope(c: tuple[float, ...], x: float) -> tuple[float, float]:
 
 @compiled
 def mixed(one: float, a: tuple[float, ...], two: float, b: tuple[float, ...]) -> tuple[float, ...]:
-    """Twelve coefficients of a sum of two polynomials."""
+    """Ten coefficients of a sum of two polynomials."""
     low = one * a[0] + two * b[0], one * a[1] + two * b[1], one * a[2] + two * b[2]
     up = one * a[3] + two * b[3], one * a[4] + two * b[4], one * a[5] + two * b[5]
     more = one * a[6] + two * b[6], one * a[7] + two * b[7], one * a[8] + two * b[8]
-    high = one * a[9] + two * b[9], one * a[10] + two * b[10], one * a[11] + two * b[11]
-    return low + up + more + high
+    return low + up + more + (one * a[9] + two * b[9],)
 
 
 @compiled
@@ -179,16 +176,12 @@ def blackbody(table: Table, temperature: Array, signal: Array, slope: Array) -> 
 
 @compiled
 def temperature(table: Table, signal: Array, result: Array) -> None:
-    """Temperature [K] of a blackbody with a signal (time) [K], in place; NaN where undefined."""
-    outside, scale, narrow = 0.0, 1.0 / table.half_signal, 1.0 / table.half
+    """Temperature of a signal (time) [K] within 0.01 K, in place; NaN where undefined."""
+    outside, scale = 0.0, 1.0 / table.half_signal
     for t in range(signal.size):
         x = (signal[t] - table.middle_signal) * scale
         outside += 0.0 if abs(x) <= 1.0 else 1.0
         result[t] = polynomial(table.inverse, x)
-    for _ in range(table.newton):
-        for t in range(signal.size):
-            value, slope = with_slope(table.signal, (result[t] - table.middle) * narrow)
-            result[t] -= (value - signal[t]) / slope * table.half
     if outside > 0.0:
         for t in range(signal.size):
             if not abs(signal[t] - table.middle_signal) <= table.half_signal:
@@ -205,6 +198,18 @@ def _inverse(table: Table, signal: float) -> float:
         scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(table.amplitude / excess)
         return float((scale - table.shift) / table.wavelength)
     return float(np.nan)
+
+
+@compiled
+def fill(result: Array, value: float) -> None:
+    for t in range(result.size):
+        result[t] = value
+
+
+@compiled
+def copy(values: Array, result: Array) -> None:
+    for t in range(values.size):
+        result[t] = values[t]
 
 
 @compiled
@@ -236,8 +241,16 @@ def range_of(values: Array) -> Any:
 @compiled
 def combined(columns: Array, spans: tiles.Whole, scales: Array, count: int, result: Array) -> None:
     """Sum of the first columns (column, time) times scales, in place."""
-    result[:] = 0.0
-    for j in range(count):
+    fill(result, 0.0)
+    for j in range(0, count - count % 4, 4):
+        start, stop = spans[j, 0], spans[j + 3, 1]
+        a, b = columns[j, start:stop], columns[j + 1, start:stop]
+        c, d = columns[j + 2, start:stop], columns[j + 3, start:stop]
+        w, x, y, z = scales[j], scales[j + 1], scales[j + 2], scales[j + 3]
+        part = result[start:stop]
+        for t in range(part.size):
+            part[t] += w * a[t] + x * b[t] + y * c[t] + z * d[t]
+    for j in range(count - count % 4, count):
         start, stop = spans[j]
         column, part, scale = columns[j, start:stop], result[start:stop], scales[j]
         for t in range(part.size):
@@ -247,7 +260,18 @@ def combined(columns: Array, spans: tiles.Whole, scales: Array, count: int, resu
 @compiled
 def projected(columns: Array, spans: tiles.Whole, count: int, curve: Array, result: Array) -> None:
     """Products of the first columns (column, time) with a curve, in place."""
-    for j in range(count):
+    for j in range(0, count - count % 4, 4):
+        start, stop, w, x, y, z = spans[j, 0], spans[j + 3, 1], 0.0, 0.0, 0.0, 0.0
+        a, b = columns[j, start:stop], columns[j + 1, start:stop]
+        c, d = columns[j + 2, start:stop], columns[j + 3, start:stop]
+        part = curve[start:stop]
+        for t in range(part.size):
+            w += a[t] * part[t]
+            x += b[t] * part[t]
+            y += c[t] * part[t]
+            z += d[t] * part[t]
+        result[j], result[j + 1], result[j + 2], result[j + 3] = w, x, y, z
+    for j in range(count - count % 4, count):
         start, stop = spans[j]
         result[j] = dot(columns[j, start:stop], curve[start:stop])
 
@@ -269,165 +293,3 @@ def projected_both(columns: Array, spans: tiles.Whole, first: Array, last: Array
     if count % 2:
         projected(columns[-1:], spans[-1:], 1, first, to[0, -1:])
         projected(columns[-1:], spans[-1:], 1, last, to[1, -1:])
-
-
-@compiled
-def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
-    """
-    Value of a rank, from 0, of values that are not negative, from a guess: no sorting.
-
-    By interpolation between the numbers of values below two others. The bits of such numbers, as
-    whole numbers, are in the same order, and NaN above all.
-    """
-    bits = values.view(np.uint32)
-    least, most = np.float32(0.0), np.float32(values.size)
-    low, high = np.float32(0.0), np.float32(np.inf)
-    middle, goal = np.float32(guess), np.float32(rank)
-    for turn in range(_GUESSES):
-        below = np.float32(0.0)  # sums of one kind are taken many at once
-        for t in range(values.size):
-            below += np.float32(1.0) if values[t] < middle else np.float32(0.0)
-        if below <= goal:
-            low, least = middle, below
-        else:
-            high, most = middle, below
-        if below == goal:
-            break
-        if high == np.float32(np.inf):  # small values are about as many in each interval
-            growth = (goal + np.float32(0.5)) / max(below, np.float32(0.5))
-            middle = low * min(max(growth, np.float32(1.01)), np.float32(4.0))
-        elif turn % 3 == 2:
-            middle = np.float32(0.5) * (low + high)
-        else:
-            share = (goal + np.float32(0.5) - least) / (most - least)
-            middle = low + share * (high - low)
-        if not low < middle < high:
-            break
-    lowest, above = np.float32(low).view(np.uint32), np.uint32(0xFFFFFFFF)
-    for t in range(bits.size):  # what is below the bound wraps around
-        above = min(above, np.uint32(bits[t] - lowest))
-    return float(np.uint32(lowest + above).view(np.float32))
-
-
-def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
-    """Weighted line, and that of bisquare weights, of arrays of a precision, compiled."""
-    zero, one = real(0.0), real(1.0)
-
-    @compiled
-    def line(total: Any, first: Any, second: Any, square: Any, product: Any) -> Any:
-        middle, centre = first / total, second / total
-        energy = square - total * middle * middle
-        slope = (product - total * middle * centre) / energy
-        return slope, centre - slope * middle, energy
-
-    @compiled
-    def moments(x: Any, y: Any, weights: Any) -> Any:
-        """Slope and intercept of a weighted line, and the energy of the abscissa about its mean."""
-        total, first, second, square, product = zero, zero, zero, zero, zero
-        for t in range(x.size):
-            w = weights[t]
-            wx = w * x[t]
-            total += w
-            first += wx
-            second += w * y[t]
-            square += wx * x[t]
-            product += wx * y[t]
-        return line(total, first, second, square, product)
-
-    @compiled
-    def reweighted(x: Any, y: Any, residual: Any, scale: float, weights: Any) -> Any:
-        """As `moments`, with Tukey's bisquare weights of residuals, in place."""
-        inverse = real(1.0 / (residuals.TUNING * scale))
-        total, first, second, square, product = zero, zero, zero, zero, zero
-        for t in range(x.size):
-            r = residual[t] * inverse
-            kept = max(one - r * r, zero)
-            w = kept * kept
-            weights[t] = w
-            wx = w * x[t]
-            total += w
-            first += wx
-            second += w * y[t]
-            square += wx * x[t]
-            product += wx * y[t]
-        return line(total, first, second, square, product)
-
-    return moments, reweighted
-
-
-moments, reweighted = _of(np.float64)
-_moments, _reweighted = _of(np.float32)
-
-
-@compiled
-def _started(x: Array, y: Array, noise: float, residual: Array, few: Any) -> None:
-    """Residual from the best of three starts, in place; see `residuals.regress`."""
-    middle, centre = mean(x), mean(y)
-    step = max(1, x.size // residuals.STARTING_POINTS)
-    count = (x.size + step - 1) // step
-    xs, ys, rest = few[0, :count], few[1, :count], few[2, :count]
-    weights, plain, magnitude = few[3, :count], few[4, :count], few[5, :count]
-    for i in range(count):
-        xs[i], ys[i], weights[i] = x[i * step] - middle, y[i * step] - centre, 1.0
-    slope, intercept, _ = _moments(xs, ys, weights)
-    for i in range(count):
-        plain[i] = ys[i] - intercept - slope * xs[i]
-    rank, zero = int(residuals.SHARE * count), np.float32(0.0)
-    best, best_slope, best_intercept = np.inf, np.inf, np.inf
-    for start in range(3):
-        sign = np.float32(2 * start - 3) if start > 0 else zero
-        for i in range(count):
-            weights[i] = 1.0 if sign * plain[i] >= zero else 0.0
-        slope, intercept, _ = _moments(xs, ys, weights)
-        deviation = 0.0
-        for turn in range(residuals.STARTING_STEPS):
-            if turn > 0:
-                scale = max(noise, residuals.ANNEALING * residuals.TO_STD * deviation)
-                slope, intercept, _ = _reweighted(xs, ys, rest, scale, weights)
-            total = zero
-            for i in range(count):
-                rest[i] = ys[i] - intercept - slope * xs[i]
-                magnitude[i] = abs(rest[i])
-                total += magnitude[i]
-            guess = deviation if turn > 0 else 0.5 * total / count
-            deviation = ranked(magnitude, rank, max(guess, noise / residuals.TO_STD))
-        if deviation < best:
-            best, best_slope, best_intercept = deviation, slope, intercept
-    for t in range(x.size):
-        residual[t] = y[t] - centre - best_intercept - best_slope * (x[t] - middle)
-
-
-@compiled
-def regress(
-    x: Array, y: Array, noise: float, weights: Array, residual: Array, few: Any, again: int
-) -> tuple[float, float, float, float]:
-    """
-    Robust line, as `residuals.regress`; residual and weights in place.
-
-    Slope, its variance, the scale, and the energy of the abscissa.
-    """
-    if again:
-        slope, intercept, _ = moments(x, y, weights)
-        for t in range(x.size):
-            residual[t] = y[t] - intercept - slope * x[t]
-    else:
-        _started(x, y, noise, residual, few)
-    magnitude, rank = few[5], int(residuals.SHARE * x.size)
-    deviation = 0.0
-    for t in range(x.size):
-        magnitude[t] = abs(residual[t])
-    for _ in range(residuals.STEPS):
-        deviation = ranked(magnitude, rank, max(deviation, noise / residuals.TO_STD))
-        scale = max(noise, residuals.TO_STD * deviation)
-        slope, intercept, energy = reweighted(x, y, residual, scale, weights)
-        for t in range(x.size):
-            residual[t] = y[t] - intercept - slope * x[t]
-            magnitude[t] = abs(residual[t])
-    kept, lagged = (residual[0] * weights[0]) ** 2, 0.0
-    for t in range(1, x.size):
-        one = residual[t] * weights[t]
-        kept += one * one
-        lagged += one * residual[t - 1] * weights[t - 1]
-    correlation = min(max(lagged / kept if kept > 0 else 0.0, 0.0), residuals.MOST_CORRELATED)
-    independent = (1.0 - correlation) / (1.0 + correlation)
-    return slope, scale**2 / energy / independent, scale, energy

@@ -1,6 +1,6 @@
 """Steps 1 to 4 of `method` for one pixel of two bands, compiled; their bars are in `bars`."""
 
-from math import erfc, log, sqrt
+from math import erfc, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import emission as emissions
-from dbthermal.separation._subspace import kernels, reflection_ratio
-from dbthermal.separation._subspace.kernels import compiled
+from dbthermal.separation._subspace import kernels, reflection_ratio, regression
+from dbthermal.separation._subspace.kernels import inlined
 from dbthermal.separation._subspace.shared import Model, Work
 
 CHANCE: Final = float(chi2.isf(reflection_ratio.CHANCE, 1))
@@ -43,7 +43,7 @@ class Line(NamedTuple):
     known: bool  # the emissivity is the material's
 
 
-@compiled
+@inlined
 def ratios(model: Model, work: Work) -> Ratio:
     """Step 1; coefficients (2, column) in place."""
     curves = work.first, work.straight
@@ -87,7 +87,7 @@ def ratios(model: Model, work: Work) -> Ratio:
     )
 
 
-@compiled
+@inlined
 def _scatter(model: Model, work: Work) -> None:
     """Scatter (order, 3) of the whitened signals outside the functions of each order (eq. 3)."""
     z, s, coefficients, steps = work.first, work.straight, work.coefficients, model.steps
@@ -103,7 +103,7 @@ def _scatter(model: Model, work: Work) -> None:
             scatter[0], scatter[1], scatter[2] = a * one * one, b * one * two, d * two * two
 
 
-@compiled
+@inlined
 def _null_combination(
     ratio: float, noise: tuple[float, float]
 ) -> tuple[tuple[float, float], float]:
@@ -115,7 +115,7 @@ def _null_combination(
     return (off0 * variance * one, off1 * variance * two), variance
 
 
-@compiled
+@inlined
 def _energies(
     a: float, b: float, d: float, axis: tuple[float, float], known: float
 ) -> tuple[float, float]:
@@ -127,21 +127,22 @@ def _energies(
     return along, a + d - along
 
 
-@compiled
+@inlined
 def _order(scatter: Array, axis: tuple[float, float], known: float, frames: int) -> int:
     """Order less one of the lowest information criterion, see `reflection_ratio.choose_order`."""
     lowest = min(reflection_ratio.LOWEST_ORDER, len(scatter) - 1) - 1
-    best, least = lowest, np.inf
+    # N ln E + K ln N is least where E N^(K / N) is.
+    best, least, price, step = lowest, np.inf, 1.0, frames ** (1.0 / frames)
     for order in range(lowest, scatter.shape[0] - 1):
         a, b, d = scatter[order]
-        null = max(_energies(a, b, d, axis, known)[1], _TINY)
-        criterion = frames * log(null) + (order + 1) * log(frames)
+        criterion = price * max(_energies(a, b, d, axis, known)[1], _TINY)
+        price *= step
         if criterion < least:
             best, least = order, criterion
     return best + 1 if scatter.shape[0] > 1 else 0
 
 
-@compiled
+@inlined
 def may_be_gray(model: Model, ratios: Ratio) -> bool:
     """As `reflection_ratio.may_be_gray`: in two bands the part across the axis is one number."""
     noise = model.noise
@@ -159,100 +160,72 @@ def may_be_gray(model: Model, ratios: Ratio) -> bool:
     return nearest < _GRAY_LIMIT and chance > reflection_ratio.GRAY_CHANCE
 
 
-@compiled
-def _weights(ratios: Ratio, emissivity: float) -> tuple[float, float]:
+@inlined
+def weights(ratios: Ratio, emissivity: float) -> tuple[float, float]:
     """Weights w_m e_m of the bands' signals in h (eq. 6)."""
     last = 1.0 - ratios.ratio * (1.0 - emissivity)
     return ratios.weights[0] * emissivity, ratios.weights[1] * last
 
 
-@compiled
-def _approach(model: Model, ratios: Ratio, emissivity: float, work: Work) -> None:
-    """A step towards h(x) = q (eq. 6), and the object's signal there, in place."""
+@inlined
+def _approach(model: Model, ratios: Ratio, emissivity: float, work: Work, emitted: Array) -> None:
+    """A step of Newton towards h(x) = q (eq. 6); h' and q - h before it, u_1 after, in place."""
     first, second, now, after = model.first, model.second, work.temperature, work.spare
     target, middle, scale, outside = work.target, first.middle, 1.0 / first.half, 0.0
-    one, two = _weights(ratios, emissivity)
+    one, two = weights(ratios, emissivity)
     mixed = kernels.mixed(one, first.signal, two, second.signal)
     for t in range(now.size):
         x = (now[t] - middle) * scale
         value, slope = kernels.with_slope(mixed, x)
         y = x + (target[t] - value) / slope
         outside += 0.0 if (abs(x) <= 1.0) & (abs(y) <= 1.0) else 1.0
+        work.lack[t], work.steepness[t] = target[t] - value, slope * scale
         after[t] = middle + first.half * y
-        work.emitted[t] = kernels.polynomial(first.signal, y)
+        emitted[t] = kernels.polynomial(first.signal, y)
     if outside > 0.0:
         for t in range(now.size):
             if not max(abs(now[t] - middle), abs(after[t] - middle)) <= first.half:
                 a, slope = kernels.exact(first, now[t])
                 b, other_slope = kernels.exact(second, now[t])
-                steepness = one * slope + two * other_slope
-                after[t] = now[t] + (target[t] - one * a - two * b) / steepness
-                work.emitted[t] = kernels.exact(first, after[t])[0]
-    now[:] = after
-
-
-@compiled
-def _arrive(model: Model, ratios: Ratio, emissivity: float, work: Work) -> None:
-    """The last step, with h' and the partial derivative; and both signals there, in place."""
-    first, second, now, after = model.first, model.second, work.temperature, work.spare
-    target, middle, scale, outside = work.target, first.middle, 1.0 / first.half, 0.0
-    one, two = _weights(ratios, emissivity)
-    mixed = kernels.mixed(one, first.signal, two, second.signal)
-    for t in range(now.size):
-        x = (now[t] - middle) * scale
-        value, slope = kernels.with_slope(mixed, x)
-        other = kernels.polynomial(second.signal, x)
-        y = x + (target[t] - value) / slope
-        outside += 0.0 if (abs(x) <= 1.0) & (abs(y) <= 1.0) else 1.0
-        work.steepness[t] = slope * scale
-        work.partial[t] = other + emissivity * (work.emitted[t] - other)
-        after[t] = middle + first.half * y
-        work.at_object[t] = kernels.polynomial(first.signal, y)
-        work.other_at_object[t] = kernels.polynomial(second.signal, y)
-    if outside > 0.0:
-        for t in range(now.size):
-            if not max(abs(now[t] - middle), abs(after[t] - middle)) <= first.half:
-                a, slope = kernels.exact(first, now[t])
-                b, other_slope = kernels.exact(second, now[t])
+                work.lack[t] = target[t] - one * a - two * b
                 work.steepness[t] = one * slope + two * other_slope
-                work.partial[t] = b + emissivity * (a - b)
-                after[t] = now[t] + (target[t] - one * a - two * b) / work.steepness[t]
-                work.at_object[t] = kernels.exact(first, after[t])[0]
-                work.other_at_object[t] = kernels.exact(second, after[t])[0]
-    now[:] = after
+                after[t] = now[t] + work.lack[t] / work.steepness[t]
+                emitted[t] = kernels.exact(first, after[t])[0]
+    kernels.copy(after, now)
 
 
-@compiled
+@inlined
 def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     """Steps 2 and 3 in turns: the object (eq. 5, 6) and the first emissivity (eq. 7), in place."""
     z, weights, temperature = work.first, work.weights, work.temperature
     count, w, material = ratios.order + model.steps, ratios.weights, work.material
-    combined = w[0] * work.coefficients[0] + w[1] * work.coefficients[1]
-    kernels.combined(model.object_part, model.spans, combined, count, work.target)
+    for j in range(count):
+        work.columns[j] = w[0] * work.coefficients[0, j] + w[1] * work.coefficients[1, j]
+    kernels.combined(model.object_part, model.spans, work.columns, count, work.target)
     kernels.temperature(model.second, work.target, temperature)
     largest = max(1.0, ratios.ratio)
     middle = 0.5 * (1.0 + (largest - 1.0) / largest)
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
     kernels.blackbody(model.first, temperature, work.emitted, work.spare)
-    work.partial[:] = 1.0
-    guess = kernels.moments(work.emitted, z, work.partial)[0]
+    kernels.fill(work.lack, 1.0)
+    guess = regression.moments(work.emitted, z, work.lack)[0]
     emissivity = guess if 0 < guess < 1 else middle
     known = ratios.pooled and not np.isnan(material[2])
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
     for turn in range(emissions.ROUNDS):
-        _approach(model, ratios, emissivity, work)
-        slope, variance, scale, energy = kernels.regress(
+        _approach(model, ratios, emissivity, work, work.emitted)
+        slope, variance, scale, energy = regression.regress(
             work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
         )
         constant = energy < emissions.OBJECT_TO_NOISE * count * ratios.null_variance and not known
         emissivity = material[2] if known else middle if constant else slope
-    _arrive(model, ratios, emissivity, work)
+    _approach(model, ratios, emissivity, work, work.at_object)
     other = 1.0 - ratios.ratio * (1.0 - emissivity)
     return Line((emissivity, other), variance, scale, energy, constant, known)
 
 
-@compiled
+@inlined
 def background(model: Model, line: Line, work: Work) -> None:
     """Step 4 (eq. 9), and the bend of the reflections (eq. 11), in place."""
     z, other, mean, result, bend = work.first, work.second, work.mean, work.background, work.bend
@@ -260,6 +233,7 @@ def background(model: Model, line: Line, work: Work) -> None:
     one, two = ((1.0 - first) / model.noise[0]) ** 2, ((1.0 - last) / model.noise[1]) ** 2
     one, two = one / (one + two), two / (one + two)
     inverse, other_inverse, reflected = 1.0 / (1.0 - first), 1.0 / (1.0 - last), work.spare
+    kernels.blackbody(model.second, work.temperature, work.other_at_object, reflected)
     for t in range(z.size):
         reflected[t] = (z[t] - first * work.at_object[t]) * inverse
         bend[t] = (other[t] - last * work.other_at_object[t]) * other_inverse
@@ -290,7 +264,7 @@ def background(model: Model, line: Line, work: Work) -> None:
                 apart_exactly = kernels.exact(model.second, mean[t])[0]
                 apart_exactly -= kernels.exact(model.first, mean[t])[0]
                 bend[t] = (1.0 - last) * apart_exactly
-    result[:] = mean
+    kernels.copy(mean, result)
     finite = kernels.mean(bend) * 0.0
     if not (0 < first < 1 and 0 < last < 1 and finite == 0):
-        bend[:] = 0.0
+        kernels.fill(bend, 0.0)

@@ -35,7 +35,7 @@ SHARE: Final = 0.3
 TO_STD: Final = 1.0 / float(ndtri(0.5 * (1.0 + SHARE)))
 ANNEALING: Final = 0.7
 STARTING_STEPS: Final = 5
-STARTING_POINTS: Final = 100
+STARTING_POINTS: Final = 128
 STEPS: Final = 3
 # Largest correlation of neighbouring residuals: that of one all slow would be 1.
 MOST_CORRELATED: Final = 0.98
@@ -234,10 +234,11 @@ def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
 
     Disturbances of a resting background lie mostly on one side of it, and one of the halves is
     then nearly free of it. Each start closes in on the densest half of the points by a scale that
-    is a fraction of the deviation; the one with the smallest deviation wins, pixel by pixel. A
-    hundred points in single precision are enough to start from.
+    is a fraction of the deviation; the one with the smallest deviation wins, pixel by pixel. Some
+    points in single precision are enough to start from.
     """
-    every = slice(None, None, max(1, abscissa.shape[0] // STARTING_POINTS))
+    count = min(len(abscissa), STARTING_POINTS)
+    every = np.arange(count) * len(abscissa) // count
     # About its mean, or single precision would not resolve a small range.
     centred, up = abscissa - abscissa.mean(axis=0), ordinate - ordinate.mean(axis=0)
     few = centred[every].astype(np.float32), up[every].astype(np.float32)

@@ -42,8 +42,8 @@ class Work(NamedTuple):
     target: Array  # null combination of the bands, smoothed (eq. 5)
     temperature: Array  # of the object [K]
     emitted: Array  # signal of the object at the last regression
-    steepness: Array  # see `emission._Fit`
-    partial: Array
+    steepness: Array  # h'(x) before the last step towards the object
+    lack: Array  # q - h(x) there [K]
     weights: Array  # of the regression
     residual: Array
     kernel: Array

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from dbthermal import _smooth as smooth
+from dbthermal.separation._subspace import background as backgrounds
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import pieces, reflection_ratio, residuals
 from dbthermal.separation._tiles import USELESS, Array, Mask, Pixels, Tile, Whole, out_of_range
@@ -106,8 +107,8 @@ def _steps(
         slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
         gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
     emission = emissions.estimate(straight, functions, ratios, drift, start)
-    background, variance = emissions.estimate_background(tile, emission, ratios)
-    of_object, of_background = emissions.pattern_variances(tile, emission, ratios, background)
+    background, variance = backgrounds.estimate(tile, emission, ratios)
+    of_object, of_background = backgrounds.pattern_variances(tile, emission, ratios, background)
     films = np.stack([emission.temperature, background])
     stds = np.sqrt([emission.temperature_std**2 + of_object, variance + of_background])
     lost = ~((np.abs(films) < USELESS) & (stds < USELESS))
@@ -137,4 +138,4 @@ def _steps(
         sums=np.add.reduceat(curves, pieces.blocks(frames)[:-1], axis=1),
         **{name: parts[name] for name in parts if name in Solution.__dataclass_fields__},
     )
-    return solution, emissions.bend(tile, emission, background), emission.line
+    return solution, backgrounds.bend(tile, emission, background), emission.line

@@ -22,8 +22,14 @@ BEAD: Final = 3
 SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 """Methods that take the shift of the reflections."""
 
+SLOW: Final = "dbvt"
+"""Method that gets the surroundings of a bead only: a whole image takes it minutes."""
+
 REACH: Final = 5
-"""Pixels around a bead that they get: of some shifts, by which they pair the pixels."""
+"""Pixels around a bead that it gets: of some shifts, by which it pairs the pixels."""
+
+RESTING: Final = 0.1
+"""Standard deviation over time [K] below which an object counts as at rest."""
 
 _STRAY: Final = 0.01
 
@@ -125,17 +131,21 @@ def over_the_image(scene: xr.Dataset, separated: xr.Dataset) -> xr.Dataset:
     """Errors of a separation over the object's pixels in which the background moves.
 
     `good` [1], the share without a flag; of these `object_temperature_rmse` [K], root mean square
-    over time, median; and `covered` [1], the share of samples whose 95 % interval holds the truth.
+    over time, median; `covered` [1], the share of samples whose 95 % interval holds the truth; and
+    `resting` [1], the share whose object changes by less than `RESTING`, where two bands leave
+    the emissivity open.
     """
     background, status = scene["background_temperature"], separated["status"]
     moving = (background.std("time") > MOVING) & scene["on_object"]
     good = moving & (status == 0)
     error = (separated["object_temperature"] - scene["object_temperature"]).where(good)
     inside = abs(error) < INTERVAL * separated["object_temperature_std"]
+    resting = moving & (scene["object_temperature"].std("time") < RESTING)
     values = {
         "good": (good.sum() / moving.sum(), "1"),
         "object_temperature_rmse": (((error**2).mean("time") ** 0.5).median(), "K"),
         "covered": (inside.where(good).mean(), "1"),
+        "resting": (resting.sum() / moving.sum(), "1"),
     }
     return xr.Dataset({name: ((), float(part), {"units": u}) for name, (part, u) in values.items()})
 
@@ -164,9 +174,8 @@ def at_thermocouple(
     The estimate is the mean over the pixels that the bead covers. The reading has the errors of a
     probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
     number of probes, so that the result does not depend on one probe's error. Variants are label ->
-    `method` of `separation.solve` and its arguments; methods that treat each pixel alone get the
-    bead's pixels only, and, of those that take it, with the shift of the reflections those around
-    it as well.
+    `method` of `separation.solve` and its arguments, with the shift of the reflections where it
+    takes one.
 
     Returns
     -------
@@ -216,18 +225,19 @@ def _mean(
     shift: xr.Dataset | None,
 ) -> xr.DataArray:
     """Object temperature (time) [K] of one method, mean over the bead's pixels."""
-    seen, options = corrected, arguments(variant)
-    if not separation.get_method(variant["method"]).whole_image:
-        reach = 0
-        if shift is not None and variant["method"] in SHIFTED:
-            reach = REACH
+    options = arguments(variant)
+    if shift is not None and variant["method"] in SHIFTED:
+        options["reflection_shift"] = shift
+    seen = corrected
+    if variant["method"] == SLOW:
+        reach = REACH if "reflection_shift" in options else 0
         around = {
             dim: slice(max(0, part.start - reach), part.stop + reach)
             for dim, part in square.items()
         }
         seen = corrected.isel(around)
-        if shift is not None and reach:
-            options["reflection_shift"] = shift.isel(around)
+        if reach:
+            options["reflection_shift"] = options["reflection_shift"].isel(around)
     estimates = separation.solve(seen, response, **options)["object_temperature"]
     bead = {dim: corrected[dim][part] for dim, part in square.items()}
     return estimates.sel(bead).mean(("y", "x"), skipna=False)
