@@ -46,7 +46,7 @@ def _kelvin(text: str) -> float:
 
 
 def _kelvin_or_path(text: str) -> float | Path:
-    return _kelvin(text) if text[:1].isdigit() and text[-1:] in "CK" else Path(text)
+    return _kelvin(text) if re.fullmatch(r"[-\d.]+[CK]?", text) else Path(text)
 
 
 _KINDS: Final[dict[str, Any]] = {
@@ -179,7 +179,7 @@ list the filters and materials that come with the package
 --json
 
 completion main.completion
-print the completion of commands for bash, taken over by: eval "$(dbthermal completion)"
+print the completion of commands for bash and zsh, taken over by: eval "$(dbthermal completion)"
 -
 """
 """Command, its function and arguments; its summary; examples."""
@@ -239,6 +239,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.traceback:
             raise
         status, reason = 1, _reason(error, options.command)
+        for name in vars(options):  # of an argument of Python, as it is named here
+            reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
     print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
     return status
 
@@ -287,7 +289,7 @@ def _carry_out(options: argparse.Namespace) -> int:
 
 
 def _completion() -> str:
-    """Function of bash for the names of commands and of their options; files are left to it."""
+    """Function of bash, and of zsh, for names of commands and options; files are left to it."""
     commands: Any = next(one for one in _parser()._actions if one.choices)
     named = {name: " ".join(one._option_string_actions) for name, one in commands.choices.items()}
     cases = "\n".join(f"    {name}) words='{words}';;" for name, words in named.items())
@@ -298,6 +300,7 @@ def _completion() -> str:
   esac
   COMPREPLY=($(compgen -W "$words" -- "${{COMP_WORDS[COMP_CWORD]}}"))
 }}
+[ -z "${{ZSH_VERSION-}}" ] || {{ autoload -U compinit bashcompinit; compinit; bashcompinit; }}
 complete -o default -F _dbthermal dbthermal"""
 
 

@@ -155,7 +155,7 @@ def test_info_of_stores_and_files(results: Path) -> None:
     assert found["bands"] == ["8-14", "9.5"]
     assert found["frame_rate_Hz"] == pytest.approx(10, abs=0.01)
     status = store.open_dataset(results / "result.zarr")["status"].values
-    assert found["status_shares"]["none"] == pytest.approx((status == 0).mean(), abs=1e-6)
+    assert found["status_shares"]["no_flag"] == pytest.approx((status == 0).mean(), abs=1e-6)
     assert found["provenance"]["parameters"]["command"] == "separate"
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
     assert one["stage"] == "recording of one band"
@@ -213,7 +213,7 @@ def test_curves_films_pictures(results: Path) -> None:
         np.testing.assert_array_equal(opened["status"], result["status"])
     assert (results / "out.png").read_bytes().startswith(b"\x89PNG")
     line = refused(results, "export", "result.zarr", "-o", "out.xyz")
-    assert "Must end in one of ['.csv', '.tif', '.png', '.nc']" in line
+    assert "Must end in one of ['.csv', '.tif', '.nc', '.png', '.pdf', '.svg']" in line
     line = refused(results, "export", "result.zarr", "--pixel", "24", "0", "-o", "no.csv")
     assert "Must lie in the image of 24 x 32" in line
 
@@ -307,6 +307,22 @@ def test_missing_extras_are_named(
     assert found.returncode == 1
     (line,) = found.stderr.splitlines()
     assert f"pip install 'dbthermal[{extra}]'" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ("import a.tif b.tif --bands 8-14 9.5 --unit count --clock 10 -o x.zarr", "--offset [s]."),
+        ("separate scene.zarr response.zarr -o x.zarr", "Invalid raw counts of 'scene.zarr'."),
+        ("separate response.zarr scene.zarr -o x.zarr", "Invalid dims ('band', 'temperature')"),
+        ("report result.zarr -o x.html --region 0 900 0 4", "Invalid rows 0 to 900, columns 0 to"),
+    ],
+)
+def test_mistakes_are_explained_in_words_of_the_commands(
+    results: Path, arguments: str, reason: str
+) -> None:
+    """Missing options, raw counts, exchanged stores and places outside have a line each."""
+    assert reason in refused(results, *arguments.split())
 
 
 def test_bash_completes_commands_and_options(tmp_path: Path) -> None:

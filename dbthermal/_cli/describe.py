@@ -32,6 +32,12 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
             said[f"{name}_shares"] = _shares(dataset[name])
+    for name, unit in (("netd", "_K"), ("emissivity", "")):
+        if name in dataset and dataset[name].dims[:1] == ("band",):
+            good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)
+            values = [one[np.isfinite(one)] for one in np.atleast_1d(good.values)]
+            medians = [round(float(np.median(one)), 4) if one.size else None for one in values]
+            said[f"median_{name}{unit}"] = dict(zip(said["bands"], medians, strict=True))
     if not everything:
         return said
     said["variables"] = {
@@ -62,7 +68,7 @@ def _stage(dataset: xr.Dataset) -> str:
 def _shares(flags: xr.DataArray) -> dict[str, float]:
     """Share of the values without a flag, and of each flag found."""
     values = flags.values
-    shares = {"none": float((values == 0).mean())}
+    shares = {"no_flag": float((values == 0).mean())}
     for name in str(flags.attrs["flag_meanings"]).split():
         share = float(schema.has_flag(flags, name).mean())
         shares |= {name: share} if share else {}

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,7 @@ def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict
     height, width = view.shape
     boxes = [(y, y + 1, x, x + 1) for y, x in options.pixel] + [*map(tuple, options.region)]
     for top, bottom, left, right in boxes or [(0, height, 0, width)]:
-        label = f"rows {top} to {bottom}, columns {left} to {right}"
-        if not (0 <= top < bottom <= height and 0 <= left < right <= width):
-            raise ValueError(f"Invalid {label}. Must lie in the image of {height} x {width}.")
-        region = explorer.Region("rectangle", ((top, left), (bottom, right)))
+        ((label, region),) = _regions(result, [(top, bottom, left, right)]).items()
         one = bottom - top == right - left == 1
         curve = view.curve(options.variable, region, pixels="all" if one else "unflagged")
         where = f"pixel {top} {left}" if one else label
@@ -48,6 +46,17 @@ def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict
         raise ValueError(f"Invalid '{options.variable}' without time. Must be a film.")
     xr.Dataset(columns).to_dataframe().to_csv(path, index_label="time [s]")
     return {"columns": ["time [s]", *columns]}
+
+
+def _regions(result: xr.Dataset, boxes: Iterable[Sequence[int]]) -> dict[str, explorer.Region]:
+    """Rectangles y0 y1 x0 x1 by their names, which must lie in the image."""
+    found, height, width = {}, result.sizes["y"], result.sizes["x"]
+    for top, bottom, left, right in boxes:
+        label = f"rows {top} to {bottom}, columns {left} to {right}"
+        if not (0 <= top < bottom <= height and 0 <= left < right <= width):
+            raise ValueError(f"Invalid {label}. Must lie in the image of {height} x {width}.")
+        found[label] = explorer.Region("rectangle", ((top, left), (bottom, right)))
+    return found
 
 
 def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
@@ -95,13 +104,7 @@ def report(options: argparse.Namespace) -> dict[str, Any]:
     from dbthermal import reporting  # noqa: PLC0415 - optional
 
     result, shown = opened(options.result), [opened(one) for one in options.shown]
-    regions = {
-        f"rows {top} to {bottom}, columns {left} to {right}": explorer.Region(
-            "rectangle", ((top, left), (bottom, right))
-        )
-        for top, bottom, left, right in options.region
-    }
-    reporting.report(result, options.output, *shown, regions=regions)
+    reporting.report(result, options.output, *shown, regions=_regions(result, options.region))
     return {str(options.output): {"bytes": options.output.stat().st_size}}
 
 

@@ -81,10 +81,9 @@ def _record(devices: Devices, folder: Path) -> list[Summary]:
         summaries = [protocols.record_scene(devices, folder / f"{name}.zarr", preview=show)]
     else:
         set_temperature = partial(_set_blackbody, devices)
-        steps = protocols.record_sweep(
+        summaries = protocols.record_sweep(
             devices, folder, set_temperature=set_temperature, preview=show
         )
-        summaries = [step.summary for step in steps]
     _say("")
     return summaries
 

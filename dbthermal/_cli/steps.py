@@ -95,6 +95,9 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     """Command `separate`."""
     source, response = opened(options.capture), opened(options.response).load()
     known, shown = _known(options), sys.stderr.isatty()
+    if not options.correction and "counts" in source and source["counts"].dtype.kind == "u":
+        rule = "Must be corrected: by 'dbthermal correct', or with --correction"
+        raise ValueError(f"Invalid raw counts of '{options.capture}'. {rule}.")
     if options.correction:
         scene.separate_capture(
             source,

@@ -49,6 +49,9 @@ def explore(
     the standard deviation of the mean (`View.curve`). What a pixel's status says is hatched. Where
     no browser is, as in papermill or HTML, a picture stands in its place.
 
+    nbconvert prefers a widget's saved state, which shows nothing without a kernel, to that picture,
+    unless ``--NbConvertBase.display_data_priority="['image/png', 'text/html', 'text/plain']"``.
+
     Parameters
     ----------
     data : Dataset, str or Path

@@ -57,26 +57,17 @@ class Settings:
 
     Which direction and switch a wheel needs for homing is uncertain: None keeps what the controller
     has.
-
-    Attributes
-    ----------
-    serial_number : int or None
-        That of the controller; another one is then refused.
-    home_offset : float
-        From the home position to slot 1 [deg]; differs by wheel: look.
-    home_direction, home_limit_switch : int or None
-        1 forward, 2 reverse; 1 the reverse switch, 4 the forward one.
-    velocity, home_velocity, acceleration : float
-        Speeds of moves and of the search for home [turn/s], and acceleration [turn/s^2].
     """
 
+    # Of the controller; another one is then refused.
     serial_number: Annotated[int, Field(strict=True, ge=1, lt=2**32)] | None = None
+    # From the home position to slot 1 [deg]; differs by wheel: look.
     home_offset: Annotated[float, Field(strict=True, gt=-360.0, lt=360.0)] = 0.0
-    home_direction: Literal[1, 2] | None = None
-    home_limit_switch: Literal[1, 4] | None = None
-    velocity: Speed = 1.0
-    home_velocity: Speed = 0.2
-    acceleration: Annotated[float, Field(strict=True, ge=0.1, le=1e5)] = 1.0
+    home_direction: Literal[1, 2] | None = None  # 1 forward, 2 reverse
+    home_limit_switch: Literal[1, 4] | None = None  # 1 the reverse switch, 4 the forward one
+    velocity: Speed = 1.0  # [turn/s]
+    home_velocity: Speed = 0.2  # [turn/s]
+    acceleration: Annotated[float, Field(strict=True, ge=0.1, le=1e5)] = 1.0  # [turn/s^2]
 
 
 @dataclass(frozen=True)

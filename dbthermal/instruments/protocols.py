@@ -9,7 +9,6 @@ import threading
 import time as system_time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,33 +28,10 @@ from dbthermal.instruments.recording._reader import (
 )
 from dbthermal.instruments.session import Session
 
-__all__ = ["Step", "ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
+__all__ = ["ask_for_blackbody", "record_scene", "record_sweep", "wait_stable"]
 __dir__ = __all__.copy
 
 STABILITY_PERIOD: Final = 1.0  # time from reading to reading while a temperature is awaited [s]
-
-
-@dataclass(frozen=True)
-class Step:
-    """One recording of a sweep.
-
-    Attributes
-    ----------
-    number : int
-        Number of the temperature, from 0.
-    temperature, blackbody : float
-        Set point of the blackbody, and mean of its readings during the recording [K].
-    band : str or None
-        Band of the filter; None without a wheel.
-    summary : Summary
-        Result of the recording.
-    """
-
-    number: int
-    temperature: float
-    blackbody: float
-    band: str | None
-    summary: Summary
 
 
 def ask_for_blackbody(name: str, temperature: float) -> None:
@@ -140,7 +116,7 @@ def record_sweep(
     set_temperature: Callable[[float], None],
     limits: Limits | None = None,
     preview: Callable[[Preview], None] | None = None,
-) -> list[Step]:
+) -> list[Summary]:
     """Record a blackbody at each of its temperatures, once it is stable, through each filter.
 
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep.
@@ -162,8 +138,9 @@ def record_sweep(
 
     Returns
     -------
-    list of Step
-        In the order of the session, with those that were recorded before.
+    list of Summary
+        In the order of the session, by temperature, then filter, with those that were recorded
+        before.
 
     Raises
     ------
@@ -185,7 +162,7 @@ def record_sweep(
         for band in session.swept or (None,)
     ]
     kept = [_kept(*step) for step in plan]
-    steps: list[Step] = []
+    summaries: list[Summary] = []
     resting: int | None = None
     for (number, temperature, band, planned), was in zip(plan, kept, strict=True):
         if was is None and resting != number:
@@ -194,10 +171,9 @@ def record_sweep(
             devices.correct_offsets()
             resting = number
         path = held.place() / planned.name
-        summary = was or _record_step(devices, band, path, limits, preview)
-        blackbody = mean_reading(path if was else summary.path, BLACKBODY)
-        steps.append(Step(number, temperature, blackbody, band, summary))
-    return steps
+        summaries.append(was or _record_step(devices, band, path, limits, preview))
+        mean_reading(path if was else summaries[-1].path, BLACKBODY)  # which it must have
+    return summaries
 
 
 def record_scene(

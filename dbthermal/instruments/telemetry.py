@@ -29,8 +29,6 @@ ROWS: Final = 2
 WORDS: Final = 142
 """Least number of words that hold all the fields."""
 
-_WORD_BITS: Final = 16
-
 
 @dataclass(frozen=True)
 class Field:
@@ -46,11 +44,6 @@ class Field:
     def span(self) -> slice:
         """Words of the number."""
         return slice(self.word, self.word + self.words)
-
-    @property
-    def lowest(self) -> int:
-        """Lowest number that it can hold."""
-        return -(1 << (_WORD_BITS * self.words - 1)) if self.signed else 0
 
 
 FIELDS: Final = MappingProxyType(
@@ -107,12 +100,11 @@ def encode(values: Mapping[str, float], columns: int, rows: int = ROWS) -> Count
     for name, value in values.items():
         field = FIELDS[name]
         number = round((value - field.zero) * field.steps) if field.steps else int(value)
-        highest = field.lowest + (1 << _WORD_BITS * field.words) - 1
-        if not field.lowest <= number <= highest:
-            raise ValueError(
-                f"Invalid {name} of {number} steps. Must lie in {field.lowest} to {highest}."
-            )
-        data = number.to_bytes(2 * field.words, "big", signed=field.signed)
+        try:
+            data = number.to_bytes(2 * field.words, "big", signed=field.signed)
+        except OverflowError as error:
+            rule = f"Must fit {field.words} words: {error}"
+            raise ValueError(f"Invalid {name} of {number} steps. {rule}.") from error
         words[field.span] = np.frombuffer(data, ">u2")
     return words.reshape(rows, columns)
 

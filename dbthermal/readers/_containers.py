@@ -81,6 +81,9 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, tuple[Any, list[str]]]:
         start = one.id.get_offset() if one.chunks is None else None
         if start is not None and any(start <= place < start + one.nbytes for place in headers):
             raise ValueError(f"Overlapping parts of '{path.name}'. Must lie apart.")
+        if one.chunks is None and (stored := one.id.get_storage_size()) != one.nbytes:
+            rule = f"Must be all of the {stored} bytes stored"
+            raise ValueError(f"Invalid shape {one.shape} of '{name}' of '{path.name}'. {rule}.")
         pieces = zip(one.shape, one.chunks or one.shape, strict=True)
         wanted = math.prod(-(-size // part) for size, part in pieces) if one.chunks else 0
         chunks = [one.id.get_chunk_info(n) for n in range(one.id.get_num_chunks() if wanted else 0)]

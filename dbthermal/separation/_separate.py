@@ -91,7 +91,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     source = "none" if reflection_shift is None else "given"
     alone = None
-    if reflection_shift is None and min(corrected.sizes["y"], corrected.sizes["x"]) >= _WIDE:
+    narrower = min(corrected.sizes.get(name, 0) for name in ("y", "x"))  # solve refuses others
+    if reflection_shift is None and narrower >= _WIDE:
         # Pixels whose bands are apart take long: some tell whether the cameras are.
         pixels = corrected.sizes["y"] * corrected.sizes["x"]
         every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))

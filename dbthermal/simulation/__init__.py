@@ -11,7 +11,6 @@ from dbthermal.simulation._nuisances import (
     fire_shutter,
     lag,
     lose_frames,
-    repeat_frames,
     spoil_pixels,
 )
 from dbthermal.simulation._rig import (
@@ -48,7 +47,6 @@ __all__ = [
     "lose_frames",
     "observe",
     "pattern",
-    "repeat_frames",
     "scene",
     "side_by_side",
     "spoil_pixels",

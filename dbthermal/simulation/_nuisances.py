@@ -8,7 +8,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import planck, schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array
 from dbthermal.correction import lag_coefficients
 from dbthermal.simulation._rig import observe
 
@@ -85,34 +85,10 @@ def expose(
     )
 
 
-def repeat_frames(corrected: xr.Dataset, lost: Mask) -> xr.Dataset:
-    """Replace lost frames by copies of the frame before, as a driver does that stamps none.
-
-    Parameters
-    ----------
-    corrected : Dataset
-        Capture of stage `corrected`; the result has no `exposure_time`.
-    lost : Mask
-        Lost frames (band, time), none of them a band's first, or a ValueError.
-    """
-    expected = corrected["counts"].shape[:2]
-    if lost.shape != expected or lost.dtype != bool:
-        found = f"{lost.shape} of {lost.dtype}"
-        raise ValueError(f"Invalid lost frames {found}. Must be {expected} of bool.")
-    if lost[:, 0].any():
-        raise ValueError("Invalid lost frames: a first one. Must have one before to be repeated.")
-    counts = corrected["counts"].values.copy()
-    for band, gone in enumerate(lost):
-        for frame in np.flatnonzero(gone):
-            counts[band, frame] = counts[band, frame - 1]
-    unstamped = corrected.drop_vars("exposure_time", errors="ignore")
-    return unstamped.assign(counts=corrected["counts"].copy(data=counts))
-
-
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:
-    """Lose frames at random in each band: each is replaced by the one before (`repeat_frames`).
+    """Lose frames at random: each is replaced by the one before, as by a driver that stamps none.
 
-    The result has `repeated` (band, time), bool, beside the counts.
+    The result has no `exposure_time`, and `repeated` (band, time), bool, beside the counts.
 
     Parameters
     ----------
@@ -128,8 +104,12 @@ def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -
         raise ValueError(f"Invalid share {share} of lost frames. Must lie in [0, 1).")
     lost = rng.random(counts.shape[:2]) < share
     lost[:, 0] = False  # no frame before it to be repeated
+    movies = counts.copy(deep=True)
+    for band, frame in np.argwhere(lost):
+        movies.values[band, frame] = movies.values[band, frame - 1]
     truth = {"units": "1", "long_name": "repeats the frame before"}
-    return repeat_frames(corrected, lost).assign(repeated=(("band", "time"), lost, truth))
+    unstamped = corrected.drop_vars("exposure_time", errors="ignore")
+    return unstamped.assign(counts=movies, repeated=(("band", "time"), lost, truth))
 
 
 def fire_shutter(

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal.store._integrity import (
     MARK,
@@ -28,7 +28,8 @@ from dbthermal.store._integrity import (
 )
 from dbthermal.store._results import as_json, whole
 
-_COMPRESSORS = (ZstdCodec(), Crc32cCodec())
+# Next to no time beside that of the writing, and smaller than Zstandard without a shuffle of bytes.
+_COMPRESSORS = (BloscCodec(cname="lz4", clevel=1, shuffle="shuffle"), Crc32cCodec())
 _CHUNK_BYTES: Final = 2**20
 """Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
 

@@ -9,13 +9,22 @@ from hypothesis import strategies as st
 from scipy.interpolate import BarycentricInterpolator, CubicSpline
 
 from dbthermal import alignment, separation, simulation
+from dbthermal._arrays import Mask
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.simulation import Background, Rig, expose, repeat_frames
+from dbthermal.simulation import Background, Rig, expose
 
 RIG = Rig()
 FRAMES, STEPS, START = 350, 20, 80
 PERIOD = 0.1
 FINE = np.arange(STEPS * (FRAMES + 10)) * PERIOD / STEPS
+
+
+def repeat_frames(capture: xr.Dataset, lost: Mask) -> xr.Dataset:
+    """Capture in which each lost frame (band, time) is a copy of the one before, unstamped."""
+    counts = capture["counts"].copy(deep=True)
+    for band, frame in np.argwhere(lost):
+        counts.values[band, frame] = counts.values[band, frame - 1]
+    return capture.drop_vars("exposure_time", errors="ignore").assign(counts=counts)
 
 
 def glass(

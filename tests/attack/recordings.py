@@ -95,6 +95,8 @@ def recordings(rng: Rng) -> Attack:
     limit = "JPEG-LS has no checksum" if form == "csq" else ""
     if form in _STORES and "zar" not in part.name:
         limit = "chunks without a checksum"
+    if form in {"seq", "fff"} and what == "cut":
+        limit = "a cut between two frames ends a recording"
     if form == "tif" and what == "zero":
         limit = "zeros may end the chain of pages"
     act = lambda: _read(path, form)  # noqa: E731

@@ -219,6 +219,6 @@ def test_a_sweep_follows_its_folder(tmp_path: Path) -> None:
     with rig(from_yaml(TWO)) as devices:
         devices.prepare()
         steps = swept(devices, before, preview=move)
-    assert [step.summary.path.parent for step in steps] == [before, after, after, after]
+    assert [step.path.parent for step in steps] == [before, after, after, after]
     assert open_sweep(after, "plate", frames=5).sizes["temperature"] == 2
     assert not before.exists()

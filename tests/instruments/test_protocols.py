@@ -26,8 +26,7 @@ from dbthermal import store
 from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.protocols import Step
-from dbthermal.instruments.recording import Preview, _reader, notes, open_capture
+from dbthermal.instruments.recording import Preview, Summary, _reader, notes, open_capture
 
 QUICKLY = ("window: 3", "window: 0.02")
 ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)
@@ -66,7 +65,7 @@ def swept(
     folder: Path,
     log: list[float] | None = None,
     preview: Callable[[Preview], None] | None = None,
-) -> list[Step]:
+) -> list[Summary]:
     """Sweep a blackbody that is at once where it is set."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocols, "STABILITY_PERIOD", 0.01)
@@ -77,7 +76,7 @@ def swept(
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Step]]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Summary]]:
     """Record two temperatures through two filters."""
     folder = tmp_path_factory.mktemp("sweep")
     with rig(from_yaml(TWO)) as devices:
@@ -85,22 +84,17 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Step]
         return folder, swept(devices, folder)
 
 
-def test_each_temperature_and_filter_is_a_recording(recorded: tuple[Path, list[Step]]) -> None:
-    """Names and steps say which; the temperature is the one that was read meanwhile."""
+def test_each_temperature_and_filter_is_a_recording(recorded: tuple[Path, list[Summary]]) -> None:
+    """Names say which; the temperature is the one that was read meanwhile."""
     folder, steps = recorded
     names = [f"plate_{number:02d}_{band}.zarr" for number in range(2) for band in ("9.5", "11")]
-    assert [step.summary.path.name for step in steps] == names
+    assert [step.path.name for step in steps] == names
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
-    assert [(step.number, step.temperature, step.band) for step in steps[:3]] == [
-        (0, 300.0, "9.5"),
-        (0, 300.0, "11"),
-        (1, 290.0, "9.5"),
-    ]
-    found = [step.blackbody for step in steps[::2]]
+    found = [_reader.mean_reading(step.path, "blackbody") for step in steps[::2]]
     np.testing.assert_allclose(found, [300.0, 290.0], rtol=0, atol=1e-4)  # [K]
 
 
-def test_wheel_decides_what_is_seen(recorded: tuple[Path, list[Step]]) -> None:
+def test_wheel_decides_what_is_seen(recorded: tuple[Path, list[Summary]]) -> None:
     """Joined, all bands have the counts of their filter at the temperature that was read."""
     movies = recording.open_sweep(recorded[0], "plate", frames=8)
     assert movies["counts"].shape == (3, 2, 8, *SHAPE)
@@ -112,7 +106,7 @@ def test_wheel_decides_what_is_seen(recorded: tuple[Path, list[Step]]) -> None:
     assert movies.attrs["is_simulated"] is True
 
 
-def test_recording_says_what_it_was_made_with(recorded: tuple[Path, list[Step]]) -> None:
+def test_recording_says_what_it_was_made_with(recorded: tuple[Path, list[Summary]]) -> None:
     """Devices, slot of the wheel and blackbody are in each recording, under its band's name."""
     path = recorded[0] / "plate_01_11.zarr"
     identities = store.open_dataset(path).attrs["identities"]
@@ -124,7 +118,7 @@ def test_recording_says_what_it_was_made_with(recorded: tuple[Path, list[Step]])
     assert found["ffc 11"] == 3
 
 
-def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Step]]) -> None:
+def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Summary]]) -> None:
     """Counts are of region and good frames, corrected, and temperatures are those read."""
     region = {"plate": (slice(0, 2), slice(0, 10))}
     series = recording.bench_series(recorded[0], "plate", region)["plate"]
@@ -148,7 +142,7 @@ def test_bench_series_are_means_over_regions(recorded: tuple[Path, list[Step]]) 
         recording.bench_series(recorded[0], "plate", {"wall": (slice(0, 2), slice(0, 2))})
 
 
-def test_what_is_missing_is_named(recorded: tuple[Path, list[Step]], tmp_path: Path) -> None:
+def test_what_is_missing_is_named(recorded: tuple[Path, list[Summary]], tmp_path: Path) -> None:
     """Missing sweeps, frames, readings and recordings each raise an error that names them."""
     folder, _ = recorded
     with pytest.raises(FileNotFoundError, match="No recording of a sweep 'dish'"):
@@ -161,7 +155,7 @@ def test_what_is_missing_is_named(recorded: tuple[Path, list[Step]], tmp_path: P
 
 
 def test_recordings_of_a_step_must_agree(
-    recorded: tuple[Path, list[Step]], monkeypatch: pytest.MonkeyPatch
+    recorded: tuple[Path, list[Summary]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A blackbody that drifted between two filters has no one temperature."""
     values = iter([300.0, 300.2])
@@ -192,8 +186,8 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         steps = swept(devices, tmp_path, log)
         assert log == [290.0]
         assert {path: path.stat().st_mtime_ns for path in was} == was
-        assert (len(steps), steps[0].summary.ended) == (4, "duration")
-        assert steps[0].summary.totals["8-14"]["frames"] > 8
+        assert (len(steps), steps[0].ended) == (4, "duration")
+        assert steps[0].totals["8-14"]["frames"] > 8
         assert swept(devices, tmp_path, log) == steps
         # Offsets are corrected before the sweep, and at each temperature that is recorded.
         assert devices.world is not None
@@ -251,7 +245,7 @@ def test_sweep_without_a_wheel(tmp_path: Path) -> None:
     with rig(session) as devices:
         devices.prepare()
         steps = swept(devices, tmp_path)
-    assert [(step.band, step.summary.path.name) for step in steps] == [(None, "plate_00.zarr")]
+    assert [step.path.name for step in steps] == ["plate_00.zarr"]
     movies = recording.open_sweep(tmp_path, "plate", frames=8)
     np.testing.assert_array_equal(movies["counts"][:, 0, 0, 0, 0], [4000, 23_000])
 

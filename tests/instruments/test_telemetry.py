@@ -14,7 +14,8 @@ COLUMNS = 640
 
 def numbers(field: telemetry.Field) -> st.SearchStrategy[float]:
     """Values that a field can hold."""
-    every = st.integers(field.lowest, field.lowest + (1 << 16 * field.words) - 1)
+    lowest = -(1 << 16 * field.words - 1) if field.signed else 0
+    every = st.integers(lowest, lowest + (1 << 16 * field.words) - 1)
     return every.map(lambda number: number / field.steps + field.zero) if field.steps else every
 
 

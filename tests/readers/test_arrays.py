@@ -13,6 +13,7 @@ import xarray as xr
 import zarr
 from flir_files import damaged, scene
 from numpy.testing import assert_allclose, assert_array_equal
+from zarr.codecs import BloscCodec
 
 from dbthermal import readers
 
@@ -97,6 +98,12 @@ def test_other_units_dims_and_files_are_refused(tmp_path: Path) -> None:
         file.create_virtual_dataset("virtual", form)
     with pytest.raises(ValueError, match=r"Invalid 'virtual' in other files"):
         read(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file.create_dataset("frames", (3, 24, 32), "u2")  # of which nothing was written
+    with pytest.raises(
+        ValueError, match=r"Invalid shape .* of 'b\.h5'\. Must be all of the 0 bytes"
+    ):
+        read(tmp_path / "b.h5")
 
 
 def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
@@ -114,6 +121,22 @@ def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match=r"Damaged 'empty': .*Must be a whole zarr"):
         read(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("form", [2, 3])
+def test_a_blosc_chunk_of_a_false_size_is_not_decoded(tmp_path: Path, form: Any) -> None:
+    """Blosc reads as far as a chunk's header says, beyond its memory: a wrong size is refused."""
+    path = tmp_path / "a.zarr"
+    blosc: Any = {"id": "blosc", "cname": "lz4"} if form == 2 else BloscCodec(cname="lz4")
+    options: Any = {"chunks": (1, 24, 32), "compressors": blosc, "zarr_format": form}
+    zarr.create_array(path, data=scene(), **options)
+    assert_array_equal(read(path).counts, scene())
+    chunk = path / ("1.0.0" if form == 2 else "c/1/0/0")
+    whole = chunk.read_bytes()
+    for place, content in ((4, b"\xff\xff\xff\x7f"), (12, b"\xff\xff\xff\x7f"), (0, b"")):
+        chunk.write_bytes(whole[:place] + content + whole[place + 4 :] if content else content)
+        with pytest.raises(ValueError, match=r"Damaged chunk '(1\.0\.)?0' of 'a\.zarr'"):
+            read(path)
 
 
 @pytest.mark.parametrize("form", [2, 3])

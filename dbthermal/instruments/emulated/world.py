@@ -16,7 +16,6 @@ from typing import Any, Final
 
 from dbthermal.instruments.session import Session
 
-POSITIONS: Final = 6  # slots of the wheel, numbered from 1
 ROOM: Final = 296.15  # default temperature of the room [K]
 FPA: Final = 308.15  # default temperature of a focal-plane array [K]
 
@@ -44,7 +43,8 @@ class CameraState:
 class World:
     """One emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s], from an `epoch`.
 
-    `filters` has the band in each slot of the wheel, 1 to 6. `scene` has temperatures [K] by name
+    `filters` has the band in each slot of the wheel, 1 to 6, and `wheel_position` is the slot in
+    the beam, None while the wheel turns, between two. `scene` has temperatures [K] by name
     at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.
     `thermocouples` has the place of each channel, 1 to 8: a name in the scene, ``"blackbody"``,
     ``"room"`` or ``"open"``. Single attributes may be read and set from any thread. To change
@@ -63,14 +63,14 @@ class World:
     ) -> None:
         self.lock = threading.RLock()
         self.clock = clock
-        self.filters = {_slot(slot): name for slot, name in (filters or {}).items()}
+        self.filters = dict(filters or {})
         self.thermocouples: dict[int, str] = {}
         self.cameras: dict[str, CameraState] = {}
         self.blackbody_temperature = blackbody_temperature
         self.epoch = clock()
         self.scene_began = math.inf if waits else self.epoch
         self._scene = scene
-        self._wheel: int | None = _slot(wheel_position)
+        self.wheel_position: int | None = wheel_position
 
     @property
     def time(self) -> float:
@@ -87,19 +87,9 @@ class World:
         return max(0.0, self.epoch + now - self.scene_began)
 
     @property
-    def wheel_position(self) -> int | None:
-        """Slot in the beam, 1 to 6; None while the wheel turns, between two slots."""
-        return self._wheel
-
-    @wheel_position.setter
-    def wheel_position(self, position: int | None) -> None:
-        self._wheel = None if position is None else _slot(position)
-
-    @property
     def filter_name(self) -> str | None:
         """Band of the filter in the beam; None between two slots, or where the slot is empty."""
-        position = self._wheel
-        return None if position is None else self.filters.get(position)
+        return None if self.wheel_position is None else self.filters.get(self.wheel_position)
 
     def scene_temperatures(self) -> dict[str, float]:
         """Temperatures [K] in the scene by name, with ``"blackbody"`` and ``"room"``."""
@@ -165,10 +155,3 @@ def emulated_world(session: Session, **settings: Any) -> World:
     world = World(filters=session.filters, **{"scene": lambda _: room, **settings})
     world.furnish(session)
     return world
-
-
-def _slot(position: int) -> int:
-    """Return the position if it is a slot."""
-    if position not in range(1, POSITIONS + 1):
-        raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
-    return position
