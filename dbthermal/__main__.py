@@ -90,7 +90,7 @@ materials text*         as listed by 'data'; all by default
 --correction-output path   store of gain and offset, where the blackbody fills the view
 --no-shutter flag       no camera has a shutter
 --time-constant number  thermal, of the pixels [s]
---register auto|none|translation|affine|homography   transform of the views, none if on one grid
+--register none|translation|affine|homography   transform between the views, none if on one grid
 --reference text        band whose frames are left as they are in time
 --correction path       store of gain and offset: all steps of a raw capture, by rows
 --method text           one step alone, by rows: subspace, calibrated, naive, ratio, bcp, dbvt
@@ -212,7 +212,7 @@ def _options(kind: str, text: str) -> dict[str, Any]:
         return {"action": "store_true", "help": text}
     if "|" in kind:
         choices = kind.split("|")
-        default = "auto" if "auto" in choices else None
+        default = "homography" if "homography" in choices else None
         return {"choices": choices, "default": default, "help": text}
     ((name, number, default),) = re.findall(r"^([a-z]+)([0-9+*?]?)[!&]?=?(.*)$", kind)
     made: dict[str, Any] = {"type": _KINDS[name], "help": text}

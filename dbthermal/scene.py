@@ -19,6 +19,7 @@ from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
 from dbthermal.separation import separate
+from dbthermal.separation._separate import LEAST_APART, cameras_apart
 
 __all__ = ["separate_capture"]
 __dir__ = __all__.copy
@@ -42,7 +43,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     correction: xr.Dataset,
     response: xr.Dataset,
     *,
-    registration: Literal["auto", "translation", "affine", "homography"] | None = "auto",
+    registration: Literal["translation", "affine", "homography"] | None = "homography",
     correcting: Mapping[str, Any] = MappingProxyType({}),
     aligning: Mapping[str, Any] = MappingProxyType({}),
     separating: Mapping[str, Any] = MappingProxyType({}),
@@ -68,7 +69,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         From `correction.fit_correction`.
     response : Dataset
         From `calibration.fit_response`, with its `noise`.
-    registration : {"auto", "translation", "affine", "homography"}, optional
+    registration : {"translation", "affine", "homography"}, optional
         Kind of transform between the views, see `alignment.register`; None if they are on one grid
         already. A `transform` in `aligning` takes its place.
     correcting, aligning, separating : mapping, optional
@@ -168,7 +169,8 @@ def _aligned(
             field = _shift(aligned, response)
     if field is None:
         return aligned, None
-    return aligned, field if seen_apart(field) else None
+    apart = seen_apart(field) and cameras_apart(aligned, response) > LEAST_APART
+    return aligned, field if apart else None
 
 
 def _shift(aligned: xr.Dataset, response: xr.Dataset) -> xr.Dataset | None:

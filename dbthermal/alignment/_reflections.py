@@ -107,7 +107,7 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
 
 
 def seen_apart(field: xr.Dataset) -> bool:
-    """Whether a shift is more than its deviation: that of cameras at one place is not."""
+    """Say that a shift is more than its deviation; that of cameras at one place is not."""
     known = field["known"].values
     if not known.any():
         return False

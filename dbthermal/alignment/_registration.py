@@ -1,13 +1,11 @@
 """Registration of several views of one object, by the enhanced correlation coefficient."""
 
-from collections.abc import Sequence
 from operator import itemgetter
 from typing import Final, Literal
 
 import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter, map_coordinates, median_filter, spline_filter
-from scipy.stats import chi2
 
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
@@ -33,10 +31,6 @@ _FREE: Final = {"translation": [2, 5], "affine": [0, 1, 2, 3, 4, 5], "homography
 # of the polynomial from view to view, and scales of the residual from which a pixel does not count.
 _NEWTON, _STEP, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-3, 1e-4, 4, 2, 3.0
 _QUARTER: Final = 0.25  # of the texture, whose residual is the scale
-# Blocks of pixels along the shorter side whose residuals are taken for independent; probability of
-# chance above which more numbers of a transform are not supported; and its largest deviation, where
-# the object has texture [pixel].
-_BLOCKS, _CHANCE, _LARGEST_STD = 12, 1e-3, 0.25
 # A place, and half a pixel above, below, to the left and right of it.
 _AROUND: Final = np.array([[0, 0], [-0.5, 0], [0.5, 0], [0, -0.5], [0, 0.5]])[..., np.newaxis]
 # Steps, and relative change of the correlation, at which the maximisation stops.
@@ -47,9 +41,7 @@ _LEAST_OVERLAP: Final = 0.5
 
 
 def register(
-    corrected: xr.Dataset,
-    *,
-    model: Literal["auto", "translation", "affine", "homography"] = "auto",
+    corrected: xr.Dataset, *, model: Literal["translation", "affine", "homography"] = "homography"
 ) -> xr.DataArray:
     r"""Estimate the transform from the pixels of the first view to those of the others.
 
@@ -74,18 +66,16 @@ def register(
     corrected : Dataset
         Stage `corrected` of `schema`: views of one object, displaced by at most about a tenth of
         the image. Of a capture with a `segment` the longest is used.
-    model : {"auto", "translation", "affine", "homography"}
-        Kind of transform. By default the simplest that the object's texture supports: what a richer
-        one adds differs from zero beyond chance (Wald's test, with the deviations of blocks of
-        pixels). An affine one fits cameras that look the same way.
+    model : {"translation", "affine", "homography"}
+        Kind of transform; where the object has little texture, such as one warm spot, the simplest
+        that fits. An affine one fits cameras that look the same way.
 
     Returns
     -------
     DataArray
         (band, row, column) [1], for `align`: for each band H, which takes the homogeneous position
         (x, y, 1) of a pixel of the first view to that of the same point in this one. Pixels count
-        from 0 at the centre of the first; the identity in the first band. Attributes: `model` of
-        each band, and `std` [pixel] of the places where the object has texture, root mean square.
+        from 0 at the centre of the first; the identity in the first band. Attribute: `model`.
 
     Raises
     ------
@@ -93,8 +83,7 @@ def register(
         If OpenCV, of the extra ``alignment``, is not installed.
     TypeError, ValueError
         If the image is smaller than 16 pixels either way, a mean is not finite, the correlation of
-        two views is below 0.5, they share less than half the image, or the texture tells no
-        transform within 0.25 pixel.
+        two views is below 0.5, or they share less than half the image.
 
     References
     ----------
@@ -117,8 +106,8 @@ def register(
     >>> transform.sel(band="9.5").values[:2, 2].round(1).tolist()  # [pixel]
     [3.0, 2.0]
     """
-    if model not in ("auto", *_MODELS):
-        raise ValueError(f"Unknown model '{model}'. Must be one of {('auto', *_MODELS)}.")
+    if model not in _MODELS:
+        raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")
     counts = schema.check(corrected, "corrected")["counts"]
     if "segment" in corrected:  # the longest: a new pattern would be detail that does not move
         numbers, frames = np.unique(corrected["segment"], return_counts=True)
@@ -131,23 +120,20 @@ def register(
         )
     bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
     first, *others = [_curves(view, bad) for view in counts]
-    matrices, kinds, stds = [np.eye(3)], ["identity"], [0.0]
+    matrices = [np.eye(3)]
     for band, other in zip(counts["band"].values[1:], others, strict=True):
-        matrix, kind, std = _transform(first, other, model, str(band))
-        matrices.append(matrix)
-        kinds.append(kind)
-        stds.append(std)
+        matrices.append(_transform(first, other, model, str(band)))
     return xr.DataArray(
         np.stack(matrices),
         dims=TRANSFORM.dims,
         coords={"band": counts["band"].values},
-        attrs={**TRANSFORM.attrs, "model": kinds, "std": stds},
+        attrs={**TRANSFORM.attrs, "model": model},
         name="transform",
     )
 
 
 def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
-    """What changes smoothly at a few times (time, y, x), over its mean and standard deviation."""
+    """Smooth curves at a few times (time, y, x), over their mean and standard deviation."""
     frames = np.asarray(view.values)
     present = np.flatnonzero(~clocks.missing(frames))
     chosen = np.unique(np.linspace(0, present.size - 1, min(present.size, _FRAMES)).astype(int))
@@ -193,8 +179,8 @@ def _smooth(signal: Array) -> Array:
     return np.asarray(curve[((np.arange(order) + 0.5) * len(signal) / order).astype(int)])
 
 
-def _transform(first: Array, other: Array, model: str, band: str) -> tuple[Array, str, float]:
-    """Homography (3, 3) from the first images (time, y, x) to others, its model and deviation."""
+def _transform(first: Array, other: Array, model: str, band: str) -> Array:
+    """Homography (3, 3) from the first images (time, y, x) to others."""
     found, failures = [], []
     # What rises steadily, as only a heated object does, tells the start where it correlates better.
     for weights in (np.ones(len(first)), np.linspace(-1.0, 1.0, len(first))):
@@ -205,46 +191,17 @@ def _transform(first: Array, other: Array, model: str, band: str) -> tuple[Array
             failures.append(error)
     if not found:
         raise failures[0]
-    matrix, kinds = max(found, key=itemgetter(0))[1], _MODELS if model == "auto" else (model,)
+    matrix, kinds = max(found, key=itemgetter(0))[1], _MODELS[: _MODELS.index(model) + 1]
     # The coarse images have little perspective.
     for blur, some in ((_BLURS[-1] * first.shape[1], kinds[:2]), (_FINEST, kinds)):
         pair = [gaussian_filter(images, blur, axes=(1, 2)) for images in (first, other)]
-        matrix, kind, std = _supported(pair, matrix, some, band)
-    if not std <= _LARGEST_STD:
-        raise ValueError(
-            f"Invalid view in band '{band}': its {kind} is known within {std:.2f} pixel. Must be "
-            f"within {_LARGEST_STD}: the object shows too little texture; register on an edge, or "
-            "a heated target."
-        )
-    return matrix, kind, std
+        for kind in some:
+            matrix = _fitted(pair, matrix, _FREE[kind], band)
+    return matrix
 
 
-def _supported(
-    pair: list[Array], start: Array, kinds: Sequence[str], band: str
-) -> tuple[Array, str, float]:
-    """Transform, kind and deviation: of the last kind whose additional numbers are significant."""
-    matrix, result = start, None
-    for place, kind in enumerate(kinds):
-        try:
-            matrix, covariance, std = _fitted(pair, matrix, _FREE[kind], band)
-        except ValueError:  # more numbers than the texture tells leave the image
-            if result is None:
-                raise
-            break
-        # Wald: a^T C^-1 a of the numbers a that the simpler model lacks is chi-square by chance.
-        more = np.flatnonzero(~np.isin(_FREE[kind], _FREE[kinds[place - 1]]))
-        away = (matrix - np.eye(3)).ravel()[_FREE[kind]][more]
-        inverse = np.linalg.pinv(covariance[np.ix_(more, more)], hermitian=True)
-        if result is None or away @ inverse @ away > chi2.isf(_CHANCE, more.size):
-            result = matrix, kind, std
-    assert result is not None
-    return result
-
-
-def _fitted(
-    pair: list[Array], matrix: Array, free: list[int], band: str
-) -> tuple[Array, Array, float]:
-    """Transform that matches images best, covariance of its free numbers, deviation [pixel].
+def _fitted(pair: list[Array], matrix: Array, free: list[int], band: str) -> Array:
+    """Transform that matches images best.
 
     By Gauss-Newton steps, of splines: the enhanced correlation interpolates by lines, and is off by
     some hundredths of a pixel.
@@ -253,7 +210,6 @@ def _fitted(
     count, splines = len(pair[0]), [spline_filter(image) for image in pair[1]]
     unit = np.array([1 / shape[1], 1 / shape[0], 1] * 2 + [shape[1] ** -2, shape[0] ** -2])[free]
     steps = _STEP * unit[:, np.newaxis] * np.eye(9)[free]
-    row, column = np.indices(shape) // max(1, min(shape) // _BLOCKS)
     weights = np.ones(shape)
     for _ in range(_NEWTON):
         places = positions(matrix, shape)
@@ -282,7 +238,6 @@ def _fitted(
         found = inverse @ flat @ values.ravel()
         residual = values - np.tensordot(found, design, axes=1)
         square, texture = np.sum(residual**2, axis=0), np.sum(slopes**2, axis=(0, 1))
-        scores = np.einsum("ntp,tp->np", weighted, residual)
         # Scale of the residual of the texture's quarter that matches best: an edge is no outlier
         # of what is flat, and much may mirror other things.
         order = np.argsort(square)
@@ -293,14 +248,7 @@ def _fitted(
         matrix = matrix / matrix[2, 2]
         if np.max(np.abs(found[: len(free)])) < _CONVERGED:
             break
-    # Residuals of neighbours are alike: N^-1 sum_b (s_b s_b^T) N^-1, with the sums s over blocks.
-    label = (row * shape[1] + column)[inside]
-    sums = np.stack([np.bincount(label, weights=score) for score in scores])
-    covariance = (inverse @ sums @ sums.T @ inverse)[: len(free), : len(free)]
-    moved = np.einsum("atp,nap->ntp", slopes, np.array(motion) / (2.0 * _STEP))
-    variance = np.einsum("ntp,nm,mtp->", moved, covariance, moved, optimize=True)
-    std = float(np.sqrt(variance / texture.sum()))
-    return matrix, np.asarray(covariance * np.outer(unit, unit)), std
+    return matrix
 
 
 def _inside(places: Array, band: str) -> Mask:

@@ -86,10 +86,10 @@ def _inside(corners: Array, rows: Array, columns: Array) -> Mask:
     for (row, column), (next_row, next_column) in zip(
         corners, np.roll(corners, -1, 0), strict=True
     ):
-        if row != next_row:
-            spans = (row <= rows) != (next_row <= rows)
-            crossing = column + (rows - row) / (next_row - row) * (next_column - column)
-            odd ^= spans & (columns < crossing)
+        spanned = ((row <= rows) != (next_row <= rows))[:, 0]
+        if spanned.any():
+            along = (rows[spanned] - row) / (next_row - row)
+            odd[spanned] ^= columns < column + along * (next_column - column)
     return odd
 
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 # Pixels, about, from which it is told whether bands are apart.
 _LOOKED_AT: Final = 2000
-# Share of the pixels with moving reflections whose bands are apart, from which a shift is sought.
-_APART: Final = 0.02
+LEAST_APART: Final = 0.02
+"""Share of the pixels with moving reflections whose bands are apart, from which a shift is used."""
 # Rows and columns, at least, in which a shift can be found.
 _WIDE: Final = 24
 
@@ -93,12 +93,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     alone = None
     narrower = min(corrected.sizes.get(name, 0) for name in ("y", "x"))  # solve refuses others
     if reflection_shift is None and narrower >= _WIDE:
-        # Pixels whose bands are apart take long: some tell whether the cameras are.
-        pixels = corrected.sizes["y"] * corrected.sizes["x"]
-        every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
-        some = corrected.isel(y=every, x=every)
-        apart = _share_apart(solve(some, response, workers=workers))
-        if apart > _APART:
+        apart = cameras_apart(corrected, response, workers)
+        if apart > LEAST_APART:
             shift = alignment.reflection_shift(corrected, response)
             if seen_apart(shift):
                 alone = one(reflection_shift=shift)
@@ -127,6 +123,14 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     if materials is not None:
         result["material"] = materials
     return result.assign_attrs(reflection_shift=source)
+
+
+def cameras_apart(corrected: xr.Dataset, response: xr.Dataset, workers: int = 2) -> float:
+    """Share of some pixels with moving reflections whose bands are apart: all would take long."""
+    pixels = corrected.sizes["y"] * corrected.sizes["x"]
+    every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
+    some = corrected.isel(y=every, x=every).load()
+    return _share_apart(solve(some, response, workers=workers))
 
 
 def _share_apart(result: xr.Dataset) -> float:

@@ -78,29 +78,6 @@ def test_object_registers(truth: tuple[tuple[float, float], float, float], model
         np.testing.assert_array_equal(found.values[0], np.eye(3))
 
 
-def test_the_model_is_what_the_texture_supports() -> None:
-    """No scale is found on a warm spot whose radiance bends; a scale on a picture is.
-
-    A quadratic response makes the spot narrower in one view, as a scale would.
-    """
-    (y, x), rng, rise = np.indices(SHAPE), np.random.default_rng(4), np.linspace(0.2, 1.0, 40)
-    spot = [np.exp(-((y - 46 - b) ** 2 + (x - 60 - 2 * b) ** 2) / 500.0) for b in (0.0, 1.0)]
-    first, second = (rise[:, np.newaxis, np.newaxis] * part for part in spot)
-    counts = np.stack([1000.0 * first, 800.0 * second + 200.0 * second**2])
-    counts += rng.normal(0.0, 3.0, counts.shape)
-    capture = xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), counts)},
-        {"band": ["8-14", "9.5"], "time": np.arange(40) / 10.0},
-    )
-    found = alignment.register(capture)
-    picture = alignment.register(views(homography((3.3, -4.6), 1, 1.01)))
-    print(f"spot: {found.values[1][:2, 2]} +- {found.attrs['std'][1]:.4f} pixel")
-    assert found.attrs["model"] == ["identity", "translation"]
-    np.testing.assert_allclose(found.values[1][:2, 2], [2.0, 1.0], rtol=0, atol=0.02)  # [pixel]
-    assert found.attrs["std"][1] < 0.02  # [pixel]
-    assert picture.attrs["model"] == ["identity", "affine"]
-
-
 def test_views_are_warped() -> None:
     """After `align` the second view shows the object where the first does; outside it is NaN."""
     capture = views(homography((3.3, -4.6), 1, 1.01))
