@@ -19,7 +19,7 @@ from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture
 from dbthermal.schema import Status
 from dbthermal.separation import separate
-from dbthermal.separation._separate import LEAST_APART, cameras_apart
+from dbthermal.separation._separate import cameras_apart
 
 __all__ = ["separate_capture"]
 __dir__ = __all__.copy
@@ -169,7 +169,7 @@ def _aligned(
             field = _shift(aligned, response)
     if field is None:
         return aligned, None
-    apart = seen_apart(field) and cameras_apart(aligned, response) > LEAST_APART
+    apart = seen_apart(field) and cameras_apart(aligned, response) > 0.0
     return aligned, field if apart else None
 
 

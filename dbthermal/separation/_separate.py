@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 # Pixels, about, from which it is told whether bands are apart.
 _LOOKED_AT: Final = 2000
-LEAST_APART: Final = 0.02
-"""Share of the pixels with moving reflections whose bands are apart, from which a shift is used."""
+# Share of the pixels with moving reflections whose bands are apart, from which a shift is sought,
+# if it is that by more than so many of its standard deviations.
+_APART, _SIGMAS = 0.02, 3.0
 # Rows and columns, at least, in which a shift can be found.
 _WIDE: Final = 24
 
@@ -94,7 +95,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     narrower = min(corrected.sizes.get(name, 0) for name in ("y", "x"))  # solve refuses others
     if reflection_shift is None and narrower >= _WIDE:
         apart = cameras_apart(corrected, response, workers)
-        if apart > LEAST_APART:
+        if apart > 0.0:
             shift = alignment.reflection_shift(corrected, response)
             if seen_apart(shift):
                 alone = one(reflection_shift=shift)
@@ -126,11 +127,17 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
 
 def cameras_apart(corrected: xr.Dataset, response: xr.Dataset, workers: int = 2) -> float:
-    """Share of some pixels with moving reflections whose bands are apart: all would take long."""
+    """Share of some pixels with moving reflections whose bands are apart, 0 if that may be chance.
+
+    All pixels would take long.
+    """
     pixels = corrected.sizes["y"] * corrected.sizes["x"]
     every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
     some = corrected.isel(y=every, x=every).load()
-    return _share_apart(solve(some, response, workers=workers))
+    share = _share_apart(solve(some, response, workers=workers))
+    number = some.sizes["y"] * some.sizes["x"]
+    chance = _SIGMAS * np.sqrt(_APART * (1.0 - _APART) / number)  # binomial
+    return share if share > _APART + chance else 0.0
 
 
 def _share_apart(result: xr.Dataset) -> float:
