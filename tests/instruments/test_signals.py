@@ -28,6 +28,14 @@ ENDING = (signal.SIGTERM, signal.SIGHUP)
 SCENE = scene_text().replace('3: "11"', "3: 10.6")
 
 
+@pytest.fixture(autouse=True)
+def hung_up() -> Iterator[None]:
+    """Undo what nohup does to the tests themselves: SIGHUP is not ignored, by children neither."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @contextmanager
 def acquiring(
     folder: Path, duration: float, *, before: str = "pass", output: int = subprocess.DEVNULL
