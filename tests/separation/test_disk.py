@@ -215,10 +215,12 @@ def test_kill_and_restart(path: Path, tmp_path: Path) -> None:
     separation.run(path, tmp_path / "rest.zarr", RIG.response(), memory=MEMORY)
     rng, target = np.random.default_rng(5), tmp_path / "killed.zarr"
     command = [sys.executable, "-c", KILLED, str(path), str(target), str(MEMORY)]
-    kills = 0
+    begin = time.monotonic()
+    subprocess.run([*command[:4], str(tmp_path / "timed.zarr"), str(MEMORY)], check=True)
+    whole, kills = time.monotonic() - begin, 0
     for _ in range(10):
         process = subprocess.Popen(command)
-        time.sleep(rng.uniform(2.0, 6.0))
+        time.sleep(whole * rng.uniform(0.4, 0.95))
         if process.poll() is None:
             os.kill(process.pid, signal.SIGKILL)
             kills += 1
