@@ -36,8 +36,9 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
         if name in dataset and dataset[name].dims[:1] == ("band",):
             good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)
             values = [one[np.isfinite(one)] for one in np.atleast_1d(good.values)]
-            medians = [round(float(np.median(one)), 4) if one.size else None for one in values]
-            said[f"median_{name}{unit}"] = dict(zip(said["bands"], medians, strict=True))
+            if all(one.size for one in values):  # of no pixel without a flag there is none
+                medians = [round(float(np.median(one)), 4) for one in values]
+                said[f"median_{name}{unit}"] = dict(zip(said["bands"], medians, strict=True))
     if not everything:
         return said
     said["variables"] = {
