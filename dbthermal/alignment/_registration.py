@@ -49,7 +49,7 @@ def register(
     reflection hardly counts. Their means are brought together by the translation of the highest
     correlation [1]_, and then, to some hundredths of a pixel, the curves by robust least squares,
 
-    .. math:: \min \sum_p \varrho \Big(\sum_t [f(I_1(p, t)) + o(t) - I_2(H p, t)]^2 \Big)
+    .. math:: \min \sum_p \varrho \left(\sum_t [f(I_1(p, t)) + o(t) - I_2(H p, t)]^2 \right)
 
     with Tukey's bisquare :math:`\varrho`, so that pixels in which the views mirror different things
     do not count, and a quadratic :math:`f`, for the bands' radiances bend against one another: a
