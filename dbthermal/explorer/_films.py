@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _rows, store
+from dbthermal import _rows, schema, store
+from dbthermal._arrays import Array, Mask
 from dbthermal.response import Curve
 
 Values = npt.NDArray[np.float32]
@@ -109,3 +110,21 @@ def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
             "store, as from separation.separate."
         )
     return data
+
+
+def marks(capture: xr.Dataset, time: Array) -> dict[str, float]:
+    """Shutter events of a capture, and where a run of flagged frames begins, by name [s]."""
+    found: dict[str, Mask] = {}
+    if "segment" in capture:
+        found["shutter event"] = np.asarray(np.diff(capture["segment"].values, prepend=0) > 0)
+    if "frame_flags" in capture:
+        flags = capture["frame_flags"]
+        for name in str(flags.attrs.get("flag_meanings", "")).split():
+            found[name.replace("_", " ")] = np.asarray(
+                schema.has_flag(flags, name).any([dim for dim in flags.dims if dim != "time"])
+            )
+    events = {}
+    for name, where in found.items():
+        begins = np.flatnonzero(where & ~np.roll(np.append(where, False), 1)[:-1])
+        events.update({f"{name} {i}": float(time[at]) for i, at in enumerate(begins, 1)})
+    return events

@@ -13,7 +13,7 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
-from dbthermal.explorer._films import Pane, Progress, Values, opened
+from dbthermal.explorer._films import Pane, Progress, Values, marks, opened
 from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
 from dbthermal.schema import Status
 
@@ -107,7 +107,11 @@ class View:
         film = next(iter(self.panes.values())).array
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
-        self.events = {**self._marks(), **{name: float(one) for name, one in events.items()}}
+        shown = self.data if self.capture is None else self.capture
+        self.events = {
+            **marks(shown, self.time),
+            **{name: float(one) for name, one in events.items()},
+        }
         for name, moment in self.events.items():
             if not np.isfinite(moment):
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
@@ -170,25 +174,6 @@ class View:
             else:
                 curve = responses.curve(self._response, band)
                 yield Pane(f"input {band}", label, "K", one, absolute=True, curve=curve)
-
-    def _marks(self) -> dict[str, float]:
-        """Events of the capture: shutter events, and where a run of flagged frames begins."""
-        marks: dict[str, Mask] = {}
-        capture = self.capture if self.capture is not None else self.data
-        if "segment" in capture:
-            events = np.diff(capture["segment"].values, prepend=0)
-            marks["shutter event"] = np.asarray(events > 0)
-        if "frame_flags" in capture:
-            flags = capture["frame_flags"]
-            for name in str(flags.attrs.get("flag_meanings", "")).split():
-                marks[name.replace("_", " ")] = np.asarray(
-                    schema.has_flag(flags, name).any([dim for dim in flags.dims if dim != "time"])
-                )
-        found = {}
-        for name, where in marks.items():
-            begins = np.flatnonzero(where & ~np.roll(np.append(where, False), 1)[:-1])
-            found.update({f"{name} {i}": float(self.time[at]) for i, at in enumerate(begins, 1)})
-        return found
 
     def pane(self, name: str) -> Pane:
         """Pane of a name, read so far that a frame of it is quick; ValueError for another name."""
