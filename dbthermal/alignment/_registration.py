@@ -1,4 +1,4 @@
-"""Registration of several views of one object, by the enhanced correlation coefficient."""
+"""Registration of several views of one object, by robust least squares between smooth curves."""
 
 from operator import itemgetter
 from typing import Final, Literal
@@ -53,7 +53,7 @@ def register(
 
     with Tukey's bisquare :math:`\varrho`, so that pixels in which the views mirror different things
     do not count, and a quadratic :math:`f`, for the bands' radiances bend against one another: a
-    warm spot would be narrower in the one than in the other.
+    warm spot would be narrower in the one than in the other. H takes positions to positions:
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
