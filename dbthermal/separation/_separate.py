@@ -99,7 +99,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
             shift = alignment.reflection_shift(corrected, response)
             if seen_apart(shift):
                 alone = one(reflection_shift=shift)
-                if _share_apart(alone) < apart:
+                left, moving = _pixels_apart(alone)
+                if left / moving < apart:
                     reflection_shift, source = shift, "found"
     if alone is None or source != "found":
         alone = one(reflection_shift=reflection_shift)
@@ -134,15 +135,14 @@ def cameras_apart(corrected: xr.Dataset, response: xr.Dataset, workers: int = 2)
     pixels = corrected.sizes["y"] * corrected.sizes["x"]
     every = slice(None, None, max(1, int(np.sqrt(pixels / _LOOKED_AT))))
     some = corrected.isel(y=every, x=every).load()
-    share = _share_apart(solve(some, response, workers=workers))
-    number = some.sizes["y"] * some.sizes["x"]
-    chance = _SIGMAS * np.sqrt(_APART * (1.0 - _APART) / number)  # binomial
-    return share if share > _APART + chance else 0.0
+    apart, moving = _pixels_apart(solve(some, response, workers=workers))
+    chance = _SIGMAS * np.sqrt(_APART * (1.0 - _APART) / moving)  # binomial
+    return apart / moving if apart / moving > _APART + chance else 0.0
 
 
-def _share_apart(result: xr.Dataset) -> float:
-    """Share of the pixels with moving reflections whose bands are not simultaneous."""
+def _pixels_apart(result: xr.Dataset) -> tuple[int, int]:
+    """Pixels with moving reflections whose bands are not simultaneous, and all such, at least 1."""
     status = result["status"].values
     moving = (status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0
     apart = (status & np.uint32(Status.BANDS_APART)) != 0
-    return float((apart & moving).sum() / max(moving.sum(), 1))
+    return int((apart & moving).sum()), max(int(moving.sum()), 1)
