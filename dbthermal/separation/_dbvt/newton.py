@@ -272,47 +272,39 @@ def whittaker(diagonal: Tensor, stiffness: Tensor, right: Tensor) -> Tensor:
     definite, solved by the factors :math:`L\,\mathrm{diag}(p)\,L^T` with a recursion over time,
     compiled: on the processor, wherever the tensors are.
     """
-    solved = right.numpy(force=True).copy()
+    solved = np.pad(right.numpy(force=True), ((2, 2), (0, 0), (0, 0)))
     _recursion(diagonal.numpy(force=True), stiffness.numpy(force=True), solved)
-    return torch.as_tensor(solved, device=right.device)
+    return torch.as_tensor(solved[2:-2], device=right.device)
 
 
 @njit(nogil=True, error_model="numpy")
 def _recursion(diagonal: Array, stiffness: Array, solved: Array) -> None:
-    """Factors from the first frame on, then the solution from the last one back, in place."""
-    frames, sides, columns = solved.shape
-    pivot, below = np.zeros_like(diagonal), np.zeros_like(diagonal)
-    further = np.zeros_like(diagonal)
-    for t in range(frames):
+    """Factors from the first frame on, then the solution from the last one back, in place.
+
+    Two rows of zeros before and behind take what the ends have not; so do pivots of infinity.
+    """
+    rows, sides, columns = solved.shape
+    pivot = np.full((rows, columns), np.inf)
+    below, further = np.zeros((rows, columns)), np.zeros((rows, columns))
+    for t in range(2, rows - 2):
         # D^T D has the diagonal 1, 5, 6, ..., 6, 5, 1, beside it -2, -4, ..., -4, -2, and then 1.
-        edge = min(t, frames - 1 - t)
-        center = 1.0 if edge == 0 else 5.0 if edge == 1 else 6.0
-        beside = -2.0 if t in (1, frames - 1) else -4.0
+        center = (1.0, 5.0, 6.0)[min(t - 2, rows - 3 - t, 2)]
+        beside = -2.0 if t in (3, rows - 3) else -4.0
         for c in range(columns):
-            stiff = stiffness[c]
-            main = diagonal[t, c] + center * stiff
-            if t > 0:  # rows t - 1 and t - 2 of the factor
-                raw = stiff * (beside - below[t - 1, c])
-                below[t, c] = raw / pivot[t - 1, c]
-                main -= below[t, c] * raw
-            if t > 1:
-                further[t, c] = stiff / pivot[t - 2, c]
-                main -= further[t, c] * stiff
-            pivot[t, c] = main
+            near = stiffness[c] * (beside - below[t - 1, c])
+            below[t, c], further[t, c] = near / pivot[t - 1, c], stiffness[c] / pivot[t - 2, c]
+            less = below[t, c] * near + further[t, c] * stiffness[c]
+            pivot[t, c] = diagonal[t - 2, c] + center * stiffness[c] - less
         for side in range(sides):
             for c in range(columns):
-                if t > 0:
-                    solved[t, side, c] -= below[t, c] * solved[t - 1, side, c]
-                if t > 1:
-                    solved[t, side, c] -= further[t, c] * solved[t - 2, side, c]
-    for t in range(frames - 1, -1, -1):
+                before = below[t, c] * solved[t - 1, side, c]
+                solved[t, side, c] -= before + further[t, c] * solved[t - 2, side, c]
+    for t in range(rows - 3, 1, -1):
         for side in range(sides):
             for c in range(columns):
-                solved[t, side, c] /= pivot[t, c]
-                if t < frames - 1:
-                    solved[t, side, c] -= below[t + 1, c] * solved[t + 1, side, c]
-                if t < frames - 2:
-                    solved[t, side, c] -= further[t + 2, c] * solved[t + 2, side, c]
+                after = below[t + 1, c] * solved[t + 1, side, c]
+                after += further[t + 2, c] * solved[t + 2, side, c]
+                solved[t, side, c] = solved[t, side, c] / pivot[t, c] - after
 
 
 with suppress(RuntimeError):  # without a folder that may be written each process compiles
