@@ -9,12 +9,16 @@ Beyond its threshold the Huber loss has no curvature: a share of that of a parab
 1981, doi:10.1002/0471725250) is added, as much as it takes to lower the objective.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
+from dbthermal._arrays import Array
 from dbthermal.separation._dbvt import DbvtSettings, objective
 from dbthermal.separation._dbvt.objective import Columns, Images, Unknowns
 
@@ -265,30 +269,43 @@ def whittaker(diagonal: Tensor, stiffness: Tensor, right: Tensor) -> Tensor:
 
     with d (time, column) positive, :math:`\lambda` (column,), b (time, side, column) of at least
     four times (Whittaker 1923, doi:10.1017/S0013091500077853): of bandwidth five, positive
-    definite, solved by the factors :math:`L\,\mathrm{diag}(p)\,L^T` with a recursion over time.
+    definite, solved by the factors :math:`L\,\mathrm{diag}(p)\,L^T` with a recursion over time,
+    compiled: on the processor, wherever the tensors are.
     """
-    frames = diagonal.shape[0]
-    # D^T D has the diagonal 1, 5, 6, ..., 6, 5, 1, beside it -2, -4, ..., -4, -2, and then 1.
-    center, beside = diagonal.new_full((frames, 1), 6.0), diagonal.new_full((frames - 1, 1), -4.0)
-    center[[0, -1]], center[[1, -2]], beside[[0, -1]] = 1.0, 5.0, -2.0
-    main, near = (diagonal + center * stiffness).unbind(), (beside * stiffness).unbind()
-    solved, pivots = list(right.unbind()), [main[0]]
-    below, further = [torch.zeros_like(stiffness)], [torch.zeros_like(stiffness)]
-    for t in range(1, frames):
-        # Rows t - 1 and t - 2 of the factor; the first rows have no further neighbour.
-        far = stiffness / pivots[t - 2] if t > 1 else further[0]
-        raw = near[t - 1] - far * pivots[t - 2] * below[t - 1] if t > 1 else near[0]
-        close = raw / pivots[t - 1]
-        pivot = main[t] - close * raw
-        solved[t] = solved[t] - close * solved[t - 1]
-        if t > 1:
-            pivot = pivot - far * stiffness
-            solved[t] = solved[t] - far * solved[t - 2]
-        pivots.append(pivot)
-        below.append(close)
-        further.append(far)
-    solved = [part / pivot for part, pivot in zip(solved, pivots, strict=True)]
-    solved[-2] = solved[-2] - below[-1] * solved[-1]
-    for t in range(frames - 3, -1, -1):
-        solved[t] = solved[t] - below[t + 1] * solved[t + 1] - further[t + 2] * solved[t + 2]
-    return torch.stack(solved)
+    solved = np.pad(right.numpy(force=True), ((2, 2), (0, 0), (0, 0)))
+    _recursion(diagonal.numpy(force=True), stiffness.numpy(force=True), solved)
+    return torch.as_tensor(solved[2:-2], device=right.device)
+
+
+@njit(nogil=True, error_model="numpy")
+def _recursion(diagonal: Array, stiffness: Array, solved: Array) -> None:
+    """Factors from the first frame on, then the solution from the last one back, in place.
+
+    Two rows of zeros before and behind take what the ends have not; so do pivots of infinity.
+    """
+    rows, sides, columns = solved.shape
+    pivot = np.full((rows, columns), np.inf)
+    below, further = np.zeros((rows, columns)), np.zeros((rows, columns))
+    for t in range(2, rows - 2):
+        # D^T D has the diagonal 1, 5, 6, ..., 6, 5, 1, beside it -2, -4, ..., -4, -2, and then 1.
+        center = (1.0, 5.0, 6.0)[min(t - 2, rows - 3 - t, 2)]
+        beside = -2.0 if t in (3, rows - 3) else -4.0
+        for c in range(columns):
+            near = stiffness[c] * (beside - below[t - 1, c])
+            below[t, c], further[t, c] = near / pivot[t - 1, c], stiffness[c] / pivot[t - 2, c]
+            less = below[t, c] * near + further[t, c] * stiffness[c]
+            pivot[t, c] = diagonal[t - 2, c] + center * stiffness[c] - less
+        for side in range(sides):
+            for c in range(columns):
+                before = below[t, c] * solved[t - 1, side, c]
+                solved[t, side, c] -= before + further[t, c] * solved[t - 2, side, c]
+    for t in range(rows - 3, 1, -1):
+        for side in range(sides):
+            for c in range(columns):
+                after = below[t + 1, c] * solved[t + 1, side, c]
+                after += further[t + 2, c] * solved[t + 2, side, c]
+                solved[t, side, c] = solved[t, side, c] / pivot[t, c] - after
+
+
+with suppress(RuntimeError):  # without a folder that may be written each process compiles
+    _recursion.enable_caching()

@@ -22,8 +22,8 @@ BEAD: Final = 3
 SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 """Methods that take the shift of the reflections."""
 
-SLOW: Final = "dbvt"
-"""Method that gets the surroundings of a bead only: a whole image takes it minutes."""
+SLOW: Final = ("dbvt", "naive")
+"""Methods that get the surroundings of a bead only: a whole image takes them minutes."""
 
 REACH: Final = 5
 """Pixels around a bead that it gets: of some shifts, by which it pairs the pixels."""
@@ -229,7 +229,7 @@ def _mean(
     if shift is not None and variant["method"] in SHIFTED:
         options["reflection_shift"] = shift
     seen = corrected
-    if variant["method"] == SLOW:
+    if variant["method"] in SLOW:
         reach = REACH if "reflection_shift" in options else 0
         around = {
             dim: slice(max(0, part.start - reach), part.stop + reach)
