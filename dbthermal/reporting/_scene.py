@@ -260,7 +260,7 @@ def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
     meaning = {bit.label: bit.meaning for bit in Status}
     words = {
         "no_flag": "measured, and nothing speaks against it",
-        "no_flag_but_for_some_frames": "measured, and frames that the pixel alone lacks are bridged",
+        "no_flag_but_for_some_frames": "measured, and frames that it alone lacks are bridged",
         "completed": "not measured here, but completed from what else is known",
         "without_value": "no object temperature at any time",
     }
