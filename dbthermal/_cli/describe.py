@@ -32,6 +32,8 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
             said[f"{name}_shares"] = _shares(dataset[name])
+    if "frames_missing" in dataset.attrs:
+        said["frames_missing"] = int(dataset.attrs["frames_missing"])
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):
             good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)

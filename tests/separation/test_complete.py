@@ -159,11 +159,11 @@ def test_black_gives_the_reading() -> None:
     assert bool((apart < 4.0 * np.hypot(whole["object_temperature_std"], RIG.noise[0])).all())
 
 
-def test_lost_frames_of_a_measured_pixel(half: Case) -> None:
-    """Frames that are lost in a band are bridged, flagged, and right within their intervals."""
+def test_gaps_of_single_pixels(half: Case) -> None:
+    """Samples that a pixel alone lacks are bridged, flagged, and right within their intervals."""
     scene, capture, _ = half
     lost = capture.copy(deep=True)
-    lost["counts"].values[1, [0, 50, 51, 52, 53, 54, 55, 120, 199]] = np.nan
+    lost["counts"].values[1, [0, 50, 51, 52, 53, 54, 55, 120, 199], ::2] = np.nan
     alone = separation.solve(lost, RESPONSE)
     whole = separation.complete(alone, lost, RESPONSE)
     measured = alone["object_temperature"].notnull().any("time")
@@ -172,9 +172,24 @@ def test_lost_frames_of_a_measured_pixel(half: Case) -> None:
     within = float((error < 1.96 * whole["object_temperature_std"]).where(gaps).mean())
     print(f"bridged: {float(error.where(gaps).median()):.3f} K, intervals hold {within:.3f}")
     assert bool(whole["object_temperature"].notnull().all())
+    assert whole.attrs["frames_missing"] == 0
     flagged = (whole["status"] & int(Status.COMPLETED_FRAMES)) != 0
-    assert bool(flagged.where(measured, True).all())
+    assert bool(flagged.where(gaps.any("time"), True).all())
     assert within > 0.9
+
+
+def test_frames_that_no_pixel_has(half: Case) -> None:
+    """Frames without data of a camera stay empty, are counted, and leave no flag at a pixel."""
+    _, capture, _ = half
+    frames = [0, 50, 51, 52, 53, 54, 55, 120, 199]
+    lost = capture.copy(deep=True)
+    lost["counts"].values[1, frames] = np.nan
+    alone = separation.solve(lost, RESPONSE)
+    whole = separation.complete(alone, lost, RESPONSE)
+    empty = whole["object_temperature"].isnull()
+    np.testing.assert_array_equal(np.flatnonzero(empty.all(("y", "x"))), frames)
+    assert int(empty.any(("y", "x")).sum()) == whole.attrs["frames_missing"] == len(frames)
+    assert bool((whole["status"].where(alone["status"] == 0, 0) == 0).all())
 
 
 def test_dead_pixels_stay_empty(half: Case) -> None:
