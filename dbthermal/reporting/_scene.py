@@ -42,6 +42,7 @@ _WORDS: Final = {
     "time_offset": "clock of the second camera behind the first [s]",
     "frames_lost": "frames lost",
     "frames_missing": "frames without data of all bands at any pixel",
+    "frames_bridged": "frames bridged in a pixel that lacks some, mean",
 }
 _NEAREST: Final = 3  # materials that are named
 

@@ -83,8 +83,9 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         ``completed_from_surroundings``, where others were added, and ``completed_frames`` where
         frames of a pixel were. Values stay NaN at bad pixels and constant signals, and in frames
         of which no pixel has data of all bands (attribute `frames_missing`, their number); a sample
-        that a pixel alone lacks is bridged from those around it. Attributes `surroundings`,
-        `surroundings_std` [K] and `surroundings_source`.
+        that a pixel alone lacks is bridged from those around it (`frames_bridged`, mean number of
+        them in a pixel that has any). Attributes `surroundings`, `surroundings_std` [K] and
+        `surroundings_source`.
 
     Raises
     ------
@@ -151,11 +152,13 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         film = completed[FILMS[0]].values
         given = [np.isfinite(film[:, rows]).any(axis=(1, 2)) for rows in inputs.blocks]
         frames = np.any(given, axis=0)
-        list(threads.map(partial(_bridge_rows, completed, frames), inputs.blocks))
+        parts = threads.map(partial(_bridge_rows, completed, frames), inputs.blocks)
+        bridged = np.concatenate(list(parts))
     completed["status"].attrs.update(schema.status_attrs())
     curve = inputs.curves[inputs.bands[0]]
     return completed.assign_attrs(
         frames_missing=int(np.count_nonzero(~frames)),
+        frames_bridged=float(bridged.sum() / max(1, np.count_nonzero(bridged))),
         surroundings=float(np.mean(curve.temperature(np.asarray(level.signal) + curve.reference))),
         surroundings_std=float(np.mean(level.std)),
         surroundings_source="capture" if surroundings is None else "stated",
@@ -218,13 +221,14 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
     completed["status"].values[y, x] |= filled * np.uint32(_BITS[source])
 
 
-def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> None:
+def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
     """Bridge gaps of single pixels of some rows by lines, in place, and set the bit that says so.
 
     Only in the frames (time) that some pixel has. The deviation grows as that of a random walk of
-    the curve's own steps.
+    the curve's own steps. Returns how many each pixel (y, x) had, in one of the films.
     """
     time = completed["time"].values[frames]
+    number = np.zeros(completed["status"].values[rows].shape, dtype=np.intp)
     for name in FILMS:
         films = [completed[one].values for one in (name, f"{name}_std")]
         gaps = np.isnan(films[0][frames, rows])
@@ -235,6 +239,8 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> None:
             _bridge(curve, std, gaps[:, y, x], time)
             films[0][place], films[1][place] = curve, std
         completed["status"].values[rows] |= bridged * np.uint32(Status.COMPLETED_FRAMES)
+        number = np.maximum(number, bridged * gaps.sum(axis=0))
+    return number
 
 
 def _bridge(value: Array, std: Array, gap: Mask, time: Array) -> None:
