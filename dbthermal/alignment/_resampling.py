@@ -31,6 +31,7 @@ MAP: Final = schema.Variable(
 
 _TAPS: Final = 6  # pixels a side that a sample between pixels is made of
 _ROUNDING: Final = 1e-7  # a weight that is none [1]
+_BEYOND: Final = 0.1  # so far outside the centre of the last pixel its line still holds [pixel]
 
 _STEP: Final = 5.0  # standard deviations of noise beyond which a step lies between two frames
 # A pixel position is rounded to this, so that a border met exactly is not missed [pixel].
@@ -175,13 +176,14 @@ def interpolation(places: Array, taps: int) -> csr_array:
 
     Those of the polynomials through so many neighbours a side (Lagrange): of 6 they keep 95 % of
     what is four pixels long and 99.7 % from seven on, half-way between pixels; lines keep 71 and
-    90 %. A place without so many has no weights.
+    90 %. A place without so many has no weights, but for `_BEYOND`.
     """
     shape = places.shape[1:]
     nodes, inside, factors = np.arange(taps), np.ones(places[0].size, dtype=bool), []
     spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
     for place, size in zip(places.reshape(2, -1), shape, strict=True):
-        inside &= (place >= taps // 2 - 1) & (place <= size - taps // 2)
+        first_node, last_node = taps // 2 - 1 - _BEYOND, size - taps // 2 + _BEYOND
+        inside &= (place >= first_node) & (place <= last_node)
         here = np.where(inside, place, 0.0)
         first = np.clip(np.floor(here) - (taps // 2 - 1), 0, size - taps)
         away = (here - first)[:, np.newaxis] - nodes
