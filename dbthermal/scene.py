@@ -128,6 +128,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         shift = None if field is None else field.isel(y=around)
         part = aligned.isel(y=around).load()
         result = separate(part, response, **{"reflection_shift": shift, **separating})
+        if target is not None:  # known of these rows alone
+            del result.attrs["frames_missing"], result.attrs["frames_bridged"]
         maps = {} if shift is None else {"reflection_shift": shift["shift"]}
         return result.assign(maps).isel(y=own).assign_attrs(attrs)
 

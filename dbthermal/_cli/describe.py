@@ -32,6 +32,8 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
             said[f"{name}_shares"] = _shares(dataset[name])
+    frames = ("frames_missing", "frames_bridged")
+    said |= {name: round(dataset.attrs[name], 1) for name in frames if name in dataset.attrs}
     for name, unit in (("netd", "_K"), ("emissivity", "")):
         if name in dataset and dataset[name].dims[:1] == ("band",):
             good = dataset[name].where(dataset["status"] == 0 if "status" in dataset else True)
@@ -70,6 +72,9 @@ def _shares(flags: xr.DataArray) -> dict[str, float]:
     """Share of the values without a flag, and of each flag found."""
     values = flags.values
     shares = {"no_flag": float((values == 0).mean())}
+    bit = schema.Status.COMPLETED_FRAMES
+    if bit.label in str(flags.attrs["flag_meanings"]).split():
+        shares["no_flag_but_for_some_frames"] = float((values == bit).mean())
     for name in str(flags.attrs["flag_meanings"]).split():
         share = float(schema.has_flag(flags, name).mean())
         shares |= {name: share} if share else {}

@@ -41,6 +41,8 @@ _WORDS: Final = {
     "reflection_shift": "shift between the cameras' reflections",
     "time_offset": "clock of the second camera behind the first [s]",
     "frames_lost": "frames lost",
+    "frames_missing": "frames without data of all bands at any pixel",
+    "frames_bridged": "frames bridged in a pixel that lacks some, mean",
 }
 _NEAREST: Final = 3  # materials that are named
 
@@ -259,7 +261,7 @@ def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
     meaning = {bit.label: bit.meaning for bit in Status}
     words = {
         "no_flag": "measured, and nothing speaks against it",
-        "no_flag_but_for_some_frames": "measured, and gaps of some frames are bridged",
+        "no_flag_but_for_some_frames": "measured, and frames that it alone lacks are bridged",
         "completed": "not measured here, but completed from what else is known",
         "without_value": "no object temperature at any time",
     }

@@ -11,6 +11,7 @@ from dbthermal import alignment
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.schema import Status
 from dbthermal.separation._completion.complete import complete
+from dbthermal.separation._completion.prior import stated
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._solve import solve
 
@@ -91,13 +92,17 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     """
     one = partial(solve, corrected, response, settings=settings, workers=workers, progress=progress)
     source = "none" if reflection_shift is None else "given"
+    stated(prior, [str(band) for band in corrected["band"].values])  # refused before the work
     alone = None
     narrower = min(corrected.sizes.get(name, 0) for name in ("y", "x"))  # solve refuses others
     if reflection_shift is None and narrower >= _WIDE:
         apart = cameras_apart(corrected, response, workers)
         if apart > 0.0:
-            shift = alignment.reflection_shift(corrected, response)
-            if seen_apart(shift):
+            try:
+                shift = alignment.reflection_shift(corrected, response)
+            except ValueError:  # no shift explains it: the pixels keep the flag
+                shift = None
+            if shift is not None and seen_apart(shift):
                 alone = one(reflection_shift=shift)
                 left, moving = _pixels_apart(alone)
                 if left / moving < apart:

@@ -78,6 +78,25 @@ def test_object_registers(truth: tuple[tuple[float, float], float, float], model
         np.testing.assert_array_equal(found.values[0], np.eye(3))
 
 
+def test_a_warm_spot_tells_the_translation_alone() -> None:
+    """Where texture tells neither rotation nor scale, they are those of equal cameras."""
+    value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
+    for shape in ((24, 32), (32, 40), (48, 64)):
+        errors = []
+        for seed in range(3):
+            rng = np.random.default_rng(seed)
+            scene = simulation.walkers(np.arange(200) / 10.0, shape, value, rng)
+            capture = simulation.observe(scene, RIG.response(), rng)
+            # A blackbody of four steps of 16 frames leaves an eighth of the noise of a frame.
+            noise = RIG.response()["noise"].values.reshape(2, 1, 1, 1)
+            pattern = rng.normal(0, 0.125, (2, 1, *shape)) * noise
+            capture["counts"] = capture["counts"] + pattern.astype(np.float32)
+            found = alignment.register(capture).values[1]
+            errors.append(np.hypot(*(resampling.positions(found, shape) - np.indices(shape))).max())
+        print(f"{shape}: {np.round(errors, 3)} pixel")
+        assert np.median(errors) < 0.15  # [pixel]
+
+
 def test_views_are_warped() -> None:
     """After `align` the second view shows the object where the first does; outside it is NaN."""
     capture = views(homography((3.3, -4.6), 1, 1.01))

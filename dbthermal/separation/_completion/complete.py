@@ -81,9 +81,11 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         The variables of the result, and its values bit for bit where it has any; `status` has the
         bits ``completed_from_material`` or ``completed_from_prior``, and
         ``completed_from_surroundings``, where others were added, and ``completed_frames`` where
-        frames of a pixel were. Values stay NaN at bad pixels and constant signals. A sample that is
-        NaN in a band is bridged from those around it. Attributes `surroundings`,
-        `surroundings_std` [K] and `surroundings_source`.
+        frames of a pixel were. Values stay NaN at bad pixels and constant signals, and in frames
+        of which no pixel has data of all bands (attribute `frames_missing`, their number); a sample
+        that a pixel alone lacks is bridged from those around it (`frames_bridged`, mean number of
+        them in a pixel that has any). Attributes `surroundings`, `surroundings_std` [K] and
+        `surroundings_source`.
 
     Raises
     ------
@@ -147,9 +149,16 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     completed = result.copy(deep=True)
     with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
         list(threads.map(partial(_complete_rows, scene, completed), inputs.blocks))
+        film = completed[FILMS[0]].values
+        given = [np.isfinite(film[:, rows]).any(axis=(1, 2)) for rows in inputs.blocks]
+        frames = np.any(given, axis=0)
+        parts = threads.map(partial(_bridge_rows, completed, frames), inputs.blocks)
+        bridged = np.concatenate(list(parts))
     completed["status"].attrs.update(schema.status_attrs())
     curve = inputs.curves[inputs.bands[0]]
     return completed.assign_attrs(
+        frames_missing=int(np.count_nonzero(~frames)),
+        frames_bridged=float(bridged.sum() / max(1, np.count_nonzero(bridged))),
         surroundings=float(np.mean(curve.temperature(np.asarray(level.signal) + curve.reference))),
         surroundings_std=float(np.mean(level.std)),
         surroundings_source="capture" if surroundings is None else "stated",
@@ -194,48 +203,55 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, rows: slice) -> None:
 
 
 def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, source: int) -> None:
-    """Fill in missing values, bridge the gaps that remain, and set the bits that say so."""
+    """Fill in missing values, and set the bits that say so."""
     y, x = np.divmod(places, completed.sizes["x"])
-    filled, bridged = np.zeros((2, places.size), dtype=bool)
+    filled = np.zeros(places.size, dtype=bool)
     order = np.argsort(scene.inputs.bands)  # the capture's
     for name in (*FILMS, *MAPS):
         both = (name, f"{name}_std")
         old = [completed[one].values[:, y, x].astype(np.float64) for one in both]
         new = [values[one][order] if name in MAPS else values[one] for one in both]
         take = np.isnan(old[0]) & np.isfinite(new[0]) & np.isfinite(new[1])
-        done = [np.where(take, *pair) for pair in zip(new, old, strict=True)]
         filled |= take.any(axis=0)
-        if name in FILMS:
-            bridged |= _bridge(done[0], done[1], scene.inputs.capture["time"].values)
-        for one, part in zip(both, done, strict=True):
-            completed[one].values[:, y, x] = part
+        for one, pair in zip(both, zip(new, old, strict=True), strict=True):
+            completed[one].values[:, y, x] = np.where(take, *pair)
     if (name := "emissivity_covariance") in completed:
         before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
         completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)
-    flags = filled * np.uint32(_BITS[source]) | bridged * np.uint32(Status.COMPLETED_FRAMES)
-    completed["status"].values[y, x] |= flags
+    completed["status"].values[y, x] |= filled * np.uint32(_BITS[source])
 
 
-def _bridge(value: Array, std: Array, time: Array) -> Mask:
-    """Bridge gaps of curves (time, pixel) by lines, in place; pixels (pixel) that had any.
+def _bridge_rows(completed: xr.Dataset, frames: Mask, rows: slice) -> Whole:
+    """Bridge gaps of single pixels of some rows by lines, in place, and set the bit that says so.
 
-    The deviation grows as that of a random walk of the curve's own steps.
+    Only in the frames (time) that some pixel has. The deviation grows as that of a random walk of
+    the curve's own steps. Returns how many each pixel (y, x) had, in one of the films.
     """
-    gaps = np.isnan(value)
-    pixels = np.flatnonzero(gaps.any(axis=0) & ~gaps.all(axis=0))
-    for pixel in pixels:
-        gap = gaps[:, pixel]
-        known, missing = np.flatnonzero(~gap), np.flatnonzero(gap)
-        after = np.searchsorted(known, missing)
-        left, right = known[np.maximum(after - 1, 0)], known[np.minimum(after, known.size - 1)]
-        since, until = np.abs(time[missing] - time[left]), np.abs(time[right] - time[missing])
-        steps = np.diff(value[known, pixel]) ** 2 / np.diff(time[known])
-        rate = steps.mean() if steps.size else 0.0
-        apart = np.where(left == right, 1.0, since + until)
-        walk = rate * np.where(left == right, since, since * until / apart)
-        value[missing, pixel] = np.interp(time[missing], time[known], value[known, pixel])
-        variance = np.interp(time[missing], time[known], std[known, pixel] ** 2)
-        std[missing, pixel] = np.sqrt(variance + walk)
-    result = np.zeros(value.shape[1], dtype=bool)
-    result[pixels] = True
-    return result
+    time = completed["time"].values[frames]
+    number = np.zeros(completed["status"].values[rows].shape, dtype=np.intp)
+    for name in FILMS:
+        films = [completed[one].values for one in (name, f"{name}_std")]
+        gaps = np.isnan(films[0][frames, rows])
+        bridged = gaps.any(axis=0) & ~gaps.all(axis=0)
+        for y, x in zip(*np.nonzero(bridged), strict=True):
+            place = (frames, rows.start + y, x)
+            curve, std = (film[place].astype(np.float64) for film in films)
+            _bridge(curve, std, gaps[:, y, x], time)
+            films[0][place], films[1][place] = curve, std
+        completed["status"].values[rows] |= bridged * np.uint32(Status.COMPLETED_FRAMES)
+        number = np.maximum(number, bridged * gaps.sum(axis=0))
+    return number
+
+
+def _bridge(value: Array, std: Array, gap: Mask, time: Array) -> None:
+    """Bridge the gaps of a curve (time), in place."""
+    known, missing = np.flatnonzero(~gap), np.flatnonzero(gap)
+    after = np.searchsorted(known, missing)
+    left, right = known[np.maximum(after - 1, 0)], known[np.minimum(after, known.size - 1)]
+    since, until = np.abs(time[missing] - time[left]), np.abs(time[right] - time[missing])
+    steps = np.diff(value[known]) ** 2 / np.diff(time[known])
+    rate = steps.mean() if steps.size else 0.0
+    apart = np.where(left == right, 1.0, since + until)
+    walk = rate * np.where(left == right, since, since * until / apart)
+    value[missing] = np.interp(time[missing], time[known], value[known])
+    std[missing] = np.sqrt(np.interp(time[missing], time[known], std[known] ** 2) + walk)

@@ -102,7 +102,10 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
     for label in np.unique(labels[told & (labels >= 0)]):
         here, wanted = told & (labels == label), ~known & (labels == label)
         value[:, wanted] = np.median(shared[:, here], axis=-1)[..., np.newaxis]
-        covariance[..., wanted] = np.median(shared_covariance[..., here], axis=-1)[..., np.newaxis]
+        # Those of the label that were not pooled tell how much its pixels differ.
+        between = np.cov(shared[:, here]) if here.sum() > 1 else 0.0
+        around = np.median(shared_covariance[..., here], axis=-1) + between
+        covariance[..., wanted] = around[..., np.newaxis]
         source[wanted] = MATERIAL
     names = [str(result["band"].values[band]) for band in bands]
     pattern = (np.zeros(len(bands)) if inputs.pattern is None else inputs.pattern)[bands]
@@ -208,13 +211,15 @@ def find_level(scene: Scene) -> Level:
     """Level of the background over the pixels, from those that show it, beside what is known.
 
     Each pixel's posterior without the prior in it is a measurement; their weighted median, and the
-    scatter that they do not explain, which is how much pixels differ.
+    scatter that they do not explain, which is how much pixels differ. Pixels whose emissivities
+    come from one prior, or from other pixels, share its error: together they count as one pixel.
     """
     tile, valid, places = scene.sample()
     sources = np.where(valid.any(axis=0), scene.source[places], -1)
-    parts = []
+    parts, counted = [], []
     for source in np.unique(sources[sources >= 0]):
         here = sources == source
+        counted.append(np.full(here.sum(), 1.0 if source == OWN else 1.0 / here.sum()))
         part = tile.select_pixels(here), valid[:, here], int(source), places[here]
         parts.append(solve(scene, *part)[1])
     if not parts:
@@ -229,13 +234,13 @@ def find_level(scene: Scene) -> Level:
     seen = np.isfinite(value) & (variance < before)
     if not np.any(seen):
         return level
-    value, variance = value[seen], variance[seen]
-    weight = 1.0 / (variance + np.median(variance))
+    value, variance, pixels = value[seen], variance[seen], np.concatenate(counted)[seen]
+    weight = pixels / (variance + np.median(variance))
     order = np.argsort(value)
     share = np.cumsum(weight[order]) / weight.sum()
     middle = float(value[order][np.searchsorted(share, 0.5)])
     scatter = (MAD * float(np.median(np.abs(value - middle)))) ** 2
     between = max(scatter - float(np.median(variance)), 0.0)
-    own = between + _MEDIAN / float(np.sum(1.0 / variance)) + _LEAST[0] ** 2
+    own = between + _MEDIAN / float(np.sum(pixels / variance)) + _LEAST[0] ** 2
     signal = (middle * wide + room * own) / (wide + own)
     return replace(level, signal=signal, std=float(np.sqrt(own * wide / (own + wide))))

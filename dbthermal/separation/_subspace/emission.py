@@ -29,7 +29,10 @@ from dbthermal.separation._subspace import residuals
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
 
-ROUNDS: Final = 2
+ROUNDS: Final = 3
+# Change of the slope with the emissivity that it starts from, below which it is extrapolated to
+# where both are the same (Aitken): the bands' responses differ far from the reference temperature.
+FASTEST: Final = 0.8
 # Energy of the object's change over that of its noise, below which its emissivity is undefined.
 OBJECT_TO_NOISE: Final = 10.0
 # The background counts as resting within so many standard deviations, in that share of frames.
@@ -154,12 +157,18 @@ def _alternate(
     guess = _plain_slope(tile.blackbody(0, temperature), tile.signals[0])
     emissivity = np.where((guess > 0) & (guess < 1), guess, middle)
     temperature = _newton(tile, ratios, emissivity, target, temperature)[0]
+    before = slope_before = np.full_like(emissivity, np.nan)
     for _ in range(ROUNDS):
         emitted = tile.blackbody(0, temperature)
         line = residuals.regress(emitted, tile.signals[0], tile.noise[0], start=line)
         functions_used = ratios.order + functions.steps
         constant = line.energy < OBJECT_TO_NOISE * functions_used * ratios.null_variance
-        emissivity = np.where(constant, middle, line.slope)
+        moved, change = line.slope - slope_before, emissivity - before
+        slow = np.abs(moved) < FASTEST * np.abs(change)
+        rate = np.divide(moved, change, out=np.zeros_like(moved), where=slow)
+        before, slope_before = emissivity, line.slope
+        extrapolated = line.slope + (line.slope - before) * rate / (1.0 - rate)
+        emissivity = np.where(constant, middle, extrapolated)
         if tile.material is not None:
             known = ratios.pooled & np.isfinite(tile.material.emissivity)
             constant = constant & ~known

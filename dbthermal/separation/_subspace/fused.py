@@ -76,11 +76,12 @@ def _unsteady(model: Model, ratios: Ratio, work: Work) -> tuple[float, float, bo
 def _unexplained(model: Model, ratios: Ratio, work: Work, common: float) -> bool:
     """As `residuals.unexplained`."""
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
-    sums, together = work.sensitivity, 0.0
-    leverage, products, squares = model.leverage[ratios.order - 1], work.kernel, work.mean
+    sums, together, share = work.sensitivity, 0.0, common / ratios.null_variance
+    products, squares = work.kernel, work.mean
     for t in range(residual.size):
-        products[t] = residual[t] * rapid[t] - common * (1.0 - leverage[t])
-        squares[t] = rapid[t] ** 2
+        independent = rapid[t] - share * residual[t]
+        products[t] = residual[t] * independent
+        squares[t] = independent**2
     for block in range(blocks):
         total, product, square = 0.0, 0.0, 0.0
         for t in range(np.uintp(model.edges[block]), np.uintp(model.edges[block + 1])):

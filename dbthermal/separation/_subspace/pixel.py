@@ -213,13 +213,18 @@ def emission(model: Model, ratios: Ratio, work: Work, again: int) -> Line:
     known = ratios.pooled and not np.isnan(material[2])
     constant = False
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
+    before, slope_before = np.nan, np.nan
     for turn in range(emissions.ROUNDS):
         _approach(model, ratios, emissivity, work, work.emitted)
         slope, variance, scale, energy = regression.regress(
             work.emitted, z, model.noise[0], weights, work.residual, work.few, again + turn > 0
         )
         constant = energy < emissions.OBJECT_TO_NOISE * count * ratios.null_variance and not known
+        rate = (slope - slope_before) / (emissivity - before)
+        before, slope_before = emissivity, slope
         emissivity = material[2] if known else middle if constant else slope
+        if abs(rate) < emissions.FASTEST and not known and not constant:
+            emissivity += (slope - before) * rate / (1.0 - rate)
     _approach(model, ratios, emissivity, work, work.at_object)
     other = 1.0 - ratios.ratio * (1.0 - emissivity)
     return Line((emissivity, other), variance, scale, energy, constant, known)

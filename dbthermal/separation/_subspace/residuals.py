@@ -175,19 +175,22 @@ def unexplained(residual: Array, rapid: Array, null_variance: Array, common: Arr
 
     Its sum over some block, of those of repeated halving, is beyond that of noise: a change of the
     object that the smooth functions do not follow. Or blocks differ in its correlation with the
-    `rapid` part of the first band's signal h (time, pixel) [K]: these changes have not one ratio,
+    rapid changes: these have not one ratio,
 
-    .. math:: \sum_b \frac{(\sum_t r h - n \, w_1 s_1^2)^2}{\sigma^2 \sum_t h^2}
+    .. math:: \sum_b \frac{(\sum_t r h)^2}{\sigma^2 \sum_t h^2}, \quad
+              h = z_1 - r \, w_1 s_1^2 / \sigma^2
 
-    which is a chi-square variable; its last term is `common` (time, pixel) [K^2] in each frame.
+    which is a chi-square variable, for the noise of h is independent of that of r: the `rapid` part
+    of the first band's signal (time, pixel) [K] less what has the covariance `common` (pixel) [K^2]
+    with the residual.
     """
     edges, (most, limit) = blocks(len(residual))
     length = np.diff(edges)[:, np.newaxis]
-    product, square = residual * rapid - common, rapid**2
-    sums, products, squares = (
-        np.add.reduceat(part, edges[:-1], axis=0) for part in (residual, product, square)
-    )
     variance = np.where(null_variance > 0, null_variance, np.inf)
+    rapid = rapid - common / variance * residual
+    sums, products, squares = (
+        np.add.reduceat(part, edges[:-1], axis=0) for part in (residual, residual * rapid, rapid**2)
+    )
     together = (products**2 / np.where(squares > 0, squares, np.inf)).sum(axis=0) / variance
     result = together > most
     while len(sums) > 1:

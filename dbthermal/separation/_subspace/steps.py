@@ -123,8 +123,7 @@ def _steps(
     residual = residuals.null_residual(signals, functions, ratios)
     smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
     rapid = signals[0] - functions.functions @ ratios.coefficients[0]
-    free = 1.0 - functions.leverage()[:, ratios.order - 1]
-    common = ratios.null_weights[0] * noise[0] ** 2 * free
+    common = ratios.null_weights[0] * noise[0] ** 2
     curves = np.stack([residual, functions.object_part @ smoothed])
     parts = vars(ratios) | vars(emission)
     solution = Solution(
