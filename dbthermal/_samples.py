@@ -143,9 +143,16 @@ def end_of(
     else:
         end = counts.min(axis=0, where=valid, initial=counts.max(initial=0))
     there = counts == end if used is True else (counts == end) & valid
-    # A product of matrices adds up several times faster than a sum over the first axis.
-    number = np.ones(len(there), dtype=np.float32) @ there.astype(np.float32)
-    return end, number.astype(np.intp)
+    return end, counted(there)
+
+
+def counted(there: Mask) -> npt.NDArray[np.intp]:
+    """Number (pixel) of samples (time, pixel) that are true."""
+    # Bytes, as many as cannot overflow, add up many times faster than truth values.
+    most, total = np.iinfo(np.uint8).max, np.zeros(there.shape[1], dtype=np.intp)
+    for start in range(0, len(there), most):
+        total += there[start : start + most].view(np.uint8).sum(axis=0, dtype=np.uint8)
+    return total
 
 
 def near_end(

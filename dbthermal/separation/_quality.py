@@ -60,7 +60,9 @@ def read(
     """
     raw = part["counts"].values
     counts = raw.reshape(*raw.shape[:2], -1)  # judged in its own precision, which is cheaper
-    valid = np.all(schema.measured(counts), axis=0)
+    valid = np.ones(counts.shape[1:], dtype=bool)
+    if not schema.measured(np.array([counts.min(), counts.max()])).all():  # NaN is both
+        valid = np.all(schema.measured(counts), axis=0)
     if "mask" in part:
         valid &= part["mask"].broadcast_like(part["counts"][0]).values.reshape(valid.shape)
     counts = _kept(counts, valid)
@@ -70,7 +72,7 @@ def read(
     frozen, copied = _frozen(same, valid, [it.chance for it in known])
     valid &= ~copied[:, np.newaxis]
     counts = _kept(counts, valid).astype(np.float64)
-    frames = valid.sum(axis=0)
+    frames = samples.counted(valid)
     invalid = too_few(valid, fewest, most_missing)
     if valid.all():
         constant = np.any([band.all(axis=0) for band in same], axis=0) & ~invalid
@@ -101,7 +103,7 @@ def _kept(counts: npt.NDArray[Any], valid: Mask) -> npt.NDArray[Any]:
 def too_few(valid: Mask, fewest: int, most_missing: float = MOST_MISSING) -> Mask:
     """Pixels (pixel) with fewer valid frames (time, pixel) than can be solved, see `read`."""
     least = max(fewest, (1.0 - most_missing) * len(valid))
-    return np.asarray(valid.sum(axis=0) < least)
+    return np.asarray(samples.counted(valid) < least)
 
 
 def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
@@ -111,6 +113,8 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     background. Bridged are gaps of `LONGEST_GAP` frames that most other pixels have, in pixels that
     lack few. Returns the counts, and the samples that are valid or bridged.
     """
+    if valid.all():
+        return counts, valid
     common = valid.mean(axis=1) > MOST_MISSING
     gap = ~valid & common[:, np.newaxis]
     gap &= gap.sum(axis=0) < MOST_BRIDGED * len(valid)

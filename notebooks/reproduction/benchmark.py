@@ -66,6 +66,12 @@ class Disk:
     result_bytes: int
 
 
+@lru_cache
+def response(names: tuple[str, ...]) -> xr.Dataset:
+    """Response of the rig of these bands; its fit is no part of a separation's time."""
+    return simulation.Rig(bands=names, noise=NOISE[: len(names)]).response()
+
+
 @lru_cache(maxsize=2)
 def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
     """Simulated plate glass of so many pixels; beyond 128 those are repeated in another order."""
@@ -81,10 +87,9 @@ def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
 def solve(movie: xr.Dataset, method: str) -> xr.Dataset:
     """Separate by one thread."""
     names = [str(band) for band in movie["band"].values]
-    rig = simulation.Rig(bands=tuple(names), noise=NOISE[: len(names)])
     known = xr.DataArray(list(EMISSIVITY[: len(names)]), dims="band", coords={"band": names})
     emissivity = known if separation.get_method(method).knows_emissivity else None
-    return separation.solve(movie, rig.response(), method, emissivity=emissivity, workers=1)
+    return separation.solve(movie, response(tuple(names)), method, emissivity=emissivity, workers=1)
 
 
 def seconds_of(method: str, sizes: dict[str, int]) -> float:

@@ -94,8 +94,8 @@ SCENES: Final[dict[str, tuple[int, float, int, float, float, float, float, Films
 }
 
 
-def draw(name: str, seed: int) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
-    """Truth, capture and response of a scene."""
+def draw(name: str, seed: int, louder: float = 1.0) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
+    """Truth, capture and response of a scene, the second band so many times as loud."""
     frames, rate, count, first, change, height, period, films = SCENES[name]
     rng, time = np.random.default_rng(seed), np.arange(frames) / rate
     bands, curve = list(BANDS[:count]), rng.uniform(0.7, 2.0)
@@ -108,6 +108,7 @@ def draw(name: str, seed: int) -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
         for band, e in zip(bands, pair, strict=True)
     ]
     noise = SLOPE * NETD[:count]
+    noise[1] *= louder
     counts = counts + noise[:, None, None, None] * rng.standard_normal((count, *warm.shape))
     dims = ("time", "y", "x")
     truth = xr.Dataset(
@@ -162,3 +163,21 @@ def test_outside_scenes_hold(name: str) -> None:
     assert np.mean(unflagged) > 0.8
     assert np.mean(far) < 0.01
     assert min(shares.values()) > 0.9
+
+
+@pytest.mark.parametrize("louder", [1.0, 2.0, 4.0])
+def test_pooled_intervals_hold_with_the_noise_of_the_capture(louder: float) -> None:
+    """Pooled values are sharp enough to show a noise, and so a ratio, that is a few per cent off.
+
+    With moving reflections taken for noise where one pixel does not show that the bands share
+    them, the quiet band's was 14 to 17 % too high, and 54 to 67 % of the intervals held.
+    """
+    shares = []
+    for seed in range(4):
+        truth, capture, response = draw("heats", seed, louder)
+        labels = xr.DataArray((X < 0.5).astype(int), dims=("y", "x"))
+        result = separation.solve(capture, response.drop_vars("noise"), pool=labels)
+        error = abs(result["object_temperature"] - truth["object_temperature"])
+        shares.append(float((error < 1.96 * result["object_temperature_std"]).mean()))
+        print(louder, result["noise"].values / response["noise"].values, shares[-1])
+    assert np.mean(shares) > 0.85

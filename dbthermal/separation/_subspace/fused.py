@@ -129,7 +129,7 @@ _FIELDS: Final[dict[Any, dict[str, tuple[int, ...]]]] = {
     np.float64: {
         **dict.fromkeys(["inverse_energy", "null_variance", "contrast", "reduced_chi2"], ()),
         **dict.fromkeys(["epsilon_variance", "noise_variance", "drift_variance"], ()),
-        **dict.fromkeys(["correlation", "delay"], ()),
+        **dict.fromkeys(["correlation", "delay", "cost"], ()),
         **dict.fromkeys(["ratio", "ratio_variance", "null_weights", "emissivity"], (2,)),
         **dict.fromkeys(["missing", "lost"], (2,)),
         **dict.fromkeys(["scatter", "emissivity_covariance"], (2, 2)),
@@ -176,7 +176,10 @@ def _pixel(model: Model, least: float, work: Work, films: Any, record: Any, sums
         line = pixel.emission(model, ratios, work, again)
         pixel.background(model, line, work)
         # The bend of a gray body is not known: it is told from the signals as they are.
-        gray = gray if again > 0 else pixel.may_be_gray(model, ratios)
+        if again == 0:
+            gray, used = pixel.may_be_gray(model, ratios), ratios.order + model.steps
+            free = work.bend.size - used
+            record.cost = ratios.reduced_chi2 * free + pieces.COST * used  # eq. 12
         energy = _energy(work.bend, work.removed)
         if again == emissions.BENDS or not energy > (least * model.noise[1]) ** 2:
             break

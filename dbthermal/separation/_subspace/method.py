@@ -276,11 +276,9 @@ def _followed(tile: Tile, settings: SubspaceSettings) -> tuple[Estimate, Mask]:
     if suspect.size == 0:
         return result, first
     part, best = tile.select_pixels(suspect), result.select_pixels(suspect)
-    ratios = reflection_ratio.estimate(part.signals, functions, noise, part.material)
-    used, others = ratios.order + functions.steps, len(noise) - 1
-    cost = others * (ratios.reduced_chi2 * (tile.time.size - used) + pieces.COST * used)
+    cost = solution.cost[suspect]
     known = None if part.material is None else part.material.ratio
-    divide = division.divide if others == 1 else pieces.divide  # compiled for two bands
+    divide = division.divide if len(noise) == 2 else pieces.divide  # compiled for two bands
     divisions = divide(part.signals, tile.time, noise, tile.segment, known)
     lowest = np.min([cost, *(one.cost for one in divisions)], axis=0)
     for one in divisions:

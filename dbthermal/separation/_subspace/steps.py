@@ -52,6 +52,7 @@ class Solution(Pixels):
     constant: Mask
     restless: Mask
     gray: Mask  # the signals as they are may be those of a gray body (pixel)
+    cost: Array  # of these as one smooth curve, eq. 12 (pixel)
     correlation: Array  # of the null residual, see `residuals` (pixel)
     delay: Array  # of the bands (pixel)
     unexplained: Mask  # the residual is not noise (pixel)
@@ -81,7 +82,8 @@ def solve(
         signals[1:] -= removed
         straight = replace(part, signals=signals)
         line = line.select_pixels(bent)
-        again, bend, line = _steps(part, straight, functions, drift, result.gray[places], line)
+        as_they_are = result.gray[places], result.cost[places]
+        again, bend, line = _steps(part, straight, functions, drift, as_they_are, line)
         result.replace_pixels(places, again)
     return result
 
@@ -91,21 +93,25 @@ def _steps(
     straight: Tile,
     functions: smooth.Subspace,
     drift: float,
-    gray: Mask | None = None,
+    as_they_are: tuple[Mask, Array] | None = None,
     start: residuals.Line | None = None,
 ) -> tuple[Solution, Array, residuals.Line]:
     """
     Steps 1 to 4, the first three on signals whose reflections are proportional; and the bend.
 
-    The bend of a gray body is not known: whether it is one is told from signals as they are.
+    The bend of a gray body is not known: whether it is one is told from signals `as_they_are`, and
+    their cost as one smooth curve.
     """
     noise, signals, frames = np.array(tile.noise), straight.signals, tile.time.size
     ratios = reflection_ratio.estimate(signals, functions, noise, tile.material)
-    if gray is None:
+    if as_they_are is None:
         curve = tile.curves[0]
         temperature = np.linspace(curve.lowest, curve.highest, reflection_ratio.TEMPERATURES)
         slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
+        used = ratios.order + functions.steps
+        cost = ratios.reduced_chi2 * (frames - used) + pieces.COST * used
         gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
+        as_they_are = gray, (len(noise) - 1) * cost
     emission = emissions.estimate(straight, functions, ratios, drift, start)
     background, variance = backgrounds.estimate(tile, emission, ratios)
     of_object, of_background = backgrounds.pattern_variances(tile, emission, ratios, background)
@@ -130,7 +136,8 @@ def _steps(
         beyond=np.any(beyond, axis=1),
         ratio_variance=ratios.variance + emission.level_std**2,
         freedom=frames - functions.steps - ratios.order,
-        gray=gray,
+        gray=as_they_are[0],
+        cost=as_they_are[1],
         correlation=residuals.autocorrelation(residual),
         delay=residuals.interband_delay(residual, signals[0], functions, ratios, noise[0]),
         unexplained=residuals.unexplained(residual, rapid, ratios.null_variance, common),
