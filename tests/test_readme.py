@@ -23,7 +23,7 @@ def test_the_ten_lines_run(
     )
     temperature = temperature.assign_coords(temperature=temperature)
     store.save(counts(response, temperature).to_dataset(), tmp_path / "blackbody.zarr", {})
-    store.save(corrected, tmp_path / "scene.zarr", {})
+    store.save(corrected, tmp_path / "aligned.zarr", {})
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     names: dict[str, xr.Dataset] = {}
