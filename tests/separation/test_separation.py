@@ -34,7 +34,7 @@ def test_subspace_reaches_the_design(
 ) -> None:
     """Object and emissivities are as good as the prototype's, noise known or not."""
     case = glass_case(emissivity=list(pair), stop=stop, noise_known=noise_known)
-    scene, result = experiments.run_case(case, RIG, TIME, 400, seed=7)
+    scene, result = experiments.run_case(case, RIG, TIME, 1600, seed=7)
     score = experiments.score(scene, result)
     to_45, to_60, *of_emissivity = PROTOTYPE[pair]
     rmse = float(score["object_temperature_rmse"])
@@ -43,8 +43,8 @@ def test_subspace_reaches_the_design(
     limit = to_45 if stop == 45 else to_60
     assert limit is None or rmse <= limit
     assert np.all(errors <= of_emissivity)
-    # All but 1 %, and three deviations of chance: of four seeds 0.988 to 0.998, noise known or not.
-    assert float(score["with_temperature"]) > 0.99 - 3.0 * np.sqrt(0.99 * 0.01 / 400)
+    print(f"with a temperature: {float(score['with_temperature']):.4f}")
+    assert float(score["with_temperature"]) > 0.99
 
 
 def test_ratio_scatters_as_the_bound_allows() -> None:
