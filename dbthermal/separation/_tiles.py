@@ -6,7 +6,7 @@ cache. A tile's bands are in the order of their noise, the quietest first: the r
 emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, Self
 
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import mixing
+from dbthermal._arrays import namespace
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
@@ -52,8 +53,12 @@ class Pixels:
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
         """Return the record of the selected pixels alone."""
+        return self.each(lambda values: values[..., selected])
+
+    def each(self, function: Callable[[Any], Any]) -> Self:
+        """Return the record with a function of each of its arrays."""
         values = ((field.name, getattr(self, field.name)) for field in fields(self))
-        parts: dict[str, Any] = {name: v if v is None else v[..., selected] for name, v in values}
+        parts: dict[str, Any] = {name: v if v is None else function(v) for name, v in values}
         return replace(self, **parts)
 
     def replace_pixels(self, selected: Mask | Whole, part: Self) -> None:
@@ -222,10 +227,8 @@ class Estimate(Pixels):
 
 def out_of_range(temperature: Array, std: Array, curve: Curve) -> Mask:
     """Temperatures [K] outside the calibrated range of a response by several deviations."""
-    margin = RANGE_SIGMAS * np.where(np.isnan(std), 0.0, std)
-    return np.asarray(
-        (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
-    )
+    margin: Array = RANGE_SIGMAS * namespace(std).nan_to_num(std, posinf=np.inf)
+    return (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
 
 
 @dataclass(frozen=True)
