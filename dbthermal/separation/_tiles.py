@@ -34,8 +34,8 @@ PIXELS: Final = 320
 SAMPLES: Final = 2**19
 """Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
 
-# Times as many pixels in a tile whose steps are compiled: these keep to the cache by themselves,
-# and the pixels that need more are then enough together.
+# Times as many pixels in a tile whose steps are compiled, which keep to the cache by themselves, or
+# on a device: the pixels that need more are then enough together.
 _COMPILED: Final = 8
 # Tiles whose pixels are read together where they are then sorted by their noise.
 _TOGETHER: Final = 12
@@ -268,7 +268,8 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
     width = block.sizes["x"]
-    times = _COMPILED if method.compiled and len(inputs.bands) == 2 else 1
+    large = len(inputs.bands) == 2 or getattr(inputs.settings, "device", None) is not None
+    times = _COMPILED if method.compiled and large else 1
     fitting = max(1, min(times * PIXELS, times * SAMPLES // block.sizes["time"]))
     most = int(getattr(inputs.settings, "batch", fitting))
     size = most if displacement is None else max(width, _TOGETHER * min(most, PIXELS))
