@@ -73,10 +73,10 @@ class Joint:
     factor: Array  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
-    def difference(self, rows: slice) -> Array:
+    def difference(self, rows: slice, frames: slice | Whole = slice(None)) -> Array:
         """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of rows; 0 where not known."""
         here, beside = (
-            self.result[f"{one}_temperature"].values[:, rows].astype(np.float64)
+            self.result[f"{one}_temperature"].values[frames, rows].astype(np.float64)
             for one in ("object", "background")
         )
         here, beside = (one.reshape(len(one), -1) for one in (here, beside))
@@ -125,13 +125,15 @@ def solve(
     threads: Executor,
     *,
     pooled: bool = False,
+    before: Joint | None = None,
     blur: float = 0.0,
 ) -> Joint | None:
     """
     Solve the equations of all pixels, from a result that takes x(p) for x(r).
 
-    Writes x(r) as the object temperature and x(p) as the background temperature of the result.
-    None, and nothing is written, where the object hardly differs between the two places.
+    Or from one of inputs with the difference of a solution `before`. Writes x(r) as the object
+    temperature and x(p) as the background temperature of the result. None, and nothing is written,
+    where the object hardly differs between the two places.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         film, there, stds = (
@@ -144,8 +146,16 @@ def solve(
         some = np.unique(np.linspace(0, len(film) - 1, _LOOKED_AT).astype(np.intp))
         first, steps, change, variance = _first_band(inputs, equations.loose, some)
         curve = inputs.curves[inputs.bands[0]]
+        weights, every = system.weights(inputs, raw)[1:], slice(0, result.sizes["y"])
+        weights = np.where(solved, weights, 0.0)
+
+        def moved(frames: slice | Whole) -> Array | float:
+            """Part (pixel, frame) [K] of q that the inputs of the result were without."""
+            apart = 0.0 if before is None else before.difference(every, frames).T
+            return np.sum(weights.T[:, np.newaxis] * apart, axis=2)
+
         both = partial(_both, curve, solved, system.coefficients(inputs, raw, solved))
-        looked_at = partial(both, _bridge(film[some], solved), change[:, some])
+        looked_at = partial(both, _bridge(film[some], solved), moved(some), change[:, some])
         here, beside, _ = looked_at(equations)
         # In units of the deviation or, of a method without one, of the noise.
         std = np.where(np.isfinite(stds[some]), stds[some], inputs.noise.min())
@@ -161,7 +171,9 @@ def solve(
         _bridge(film, solved)
         unsettled = np.zeros(solved.size, dtype=bool)
         parts = [slice(at, at + _FRAMES) for at in range(0, len(film), _FRAMES)]
-        results = threads.map(lambda part: both(film[part], change[:, part], equations), parts)
+        results = threads.map(
+            lambda part: both(film[part], moved(part), change[:, part], equations), parts
+        )
         for part, (*pair, step) in zip(parts, results, strict=True):
             film[part], there[part] = (
                 np.where(solved, curve.temperature(one.T + curve.reference), np.nan) for one in pair
@@ -180,6 +192,7 @@ def _both(
     solved: Mask,
     shares: Array,
     alone: Array,
+    moved: Array | float,
     change: Array,
     equations: system.Equations,
 ) -> tuple[Array, Array, Array]:
@@ -188,6 +201,7 @@ def _both(
         signal = np.where(solved, curve.signal(alone) - curve.reference, 0.0)
         signal = np.ascontiguousarray(signal.T, dtype=np.float32)
         target = shares[0][:, np.newaxis] * signal + equations.other_bands(shares[1:], signal)
+        target += moved
         return equations.solve(target, signal, change)
 
 

@@ -295,10 +295,15 @@ def _solve_jointly(
     _separate_all(inputs, material, result, threads, bar)
     both = joint.solve(inputs, result, threads, blur=blur)
     if inputs.labels is not None:
-        apart = inputs if both is None else replace(inputs, difference=both.difference)
+        apart = inputs
+        if both is not None:
+            # Without the difference the backgrounds, which bend the bands apart, are far off.
+            films = result[["object_temperature", "background_temperature"]].copy(deep=True)
+            both = replace(both, result=films)
+            apart = replace(inputs, difference=both.difference)
         material = pooling.materials(apart, threads, bar, every=True)
-        _separate_all(inputs, material, result, threads, bar)
-        both = joint.solve(inputs, result, threads, pooled=True)
+        _separate_all(apart, material, result, threads, bar)
+        both = joint.solve(inputs, result, threads, pooled=True, before=both)
     if both is not None:
         apart = replace(inputs, difference=both.difference)
         material = material if inputs.labels is None else pooling.materials(apart, threads, bar)

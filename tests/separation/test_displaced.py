@@ -75,6 +75,26 @@ def test_cameras_apart_are_as_good_as_at_one_place(moved: tuple[xr.Dataset, ...]
     assert 0.92 < got["cover"] < 0.98
 
 
+def test_backgrounds_of_two_materials_are_told_before_the_pooled_object() -> None:
+    """The bend between the responses is that of the right background, not of one tens of kelvin off."""
+    width, shift, rig = 24, np.zeros((2, 20, 48)), simulation.Rig(noise=(0.003, 0.03))
+    shift[1] = 4.0
+    concrete = GLASS.copy(data=[0.928, 0.871])
+    emissivity = xr.concat([GLASS] * width + [concrete] * width, "x").expand_dims(y=20)
+    emissivity, rng = emissivity.transpose("band", "y", "x"), np.random.default_rng(1)
+    scene = SMALL.draw(TIME, emissivity, rng, shift)
+    capture = simulation.observe(scene, rig.response(), rng)
+    # The second camera sees glass beside the first columns of concrete: a ratio of its own.
+    columns = np.repeat([0, 1, 2], [width, 4, width - 4])
+    labels = xr.DataArray(np.tile(columns, (20, 1)), dims=("y", "x"))
+    options = {"pool": labels, "reflection_shift": field(shift)}
+    got = judged(scene, separation.solve(capture, rig.response(), **options))
+    print(got)
+    assert got["good"] > 0.85
+    assert got["rmse"] < 0.005
+    assert got["cover"] > 0.88
+
+
 def test_pixels_without_a_pair_are_flagged(moved: tuple[xr.Dataset, ...]) -> None:
     """Where the second camera does not see the reflection nothing is estimated, with a reason."""
     *_, shift, result = moved
