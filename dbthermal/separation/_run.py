@@ -67,8 +67,9 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     source : str, Path, Dataset, or a sequence of these
         Stage `corrected` of `schema`, as for `solve`: a folder ``*.zarr`` of `store.save`, which
         every process opens by itself, or a lazy Dataset (of zarr, dask), of which every process is
-        sent its rows. Of dask's a chunk's rows are read once, for all blocks in it. What `correct_capture` or `align` leave to be computed, threads can take, and
-        the workers of a cluster, not those of a ProcessPoolExecutor.
+        sent its rows; those of a chunk of dask's are read once, for all their blocks. What
+        `correct_capture` or `align` leave to be computed, threads can take, and the workers of a
+        cluster, not those of a ProcessPoolExecutor.
     target : str or Path, or as many
         Folder ``*.zarr`` for each result. While it is made, its parts are in ``*.zarr.parts``.
     response : Dataset
