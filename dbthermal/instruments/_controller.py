@@ -205,7 +205,14 @@ class Controller:
 
     def prepare(self) -> None:
         """Set the speeds, read them back, and enable the motor; WheelError if it takes not all."""
-        self._set_velocity()
+        wanted = self._settings.velocity, self._settings.acceleration
+        velocity, acceleration = self.scale.device_speeds(*wanted)
+        speeds = apt.VelocityParameters(CHANNEL, 0, acceleration, velocity)
+        self._send(Id.MOT_SET_VELPARAMS, data=speeds.pack())
+        reply = self._request(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
+        actual = apt.VelocityParameters.parse(reply)
+        _must_agree("velocity", actual.maximum, speeds.maximum)
+        _must_agree("acceleration", actual.acceleration, speeds.acceleration)
         self._set_home()
         self._send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
         reply = self._request(Id.MOD_REQ_CHANENABLESTATE, Id.MOD_GET_CHANENABLESTATE)
@@ -263,16 +270,6 @@ class Controller:
             f"Its model must begin with one of {sorted(MODELS)}."
         )
 
-    def _set_velocity(self) -> None:
-        wanted = self._settings.velocity, self._settings.acceleration
-        velocity, acceleration = self.scale.device_speeds(*wanted)
-        speeds = apt.VelocityParameters(CHANNEL, 0, acceleration, velocity)
-        self._send(Id.MOT_SET_VELPARAMS, data=speeds.pack())
-        reply = self._request(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
-        actual = apt.VelocityParameters.parse(reply)
-        _must_agree("velocity", actual.maximum, speeds.maximum)
-        _must_agree("acceleration", actual.acceleration, speeds.acceleration)
-
     def _set_home(self) -> None:
         """Set the speed of homing, and direction and switch where the settings give them."""
         settings = self._settings
@@ -326,8 +323,10 @@ class Controller:
             if not (received := self._transport.read(READ_SIZE, remaining)):
                 return None
             for message in reversed(self._sorted(received)):
-                is_reply = (message.id, message.source) == (reply, source)
-                if is_reply and channel in {0, _channel(message)}:
+                about = (
+                    int.from_bytes(message.data[:2], "little") if message.data else message.param1
+                )
+                if (message.id, message.source) == (reply, source) and channel in {0, about}:
                     return message
         return None
 
@@ -370,11 +369,6 @@ class Controller:
             f" It reported error {notice.code} of message 0x{notice.id:04X}: {notice.notes}."
             for notice in self._notices
         )
-
-
-def _channel(message: apt.Message) -> int:
-    """Channel that a message is about."""
-    return int.from_bytes(message.data[:2], "little") if message.data else message.param1
 
 
 def _must_agree(name: str, actual: int, expected: int) -> None:

@@ -236,27 +236,22 @@ class FilterWheel(Closing):
     def _follow(self, motion: "_Motion", is_over: "Callable[[_Motion, apt.Status], bool]") -> None:
         """Poll until a motion is over; stop the wheel if it takes too long."""
         motion.began = motion.changed = self._clock()
-        confirmed = 0
+        controller, confirmed = self._controller, 0
         while confirmed < CONFIRMATIONS:
-            status = self._poll(motion)
+            status = controller.status()
+            controller.raise_notice()
+            if faults := status.bits & FAULTS:
+                controller.stop()
+                raise StalledWheelError(
+                    f"The controller reports {faults.name}, and the wheel was stopped. "
+                    "Must be none."
+                )
+            motion.update(status, self._clock())
+            motion.reported = controller.has_reported(motion.end)
             confirmed = confirmed + 1 if is_over(motion, status) else 0
             if not confirmed:
                 self._check(motion, status)
             self._sleep(POLL_INTERVAL)
-
-    def _poll(self, motion: "_Motion") -> apt.Status:
-        """Take in the motor's state."""
-        controller = self._controller
-        status = controller.status()
-        controller.raise_notice()
-        if faults := status.bits & FAULTS:
-            controller.stop()
-            raise StalledWheelError(
-                f"The controller reports {faults.name}, and the wheel was stopped. Must be none."
-            )
-        motion.update(status, self._clock())
-        motion.reported = controller.has_reported(motion.end)
-        return status
 
     def _check(self, motion: "_Motion", status: apt.Status) -> None:
         """Raise if the wheel rests where it should not, stands still, or takes too long."""

@@ -117,11 +117,9 @@ class Boson(Closing):
         self._lock = threading.Lock()
 
     @classmethod
-    def from_url(
-        cls, url: str, *, timeout: float = REPLY_TIMEOUT, world: object | None = None
-    ) -> "Boson":
+    def from_url(cls, url: str, world: object | None = None) -> "Boson":
         """Open ``serial:///dev/ttyACM0`` or ``sim://boson``, see `open_serial`; nothing is sent."""
-        return cls(open_serial(url, baudrate=BAUDRATE, world=world), timeout=timeout)
+        return cls(open_serial(url, baudrate=BAUDRATE, world=world))
 
     def close(self) -> None:
         """Release the port, once an exchange of another thread is over; the camera goes on."""
@@ -257,13 +255,9 @@ class Boson(Closing):
                     "Must be a Boson's command port that no other program uses."
                 )
             key = (fslp.COMMAND_CHANNEL, self._sequence)
-            replies = [
-                frame
-                for frame in self._decoder.feed(piece)
-                if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
-            ]
-            if replies:
-                return replies[0]
+            for frame in self._decoder.feed(piece):
+                if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST:
+                    return frame
         raise BosonTimeoutError(
             f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
             "and the camera through with booting."
@@ -277,9 +271,5 @@ def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource
     return v4l2.open_url(url, stream, decode=telemetry.metadata)
 
 
-def _open_control(url: str, world: object | None) -> Boson:
-    return Boson.from_url(url, world=world)
-
-
-KIND: Final = CameraKind(_open_frames, _open_control, telemetry_rows=(0, telemetry.ROWS))
+KIND: Final = CameraKind(_open_frames, Boson.from_url, telemetry_rows=(0, telemetry.ROWS))
 """The kind of camera of a session's ``kind: boson``."""

@@ -188,7 +188,10 @@ class CaptureFile:
         attrs: Mapping[str, Any],
         chunk: int = CHUNK,
     ) -> None:
-        (rows, columns), telemetry_rows = _common_format(sources)
+        formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
+        if len(set(formats.values())) != 1:
+            raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
+        (rows, columns), telemetry_rows = next(iter(formats.values()))
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
         self._origin, self._chunk = origin, chunk
@@ -371,10 +374,3 @@ class CaptureFile:
             for name, variable in self._variables.items()
             if variable.dims[0] == "band"
         }
-
-
-def _common_format(sources: Mapping[str, FrameSource]) -> tuple[tuple[int, int], int]:
-    formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
-    if len(set(formats.values())) != 1:
-        raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
-    return next(iter(formats.values()))

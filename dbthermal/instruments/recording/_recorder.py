@@ -345,11 +345,6 @@ class _Run:
 
 
 def _check_space(path: Path, least: int) -> None:
-    if (available := _free(path)) < least:
+    if (available := shutil.disk_usage(path).free) < least:
         message = f"Too little space: {available} bytes are free. Must be {least}"
         raise OSError(errno.ENOSPC, message, os.path.realpath(path))
-
-
-def _free(path: Path) -> int:
-    """Space that is free on the file system of a folder [byte]."""
-    return shutil.disk_usage(path).free
