@@ -119,7 +119,9 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
     kept = ("clock", "time_offset", "frames_lost", "transform")
     attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
-    halo = _halo(field)
+    halo = 1  # rows around others from which their object is told
+    if field is not None:
+        halo += int(np.ceil(_SHIFTS * np.nanmax(np.abs(field["shift"].sel(axis="y").values))))
 
     def separated(rows: slice) -> xr.Dataset:
         """Some rows of the result."""
@@ -260,10 +262,3 @@ def _blocks(aligned: xr.Dataset, halo: int) -> Iterator[slice]:
     rows = max(_FEWEST, together - 2 * halo)
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
-
-
-def _halo(field: xr.Dataset | None) -> int:
-    """Rows around others from which their object is told, if the cameras see reflections apart."""
-    if field is None:
-        return 1
-    return 1 + int(np.ceil(_SHIFTS * np.nanmax(np.abs(field["shift"].sel(axis="y").values))))

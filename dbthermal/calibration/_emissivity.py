@@ -160,12 +160,6 @@ class _Signals(NamedTuple):
         scaled = values / variance
         return np.asarray(scaled - (common / variance).T @ np.linalg.solve(inner, common @ scaled))
 
-    def adjusted_x(self, emissivity: float, weighted: Array) -> Array:
-        """Abscissa (n) [count] as the fit adjusts it, from the weighted residual (n)."""
-        # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
-        by_object = emissivity * self.emitted.covariance(weighted)
-        return self.x + by_object - (1.0 - emissivity) * self.reflected.covariance(weighted)
-
 
 def fit_emissivity(
     measured: xr.Dataset,
@@ -375,8 +369,11 @@ def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]
     emissivity = float(x @ y / (x @ x))
     for _ in range(_ITERATIONS):
         # Scatter of the readings would pass for contrast and pull the slope down: York et al.
-        # (2004) weigh by the abscissa as the fit adjusts it.
-        adjusted = signals.adjusted_x(emissivity, signals.weighted(emissivity, y - emissivity * x))
+        # (2004) weigh by the abscissa as the fit adjusts it,
+        # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
+        weighted = signals.weighted(emissivity, y - emissivity * x)
+        adjusted = x + emissivity * signals.emitted.covariance(weighted)
+        adjusted = adjusted - (1.0 - emissivity) * signals.reflected.covariance(weighted)
         weights = signals.weighted(emissivity, adjusted)
         previous, emissivity = emissivity, float((weights @ y) / (weights @ x))
         if abs(emissivity - previous) < _CONVERGED:

@@ -118,10 +118,7 @@ class Explorer(anywidget.AnyWidget):
             answer, buffers = {"error": f"{error}"}, []
         finally:
             self.view.progress = None
-        self.send(
-            {**answer, **key},
-            [np.asarray(one).tobytes() for one in buffers],
-        )
+        self.send({**answer, **key}, [np.asarray(one).tobytes() for one in buffers])
 
     def _answer_start(self, _: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer panes, times, events and legend; palettes and classes of pixels."""

@@ -188,7 +188,9 @@ class Controller:
         """
         for unit, motor in ADDRESSES:
             try:
-                info = self._greet(unit)
+                for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
+                    self._transport.write(apt.command(identifier, destination=unit))
+                info = apt.Info.parse(self._request(Id.HW_REQ_INFO, Id.HW_GET_INFO, unit=unit))
             except NoReplyError:
                 continue
             self._scale_of(info)
@@ -250,12 +252,6 @@ class Controller:
             reported = self._reported()
             self._notices.clear()
             raise WheelError(f"The controller is not well.{reported}")
-
-    def _greet(self, unit: int) -> apt.Info:
-        """Begin as the maker's example does, and ask for the identity."""
-        for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
-            self._transport.write(apt.command(identifier, destination=unit))
-        return apt.Info.parse(self._request(Id.HW_REQ_INFO, Id.HW_GET_INFO, unit=unit))
 
     def _scale_of(self, info: apt.Info) -> Scale:
         """Scale of a controller, if it is one that drives this wheel."""

@@ -168,4 +168,5 @@ def _frame(escaped: bytes) -> Frame | None:
         return None
     if _CHECKSUM.pack(checksum(body)) != sent:
         return None
-    return Frame(*_HEADER.unpack_from(body), data=body[_HEADER.size :])
+    channel, sequence, command, status = _HEADER.unpack_from(body)
+    return Frame(channel, sequence, command, status, body[_HEADER.size :])

@@ -171,22 +171,18 @@ def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
     opened = nodes if kind.families else [dev / f"bus/usb/{raw.bus:03d}/{raw.address:03d}"]
     denied = [node for node in opened if node.exists() and not os.access(node, os.R_OK | os.W_OK)]
     if denied:
-        warnings.append(f"No permission for {', '.join(map(str, denied))}. {_udev_advice(kind)}")
+        # A rule that admits the user at the machine, and the group plugdev.
+        rule = (
+            f'ATTRS{{idVendor}}=="{kind.vendor:04x}", ATTRS{{idProduct}}=="{kind.product:04x}", '
+            'MODE="0660", GROUP="plugdev", TAG+="uaccess"'
+        )
+        warnings.append(
+            f"No permission for {', '.join(map(str, denied))}. Type this, and plug it in again: "
+            f"echo '{rule}' | sudo tee -a {RULES} && sudo udevadm control --reload"
+        )
     serial = number.read_text("utf-8", "backslashreplace").strip() if number.exists() else ""
     return replace(
         device, serial=serial, nodes=tuple(str(node) for node in nodes), warnings=tuple(warnings)
-    )
-
-
-def _udev_advice(kind: Kind) -> str:
-    """Line to type: a rule that admits the user at the machine, and the group plugdev."""
-    rule = (
-        f'ATTRS{{idVendor}}=="{kind.vendor:04x}", ATTRS{{idProduct}}=="{kind.product:04x}", '
-        'MODE="0660", GROUP="plugdev", TAG+="uaccess"'
-    )
-    return (
-        f"Type this, and plug it in again: echo '{rule}' | sudo tee -a {RULES} "
-        "&& sudo udevadm control --reload"
     )
 
 

@@ -16,18 +16,11 @@ from dbthermal._arrays import Array
 from dbthermal.explorer import Region, View
 from dbthermal.figures import drawing
 from dbthermal.reporting._films import FILMS, VIEWED, Unit, sampled, video, viewer
-from dbthermal.reporting._page import (
-    Section,
-    image_tag,
-    save_page,
-    table,
-)
+from dbthermal.reporting._page import Section, image_tag, save_page, table
 from dbthermal.schema import Status
 
 Curves = Mapping[str, Mapping[str, xr.Dataset]]
 
-_FILMED: Final = 240  # frames of the film, at most
-_FASTEST: Final = 30.0  # Hz
 _SPREAD: Final = 0.02  # of emissivities of samples of one material
 _WORDS: Final = {
     "method": "method",
@@ -114,20 +107,23 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     chosen = dict(regions) or {
         "whole image": Region("rectangle", ((0, 0), (view.shape[0], view.shape[1])))
     }
+    shown = [one for one in view.panes if one in FILMS or one.startswith("emissivity ")]
     curves = {
-        name: {pane: view.curve(pane, region) for pane in view.panes if _is_averaged(pane)}
-        for name, region in chosen.items()
+        name: {pane: view.curve(pane, region) for pane in shown} for name, region in chosen.items()
     }
     table_ = emissivity.embedded_table() if materials is None else materials
-    numbers = {
-        "scene": _scene(view),
+    (rows, columns), frames = view.shape, int(view.time.size)
+    seconds = float(view.time[-1] - view.time[0])
+    sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
+    if "method" in result.attrs:
+        sentence += f"; separated by the method '{result.attrs['method']}'"
+    numbers: dict[str, Any] = {
+        "scene": {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds},
         "validity": _validity(view),
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
     sections = [
-        Section(
-            "Scene", [_scene_sentence(view), video(view, unit, title, codec), viewer(view, unit)]
-        ),
+        Section("Scene", [f"{sentence}.", video(view, unit, title, codec), viewer(view, unit)]),
         Section("Regions", list(_regions(view, unit, chosen, curves))),
         Section("What can be trusted", list(_trust(view, numbers["validity"]))),
         Section("Emissivities", list(_emissivities(numbers["regions"]))),
@@ -141,26 +137,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         numbers=numbers,
         provenance=result.attrs.get("provenance", {}) if provenance is None else provenance,
     )
-
-
-def _is_averaged(name: str) -> bool:
-    """A pane of which the regions' means are wanted."""
-    return name in FILMS or name.startswith("emissivity ")
-
-
-def _scene(view: View) -> dict[str, Any]:
-    """Size and duration."""
-    rows, columns = view.shape
-    seconds = float(view.time[-1] - view.time[0])
-    return {"rows": rows, "columns": columns, "frames": int(view.time.size), "duration_s": seconds}
-
-
-def _scene_sentence(view: View) -> str:
-    """Size, duration and method in a sentence."""
-    scene, attrs = _scene(view), view.data.attrs
-    text = f"{scene['rows']} rows of {scene['columns']} pixels, {scene['frames']} frames in "
-    text += f"{scene['duration_s']:.1f} s"
-    return text + (f"; separated by the method '{attrs['method']}'." if "method" in attrs else ".")
 
 
 def _origin(view: View) -> str:
