@@ -4,7 +4,7 @@
 step. With a target on disk it works by rows, in the memory of some of them.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from dbthermal import schema, store
+from dbthermal import _rows, schema, store
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture
@@ -137,9 +137,11 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
 
     if target is None:
         return separated(slice(0, aligned.sizes["y"]))
-    store.save_rows(
-        map(separated, _blocks(aligned, halo)), target, provenance or store.provenance({})
-    )
+    counts = aligned["counts"]
+    rows = _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"]) - 2 * halo
+    samples = max(_FEWEST, rows) * counts.size // aligned.sizes["y"]
+    blocks = _rows.blocks(counts.shape, samples)
+    store.save_rows(map(separated, blocks), target, provenance or store.provenance({}))
     return store.open_dataset(target)
 
 
@@ -253,12 +255,3 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
         values[name] = (field[name].dims, np.where(lost[near], np.nan, wide), field[name].attrs)
     here = {dim: aligned[dim] for dim in ("y", "x") if dim in aligned.coords}
     return xr.Dataset(values, coords={"axis": field["axis"], **here}, attrs=field.attrs)
-
-
-def _blocks(aligned: xr.Dataset, halo: int) -> Iterator[slice]:
-    """Rows that are separated together, with a halo on both sides."""
-    height = aligned.sizes["y"]
-    together = _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"])
-    rows = max(_FEWEST, together - 2 * halo)
-    for top in range(0, height, rows):
-        yield slice(top, min(top + rows, height))

@@ -268,13 +268,11 @@ def reflector_emissivity(
     measured : Dataset
         Stage `reflector`: `counts` of the object and `reflected_counts` of the foil (band,
         measurement) [count]; `object_temperature` by contact (measurement) [K].
-    response : Dataset
-        From `fit_response`, with its noise, which both counts have.
     reading_std : tuple of float
         Standard deviation of one reading of the contact thermometer, and of the reflected
         temperature beyond the camera's noise, as from one part of the foil to another [K].
-    bias : Bias
-        Errors that all contact readings have in common; its terms of the background are not used.
+    response, bias
+        As for `fit_emissivity`; the terms of the background are not used.
 
     Returns
     -------

@@ -11,24 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from PIL import Image
-from scipy.constants import zero_Celsius
 
 from dbthermal import figures, store
 from dbthermal._arrays import Array
-from dbthermal.explorer._films import Pane
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing
 
 SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc")
 _MOST_COLUMNS: Final = 3
-
-
-def unit(pane: Pane, *, celsius: bool) -> tuple[str, float]:
-    """Unit in which a pane is shown, and what is taken from its values for it."""
-    if pane.absolute and celsius:
-        return "\N{DEGREE SIGN}C", zero_Celsius
-    return pane.units, 0.0
 
 
 def figure(
@@ -58,7 +49,7 @@ def figure(
             axis.set(xticks=[], yticks=[])
             axis.set_title("Status: green is without a flag", fontsize=9)
         else:
-            units, offset = unit(pane, celsius=celsius)
+            units, offset = pane.unit(celsius=celsius)
             low, high = limits.get(name) or view.limits(name)
             image = xr.DataArray(view.frame(name, index) - offset, dims=("y", "x"))
             label = units if units != "1" else ""
@@ -156,7 +147,7 @@ def save(  # noqa: PLR0913 - what the page shows, by name
 
 def _table(view: View, found: xr.Dataset, *, celsius: bool) -> str:
     """Curves as comma-separated values, a row a time, with names and units in the first."""
-    units, offset = unit(view.panes[found.attrs["pane"]], celsius=celsius)
+    units, offset = view.panes[found.attrs["pane"]].unit(celsius=celsius)
     names = [("mean", offset), ("minimum", offset), ("maximum", offset), ("std", 0.0)]
     columns = {"time [s]": found["time"].values} if "time" in found.coords else {}
     for region in map(str, found["region"].values):

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.constants import zero_Celsius
 
 from dbthermal import _rows, schema, store
 from dbthermal._arrays import Array, Mask
@@ -55,6 +56,12 @@ class Pane:
         if self.name == "status":
             return "status"
         return "film" if self.array.ndim == 3 else "map"
+
+    def unit(self, *, celsius: bool) -> tuple[str, float]:
+        """Unit in which the values are shown, and what is taken from them for it."""
+        if self.absolute and celsius:
+            return "\N{DEGREE SIGN}C", zero_Celsius
+        return self.units, 0.0
 
     @cached_property
     def _source(self) -> npt.NDArray[Any]:

@@ -108,9 +108,7 @@ class TransportError(OSError):
 class Transport(Protocol):
     """A line to a device, as a driver needs it; a context manager in each implementation."""
 
-    @property
-    def is_simulated(self) -> bool:
-        """True if the device is emulated."""
+    is_simulated: bool  # True if the device is emulated
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device is gone."""
@@ -128,7 +126,7 @@ class Transport(Protocol):
 class SerialTransport(Closing):
     """An open serial port of pyserial, see `open_serial`; `url` is its name in messages."""
 
-    is_simulated: Final = False
+    is_simulated = False
 
     def __init__(self, port: "serial.Serial", url: str) -> None:
         self.url = url

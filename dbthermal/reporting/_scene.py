@@ -15,7 +15,7 @@ from dbthermal import emissivity, figures, schema
 from dbthermal._arrays import Array
 from dbthermal.explorer import Region, View
 from dbthermal.figures import drawing
-from dbthermal.reporting._films import FILMS, VIEWED, Unit, sampled, video, viewer
+from dbthermal.reporting._films import FILMS, VIEWED, sampled, video, viewer
 from dbthermal.reporting._page import Section, image_tag, save_page, table
 from dbthermal.schema import Status
 
@@ -103,7 +103,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     view = View(data, capture, response)
     if "object_temperature" not in view.panes:
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
-    result, unit = view.data, Unit(celsius=celsius)
+    result = view.data
     chosen = dict(regions) or {
         "whole image": Region("rectangle", ((0, 0), (view.shape[0], view.shape[1])))
     }
@@ -123,8 +123,15 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
     sections = [
-        Section("Scene", [f"{sentence}.", video(view, unit, title, codec), viewer(view, unit)]),
-        Section("Regions", list(_regions(view, unit, chosen, curves))),
+        Section(
+            "Scene",
+            [
+                f"{sentence}.",
+                video(view, title, codec, celsius=celsius),
+                viewer(view, celsius=celsius),
+            ],
+        ),
+        Section("Regions", list(_regions(view, chosen, curves, celsius=celsius))),
         Section("What can be trusted", list(_trust(view, numbers["validity"]))),
         Section("Emissivities", list(_emissivities(numbers["regions"]))),
         Section("What was assumed", [_assumed(view)]),
@@ -148,38 +155,33 @@ def _origin(view: View) -> str:
 
 
 def _regions(
-    view: View, unit: Unit, chosen: Mapping[str, Region], curves: Curves
+    view: View, chosen: Mapping[str, Region], curves: Curves, *, celsius: bool
 ) -> Iterator[Markup | str]:
     """Yield where the regions are, and their curves with two standard deviations."""
-    yield image_tag(_outlines(view, unit, chosen), "Object temperature, mean over time; regions.")
+    yield image_tag(
+        _outlines(view, chosen, celsius=celsius), "Object temperature, mean over time; regions."
+    )
     names = [name for name in FILMS if name in view.panes]
     figure, axes = drawing.canvas(len(names), 1, (9.0, 2.9 * len(names)))
+    unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
     for axis, name in zip(axes[:, 0], names, strict=True):
-        pane = view.panes[name]
         for region, color in zip(chosen, cycle(drawing.COLORS), strict=False):
             curve = curves[region][name]
-            mean, two = unit.of(curve["mean"].values, pane), 2 * curve["std"].values
+            mean, two = curve["mean"].values - zero, 2 * curve["std"].values
             axis.plot(view.time, mean, color=color, label=region, linewidth=1.2)
             axis.fill_between(
                 view.time, mean - two, mean + two, color=color, alpha=0.25, linewidth=0
             )
-        axis.set(title=pane.label, ylabel=f"[{unit.label(pane)}]")
+        axis.set(title=view.panes[name].label, ylabel=f"[{unit}]")
         axis.legend(frameon=False, fontsize=8)
     axes[-1, 0].set_xlabel("time [s]")
     yield image_tag(figure, "Means of the regions, and two standard deviations of these means.")
-    head = ["region", "pixels that count", f"object temperature [{unit.name}]", "its std [K]"]
+    head = ["region", "pixels that count", f"object temperature [{unit}]", "its std [K]"]
     rows = []
     for region in chosen:
         curve = curves[region]["object_temperature"]
-        mean = unit.of(curve["mean"].values, view.panes["object_temperature"])
-        rows.append(
-            [
-                region,
-                int(curve["pixels"].max()),
-                _range(mean),
-                _text(_plain(curve["std"].mean()), 3),
-            ]
-        )
+        std = _text(_plain(curve["std"].mean()), 3)
+        rows.append([region, int(curve["pixels"].max()), _range(curve["mean"].values - zero), std])
     yield table(head, rows)
     yield (
         "Pixels with a flag do not count, but those that were completed do. Errors that the pixels "
@@ -187,19 +189,18 @@ def _regions(
     )
 
 
-def _outlines(view: View, unit: Unit, chosen: Mapping[str, Region]) -> Figure:
+def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Figure:
     """Mean picture of the object with the regions on it."""
     pane = view.panes["object_temperature"]
+    unit, zero = pane.unit(celsius=celsius)
     film, step = sampled(view, pane.name, VIEWED, VIEWED * 200_000)
     with np.errstate(invalid="ignore"):
         count = film.notnull().sum("time")
-        image = unit.of(film.sum("time") / count.where(count > 0), pane)
+        image = film.sum("time") / count.where(count > 0) - zero
     aspect = view.shape[0] / view.shape[1]
     figure, axes = drawing.canvas(1, 1, (5.6, 4.6 * aspect + 0.5))
-    label = f"[{unit.label(pane)}]"
-    drawing.draw_image(
-        figure, axes[0, 0], image, pane.label, label, limits=drawing.limits_of(image)
-    )
+    limits = drawing.limits_of(image)
+    drawing.draw_image(figure, axes[0, 0], image, pane.label, f"[{unit}]", limits=limits)
     for (name, region), color in zip(chosen.items(), cycle(drawing.COLORS), strict=False):
         mask = region.mask((view.shape[0], view.shape[1]))[::step, ::step]
         if mask.all():

@@ -9,7 +9,7 @@ telemetry, serial line and frozen image, see `camera.next_shutter`.
 import math
 import time as system_time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Final
 
@@ -65,24 +65,20 @@ class EmulatedCamera(Closing):
     sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
     kind: str = "boson"  # of `MODELS`
 
-    is_simulated: Final = True
+    is_simulated: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
         self._state = self.world.camera(self.name)
         self._state.has_frames = True
-        self._number = 0
-        self._start: float | None = None
-        self._last: Counts = np.full(self.shape, CLOSED, dtype=np.uint16)
-        self._open = True
-
-    @property
-    def identity(self) -> Mapping[str, str]:
-        """Device, model and number, labelled as emulated."""
-        return {
+        self.identity: Mapping[str, str] = {
             "device": f"sim://{self.kind}/{self.name}",
             "model": MODELS[self.kind][0],
             "serial_number": str(self._state.serial_number),
         }
+        self._number = 0
+        self._start: float | None = None
+        self._last: Counts = np.full(self.shape, CLOSED, dtype=np.uint16)
+        self._open = True
 
     def close(self) -> None:
         """Give no more frames; a second call does nothing."""
