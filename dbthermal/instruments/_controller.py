@@ -17,9 +17,8 @@ units, and addresses). Facts alone, no code.
 import logging
 import threading
 import time as system_time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Annotated, Final, Literal
 
 from pydantic import ConfigDict, Field
@@ -105,16 +104,11 @@ class Scale:
         return round(counts[0] * self.velocity), round(counts[1] * self.acceleration)
 
 
+# 200 full steps of 2048 microsteps, and of 128.
 BSC20X: Final = Scale(turn=409_600, velocity=53.68, acceleration=53.68 * 204.94e-6)
-"""200 full steps of 2048 microsteps."""
-
 BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
-"""200 full steps of 128 microsteps."""
-
-MODELS: Final[Mapping[str, Scale]] = MappingProxyType(
-    {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
-)
-"""Beginnings of the model names that are accepted; some BSC201 call themselves SCC201."""
+# Beginnings of the model names that are accepted; some BSC201 call themselves SCC201.
+MODELS: Final = {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
 
 
 class WheelError(RuntimeError):

@@ -34,12 +34,8 @@ from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 __all__ = ["Devices", "ReadingError", "Thermocouples", "open_devices"]
 __dir__ = __all__.copy
 
-SCAN_AGE: Final = 1.0
-"""Longest time for which a scan of all thermocouples gives the readings of its channels [s]."""
-
-FLUSH_TIMEOUT: Final = 2.0
-"""Longest time in which the frames that a driver holds are read and discarded [s]."""
-
+SCAN_AGE: Final = 1.0  # longest time for which a scan gives the readings of its channels [s]
+FLUSH_TIMEOUT: Final = 2.0  # longest time in which the frames that a driver holds are read [s]
 WHEEL: Final = "filter_wheel"  # name of the wheel, and of the reading of its slot
 
 

@@ -48,17 +48,13 @@ MOVE_TIMEOUT: Final = 20.0  # longest move [s]
 START_TIMEOUT: Final = 1.0  # until a move is seen to start [s]
 STALL_TIMEOUT: Final = 2.0  # for which the position may not change in a move [s]
 POLL_INTERVAL: Final = 0.05  # between two status requests [s]
-
-FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
-"""State that is an error; it is uncertain if a wheel's controller sets these bits."""
-
 BAUDRATE: Final = 115_200  # [bit/s]
-
+# State that is an error; it is uncertain if a wheel's controller sets these bits.
+FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
+# Bits of a wheel that moves. The jogging bits are left out: they were seen to stick.
 MOVING: Final = (
     apt.StatusBits.MOVING_FORWARD | apt.StatusBits.MOVING_REVERSE | apt.StatusBits.HOMING
 )
-"""Bits of a wheel that moves. The jogging bits are left out: they were seen to stick."""
-
 CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
 
 

@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from dbthermal import _text as texts
 
 MEMORY: Final = 2.0**30  # largest memory that a video may take, by default [byte]
-
-PIXEL: Final = 9
-"""Memory of a pixel of a frame: number of its colour, position in the palette, mask [byte]."""
+PIXEL: Final = 9  # memory of a pixel: number of its colour, position in the palette, mask [byte]
 
 _CONTAINERS: Final = {
     "mp4": (4, (b"ftyp", b"moov", b"mdat", b"wide", b"free")),

@@ -68,12 +68,13 @@ def two_bands(
             f"Different sizes {shapes[0]} and {shapes[1]} pixels of the bands {names}. Must be "
             "equal: resample the second recording, or crop the first."
         )
-    dates = [one.attrs.get("start") for one in pair]
-    if offset is None and None in dates:
-        raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
-    if offset is None:
+    late = offset
+    if late is None:
+        dates = [one.attrs.get("start") for one in pair]
+        if None in dates:
+            raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
         begun, later = (datetime.fromisoformat(str(date)) for date in dates)
-    late = (later - begun).total_seconds() if offset is None else float(offset)
+        late = (later - begun).total_seconds()
     starts, stops = ([one["time"].values[place] for one in pair] for place in (0, -1))
     overlap = min(stops[0], stops[1] + late) - max(starts[0], starts[1] + late)
     if not overlap > 0 and max(one.sizes["time"] for one in pair) > 1:

@@ -49,16 +49,10 @@ EnumT = TypeVar("EnumT", bound=IntEnum)
 
 BAUDRATE: Final = 921600  # speed of the line [bit/s]; over USB probably without effect
 REPLY_TIMEOUT: Final = 1.0  # longest wait for a reply [s], as in the vendor's own software
-
-REPEATS: Final = 2
-"""Repetitions of a reading without a reply; a command that changes the camera is sent once."""
-
+REPEATS: Final = 2  # of a reading without a reply; what changes the camera is sent once
 FFC_TIMEOUT: Final = 10.0  # longest wait for a flat-field correction [s]
 POLL: Final = 0.05  # time between two questions while waiting [s]
-
-MAXIMUM_RECEIVED: Final = 65536
-"""Most bytes to search for one reply: a line that talks without end is an error."""
-
+MAXIMUM_RECEIVED: Final = 65536  # most bytes to search for one reply: some lines talk without end
 _READ_SIZE: Final = 4096
 
 

@@ -34,12 +34,8 @@ from dbthermal.instruments.transport import Closing
 
 Picture = Callable[[float], Counts]
 NETD: Final = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
-
-BUFFERS: Final = 32
-"""Frames that are held while no program reads, as by the V4L2 driver; beyond, they are dropped."""
-
-CLOSED: Final = 10_000
-"""Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
+BUFFERS: Final = 32  # frames that are held while no program reads, as by the V4L2 driver
+CLOSED: Final = 10_000  # of every pixel where no filter is in the beam [count]
 
 MODELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
     {"boson": ("emulated Boson", math.inf), "y16": ("emulated Y16 camera", 120.0)}
