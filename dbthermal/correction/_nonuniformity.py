@@ -84,10 +84,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     noise = np.sqrt(np.median(variance, axis=1) * freedom / chi2.median(freedom))
     for band, value in zip(counts["band"].values, noise, strict=True):
         if not value > 0:
-            raise ValueError(
-                f"Invalid noise {value} count of the movies in band '{band}'. Must be positive: "
-                "the samples must be finite and vary from frame to frame."
-            )
+            rule = "Must be positive: the samples must be finite and vary from frame to frame"
+            raise ValueError(f"Invalid noise {value} count of the movies in band '{band}'. {rule}.")
     means = counts.mean("frame", dtype=np.float64, skipna=False)
     variables = schema.variables("blackbody_frames", {"counts": means.values, "noise": noise})
     return xr.Dataset(variables, means.coords, {"frames": frames})

@@ -255,10 +255,8 @@ class Controller:
         for beginning, scale in MODELS.items():
             if info.model.startswith(beginning):
                 return scale
-        raise WrongDeviceError(
-            f"Wrong device '{info.model}', number {info.serial_number}. "
-            f"Its model must begin with one of {sorted(MODELS)}."
-        )
+        rule = f"Its model must begin with one of {sorted(MODELS)}"
+        raise WrongDeviceError(f"Wrong device '{info.model}', number {info.serial_number}. {rule}.")
 
     def _set_home(self) -> None:
         """Set the speed of homing, and direction and switch where the settings give them."""

@@ -224,10 +224,8 @@ def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summ
     if not path.exists():
         return None
     if not is_complete(path):
-        raise ValueError(
-            f"Incomplete recording '{path}'. Must be complete: move it away, and this step is "
-            "recorded again."
-        )
+        rule = "Must be complete: move it away, and this step is recorded again"
+        raise ValueError(f"Incomplete recording '{path}'. {rule}.")
     attrs = store.open_dataset(path).attrs
     was = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
     if was[number : number + 1] != [temperature]:

@@ -199,10 +199,8 @@ def open_serial(
             path, baudrate, rtscts=rtscts, exclusive=True, write_timeout=WRITE_TIMEOUT
         )
     except OSError as error:
-        raise TransportError(
-            f"Could not open '{path}': {error}. It must exist, be yours to use, and in no "
-            "other program's use."
-        ) from error
+        rule = "It must exist, be yours to use, and in no other program's use"
+        raise TransportError(f"Could not open '{path}': {error}. {rule}.") from error
     with ExitStack() as stack:
         line = stack.enter_context(SerialTransport(port, url))
         if rtscts:

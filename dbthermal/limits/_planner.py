@@ -64,15 +64,11 @@ class CaptureDesign:
             if not np.isfinite(getattr(self, name)):
                 raise ValueError(f"Invalid {name} {getattr(self, name)} K. Must be finite.")
         if self.duration > self.period:
-            raise ValueError(
-                f"Invalid duration {self.duration} s of a pulse. Must be at most the period, "
-                f"{self.period} s."
-            )
+            rule = f"Must be at most the period, {self.period} s"
+            raise ValueError(f"Invalid duration {self.duration} s of a pulse. {rule}.")
         if round(self.seconds * self.rate) < 2:
-            raise ValueError(
-                f"Invalid capture of {self.seconds} s at {self.rate} 1/s. "
-                "Must have at least two frames."
-            )
+            rule = "Must have at least two frames"
+            raise ValueError(f"Invalid capture of {self.seconds} s at {self.rate} 1/s. {rule}.")
 
 
 def plan(

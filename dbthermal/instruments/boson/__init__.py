@@ -252,10 +252,8 @@ class Boson(Closing):
             for frame in self._decoder.feed(piece):
                 if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST:
                     return frame
-        raise BosonTimeoutError(
-            f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
-            "and the camera through with booting."
-        )
+        rule = "Must be a Boson's command port, and the camera through with booting"
+        raise BosonTimeoutError(f"No reply to '{name}' within {self.timeout:g} s. {rule}.")
 
 
 def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:

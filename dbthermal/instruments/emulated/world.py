@@ -103,10 +103,8 @@ class World:
             return math.nan
         temperatures = self.scene_temperatures()
         if place not in temperatures:
-            raise KeyError(
-                f"Unknown place '{place}' of thermocouple {channel}. "
-                f"Must be one of {sorted(temperatures)}."
-            )
+            rule = f"Must be one of {sorted(temperatures)}"
+            raise KeyError(f"Unknown place '{place}' of thermocouple {channel}. {rule}.")
         return temperatures[place]
 
     def add_camera(self, name: str, serial_number: int) -> CameraState:

@@ -124,10 +124,8 @@ def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
             ("shape", source.shape, session.shape),
         ):
             if value != expected:
-                raise ValueError(
-                    f"Invalid source of band '{band}': {name} is {value}. Must be {expected}, as "
-                    "the session says."
-                )
+                rule = f"Must be {expected}, as the session says"
+                raise ValueError(f"Invalid source of band '{band}': {name} is {value}. {rule}.")
 
 
 def _new_file(
