@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, namespace
 
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 
@@ -44,7 +44,7 @@ class Subspace:
 
     def leverage(self) -> Array:
         r"""Variance :math:`\sum_i \Phi_i(t)^2` (time, order) of fits to white noise of 1."""
-        result = np.zeros((self.orders, len(self.functions)))
+        result = namespace(self.functions).zeros_like(self.object_part.T[self.steps :])
         for column, (start, stop) in enumerate(self.spans):
             result[max(column - self.steps, 0) :, start:stop] += (
                 self.object_part[start:stop, column] ** 2
@@ -53,8 +53,8 @@ class Subspace:
 
     def columns(self, order: npt.NDArray[np.intp]) -> Mask:
         """Columns in use (column, pixel) at each pixel's order, 1 for the constant alone."""
-        places = np.arange(self.functions.shape[1])[:, np.newaxis]
-        return np.asarray(places < order + self.steps)
+        columns = namespace(order).arange(self.functions.shape[1], device=order.device)
+        return columns[:, np.newaxis] < order + self.steps
 
 
 def subspace(

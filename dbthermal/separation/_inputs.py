@@ -1,5 +1,6 @@
 """Inputs of a separation: the method, a capture and all that is known of it, checked."""
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Final
@@ -89,6 +90,24 @@ def require(settings: Any, method: str, name: str, holds: Any, rule: str) -> Non
     if not holds:
         value = getattr(settings, name)
         raise ValueError(f"Invalid {name} {value} of method '{method}'. Must {rule}.")
+
+
+def require_device(device: str, method: str) -> None:
+    """Refuse a device that torch cannot compute on here; ImportError without torch."""
+    try:
+        torch = importlib.import_module("torch")
+        torch.ones(1, dtype=torch.float64, device=device).item()
+    except ImportError as error:
+        raise ImportError(
+            f"Missing library 'torch' for device '{device}' of method '{method}'. Must be "
+            "installed: python -m pip install 'dbthermal[torch]'."
+        ) from error
+    except (AssertionError, RuntimeError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"Invalid device '{device}' of method '{method}'. Must be one on which torch has "
+            f"double precision here: {reason}"
+        ) from error
 
 
 def check(  # noqa: PLR0913 - all that the user gives, by name

@@ -6,7 +6,7 @@ cache. A tile's bands are in the order of their noise, the quietest first: the r
 emissivity needs a quiet ordinate.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, Self
 
@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import mixing
+from dbthermal._arrays import namespace
 from dbthermal.response import Curve
 from dbthermal.schema import Status
 from dbthermal.separation import _displaced as displaced
@@ -33,8 +34,8 @@ PIXELS: Final = 320
 SAMPLES: Final = 2**19
 """Samples of a band in a tile, at most: a long capture has tiles of fewer pixels."""
 
-# Times as many pixels in a tile whose steps are compiled: these keep to the cache by themselves,
-# and the pixels that need more are then enough together.
+# Times as many pixels in a tile whose steps are compiled, which keep to the cache by themselves, or
+# on a device: the pixels that need more are then enough together.
 _COMPILED: Final = 8
 # Tiles whose pixels are read together where they are then sorted by their noise.
 _TOGETHER: Final = 12
@@ -52,8 +53,12 @@ class Pixels:
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
         """Return the record of the selected pixels alone."""
+        return self.each(lambda values: values[..., selected])
+
+    def each(self, function: Callable[[Any], Any]) -> Self:
+        """Return the record with a function of each of its arrays."""
         values = ((field.name, getattr(self, field.name)) for field in fields(self))
-        parts: dict[str, Any] = {name: v if v is None else v[..., selected] for name, v in values}
+        parts: dict[str, Any] = {name: v if v is None else function(v) for name, v in values}
         return replace(self, **parts)
 
     def replace_pixels(self, selected: Mask | Whole, part: Self) -> None:
@@ -222,10 +227,8 @@ class Estimate(Pixels):
 
 def out_of_range(temperature: Array, std: Array, curve: Curve) -> Mask:
     """Temperatures [K] outside the calibrated range of a response by several deviations."""
-    margin = RANGE_SIGMAS * np.where(np.isnan(std), 0.0, std)
-    return np.asarray(
-        (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
-    )
+    margin: Array = RANGE_SIGMAS * namespace(std).nan_to_num(std, posinf=np.inf)
+    return (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
 
 
 @dataclass(frozen=True)
@@ -265,7 +268,8 @@ def cut(inputs: Inputs, rows: slice, material: Material | None = None) -> Iterat
     source = rows if displacement is None else displacement.source(rows)
     block = inputs.capture.isel(y=source).load()
     width = block.sizes["x"]
-    times = _COMPILED if method.compiled and len(inputs.bands) == 2 else 1
+    large = len(inputs.bands) == 2 or getattr(inputs.settings, "device", None) is not None
+    times = _COMPILED if method.compiled and large else 1
     fitting = max(1, min(times * PIXELS, times * SAMPLES // block.sizes["time"]))
     most = int(getattr(inputs.settings, "batch", fitting))
     size = most if displacement is None else max(width, _TOGETHER * min(most, PIXELS))

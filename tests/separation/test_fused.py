@@ -1,5 +1,6 @@
-"""The compiled steps of two bands repeat those stated for arrays, within rounding."""
+"""The steps stated for arrays: those compiled for two bands, and tensors, repeat them."""
 
+import sys
 from dataclasses import fields, replace
 from itertools import product
 
@@ -8,7 +9,7 @@ import pytest
 import xarray as xr
 
 from dbthermal import _smooth as smooth
-from dbthermal import response, simulation
+from dbthermal import response, separation, simulation
 from dbthermal.response import Curve
 from dbthermal.separation._subspace import (
     division,
@@ -26,6 +27,8 @@ TIME = np.arange(240) / 10.0  # s
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
 # Largest difference, relative to the deviation of a quantity or, if it has none, to its size.
 ROUNDING = 1e-3
+SATURATED = np.arange(8) == 1  # (x), at the top tenth of what they show
+TENSORS = 1e-6  # the same, of tensors over arrays
 
 
 def tile_of(emissivity: tuple[float, float] = (0.86, 0.72), highest: float = 353.15) -> Tile:
@@ -69,8 +72,8 @@ CASES = {
 }
 
 
-def assert_alike(one: steps.Solution, other: steps.Solution) -> None:
-    """Fail if a quantity of the compiled solution differs by more than rounding.
+def assert_alike(one: steps.Solution, other: steps.Solution, rounding: float = ROUNDING) -> None:
+    """Fail if a quantity of a solution differs from that of arrays by more than rounding.
 
     Where the ratios are those of noise, and the object is not defined, only step 1 is compared.
     """
@@ -91,14 +94,11 @@ def assert_alike(one: steps.Solution, other: steps.Solution) -> None:
         scale = scales.get(field.name, np.abs(b) + 1e-3 * np.abs(b[known]).mean()) + 1e-12
         error = np.abs(a[known] - b[known]) / np.broadcast_to(scale, b.shape)[known]
         print(f"{field.name}: {error.max():.1e}")
-        assert error.max() < ROUNDING, field.name
+        assert error.max() < rounding, field.name
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("least", [0.0, 0.2])
-@pytest.mark.parametrize("way", ["plain", "steps", "pieces", "material", "pattern", "linear"])
-def test_compiled_steps_are_those_of_arrays(case: str, least: float, way: str) -> None:
-    """Every quantity of every kind of pixel is the same in both forms, within rounding."""
+def posed(case: str, way: str) -> tuple[Tile, smooth.Subspace]:
+    """Tile of a case, and the functions of time that one way of posing it has."""
     tile = tile_of(**CASES[case])  # type: ignore[arg-type]
     segment = (TIME > 9.0).astype(np.intp)
     functions = smooth.subspace(TIME, 14, segment=segment if way == "steps" else None)
@@ -114,10 +114,86 @@ def test_compiled_steps_are_those_of_arrays(case: str, least: float, way: str) -
         table = RIG.response()
         lines = {name: response.curve(table, name, "linear") for name in RIG.bands}
         tile = replace(tile, curves=tuple(lines[curve.band] for curve in tile.curves))
+    return tile, functions
+
+
+WAYS = ["plain", "steps", "pieces", "material", "pattern", "linear"]
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("least", [0.0, 0.2])
+@pytest.mark.parametrize("way", WAYS)
+def test_compiled_steps_are_those_of_arrays(case: str, least: float, way: str) -> None:
+    """Every quantity of every kind of pixel is the same in both forms, within rounding."""
+    tile, functions = posed(case, way)
     with np.errstate(all="ignore"):
         one = fused.solve(tile, functions, 3.0, least)
         other = steps.solve(tile, functions, 3.0, least)
     assert_alike(one, other)
+
+
+@pytest.fixture(params=["cpu", "cuda"])
+def device(request: pytest.FixtureRequest) -> str:
+    """Device of torch; a skip where it has none of the kind."""
+    if request.param == "cuda" and not pytest.importorskip("torch").cuda.is_available():
+        pytest.skip("torch has no CUDA device here: tensors on a GPU are not compared")
+    return str(request.param)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("way", WAYS)
+def test_tensors_repeat_the_arrays(case: str, way: str, device: str) -> None:
+    """On tensors the same text gives the same, but for the order of its sums."""
+    tile, functions = posed(case, way)
+    with np.errstate(all="ignore"):
+        other = steps.solve(tile, functions, 3.0, 0.0)
+    assert_alike(steps.solve_on(device, tile, functions, 3.0, 0.0), other, TENSORS)
+
+
+@pytest.mark.parametrize("names", [("8-14", "9.5"), ("8-14", "9.5", "10.6")])
+def test_a_capture_on_a_device(
+    names: tuple[str, ...], device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bad, masked and saturated samples, rapid objects: the same bits; values within rounding."""
+    rig = simulation.Rig(bands=names, noise=(0.03, 0.35, 0.15)[: len(names)])
+    known = xr.DataArray([0.86, 0.72, 0.8][: len(names)], {"band": list(names)}, "band")
+    scene = simulation.walkers(TIME, (6, 8), known, np.random.default_rng(5), crossings=4)
+    scene["object_temperature"][120:, :, 6] += 3.0
+    capture = simulation.observe(scene, rig.response(), np.random.default_rng(5))
+    counts = capture["counts"].values  # (band, time, y, x)
+    counts[0, 40:43, 2, 2] = counts[1, :, 5, 3] = np.nan
+    np.minimum(counts, np.quantile(counts, 0.9, axis=1, keepdims=True), out=counts, where=SATURATED)
+    mask = xr.DataArray(np.full((TIME.size, 6, 8), True), dims=("time", "y", "x"))
+    mask[:20], mask[100:140, 3, 4] = False, False
+    settings = separation.SubspaceSettings(device=device)
+    one = separation.solve(capture, rig.response(), mask=mask)
+    monkeypatch.setattr(fused, "solve", None)
+    other = separation.solve(capture, rig.response(), mask=mask, settings=settings)
+    np.testing.assert_array_equal(other["status"], one["status"])
+    assert (one["status"] == 0).sum() >= 20
+    for name in ("object_temperature", "background_temperature", "emissivity", "reflection_ratio"):
+        value, expected, std = (
+            part.values for part in (other[name], one[name], one[f"{name}_std"])
+        )
+        np.testing.assert_array_equal(np.isfinite(value), np.isfinite(expected))
+        error, films = np.abs(value - expected), name.endswith("temperature")
+        print(f"{name}: {np.nanmax(error):.1e}")
+        # Films are of single precision: a few roundings of 300 K are 1e-4 K.
+        assert not np.any(error > ROUNDING * (std + 0.1 * films))
+
+
+@pytest.mark.parametrize("name", ["cuda:99", "abacus", "meta"])
+def test_a_device_that_is_not_there(name: str) -> None:
+    """A device that torch does not have is refused with its name."""
+    with pytest.raises(ValueError, match=f"Invalid device '{name}' of method 'subspace'. Must be"):
+        separation.SubspaceSettings(device=name)
+
+
+def test_a_device_without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error says which extra has the library."""
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(ImportError, match=r"Missing library 'torch' for .*dbthermal\[torch\]"):
+        separation.SubspaceSettings(device="cuda")
 
 
 @pytest.mark.parametrize("emissivity", [(0.86, 0.72), (0.9, 0.899), (0.3, 0.15)])

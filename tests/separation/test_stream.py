@@ -9,7 +9,7 @@ import xarray as xr
 
 from dbthermal import schema, simulation
 from dbthermal.schema import Status
-from dbthermal.separation import Stream, solve
+from dbthermal.separation import Stream, SubspaceSettings, solve
 from dbthermal.simulation import Rig
 
 RATE = 10.0  # [Hz]
@@ -253,6 +253,9 @@ def test_a_bad_stream_is_named(glass: Data) -> None:
         options: dict[str, Any] = {"frame_rate": RATE} | {name: 0.0}
         with pytest.raises(ValueError, match=name):
             Stream(capture, response, **options)
+    on_device = SubspaceSettings(device="cpu")
+    with pytest.raises(ValueError, match="Invalid device 'cpu' of a stream"):
+        Stream(capture, response, frame_rate=RATE, settings=on_device)
     with pytest.raises(ValueError, match="Missing noise of the response"):
         Stream(capture, response.drop_vars("noise"), frame_rate=RATE)
 

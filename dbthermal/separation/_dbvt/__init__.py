@@ -1,11 +1,10 @@
 """Settings of the paper's optimiser, algorithm DBVT; they need no torch, its modules do."""
 
-import importlib
 from dataclasses import dataclass
 from typing import Final
 
 from dbthermal import planck
-from dbthermal.separation._inputs import require
+from dbthermal.separation._inputs import require, require_device
 
 _CHOICES: Final = {
     "start": ("random", "subspace"),
@@ -107,6 +106,5 @@ class DbvtSettings:
         for name in (*positive, "first_share", "tolerance", "largest_step"):
             planck.require_positive(f"{name} of method 'dbvt'", getattr(self, name))
         require(self, "dbvt", "margin", 0 < self.margin < 0.5, "lie in (0, 0.5)")
-        cuda = self.device.startswith("cuda")
-        if cuda and not importlib.import_module("torch").cuda.is_available():
-            raise ValueError(f"Invalid device '{self.device}' of method 'dbvt'. CUDA is missing.")
+        if self.device.startswith("cuda"):
+            require_device(self.device, "dbvt")

@@ -132,6 +132,8 @@ class Stream:
         known |= {"reflection_shift": reflection_shift, "name": "stream", "response": response}
         known["method"] = replace(METHOD, minimum_frames=1, any_bands=False)
         inputs = _inputs.check(template, **known)
+        if inputs.settings.device is not None:
+            raise ValueError(f"Invalid device '{inputs.settings.device}' of a stream. Omit it.")
         self.bands = tuple(curve.band for curve in inputs.curves)
         responses.noise(response, list(self.bands))
         # From here on the quietest band is the first one.

@@ -3,6 +3,7 @@
 import numpy as np
 
 from dbthermal import mixing
+from dbthermal._arrays import like, namespace
 from dbthermal.separation._subspace.emission import Emission, weighted
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
 from dbthermal.separation._tiles import Array, Tile
@@ -21,7 +22,7 @@ def estimate(tile: Tile, emission: Emission, ratios: ReflectionRatio) -> tuple[A
     where r is the weighted mean of :math:`e_m / (1 - e_m)` and :math:`v = \kappa / s`.
     """
     bands = range(len(tile.noise))
-    noise = np.array(tile.noise)[:, np.newaxis]
+    noise = like(tile.noise, tile.signals)[:, np.newaxis]
     reflectivity = 1.0 - emission.emissivity
     precision = (reflectivity / noise) ** 2
     total = precision.sum(axis=0)
@@ -33,7 +34,7 @@ def estimate(tile: Tile, emission: Emission, ratios: ReflectionRatio) -> tuple[A
         for m in bands
     ]
     # Start from the mean signal, then one Gauss-Newton step of eq. 9 on the exact responses.
-    start = tile.temperature(0, np.asarray(sum(weights[m] * reflected[m] for m in bands)))
+    start = tile.temperature(0, weighted(reflected, weights))
     slopes = [curve.slope(start) for curve in tile.curves]
     curvature = sum(weights[m] * slopes[m] ** 2 for m in bands)
     step = sum(weights[m] * slopes[m] * (reflected[m] - tile.blackbody(m, start)) for m in bands)
@@ -50,7 +51,7 @@ def estimate(tile: Tile, emission: Emission, ratios: ReflectionRatio) -> tuple[A
     variance = 1.0 / (total * curvature) + object_share**2 * emission.smooth_variance
     variance += through * (through * emission.epsilon_variance - contrast * covariance)
     variance += contrast**2 * (of_first * ratios.inverse_energy + slope)
-    return background, np.asarray(variance)
+    return background, variance
 
 
 def pattern_variances(
@@ -73,10 +74,10 @@ def pattern_variances(
     ]
     steepness, slope = weighted(emitted, ratios.null_weights), tile.curves[0].slope(background)
     reflectivity = 1.0 - emission.emissivity
-    precision = (reflectivity / np.array(tile.noise)[:, np.newaxis]) ** 2
+    precision = (reflectivity / like(tile.noise, tile.signals)[:, np.newaxis]) ** 2
     direct = precision / precision.sum(axis=0) / reflectivity
     through = weighted(emitted, direct)
-    of_object = of_background = np.zeros(1)
+    of_object = of_background = 0.0
     for std, weight, share in zip(tile.pattern, ratios.null_weights, direct, strict=True):
         part = weight / steepness
         of_object = of_object + (std * part) ** 2
@@ -92,13 +93,13 @@ def bend(tile: Tile, emission: Emission, background: Array) -> Array:
     :math:`u_1(y)` reflected in all, so that the reflection ratios are one number for small and
     large changes of the background. Zero where a background or an emissivity is not physical.
     """
-    first = tile.blackbody(0, background)
-    signal = np.stack(
+    xp, first = namespace(background), tile.blackbody(0, background)
+    signal = xp.stack(
         [
             (1.0 - emission.emissivity[m]) * (tile.blackbody(m, background) - first)
             for m in range(1, len(tile.noise))
         ]
     )
-    physical = np.all((emission.emissivity > 0) & (emission.emissivity < 1), axis=0)
-    physical &= np.all(np.isfinite(signal), axis=(0, 1))
-    return np.where(physical, signal, 0.0)
+    physical = xp.all((emission.emissivity > 0) & (emission.emissivity < 1), axis=0)
+    physical &= xp.all(xp.isfinite(signal), axis=(0, 1))
+    return xp.where(physical, signal, 0.0)

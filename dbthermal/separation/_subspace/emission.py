@@ -25,6 +25,7 @@ from scipy.special import ndtri, stdtrit
 
 from dbthermal import _smooth as smooth
 from dbthermal import mixing
+from dbthermal._arrays import like, namespace
 from dbthermal.separation._subspace import residuals
 from dbthermal.separation._subspace.reflection_ratio import ReflectionRatio
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
@@ -82,27 +83,29 @@ def estimate(
     The regression starts from the line of nearly the same signals, if there is one.
     """
     fit = _alternate(tile, functions, ratios, start)
-    line, first, noise = fit.line, fit.emissivity, np.array(tile.noise)
+    line, first, noise = fit.line, fit.emissivity, like(tile.noise, tile.signals)
+    xp = namespace(noise)
     # Eq. 6 by implicit differentiation: dx/deps = (dh/deps - dq/deps) / h', var x = var q / h'^2.
     sensitivity = (fit.partial - functions.object_part @ ratios.coefficients[0]) / fit.steepness
     leverage, used = functions.leverage()[:, ratios.order - 1], ratios.order + functions.steps
     smooth_variance = leverage * ratios.null_variance / fit.steepness**2
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times.
-    omitted = smooth_variance * np.log(tile.time.size) / used
+    omitted = smooth_variance * float(np.log(tile.time.size)) / used
     # Variance of the slope: of the ordinate's noise, and of the abscissa's.
     kernel = line.kernel(fit.emitted)
     noise_variance = line.variance + first**2 * _curve_variance(kernel, functions, ratios)
-    curve_std = first * np.sqrt(ratios.null_variance)
+    curve_std = first * xp.sqrt(ratios.null_variance)
     walk, upper = walk_variance(line, fit.emitted, functions, noise[0], curve_std, used)
     # A uniform distribution in [-d, d] has the variance d^2 / 3.
     limit = (1.0 - first) * background_drift / np.sqrt(3.0)
     linear = _linear_variance(tile, functions, ratios, fit, limit)
-    drifting = (limit / np.ptp(fit.emitted, axis=0)) ** 2 + np.maximum(upper, linear)
+    change = xp.amax(fit.emitted, axis=0) - xp.amin(fit.emitted, axis=0)
+    drifting = (limit / change) ** 2 + xp.maximum(upper, linear)
     if tile.material is not None:
-        known = ratios.pooled & np.isfinite(tile.material.emissivity)
-        noise_variance = np.where(known, tile.material.noise_variance, noise_variance)
-        drifting = np.where(known, tile.material.drift_variance, drifting)
+        known = ratios.pooled & xp.isfinite(tile.material.emissivity)
+        noise_variance = xp.where(known, tile.material.noise_variance, noise_variance)
+        drifting = xp.where(known, tile.material.drift_variance, drifting)
     level_std = _level_std(tile, ratios, fit, noise_variance + walk)
     by_level = (ratios.null_weights * level_std).sum(axis=0)
     epsilon = ratios.inverse_energy * ratios.null_variance + by_level**2
@@ -111,7 +114,7 @@ def estimate(
     emissivity = 1.0 - ratios.ratio * (1.0 - first)
     return Emission(
         temperature=fit.temperature,
-        temperature_std=np.sqrt(_fieller(sensitivity, epsilon) + smooth_variance),
+        temperature_std=xp.sqrt(_fieller(sensitivity, epsilon) + smooth_variance),
         sensitivity=sensitivity,
         smooth_variance=smooth_variance,
         emissivity=emissivity,
@@ -123,7 +126,7 @@ def estimate(
         noise_variance=noise_variance,
         drift_variance=drifting,
         constant=fit.constant,
-        restless=np.mean(line.residual**2 < WITHIN**2 * expected, axis=0) < RESTING,
+        restless=(line.residual**2 < WITHIN**2 * expected).sum(axis=0) < RESTING * tile.time.size,
         line=line,
     )
 
@@ -149,30 +152,31 @@ def _alternate(
 ) -> _Fit:
     """Alternate the object temperature (eq. 6) and the first emissivity (eq. 7)."""
     # Eq. 5: q = w.z, smoothed, less the steps of the camera.
-    smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
+    xp = namespace(tile.signals)
+    smoothed = xp.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
     target = functions.object_part @ smoothed
     temperature = tile.temperature(1, target)
     middle = _middle(ratios.ratio)
     # The robust line is sought on a curve that is right to second order, or it locks elsewhere.
     guess = _plain_slope(tile.blackbody(0, temperature), tile.signals[0])
-    emissivity = np.where((guess > 0) & (guess < 1), guess, middle)
+    emissivity = xp.where((guess > 0) & (guess < 1), guess, middle)
     temperature = _newton(tile, ratios, emissivity, target, temperature)[0]
-    before = slope_before = np.full_like(emissivity, np.nan)
+    before = slope_before = xp.full_like(emissivity, np.nan)
     for _ in range(ROUNDS):
         emitted = tile.blackbody(0, temperature)
         line = residuals.regress(emitted, tile.signals[0], tile.noise[0], start=line)
         functions_used = ratios.order + functions.steps
         constant = line.energy < OBJECT_TO_NOISE * functions_used * ratios.null_variance
         moved, change = line.slope - slope_before, emissivity - before
-        slow = np.abs(moved) < FASTEST * np.abs(change)
-        rate = np.divide(moved, change, out=np.zeros_like(moved), where=slow)
+        slow = xp.abs(moved) < FASTEST * xp.abs(change)
+        rate = xp.where(slow, moved / xp.where(slow, change, 1.0), 0.0)
         before, slope_before = emissivity, line.slope
         extrapolated = line.slope + (line.slope - before) * rate / (1.0 - rate)
-        emissivity = np.where(constant, middle, extrapolated)
+        emissivity = xp.where(constant, middle, extrapolated)
         if tile.material is not None:
-            known = ratios.pooled & np.isfinite(tile.material.emissivity)
+            known = ratios.pooled & xp.isfinite(tile.material.emissivity)
             constant = constant & ~known
-            emissivity = np.where(known, tile.material.emissivity, emissivity)
+            emissivity = xp.where(known, tile.material.emissivity, emissivity)
         temperature, steepness, partial = _newton(tile, ratios, emissivity, target, temperature)
     assert line is not None
     return _Fit(temperature, emitted, emissivity, constant, line, steepness, partial)
@@ -181,8 +185,7 @@ def _alternate(
 def _plain_slope(abscissa: Array, ordinate: Array) -> Array:
     """Slope (pixel) of the ordinary least-squares line through points (time, pixel)."""
     centred = abscissa - abscissa.mean(axis=0)
-    energy = np.einsum("tp,tp->p", centred, centred)
-    return np.asarray(np.einsum("tp,tp->p", centred, ordinate) / energy)
+    return (centred * ordinate).sum(axis=0) / (centred**2).sum(axis=0)
 
 
 def _level_std(tile: Tile, ratios: ReflectionRatio, fit: _Fit, variance: Array) -> Array:
@@ -200,11 +203,11 @@ def _level_std(tile: Tile, ratios: ReflectionRatio, fit: _Fit, variance: Array) 
     around = tile.reference + np.array([-0.5, 0.5])  # [K]
     slopes = np.log(np.stack([one.slope(around) for one in tile.curves]))
     rates = np.diff(slopes - slopes[0], axis=1)
-    reflected = (tile.signals[0] - fit.emitted).mean(axis=0)
-    std = np.abs(reflected) * np.sqrt(variance) / (1.0 - fit.emissivity) ** 2
+    reflected, xp = (tile.signals[0] - fit.emitted).mean(axis=0), namespace(variance)
+    std = xp.abs(reflected) * xp.sqrt(variance) / (1.0 - fit.emissivity) ** 2
     # A uniform distribution of width d has the variance d^2 / 12.
-    std = np.fmin(std, (curve.highest - curve.lowest) / np.sqrt(12.0))
-    return np.asarray(ratios.ratio * rates * std)
+    widest = float((curve.highest - curve.lowest) / np.sqrt(12.0))
+    return ratios.ratio * like(rates, std) * xp.where(std < widest, std, widest)
 
 
 def _fieller(sensitivity: Array, epsilon: Array) -> Array:
@@ -214,7 +217,7 @@ def _fieller(sensitivity: Array, epsilon: Array) -> Array:
     The object is a ratio with an uncertain denominator: half the width of its 95 % interval by
     Fieller's theorem (1954), doi:10.1111/j.2517-6161.1954.tb00159.x
     """
-    return np.asarray(sensitivity**2 * epsilon / (1.0 - NORMAL95**2 * epsilon) ** 2)
+    return sensitivity**2 * epsilon / (1.0 - NORMAL95**2 * epsilon) ** 2
 
 
 def _emissivity_covariance(
@@ -235,7 +238,8 @@ def _emissivity_covariance(
     with_epsilon[0] = 0.0
     between = pairs * squares[0] * energy
     between[0], between[:, 0] = 0.0, 0.0
-    np.einsum("bbp->bp", between)[...] = ratios.variance
+    for band, variance in enumerate(ratios.variance):
+        between[band, band] = variance
     # Terms with epsilon: (e_1 (1 - e_1))^2 kappa_m kappa_n var(eps) and, of both with the other,
     # e_1 (1 - e_1)^2 kappa_m cov(kappa_n, eps).
     cross = ratio[:, np.newaxis] * with_epsilon
@@ -244,7 +248,7 @@ def _emissivity_covariance(
     # Through the background's level: -(1 - e_1) (kappa_m e_1 deps + dkappa_m).
     by_level = reflectivity * (ratio * first * (weights * level_std).sum(axis=0) + level_std)
     covariance = pairs * slope_variance + through * energy + reflectivity**2 * between
-    return np.asarray(covariance + by_level[:, np.newaxis] * by_level)
+    return covariance + by_level[:, np.newaxis] * by_level
 
 
 def walk_variance(
@@ -266,26 +270,26 @@ def walk_variance(
 
     The residual holds the `noise` of the signal and, below the `order`, that of the object's curve.
     """
-    columns = functions.rising
-    degree = np.arange(1.0, columns.shape[1] + 1)[:, np.newaxis]
+    columns, xp = functions.rising, namespace(emitted)
+    degree = like(np.arange(1.0, columns.shape[1] + 1)[:, np.newaxis], emitted)
     # Spectra of the residual, over the share of frames that the weights keep, and of the curve.
     share = line.weights.mean(axis=0)
     spectrum = columns.T @ (line.residual * line.weights) / share
     curve = columns.T @ emitted
     energy = (curve**2).sum(axis=0)
-    unit = curve / np.sqrt(energy)
+    unit = curve / xp.sqrt(energy)
     # The part orthogonal to the object's curve is the background's alone.
     spectrum = spectrum - unit * (unit * spectrum).sum(axis=0)
     # Energy of a walk at degree 1: j^2 times that at degree j, less the noise's.
     walk = degree**2 * (spectrum**2 - noise**2 / share - curve_std**2 * (degree < order))
-    octaves, widened = [], []
+    octaves, widened = [0.0 * energy], [0.0 * energy]
     for low, high, lost in OCTAVES:
         if (freedom := len(walk[low - 1 : high - 1]) - lost) > 0:
             octaves.append(walk[low - 1 : high - 1].sum(axis=0) / freedom)
             widened.append(octaves[-1] * (stdtrit(freedom, 0.975) / NORMAL95) ** 2)
     scale = (unit**2 / degree**2).sum(axis=0) / energy
-    expected, upper = (scale * np.max(one, axis=0, initial=0.0) for one in (octaves, widened))
-    return np.asarray(expected), np.asarray(upper)
+    expected, upper = (scale * xp.amax(xp.stack(one), axis=0) for one in (octaves, widened))
+    return expected, upper
 
 
 def _linear_variance(
@@ -296,13 +300,13 @@ def _linear_variance(
 
     :math:`\gamma^2 k (k d^2 + v)`, k = D / (D + v), with D of the `limit` [K] or of what is seen.
     """
-    drift = functions.rising[:, 0]
+    drift, xp = functions.rising[:, 0], namespace(limit)
     slope, size, kernel = _drift_beside(fit.line, fit.emitted, drift)
-    variance = tile.noise[0] ** 2 * np.einsum("tp,tp->p", kernel, kernel)
+    variance = tile.noise[0] ** 2 * xp.einsum("tp,tp->p", kernel, kernel)
     variance += fit.emissivity**2 * _curve_variance(kernel, functions, ratios)
-    before = np.maximum((limit / np.ptp(drift)) ** 2, size**2 + variance)
+    before = xp.maximum((limit / (drift.max() - drift.min())) ** 2, size**2 + variance)
     share = before / (before + variance)
-    return np.asarray(slope**2 * share * (share * size**2 + variance))
+    return slope**2 * share * (share * size**2 + variance)
 
 
 def _drift_beside(line: residuals.Line, curve: Array, drift: Array) -> tuple[Array, Array, Array]:
@@ -311,37 +315,36 @@ def _drift_beside(line: residuals.Line, curve: Array, drift: Array) -> tuple[Arr
 
     Weighted twice, for a large drift takes the weight from the frames that tell it best.
     """
-    weights = line.weights
+    weights, xp = line.weights, namespace(curve)
     for last in (False, True):
         weighted, total = weights * curve, weights.sum(axis=0)
         mean, middle = weighted.sum(axis=0) / total, drift @ weights / total
-        energy = np.einsum("tp,tp->p", weighted, curve) - total * mean**2
+        energy = xp.einsum("tp,tp->p", weighted, curve) - total * mean**2
         slope = (drift @ weighted - total * mean * middle) / energy
         # w (t - gamma u), about its mean, over its product with t.
         kernel = drift[:, np.newaxis] * weights
         kernel -= (middle - slope * mean) * weights
         kernel -= slope * weighted
         kernel /= drift @ kernel
-        size = np.einsum("tp,tp->p", kernel, line.residual)
+        size = xp.einsum("tp,tp->p", kernel, line.residual)
         if not last:
             beside = drift[:, np.newaxis] - (middle - slope * mean) - slope * curve
             scaled = (line.residual - size * beside) / (residuals.TUNING * line.scale)
-            weights = np.maximum(1.0 - scaled**2, 0.0) ** 2
+            weights = xp.clip(1.0 - scaled**2, min=0.0) ** 2
     return slope, size, kernel
 
 
 def _curve_variance(kernel: Array, functions: smooth.Subspace, ratios: ReflectionRatio) -> Array:
     """Variance (pixel) of the sum of a kernel (time, pixel) over the object's smoothed noise."""
     part = (functions.object_part.T @ kernel) * functions.columns(ratios.order)
-    return np.asarray(ratios.null_variance * (part**2).sum(axis=0))
+    return ratios.null_variance * (part**2).sum(axis=0)
 
 
 def _middle(ratio: Array) -> Array:
     """Middle of the interval that the ratios leave for e_1, for a constant object."""
-    largest = ratio.max(axis=0)
-    lowest = np.zeros_like(largest)
-    np.divide(largest - 1.0, largest, out=lowest, where=largest > 1.0)
-    return np.asarray(0.5 * (1.0 + lowest))
+    xp = namespace(ratio)
+    largest = xp.amax(ratio, axis=0)
+    return 0.5 + 0.5 * xp.where(largest > 1.0, 1.0 - 1.0 / largest, 0.0)
 
 
 def _newton(
@@ -362,7 +365,7 @@ def _newton(
     if len(emitted) > 2:
         others = weighted(emitted[1:], _shares(ratios, tile.noise))
     partial = mixing.mixed(emissivity, emitted[0], others)
-    return temperature + (target - value) / steepness, steepness, np.asarray(partial)
+    return temperature + (target - value) / steepness, steepness, partial
 
 
 def weighted(parts: list[Array], weights: Array) -> Array:
@@ -370,11 +373,11 @@ def weighted(parts: list[Array], weights: Array) -> Array:
     total = parts[0] * weights[0]
     for part, weight in zip(parts[1:], weights[1:], strict=True):
         total += part * weight
-    return np.asarray(total)
+    return total
 
 
 def _shares(ratios: ReflectionRatio, noise: tuple[float, ...]) -> Array:
     """Share (band - 1, pixel) [1] of the ratios but the first in the variance of epsilon."""
-    squares = (np.array(noise) ** 2)[:, np.newaxis]
+    squares = like(noise, ratios.ratio)[:, np.newaxis] ** 2
     parts = (ratios.null_weights**2 * (squares + ratios.ratio**2 * squares[0]))[1:]
-    return np.asarray(parts / parts.sum(axis=0))
+    return parts / parts.sum(axis=0)

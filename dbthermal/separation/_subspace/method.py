@@ -51,6 +51,7 @@ formation of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -58,7 +59,7 @@ from scipy.stats import chi2
 
 from dbthermal import _smooth as smooth
 from dbthermal.schema import Status
-from dbthermal.separation._inputs import Method
+from dbthermal.separation._inputs import Method, require_device
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import (
     clock,
@@ -109,16 +110,23 @@ class SubspaceSettings:
         Prior: the background drifts along with the object's own curve by at most this, up or
         down, over the capture [K], each drift as likely. No method can see that part; it only
         widens the error bars of emissivity and background.
+    device : str, optional
+        Where steps 1 to 4 of the pixels are computed. Not given, on the processor, compiled for
+        two bands; or on tensors of torch (extra ``torch``), in torch's words, such as "cuda". All
+        else, such as flags and pieces of time, is the same code on the processor.
     """
 
     background_drift: float = 3.0
+    device: str | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a drift that is negative or not finite."""
+        """Refuse a drift that is negative or not finite, and a device that is not there."""
         if not 0 <= self.background_drift < np.inf:
             raise ValueError(
                 f"Invalid background_drift {self.background_drift} K. Must be zero or positive."
             )
+        if self.device is not None:
+            require_device(self.device, "subspace")
 
 
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
@@ -169,8 +177,10 @@ def _solve(
     settings: SubspaceSettings,
     least: float = emissions.BEND,
 ) -> Solution:
-    """Steps 1 to 4, compiled for two bands."""
+    """Steps 1 to 4, compiled for two bands, or on a device."""
     solve = fused.solve if len(tile.noise) == 2 else steps.solve
+    if settings.device is not None:
+        solve = partial(steps.solve_on, settings.device)
     return solve(tile, functions, settings.background_drift, least)
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import chdtrc, chdtri
 from scipy.stats import chi2, norm
 
 from dbthermal import _smooth as smooth
+from dbthermal._arrays import host, like, namespace, quotient
 from dbthermal.separation._tiles import Array, Mask, Material, Whole
 
 LOWEST_ORDER: Final = 3
@@ -32,6 +32,7 @@ CHANCE: Final = float(2.0 * norm.sf(4.0))
 
 # Chance at which a gray body passes for another: a tenth of what is promised of a status of 0.
 GRAY_CHANCE: Final = 1e-4
+_TINY: Final = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
@@ -78,39 +79,38 @@ def estimate(
     .. [1] Fuller (1987), Measurement Error Models, doi:10.1002/9780470316665
     .. [2] Schwarz (1978), Annals of Statistics 6, 461, doi:10.1214/aos/1176344136
     """
-    frames, others = signals.shape[1], len(noise) - 1
+    xp, frames, others = namespace(signals), signals.shape[1], len(noise) - 1
     # Eq. 3: scatter of the whitened signals z_m / s_m outside the smooth functions, at all orders.
     whitened = signals / noise[:, np.newaxis, np.newaxis]
-    coefficients = np.einsum("tc,btp->bcp", functions.functions, whitened, optimize=True)
+    coefficients = functions.functions.T @ whitened
     scatter = _scatter(whitened, coefficients, functions.steps)
-    freedom = frames - functions.steps - np.arange(1.0, functions.orders + 1)[:, np.newaxis]
+    orders = like(np.arange(1.0, functions.orders + 1)[:, np.newaxis], signals)
+    freedom = frames - functions.steps - orders
     # Its energy is the largest eigenvalue along the axis, noise alone across it.
-    total = np.einsum("opbb->op", scatter)
-    largest = np.asarray(np.linalg.eigvalsh(scatter)[..., -1], dtype=np.float64)
-    pooled = np.zeros(signals.shape[2], dtype=bool)
+    total = xp.einsum("opbb->op", scatter)
+    largest = xp.linalg.eigvalsh(scatter)[..., -1]
+    pooled = xp.zeros_like(total[0], dtype=xp.bool)
     if material is not None:
         axis = material.ratio / noise[:, np.newaxis]
-        axis = axis / np.sqrt(np.einsum("bp,bp->p", axis, axis))
-        along = np.einsum("bp,opbc,cp->op", axis, scatter, axis)
+        axis = axis / xp.sqrt(xp.einsum("bp,bp->p", axis, axis))
+        along = xp.einsum("bp,opbc,cp->op", axis, scatter, axis)
         pooled = _agrees(scatter, choose_order(total - along, frames), axis)
-        largest = np.where(pooled, along, largest)
+        largest = xp.where(pooled, along, largest)
     null_energy = total - largest
     order = choose_order(null_energy, frames)
-    rows = np.arange(order.size)
+    rows = xp.arange(len(order), device=order.device)
     chosen, free = scatter[order, rows], freedom[order, 0]
     ratio = principal_ratio(chosen, noise)
     if material is not None:
-        ratio = np.where(pooled, material.ratio, ratio)
+        ratio = xp.where(pooled, material.ratio, ratio)
     # Energy along the axis less the noise's n, over |v|^2: S of the first band, for eq. 4.
     whitened_ratio = ratio / noise[:, np.newaxis]
-    length = np.einsum("bp,bp->p", whitened_ratio, whitened_ratio)
+    length = xp.einsum("bp,bp->p", whitened_ratio, whitened_ratio)
     inverse = inverse_energy((largest[order, rows] - free) / length, length, free)
     if material is not None:
-        inverse = np.where(pooled, material.inverse_energy, inverse)
+        inverse = xp.where(pooled, material.inverse_energy, inverse)
     weights, variance = null_combination(ratio, noise)
-    rapid, unit = rapid_orders(functions.orders) - 1, np.eye(len(noise))[..., np.newaxis]
-    contrast = np.full(order.shape, np.inf)
-    np.divide(largest[-1] * others, null_energy[-1], out=contrast, where=null_energy[-1] > 0)
+    rapid, unit = rapid_orders(functions.orders) - 1, like(np.eye(len(noise))[..., None], signals)
     return ReflectionRatio(
         ratio=ratio,
         variance=ratio_variance(ratio, inverse, noise),
@@ -118,11 +118,11 @@ def estimate(
         null_weights=weights,
         null_variance=variance,
         order=order + 1,
-        contrast=contrast,
+        contrast=quotient(largest[-1] * others, null_energy[-1], np.inf),
         reduced_chi2=null_energy[order, rows] / (others * free),
         coefficients=coefficients * noise[:, np.newaxis, np.newaxis] * functions.columns(order + 1),
-        scatter=np.moveaxis(chosen, 0, -1) - free * unit,
-        rapid_scatter=np.moveaxis(scatter[rapid], 1, -1) - freedom[rapid][..., None, None] * unit,
+        scatter=xp.moveaxis(chosen, 0, -1) - free * unit,
+        rapid_scatter=xp.moveaxis(scatter[rapid], 1, -1) - freedom[rapid][..., None, None] * unit,
         pooled=pooled,
     )
 
@@ -139,8 +139,8 @@ def rapid_orders(orders: int) -> Whole:
 
 def principal_ratio(scatter: Array, noise: Array) -> Array:
     """Ratios (band, pixel) [1] of a whitened scatter (pixel, band, band): its principal axis."""
-    axis = np.linalg.eigh(scatter)[1][..., -1].T * noise[:, np.newaxis]
-    return np.asarray(axis / axis[0])
+    axis = namespace(scatter).linalg.eigh(scatter)[1][..., -1].T * noise[:, np.newaxis]
+    return axis / axis[0]
 
 
 def null_combination(ratio: Array, noise: Array) -> tuple[Array, Array]:
@@ -153,22 +153,22 @@ def null_combination(ratio: Array, noise: Array) -> tuple[Array, Array]:
     # Whitened, the constraints are the vectors v = kappa / s and u = 1 / s; the part of u that is
     # orthogonal to v, r = u - v (u.v) / |v|^2, gives w = r / (s |r|^2) of variance 1 / |r|^2.
     along = ratio / noise[:, np.newaxis]
-    emitted = np.broadcast_to(1.0 / noise[:, np.newaxis], along.shape)
+    emitted = 1.0 / noise[:, np.newaxis]
     share = (along * emitted).sum(axis=0) / (along**2).sum(axis=0)
     orthogonal = emitted - share * along
     variance = 1.0 / (orthogonal**2).sum(axis=0)
     return orthogonal * variance / noise[:, np.newaxis], variance
 
 
-def inverse_energy(energy: Array, length: Array, freedom: npt.ArrayLike) -> Array:
+def inverse_energy(energy: Array, length: Array, freedom: Array | float) -> Array:
     """
     Inverse of the background's effective energy: sigma^2 of `estimate` [1/K^2].
 
     Of the energy S in the first band [K^2], the squared length of the whitened ratios [1/K^2], and
     the degrees of freedom. Infinite where the energy is not positive.
     """
-    numerator = energy + np.asarray(freedom) / length
-    return np.divide(numerator, energy**2, out=np.full_like(energy, np.inf), where=energy > 0)
+    numerator = energy + freedom / length
+    return quotient(quotient(numerator, energy, np.inf), energy, np.inf)
 
 
 def ratio_variance(ratio: Array, inverse: Array, noise: Array) -> Array:
@@ -176,7 +176,7 @@ def ratio_variance(ratio: Array, inverse: Array, noise: Array) -> Array:
     squares = (noise**2)[:, np.newaxis]
     result = inverse * (squares + ratio**2 * squares[0])
     result[0] = 0.0
-    return np.asarray(result)
+    return result
 
 
 def may_be_gray(ratios: ReflectionRatio, noise: Array, slopes: Array) -> Mask:
@@ -190,51 +190,53 @@ def may_be_gray(ratios: ReflectionRatio, noise: Array, slopes: Array) -> Mask:
     chance is the mean over them of that of the chi-square, with a degree of freedom for each band
     but one, of the nearest ratios between the two.
     """
-    along = ratios.ratio / noise[:, np.newaxis]
-    unit = along / np.sqrt((along**2).sum(axis=0))
+    xp, along = namespace(noise), ratios.ratio / noise[:, np.newaxis]
+    unit = along / xp.sqrt((along**2).sum(axis=0))
     gray = slopes / slopes[:, :1] / noise
     # The part of g / s orthogonal to v, as in `null_combination`; its variance is sigma^2.
     off = gray[..., np.newaxis] - (gray @ unit)[:, np.newaxis] * unit
-    start, step = off[:-1], np.diff(off, axis=0)
-    length = np.maximum(np.einsum("tbp,tbp->tp", step, step), np.finfo(np.float64).tiny)
-    share = np.clip(-np.einsum("tbp,tbp->tp", start, step) / length, 0.0, 1.0)
+    start, step = off[:-1], xp.diff(off, axis=0)
+    length = xp.clip(xp.einsum("tbp,tbp->tp", step, step), min=_TINY)
+    share = xp.clip(-xp.einsum("tbp,tbp->tp", start, step) / length, 0.0, 1.0)
     between = start + share[:, np.newaxis] * step
-    nearest = np.einsum("tbp,tbp->tp", between, between) / ratios.inverse_energy
+    nearest = xp.einsum("tbp,tbp->tp", between, between) / ratios.inverse_energy
     freedom = len(noise) - 1
     # The mean is no larger than the largest chance: few pixels need it.
-    gray = nearest.min(axis=0) < chdtri(freedom, GRAY_CHANCE)
-    gray[gray] = chdtrc(freedom, nearest[:, gray]).mean(axis=0) > GRAY_CHANCE
-    return np.asarray(gray)
+    near = xp.amin(nearest, axis=0) < chdtri(freedom, GRAY_CHANCE)
+    chance = chdtrc(freedom, host(nearest[:, near])).mean(axis=0)
+    gray = xp.zeros_like(near)
+    gray[near] = like(chance > GRAY_CHANCE, near)
+    return gray
 
 
 def choose_order(null_energy: Array, frames: int) -> Whole:
     """Order less one (pixel) of the lowest information criterion of an energy (order, pixel)."""
     if len(null_energy) == 1:
-        return np.zeros(null_energy.shape[1], dtype=np.intp)
-    orders = np.arange(1, null_energy.shape[0] + 1)[:, np.newaxis]
-    tiny = np.finfo(np.float64).tiny
-    criterion = frames * np.log(np.maximum(null_energy, tiny)) + orders * np.log(frames)
+        return like(np.zeros(null_energy.shape[1], dtype=np.intp), null_energy)
+    xp, price = namespace(null_energy), np.arange(1, len(null_energy) + 1) * np.log(frames)
+    criterion = frames * xp.log(xp.clip(null_energy, min=_TINY))
+    criterion += like(price[:, np.newaxis], null_energy)
     lowest = min(LOWEST_ORDER, null_energy.shape[0] - 1) - 1
-    best = lowest + np.argmin(criterion[lowest:-1], axis=0)
-    return np.asarray(best + 1)
+    return lowest + xp.argmin(criterion[lowest:-1], axis=0) + 1
 
 
 def _scatter(whitened: Array, coefficients: Array, steps: int) -> Array:
     """Scatter (order, pixel, band, band) of the signals outside the functions of each order."""
-    bands, _, pixels = whitened.shape
-    result = np.empty((coefficients.shape[1] - steps, pixels, bands, bands))
+    xp, (bands, _, pixels) = namespace(whitened), whitened.shape
+    shape = coefficients.shape[1] - steps, pixels, bands, bands
+    result = xp.empty(shape, dtype=whitened.dtype, device=whitened.device)
     for one in range(bands):
         for other in range(one, bands):
             # The basis is orthonormal: |P z|^2 = |z|^2 - sum of squared coefficients.
-            total = np.einsum("tp,tp->p", whitened[one], whitened[other])
-            held = np.cumsum(coefficients[one] * coefficients[other], axis=0)[steps:]
+            total = xp.einsum("tp,tp->p", whitened[one], whitened[other])
+            held = xp.cumsum(coefficients[one] * coefficients[other], axis=0)[steps:]
             result[:, :, one, other] = result[:, :, other, one] = total - held
     return result
 
 
 def _agrees(scatter: Array, order: Whole, axis: Array) -> Mask:
     """Pixels of which the scatter at an order agrees with a known axis; false for NaN."""
-    return agrees(scatter[order, np.arange(order.size)], axis)
+    return agrees(scatter[order, like(np.arange(len(order)), order)], axis)
 
 
 def agrees(scatter: Array, axis: Array) -> Mask:
@@ -244,7 +246,8 @@ def agrees(scatter: Array, axis: Array) -> Mask:
     Of a background along the unit vector v and white noise, the part across v is not correlated
     with that along it: :math:`|S v|^2 / (v^T S v) - v^T S v` is a chi-square variable.
     """
-    turned = np.einsum("pbc,cp->bp", scatter, axis)
-    along = np.einsum("bp,bp->p", axis, turned)
-    statistic = np.einsum("bp,bp->p", turned, turned) / along - along
-    return np.asarray(statistic < chi2.isf(CHANCE, len(axis) - 1))
+    xp = namespace(axis)
+    turned = xp.einsum("pbc,cp->bp", scatter, axis)
+    along = xp.einsum("bp,bp->p", axis, turned)
+    statistic = xp.einsum("bp,bp->p", turned, turned) / along - along
+    return statistic < chi2.isf(CHANCE, len(axis) - 1)

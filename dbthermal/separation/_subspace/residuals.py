@@ -15,6 +15,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.special import chdtri, ndtri
 
 from dbthermal import _smooth as smooth
+from dbthermal._arrays import like, namespace, quotient
 from dbthermal.separation._subspace.reflection_ratio import CHANCE, ReflectionRatio
 from dbthermal.separation._tiles import Array, Mask, Pixels, Whole
 
@@ -66,7 +67,7 @@ class Line(Pixels):
         """Weights k (time, pixel) of the ordinate z in the slope, sum k z."""
         kernel = self.weights * abscissa
         kernel -= self.weights * (kernel.sum(axis=0) / self.weights.sum(axis=0))
-        return np.asarray(kernel / self.energy)
+        return kernel / self.energy
 
 
 def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None = None) -> Line:
@@ -90,7 +91,7 @@ def regress(abscissa: Array, ordinate: Array, noise: float, start: Line | None =
     else:
         residual = _fit(abscissa, ordinate, start.weights)[2]
     for _ in range(STEPS):
-        scale = np.maximum(noise, TO_STD * _ranked_magnitude(residual))
+        scale = namespace(residual).clip(TO_STD * _ranked_magnitude(residual), min=noise)
         weights = _tukey(residual, scale)
         slope, _, residual, energy = _fit(abscissa, ordinate, weights)
     # var(slope) = s^2 / sum w (x - mean)^2, over the fraction of independent points.
@@ -104,10 +105,11 @@ def null_residual(signals: Array, functions: smooth.Subspace, ratios: Reflection
 
     White noise of the null variance where the model holds.
     """
-    residual = np.einsum("bp,btp->tp", ratios.null_weights, signals)
-    smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
+    xp = namespace(signals)
+    residual = xp.einsum("bp,btp->tp", ratios.null_weights, signals)
+    smoothed = xp.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
     residual -= functions.functions @ smoothed
-    return np.asarray(residual)
+    return residual
 
 
 def autocorrelation(residual: Array) -> Array:
@@ -117,13 +119,12 @@ def autocorrelation(residual: Array) -> Array:
     In standard deviations of white noise. A change of the object that the smooth functions do not
     follow, or a background with other ratios, leaves a correlation.
     """
-    energy = np.einsum("tp,tp->p", residual, residual)
-    lagged = np.zeros_like(energy)
-    for lag in range(1, LAGS + 1):
-        lagged += np.einsum("tp,tp->p", residual[lag:], residual[:-lag])
-    mean = np.divide(lagged, LAGS * energy, out=np.zeros_like(energy), where=energy > 0)
+    einsum = namespace(residual).einsum
+    energy = einsum("tp,tp->p", residual, residual)
+    lagged = sum(einsum("tp,tp->p", residual[lag:], residual[:-lag]) for lag in range(1, LAGS + 1))
+    mean = quotient(lagged, LAGS * energy, 0.0)
     # White noise of N frames: each lag has the variance 1 / N, independently of the others.
-    return np.asarray(mean * np.sqrt(LAGS * residual.shape[0]))
+    return mean * float(np.sqrt(LAGS * residual.shape[0]))
 
 
 def interband_delay(
@@ -147,18 +148,16 @@ def interband_delay(
     in the frames at a change, over that of the noise. The score is the largest in magnitude, in
     standard deviations of white noise.
     """
-    rapid = first - functions.functions @ ratios.coefficients[0]
-    change = np.diff(rapid, axis=0)
+    xp, rapid = namespace(first), first - functions.functions @ ratios.coefficients[0]
+    change = xp.diff(rapid, axis=0)
     freedom = residual.shape[0] - ratios.order - functions.steps
     common = freedom * ratios.null_weights[0] * noise**2
-    late = np.einsum("tp,tp->p", residual[:-1], change) + common
-    early = np.einsum("tp,tp->p", residual[1:], change) - common
-    strongest = np.maximum(np.abs(late), np.abs(early))
-    variance = ratios.null_variance * np.einsum("tp,tp->p", change, change)
-    score = np.divide(
-        strongest, np.sqrt(variance), out=np.zeros_like(strongest), where=variance > 0
-    )
-    return np.asarray(np.maximum(score, _excess(residual, change, ratios.null_variance, noise)))
+    late = xp.einsum("tp,tp->p", residual[:-1], change) + common
+    early = xp.einsum("tp,tp->p", residual[1:], change) - common
+    strongest = xp.maximum(xp.abs(late), xp.abs(early))
+    variance = ratios.null_variance * xp.einsum("tp,tp->p", change, change)
+    score = quotient(strongest, xp.sqrt(variance), 0.0)
+    return xp.maximum(score, _excess(residual, change, ratios.null_variance, noise))
 
 
 @lru_cache(maxsize=16)
@@ -185,18 +184,24 @@ def unexplained(residual: Array, rapid: Array, null_variance: Array, common: Arr
     with the residual.
     """
     edges, (most, limit) = blocks(len(residual))
-    length = np.diff(edges)[:, np.newaxis]
-    variance = np.where(null_variance > 0, null_variance, np.inf)
+    xp, length = namespace(residual), like(np.diff(edges)[:, np.newaxis], residual)
+    variance = xp.where(null_variance > 0, null_variance, np.inf)
     rapid = rapid - common / variance * residual
     sums, products, squares = (
-        np.add.reduceat(part, edges[:-1], axis=0) for part in (residual, residual * rapid, rapid**2)
+        block_sums(part, edges) for part in (residual, residual * rapid, rapid**2)
     )
-    together = (products**2 / np.where(squares > 0, squares, np.inf)).sum(axis=0) / variance
-    result = together > most
+    result = quotient(products**2, squares, 0.0).sum(axis=0) / variance > most
     while len(sums) > 1:
-        result |= np.any(sums**2 > limit * variance * length, axis=0)
+        result |= xp.any(sums**2 > limit * variance * length, axis=0)
         sums, length = sums[::2] + sums[1::2], length[::2] + length[1::2]
-    return np.asarray(result)
+    return result
+
+
+def block_sums(values: Array, edges: Whole) -> Array:
+    """Sums (block, ...) of values (time, ...) between edges, of which none are the same."""
+    xp = namespace(values)
+    total = xp.cumsum(values, axis=0)[like(edges[1:] - 1, values)]
+    return xp.concatenate([total[:1], xp.diff(total, axis=0)])
 
 
 def returning(signal: Array) -> Mask:
@@ -240,23 +245,23 @@ def _first_residual(abscissa: Array, ordinate: Array, noise: float) -> Array:
     is a fraction of the deviation; the one with the smallest deviation wins, pixel by pixel. Some
     points in single precision are enough to start from.
     """
-    count = min(len(abscissa), STARTING_POINTS)
-    every = np.arange(count) * len(abscissa) // count
+    xp, count = namespace(abscissa), min(len(abscissa), STARTING_POINTS)
+    every = like(np.arange(count) * len(abscissa) // count, abscissa)
     # About its mean, or single precision would not resolve a small range.
     centred, up = abscissa - abscissa.mean(axis=0), ordinate - ordinate.mean(axis=0)
-    few = centred[every].astype(np.float32), up[every].astype(np.float32)
-    plain = _fit(*few, np.ones_like(few[0]))[2]
-    slope, intercept, smallest = (np.full(plain.shape[1], np.inf) for _ in range(3))
-    for start in (np.ones_like(plain), plain >= 0, plain <= 0):
-        weights = start.astype(np.float32)
+    x, z = (xp.asarray(part[every], dtype=xp.float32) for part in (centred, up))
+    plain = _fit(x, z, xp.ones_like(x))[2]
+    slope = intercept = smallest = xp.full_like(centred[0], np.inf)
+    for start in (xp.ones_like(plain), plain >= 0, plain <= 0):
+        weights = xp.asarray(start, dtype=xp.float32)
         for _ in range(STARTING_STEPS):
-            *line, residual, _ = _fit(*few, weights)
+            one, other, residual, _ = _fit(x, z, weights)
             deviation = _ranked_magnitude(residual)
-            weights = _tukey(residual, np.maximum(noise, ANNEALING * TO_STD * deviation))
+            weights = _tukey(residual, xp.clip(ANNEALING * TO_STD * deviation, min=noise))
         better = deviation < smallest
-        slope, intercept = np.where(better, line, (slope, intercept))
-        smallest = np.where(better, deviation, smallest)
-    return np.asarray(up - intercept - slope * centred)
+        slope, intercept = xp.where(better, one, slope), xp.where(better, other, intercept)
+        smallest = xp.where(better, deviation, smallest)
+    return up - intercept - slope * centred
 
 
 def _fit(
@@ -267,42 +272,42 @@ def _fit(
     npt.NDArray[Precision], npt.NDArray[Precision], npt.NDArray[Precision], npt.NDArray[Precision]
 ]:
     """Weighted least squares: slope, intercept, residual (time, pixel), energy of the abscissa."""
-    total = weights.sum(axis=0)
+    einsum, total = namespace(weights).einsum, weights.sum(axis=0)
     weighted = weights * abscissa
     middle = weighted.sum(axis=0) / total
-    centre = np.einsum("tp,tp->p", weights, ordinate) / total
-    energy = np.einsum("tp,tp->p", weighted, abscissa) - total * middle**2
-    slope = (np.einsum("tp,tp->p", weighted, ordinate) - total * middle * centre) / energy
+    centre = einsum("tp,tp->p", weights, ordinate) / total
+    energy = einsum("tp,tp->p", weighted, abscissa) - total * middle**2
+    slope = (einsum("tp,tp->p", weighted, ordinate) - total * middle * centre) / energy
     intercept = centre - slope * middle
     return slope, intercept, ordinate - intercept - slope * abscissa, energy
 
 
 def _ranked_magnitude(residual: npt.NDArray[Precision]) -> Array:
     """Absolute value of rank `SHARE` over time; in single precision, which is much faster."""
-    magnitude = np.abs(residual.T, dtype=np.float32, casting="same_kind")
-    middle = int(SHARE * residual.shape[0])
-    return np.asarray(np.partition(magnitude, middle, axis=1)[:, middle], dtype=np.float64)
+    xp, middle = namespace(residual), int(SHARE * residual.shape[0])
+    magnitude = xp.abs(xp.asarray(residual.T, dtype=xp.float32))
+    if xp is np:
+        value = np.partition(magnitude, middle, axis=1)[:, middle]
+    else:
+        value = xp.kthvalue(magnitude, middle + 1).values
+    return xp.asarray(value, dtype=xp.float64)
 
 
 def _tukey(residual: npt.NDArray[Precision], scale: Array) -> npt.NDArray[Precision]:
     """Tukey's bisquare weights, (1 - (r / c s)^2)^2 inside c s."""
-    kept = residual * (1.0 / (TUNING * scale)).astype(residual.dtype)
-    kept *= kept
-    np.subtract(1.0, kept, out=kept)
-    np.maximum(kept, 0.0, out=kept)
-    kept *= kept
-    return np.asarray(kept)
+    xp = namespace(residual)
+    kept = residual * xp.asarray(1.0 / (TUNING * scale), dtype=residual.dtype)
+    kept = xp.clip(1.0 - kept * kept, min=0.0)
+    return kept * kept
 
 
 def _independent(residual: Array, weights: Array) -> Array:
     """Fraction of independent points, from the lag-one correlation of the kept residuals."""
-    kept = residual * weights
-    energy = np.einsum("tp,tp->p", kept, kept)
-    lagged = np.einsum("tp,tp->p", kept[1:], kept[:-1])
-    correlation = np.clip(
-        np.divide(lagged, energy, out=np.zeros_like(energy), where=energy > 0), 0, MOST_CORRELATED
-    )
-    return np.asarray((1.0 - correlation) / (1.0 + correlation))
+    xp, kept = namespace(residual), residual * weights
+    energy = xp.einsum("tp,tp->p", kept, kept)
+    lagged = xp.einsum("tp,tp->p", kept[1:], kept[:-1])
+    correlation = xp.clip(quotient(lagged, energy, 0.0), 0, MOST_CORRELATED)
+    return (1.0 - correlation) / (1.0 + correlation)
 
 
 def _excess(residual: Array, change: Array, null_variance: Array, noise: float) -> Array:
@@ -312,13 +317,14 @@ def _excess(residual: Array, change: Array, null_variance: Array, noise: float) 
     A chi-square variable of few degrees of freedom has a long tail: its cube root is nearly normal
     (Wilson, Hilferty 1931, doi:10.1073/pnas.17.12.684).
     """
-    steps = np.abs(change) > CHANGE * np.sqrt(2.0) * noise
-    at = np.zeros(residual.shape, dtype=bool)
+    xp = namespace(residual)
+    steps = xp.abs(change) > CHANGE * np.sqrt(2.0) * noise
+    at = xp.zeros_like(residual, dtype=xp.bool)
     at[1:] |= steps
     at[:-1] |= steps
     count = at.sum(axis=0)
-    energy = np.einsum("tp,tp->p", residual * at, residual) / null_variance
-    mean = np.divide(energy, count, out=np.ones_like(energy), where=count > 0)
+    energy = xp.einsum("tp,tp->p", residual * at, residual) / null_variance
+    mean = quotient(energy, count, 1.0)
     # The cube root of a chi-square over its n degrees has the mean 1 - v and the variance v.
-    variance = 2.0 / (9.0 * np.maximum(count, 1))
-    return np.asarray((np.cbrt(mean) - (1.0 - variance)) / np.sqrt(variance))
+    variance = 2.0 / (9.0 * xp.clip(count, min=1))
+    return (mean ** (1.0 / 3.0) - (1.0 - variance)) / xp.sqrt(variance)

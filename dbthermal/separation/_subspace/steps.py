@@ -3,12 +3,15 @@
 In arrays (time, pixel) of any number of bands. `fused` repeats them for two bands, compiled.
 """
 
+import importlib
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 
 from dbthermal import _smooth as smooth
+from dbthermal._arrays import host, like, namespace
 from dbthermal.separation._subspace import background as backgrounds
 from dbthermal.separation._subspace import emission as emissions
 from dbthermal.separation._subspace import pieces, reflection_ratio, residuals
@@ -68,24 +71,37 @@ def solve(
     With the limit of the background's `drift` [K], and the `least` bend that matters.
     """
     result, bend, line = _steps(tile, tile, functions, drift)
-    part, removed, places = tile, np.zeros(1), np.arange(result.gray.size)
+    xp, noise = namespace(bend), like(tile.noise[1:], bend)[:, np.newaxis]
+    part, removed, places = tile, 0.0 * bend, like(np.arange(len(result.gray)), bend)
     for _ in range(emissions.BENDS):
         change = bend - removed
         change -= change.mean(axis=1, keepdims=True)
-        energy = np.einsum("btp,btp->bp", change, change)
-        bent = np.any(energy > (least * np.array(tile.noise[1:])[:, np.newaxis]) ** 2, axis=0)
-        if not np.any(bent):
+        energy = xp.einsum("btp,btp->bp", change, change)
+        bent = xp.any(energy > (least * noise) ** 2, axis=0)
+        if not bent.any():
             break
         part, removed, places = part.select_pixels(bent), bend[..., bent], places[bent]
         least = emissions.BEND
-        signals = part.signals.copy()
-        signals[1:] -= removed
-        straight = replace(part, signals=signals)
+        straight = xp.concatenate([part.signals[:1], part.signals[1:] - removed])
         line = line.select_pixels(bent)
         as_they_are = result.gray[places], result.cost[places]
-        again, bend, line = _steps(part, straight, functions, drift, as_they_are, line)
+        again, bend, line = _steps(
+            part, replace(part, signals=straight), functions, drift, as_they_are, line
+        )
         result.replace_pixels(places, again)
     return result
+
+
+def solve_on(
+    device: str, tile: Tile, functions: smooth.Subspace, drift: float, least: float
+) -> Solution:
+    """As `solve`, on tensors of torch on a device; the solution is in arrays again."""
+    tensor = partial(importlib.import_module("torch").tensor, device=device)
+    material = None if tile.material is None else tile.material.each(tensor)
+    there = replace(tile, signals=tensor(tile.signals), material=material)
+    names = ("functions", "object_part", "rising")
+    columns: dict[str, Any] = {name: tensor(getattr(functions, name)) for name in names}
+    return solve(there, replace(functions, **columns), drift, least).each(host)
 
 
 def _steps(
@@ -102,7 +118,8 @@ def _steps(
     The bend of a gray body is not known: whether it is one is told from signals `as_they_are`, and
     their cost as one smooth curve.
     """
-    noise, signals, frames = np.array(tile.noise), straight.signals, tile.time.size
+    signals, frames = straight.signals, tile.time.size
+    noise, xp = like(tile.noise, signals), namespace(signals)
     ratios = reflection_ratio.estimate(signals, functions, noise, tile.material)
     if as_they_are is None:
         curve = tile.curves[0]
@@ -110,30 +127,31 @@ def _steps(
         slopes = np.stack([curve.slope(temperature) for curve in tile.curves], axis=1)
         used = ratios.order + functions.steps
         cost = ratios.reduced_chi2 * (frames - used) + pieces.COST * used
-        gray = reflection_ratio.may_be_gray(ratios, noise, slopes)
+        gray = reflection_ratio.may_be_gray(ratios, noise, like(slopes, noise))
         as_they_are = gray, (len(noise) - 1) * cost
     emission = emissions.estimate(straight, functions, ratios, drift, start)
     background, variance = backgrounds.estimate(tile, emission, ratios)
     of_object, of_background = backgrounds.pattern_variances(tile, emission, ratios, background)
-    films = np.stack([emission.temperature, background])
-    stds = np.sqrt([emission.temperature_std**2 + of_object, variance + of_background])
-    lost = ~((np.abs(films) < USELESS) & (stds < USELESS))
+    films = xp.stack([emission.temperature, background])
+    stds = xp.sqrt(xp.stack([emission.temperature_std**2 + of_object, variance + of_background]))
+    lost = ~((xp.abs(films) < USELESS) & (stds < USELESS))
     beyond = out_of_range(films, stds, tile.curves[0])
-    values = np.where(lost, np.nan, [films, stds])
+    values = xp.where(lost, np.nan, xp.stack([films, stds]))
     residual = residuals.null_residual(signals, functions, ratios)
-    smoothed = np.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
+    smoothed = xp.einsum("bp,bcp->cp", ratios.null_weights, ratios.coefficients)
     rapid = signals[0] - functions.functions @ ratios.coefficients[0]
     common = ratios.null_weights[0] * noise[0] ** 2
-    curves = np.stack([residual, functions.object_part @ smoothed])
+    curves = residual, functions.object_part @ smoothed
+    edges = pieces.blocks(frames)
     parts = vars(ratios) | vars(emission)
     solution = Solution(
         object_temperature=values[0, 0],
         object_temperature_std=values[1, 0],
         background_temperature=values[0, 1],
         background_temperature_std=values[1, 1],
-        missing=np.isnan(films).sum(axis=1),
+        missing=xp.isnan(films).sum(axis=1),
         lost=lost.sum(axis=1),
-        beyond=np.any(beyond, axis=1),
+        beyond=xp.any(beyond, axis=1),
         ratio_variance=ratios.variance + emission.level_std**2,
         freedom=frames - functions.steps - ratios.order,
         gray=as_they_are[0],
@@ -141,7 +159,7 @@ def _steps(
         correlation=residuals.autocorrelation(residual),
         delay=residuals.interband_delay(residual, signals[0], functions, ratios, noise[0]),
         unexplained=residuals.unexplained(residual, rapid, ratios.null_variance, common),
-        sums=np.add.reduceat(curves, pieces.blocks(frames)[:-1], axis=1),
+        sums=xp.stack([residuals.block_sums(curve, edges) for curve in curves]),
         **{name: parts[name] for name in parts if name in Solution.__dataclass_fields__},
     )
     return solution, backgrounds.bend(tile, emission, background), emission.line
