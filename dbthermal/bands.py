@@ -43,7 +43,6 @@ class Band:
     upper: float
 
     def __post_init__(self) -> None:
-        """Check the edges."""
         if not 0 < self.lower < self.upper < np.inf:
             raise ValueError(
                 f"Invalid edges {self.lower} m, {self.upper} m of band '{self.name}'. "

@@ -58,7 +58,6 @@ class Bias:
     stray: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         for name in ("object_tolerance", "background_tolerance"):
             value = getattr(self, name)
             if not 0 <= value < np.inf:

@@ -44,7 +44,6 @@ class Region:
     points: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
-        """Check the outline."""
         if self.kind not in get_args(Kind):
             raise ValueError(
                 f"Unknown kind of region {self.kind!r}. Must be one of {list(_LEAST)}."

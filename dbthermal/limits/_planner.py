@@ -57,7 +57,6 @@ class CaptureDesign:
     duration: float = 2.0
 
     def __post_init__(self) -> None:
-        """Refuse conditions that are no capture."""
         for name in ("seconds", "rate", "start", "level", "period", "duration"):
             planck.require_positive(name, getattr(self, name))
         for name in ("span", "amplitude"):

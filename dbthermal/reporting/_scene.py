@@ -122,15 +122,9 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         "validity": _validity(view),
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
+    film = video(view, title, codec, celsius=celsius)
     sections = [
-        Section(
-            "Scene",
-            [
-                f"{sentence}.",
-                video(view, title, codec, celsius=celsius),
-                viewer(view, celsius=celsius),
-            ],
-        ),
+        Section("Scene", [f"{sentence}.", film, viewer(view, celsius=celsius)]),
         Section("Regions", list(_regions(view, chosen, curves, celsius=celsius))),
         Section("What can be trusted", list(_trust(view, numbers["validity"]))),
         Section("Emissivities", list(_emissivities(numbers["regions"]))),

@@ -46,7 +46,6 @@ class Background:
     drift: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the kind and the numbers."""
         if self.kind not in _BACKGROUNDS:
             raise ValueError(f"Unknown background '{self.kind}'. Must be one of {_BACKGROUNDS}.")
         if not 0 <= self.count[0] <= self.count[1]:

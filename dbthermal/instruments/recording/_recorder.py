@@ -153,14 +153,8 @@ def _new_file(
         "started": _utc(),
         "provenance": store.provenance(asdict(session)),
     }
-    return CaptureFile(
-        path,
-        sources,
-        readings={name: reading.units for name, reading in readings.items()},
-        origin=monotonic(),
-        attrs=attrs,
-        chunk=limits.chunk,
-    )
+    units, start = {name: reading.units for name, reading in readings.items()}, monotonic()
+    return CaptureFile(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)
 
 
 def _utc() -> str:
