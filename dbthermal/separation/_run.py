@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
@@ -27,8 +28,10 @@ if TYPE_CHECKING:
 # Memory [byte], from the peaks of processes with one thread and with two, of 350 to 3000 frames:
 # of a process that has imported and compiled all, and with torch;
 _BASE: Final = 450_000_000
-# of a sample of a band in a block: counts (4), results (8), and those on the way to the disk;
-_SAMPLE: Final = 16
+# of a sample of a band that is read, and of one in the chunks of dask's beside that;
+_READ: Final = 4
+# of a sample of a band in a block: results (8), and those on the way to the disk;
+_SAMPLE: Final = 12
 # of a sample of a band in the tile of a compiled method (110 to 140), whose tiles have so many
 # times the pixels; of another in about the same proportion more (500 to 900).
 _TILE: Final = 140
@@ -64,8 +67,9 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     source : str, Path, Dataset, or a sequence of these
         Stage `corrected` of `schema`, as for `solve`: a folder ``*.zarr`` of `store.save`, which
         every process opens by itself, or a lazy Dataset (of zarr, dask), of which every process is
-        sent its rows. What `correct_capture` or `align` leave to be computed, threads can take, and
-        the workers of a cluster, not those of a ProcessPoolExecutor.
+        sent its rows; those of a chunk of dask's are read once, for all their blocks. What
+        `correct_capture` or `align` leave to be computed, threads can take, and the workers of a
+        cluster, not those of a ProcessPoolExecutor.
     target : str or Path, or as many
         Folder ``*.zarr`` for each result. While it is made, its parts are in ``*.zarr.parts``.
     response : Dataset
@@ -89,8 +93,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     Raises
     ------
     TypeError, ValueError
-        As `solve` does; for a method of the whole image; if the memory is too small for a row; and
-        if the parts at hand are of another run.
+        As `solve` does; for a method of the whole image; if the memory is too small for a row, with
+        the source's chunks; and if the parts at hand are of another run.
     ExceptionGroup
         Of several captures: what was raised, each with the name of its capture; all others are
         finished.
@@ -171,18 +175,21 @@ class _Job:
         if target.exists() and store.open_dataset(target).attrs.get("provenance") == provenance:
             shutil.rmtree(parts, ignore_errors=True)  # of a run that was killed at its very end
             return
-        threads, height = _share(capture, self.memory, self.executor, get_method(self.method))
+        threads, height, read = _share(capture, self.memory, self.executor, get_method(self.method))
         _begin(parts, {"height": height, **provenance})
-        rows = [slice(top, top + height) for top in range(0, capture.sizes["y"], height)]
-        paths = [parts / f"{one.start:06d}.zarr" for one in rows]
+        end = capture.sizes["y"]
+        paths = {top: parts / f"{top:06d}.zarr" for top in range(0, end, height)}
         jobs = []
         with ThreadPoolExecutor(threads) as own:
-            for one, path in zip(rows, paths, strict=True):
-                if not path.exists():
-                    here = {name: _of_rows(value, one) for name, value in self.options.items()}
-                    part = source if isinstance(source, Path) else capture.isel(y=one)
-                    task = (part, one, path, response, self.method, here, height, provenance)
-                    jobs.append((self.executor or own).submit(_separate_part, *task))
+            for top in range(0, end, read):
+                rows = slice(top, min(top + read, end))
+                blocks = range(top, rows.stop, height)
+                left = {one - top: paths[one] for one in blocks if not paths[one].exists()}
+                if left:
+                    here = {name: _of_rows(value, rows) for name, value in self.options.items()}
+                    part = source if isinstance(source, Path) else capture.isel(y=rows)
+                    task = (part, rows, left, response, self.method, here, height, provenance)
+                    jobs.append((self.executor or own).submit(_separate_rows, *task))
             self.blocks.extend(jobs)
             self.bar.total = (self.bar.total or 0) + len(jobs)
             try:
@@ -192,26 +199,30 @@ class _Job:
             finally:
                 for block in jobs:
                     block.cancel()
-        store.join_parts(paths, target)
+        store.join_parts(paths.values(), target)
         shutil.rmtree(parts)
 
 
-def _separate_part(
+def _separate_rows(
     source: Path | xr.Dataset,
     rows: slice,
-    path: Path,
+    paths: Mapping[int, Path],
     response: xr.Dataset,
     method: str,
     options: Mapping[str, Any],
     height: int,
     provenance: Mapping[str, Any],
 ) -> None:
-    """Separate a block of rows, of a capture on disk or in hand, and write it whole or not."""
+    """Read rows of a capture on disk or in hand; write each block of them whole or not."""
     part = store.open_dataset(source).isel(y=rows) if isinstance(source, Path) else source
     # What is dask's is computed here: its own threads, or the cluster's, would hold more blocks.
     part = part.load(scheduler="synchronous")
-    result = solve(part, response, method, workers=1, **options)
-    store.save_rows([result], path, provenance, height)
+    for top, path in paths.items():
+        block = slice(top, top + height)
+        here = {name: _of_rows(value, block) for name, value in options.items()}
+        result = solve(part.isel(y=block), response, method, workers=1, **here)
+        store.save_rows([result], path, provenance, height)
+        del result  # or it would be there beside the next one
 
 
 def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
@@ -250,24 +261,40 @@ def _with_noise(
 
 def _share(
     capture: xr.Dataset, memory: float, executor: Executor | None, method: Method
-) -> tuple[int, int]:
-    """Threads of a process, and rows of a block: those that `solve` reads at once, or fewer."""
-    row = capture["counts"][..., 0, :].size
+) -> tuple[int, int, int]:
+    """Threads of a process, rows of a block, as `solve` reads at once or fewer, and of a read."""
+    counts = capture["counts"]
+    row, lazy = counts[..., 0, :].size, counts.chunksizes.get("y", ())
+    chunk = max(lazy, default=counts.encoding.get("preferred_chunks", {}).get("y", 1))
     long = min(PIXELS * capture.sizes["time"], SAMPLES) * capture.sizes["band"]
     each, tile = _TILE * (1 if method.compiled else _TIMES), _TILE * _TIMES * long
-    # What a block takes is that of its samples and of a tile, or, if less, of all as one tile.
-    least = _SAMPLE * row + min(each * row, tile)
-    threads = 1 if executor or memory < _BASE + 2 * least else 2
+
+    def read(height: int) -> tuple[int, bool]:
+        """Rows that are read together: blocks as far as a chunk of dask's; whether no more is."""
+        rows = height * math.ceil(chunk / height) if lazy else height
+        return rows, rows % chunk == 0 and set(lazy[:-1]) <= {chunk}
+
+    def need(height: int) -> float:
+        """Memory [byte] of the chunks read, of the blocks' samples, and of a tile or all as one."""
+        rows, exact = read(height)
+        chunks = (rows if exact else rows + 2 * chunk) if lazy else 0
+        samples = _READ * (rows + chunks) + _SAMPLE * height
+        return samples * row + min(each * row * height, tile)
+
+    threads = 1 if executor or memory < _BASE + 2 * need(1) else 2
     if isinstance(executor, ThreadPoolExecutor):
         threads = executor._max_workers
     free = (memory - _BASE) / threads
-    if free < least:
+    if free < need(1):
         raise ValueError(
-            f"Invalid memory {memory:g} byte. Must be at least {_BASE + threads * least:g} for one "
-            f"row of {capture.sizes['x']} pixels and {capture.sizes['time']} frames."
+            f"Invalid memory {memory:g} byte. Must be at least {_BASE + threads * need(1):g} for "
+            f"one row of {capture.sizes['x']} pixels and {capture.sizes['time']} frames"
+            + (f", of a source in chunks of {chunk} rows." if lazy else ".")
         )
-    rows = int(max((free - tile) / _SAMPLE, free / (_SAMPLE + each)) / row)
-    return threads, min(rows, BLOCK_ROWS, capture.sizes["y"])
+    fit = [one for one in range(1, min(BLOCK_ROWS, capture.sizes["y"]) + 1) if need(one) <= free]
+    # A somewhat lower block, of which no chunk is read for two.
+    height = max([one for one in fit if 2 * one > fit[-1] and read(one)[1]] or fit)
+    return threads, height, read(height)[0]
 
 
 def _begin(parts: Path, plan: Mapping[str, Any]) -> None:

@@ -268,7 +268,7 @@ def get_method(name: str) -> Method:
     >>> get_method("calibrated").knows_emissivity
     True
     >>> get_method("subspace").settings(background_drift=1.0)  # K
-    SubspaceSettings(background_drift=1.0)
+    SubspaceSettings(background_drift=1.0, device=None)
     """
     if name not in METHODS:
         raise ValueError(f"Unknown method '{name}'. Must be one of {list(METHODS)}.")

@@ -35,23 +35,24 @@ _CHUNK_BYTES: Final = 2**20
 
 
 def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> tuple[int, ...]:
-    """Chunk sizes for a variable: tiles of y and x, whole in every other dimension.
+    """Chunk sizes for a variable: pieces of rows, whole in every dimension but y and x.
 
-    Every stage works pixel by pixel on all frames and bands, so a chunk holds all of a nearly
-    square tile of pixels, the smallest that has `_CHUNK_BYTES` before compression. Tiles divide a
-    `height` of rows, if there is one, so that rows that follow begin with a tile.
+    Every stage works pixel by pixel on all frames and bands, and reads rows of the image: a chunk
+    is the fewest whole rows that have `_CHUNK_BYTES` before compression, or equal parts of one. Its
+    frames are then long runs of the array, copied at twice the rate of a square tile's. Chunks
+    divide a `height` of rows, if there is one, so that rows that follow begin with a chunk.
     """
     sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
     if not {"y", "x"} <= sizes.keys():
         return tuple((sizes | ({"y": height} if height and "y" in sizes else {})).values())
     pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
     pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
-    rows = min(height or sizes["y"], math.ceil(math.sqrt(pixels)))
+    width = math.ceil(sizes["x"] / max(1, sizes["x"] // pixels))
+    most = height or sizes["y"]
+    rows = min(most, math.ceil(pixels / width))
     if height:
-        rows = next(count for count in range(rows, 0, -1) if height % count == 0)
-    width = min(sizes["x"], math.ceil(pixels / rows))
-    sizes |= {"y": rows if height else min(sizes["y"], math.ceil(pixels / width)), "x": width}
-    return tuple(sizes.values())
+        rows = next(count for count in range(rows, most + 1) if most % count == 0)
+    return tuple((sizes | {"y": rows, "x": width}).values())
 
 
 def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -> None:

@@ -34,7 +34,7 @@ _PACKAGES = ("numpy", "scipy", "xarray", "zarr")
 
 # FFmpeg's encoder of each codec of a film, with its options.
 _ENCODERS: Final[dict[str, tuple[Literal["libvpx-vp9", "libx264"], dict[str, str]]]] = {
-    "vp9": ("libvpx-vp9", {"crf": "31", "b": "0", "cpu-used": "4"}),
+    "vp9": ("libvpx-vp9", {"crf": "31", "b": "0", "deadline": "realtime", "cpu-used": "6"}),
     "h264": ("libx264", {}),
 }
 

@@ -21,13 +21,16 @@ from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
+from unittest.mock import patch
 
 import numpy as np
+import torch
 import xarray as xr
 from matplotlib.figure import Figure
 
 from dbthermal import separation, simulation, store
 from dbthermal.figures import drawing
+from dbthermal.separation._subspace import fused, steps
 from reproduction import experiments, paths
 
 RATE: Final = 10.0  # [Hz]
@@ -46,6 +49,15 @@ NOISE: Final = (0.03, 0.35, 0.15, 0.4)  # [K]
 EMISSIVITY: Final = (0.86, 0.72, 0.88, 0.95)
 ON_DISK: Final = 2**15  # pixels of the capture on disk, as 256 rows
 DAY: Final = 24 * 3600 * 60  # frames of a day at 60 Hz
+FORMS: Final = {
+    "compiled": None,
+    "arrays of NumPy": None,
+    "tensors": "cpu",
+    "tensors on GPU": "cuda",
+}
+"""Forms of the default method's steps, and the device of `SubspaceSettings`."""
+FORM_PIXELS: Final = 2560  # a tile of them
+MOVED: Final = 24  # of a sample of both bands, as it comes and with four films of results [byte]
 ARCHIVE: Final = 10_000  # captures of a full frame, USUAL["frames"] each
 
 Times = dict[tuple[str, str], dict[int, float]]
@@ -84,12 +96,13 @@ def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
     return xr.Dataset(films, coords={"band": row["band"], "time": row["time"]})
 
 
-def solve(movie: xr.Dataset, method: str) -> xr.Dataset:
+def solve(movie: xr.Dataset, method: str, settings: Any = None) -> xr.Dataset:
     """Separate by one thread."""
     names = [str(band) for band in movie["band"].values]
     known = xr.DataArray(list(EMISSIVITY[: len(names)]), dims="band", coords={"band": names})
     emissivity = known if separation.get_method(method).knows_emissivity else None
-    return separation.solve(movie, response(tuple(names)), method, emissivity=emissivity, workers=1)
+    options: dict[str, Any] = {"emissivity": emissivity, "settings": settings, "workers": 1}
+    return separation.solve(movie, response(tuple(names)), method, **options)
 
 
 def seconds_of(method: str, sizes: dict[str, int]) -> float:
@@ -101,6 +114,33 @@ def seconds_of(method: str, sizes: dict[str, int]) -> float:
         solve(movie, method)
         taken.append(time.process_time() - start)
     return min(taken)
+
+
+def forms() -> dict[str, tuple[float, float]]:
+    """Bytes a second of the default method by the form of its steps, and of its device's memory.
+
+    Both of one thread of the processor; of a GPU by the clock.
+    """
+    movie, found = capture(FORM_PIXELS, USUAL["frames"], 2), {}
+    torch.set_num_threads(1)
+    for name, device in FORMS.items():
+        if device == "cuda" and not torch.cuda.is_available():
+            continue
+        settings, taken = separation.SubspaceSettings(device=device), list[float]()
+        block, copied = torch.ones(2**27, device=device), list[float]()  # 512 MiB
+        target = block.clone()
+        clock = time.perf_counter if device == "cuda" else time.process_time
+        with patch.object(fused, "solve", steps.solve if "NumPy" in name else fused.solve):
+            for _ in range(3):
+                start = clock()
+                solve(movie, "subspace", settings)
+                taken.append(clock() - start)
+                start = clock()
+                float(target.copy_(block)[-1])  # waits for the device
+                copied.append(clock() - start)
+        found[name] = MOVED * movie["counts"][0].size / min(taken), 2 * block.nbytes / min(copied)
+        print(name, found[name], flush=True)
+    return found
 
 
 def series(method: str, name: str) -> Iterator[tuple[int, float]]:
@@ -204,11 +244,16 @@ def machine() -> str:
     if (info := Path("/proc/cpuinfo")).exists():
         model = (re.search(r"model name\s*: (.*)", info.read_text()) or [model, model])[1]
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "zarr"))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "torch", "zarr"))
     return (
         f"{model}, {os.cpu_count()} processors, {memory:.0f} GB; Python "
-        f"{platform.python_version()}, {packages}; no GPU is used"
+        f"{platform.python_version()}, {packages}; {gpu()}"
     )
+
+
+def gpu() -> str:
+    """Name of the first GPU of torch."""
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else "a GPU was not at hand"
 
 
 HEAD: Final = """# Benchmarks
@@ -227,8 +272,14 @@ over frames of {few} pixels, over bands of {pixels}.
 
 `subspace`, processor time of a sample of both bands [ns] by the number of frames: {samples}.
 
+`subspace` by the form of its steps ([GPU](cluster.md#a-gpu)), {tile} pixels; processor time of one
+thread, of a GPU the clock's; {gpu}. Bytes are those of the samples and of the four films
+of results, against what a copy reads and writes in the same memory.
+
+{forms}
+
 On paper, from the rate of {processes} processes, with nothing lost between machines, which share
-only a disk. A GPU was not at hand.
+only a disk.
 
 {costs}
 """
@@ -240,7 +291,7 @@ def rows(*cells: Sequence[str]) -> str:
     return "\n".join([head, "|---" * len(cells[0]) + "|", *rest])
 
 
-def table(times: Times, disk: Disk, busy: float) -> str:
+def table(times: Times, disk: Disk, rates: dict[str, tuple[float, float]], busy: float) -> str:
     """All that was measured, in Markdown, ratios first."""
     most = max(disk.seconds)
     frames = times["subspace", "frames"]
@@ -251,6 +302,11 @@ def table(times: Times, disk: Disk, busy: float) -> str:
         processes=most,
         ratios=rows(("ratio", ""), *ratios(times, disk)),
         methods=methods(times),
+        tile=FORM_PIXELS,
+        gpu=gpu(),
+        forms=rows(
+            ("form", "frames/s of 640x512", "GB/s", "share of the memory's"), *shares(rates)
+        ),
         samples=", ".join(f"{n}: {1e9 * s / FEW / n:.0f}" for n, s in frames.items()),
         costs=costs(disk, disk.samples / disk.seconds[most]),
         **USUAL,
@@ -272,6 +328,12 @@ def ratios(times: Times, disk: Disk) -> Iterator[tuple[str, str]]:
         gain, weak = one / disk.seconds[number], number * one / disk.weak[number]
         yield f"rate of {number} processes over one, the same capture", f"{gain:.2f}"
         yield f"rate of {number} processes over one, {number} times the rows", f"{weak:.2f}"
+
+
+def shares(rates: dict[str, tuple[float, float]]) -> Iterator[tuple[str, ...]]:
+    """Yield each form with its frames and bytes a second, and its share of the memory's rate."""
+    for name, (rate, most) in rates.items():
+        yield name, f"{rate / MOVED / FRAME:.2g}", f"{rate / 1e9:.2g}", f"{100 * rate / most:.2g} %"
 
 
 def methods(times: Times) -> str:
@@ -332,7 +394,7 @@ def main(arguments: Sequence[str] | None = None, measure: Callable[[], Times] = 
     times = measure()
     with TemporaryDirectory(dir=folder) as place:
         disk = from_disk(Path(place))
-    text = table(times, disk, busy)
+    text = table(times, disk, forms(), busy)
     store.save_text(text, folder / "benchmarks.md", record)
     store.save_figure(figure(times), folder / "benchmarks.png", record)
     if chosen.write:

@@ -67,7 +67,7 @@ def _result(experiment: Experiment, folder: Path, *args: Any, **options: Any) ->
     result = experiment(*args, **options)
     folder.mkdir(parents=True, exist_ok=True)
     with NamedTemporaryFile(dir=folder, prefix=".", delete=False) as part:
-        part.write(zlib.compress(pickle.dumps((path.name, result))))
+        part.write(zlib.compress(pickle.dumps((path.name, result)), level=1))
     Path(part.name).replace(path)
     return result
 

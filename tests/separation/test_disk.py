@@ -21,7 +21,9 @@ from reproduction.experiments import whole
 
 RIG = simulation.Rig()
 TIME = np.arange(64) / 10.0  # s
-MEMORY = _run._BASE + 9 * (_run._SAMPLE + _run._TILE) * 2 * 64 * 24  # byte: nine rows in a block
+MEMORY = (
+    _run._BASE + 9 * (_run._READ + _run._SAMPLE + _run._TILE) * 2 * 64 * 24
+)  # byte: nine rows in a block
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +140,32 @@ def test_a_lazy_dataset_is_a_source(path: Path, tmp_path: Path, kind: str) -> No
     xr.testing.assert_equal(*results)
 
 
+@pytest.mark.parametrize("rows", [16, 41, 1, 3, (5, 13, 23)], ids=str)
+def test_chunks_of_dask_are_read_once(path: Path, tmp_path: Path, rows: Any) -> None:
+    """Whatever their rows, each chunk is read for one part alone; but where they are uneven."""
+    dask = pytest.importorskip("dask.array", reason="dask is not installed")
+    held, read = store.open_dataset(path).load(), []
+
+    def noted(block: Any, block_info: Any = None) -> Any:
+        """A chunk, whose first row is noted."""
+        if block_info:
+            read.append(block_info[0]["array-location"][2][0])
+        return block
+
+    lazy = held.chunk({"y": rows})
+    lazy["counts"] = lazy["counts"].copy(data=dask.map_blocks(noted, lazy["counts"].data))
+    read.clear()
+    most = MEMORY + 4 * _run._READ * 41 * 2 * 64 * 24
+    separation.run(lazy, tmp_path / "result.zarr", RIG.response(), memory=most)
+    result = store.open_dataset(tmp_path / "result.zarr").load()
+    expected = separation.solve(held, RIG.response())
+    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+    times = max(np.unique(read, return_counts=True)[1])
+    print(f"chunks of {rows} rows: {len(read)} reads, a chunk at most {times} times")
+    # Twice more for a few pixels: by which the capture is known again, and to check it.
+    assert times <= (4 if isinstance(rows, tuple) else 3)
+
+
 def test_raw_counts_are_corrected_by_rows(tmp_path: Path) -> None:
     """A raw capture on disk, corrected when it is read, is separated as if corrected before."""
     rng, shape = np.random.default_rng(3), (41, 24)
@@ -162,9 +190,9 @@ def test_a_cluster_gives_the_same_bytes(path: Path, tmp_path: Path, lazy: bool) 
     reason = "dask.distributed is not installed: pip install dbthermal[cluster]"
     distributed = pytest.importorskip("distributed", reason=reason)
     options: dict[str, Any] = {"memory": MEMORY, "provenance": {"run of": "a test"}}
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
-        separation.run(path, tmp_path / "one.zarr", RIG.response(), executor=one, **options)
     source = dask_backed(path) if lazy else path
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as one:
+        separation.run(source, tmp_path / "one.zarr", RIG.response(), executor=one, **options)
     with (
         distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster,
         distributed.Client(cluster) as client,
@@ -196,7 +224,7 @@ def test_a_join_that_is_cut_short_loses_nothing(
         with pytest.raises(OSError, match="No space"):
             separation.run(path, tmp_path / "cut.zarr", RIG.response(), **options)
     assert not (tmp_path / "cut.zarr").exists()
-    monkeypatch.setattr(_run, "_separate_part", None)
+    monkeypatch.setattr(_run, "_separate_rows", None)
     separation.run(path, tmp_path / "cut.zarr", RIG.response(), **options)
     assert files(tmp_path / "cut.zarr") == files(tmp_path / "rest.zarr")
 
@@ -248,7 +276,7 @@ def test_parts_of_another_run_are_refused(path: Path, tmp_path: Path) -> None:
     ("options", "message"),
     [
         ({"method": "bcp"}, "Invalid method 'bcp' for a run. Must take each"),
-        ({"memory": 1e6}, "Invalid memory .* byte. Must be at least"),
+        ({"memory": 1e6}, "Invalid memory .* byte. Must be at least .* 64 frames.$"),
     ],
 )
 def test_what_is_of_the_whole_image_is_refused(

@@ -128,17 +128,18 @@ def test_missing_dataset_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shape", "dtype", "expected"),
     [
-        ((2, 350, 512, 640), "uint16", (2, 350, 28, 27)),
-        ((350, 512, 640), "float32", (350, 28, 27)),
+        ((2, 350, 512, 640), "uint16", (2, 350, 2, 640)),
+        ((350, 512, 640), "float32", (350, 2, 640)),
         ((512, 640), "uint16", (512, 640)),
-        ((350, 8, 640), "float32", (350, 8, 94)),
+        ((30000, 2, 640), "float32", (30000, 1, 10)),
+        ((350, 1, 640), "float32", (350, 1, 640)),
         ((350, 640, 8), "float32", (350, 94, 8)),
         ((350, 8, 10), "float64", (350, 8, 10)),
         ((0, 8, 10), "float64", (1, 8, 10)),
     ],
 )
 def test_chunks(shape: tuple[int, ...], dtype: str, expected: tuple[int, ...]) -> None:
-    """Tiles hold all frames and just over 1 MiB, or the whole frame where that is smaller."""
+    """All frames of the fewest whole rows that have 1 MiB, or of parts of a row that do."""
     variable = xr.Variable(("band", "time", "y", "x")[-len(shape) :], np.empty(shape, dtype))
     assert _datasets._chunks(variable) == expected
 

@@ -22,8 +22,8 @@ BEAD: Final = 3
 SHIFTED: Final = ("subspace", "calibrated", "naive", "dbvt")
 """Methods that take the shift of the reflections."""
 
-SLOW: Final = ("dbvt", "naive")
-"""Methods that get the surroundings of a bead only: a whole image takes them minutes."""
+PIXELWISE: Final = ("calibrated", "dbvt", "naive")
+"""Methods that get the surroundings of a bead only, which they treat pixel by pixel."""
 
 REACH: Final = 5
 """Pixels around a bead that it gets: of some shifts, by which it pairs the pixels."""
@@ -78,7 +78,8 @@ def judge_twin(
         separated = separation.solve(corrected, response, reflection_shift=shift)
         good = (separated["status"] == 0) & scene["on_object"]
         away = abs(separated["emissivity"] - fit["emissivity"]).where(good).mean(("y", "x"))
-        read = at_thermocouple(scene, corrected, response, informed, rng, reflection_shift=shift)
+        seen = (scene, corrected, response, separated)
+        read = at_thermocouple(*seen, informed, rng, reflection_shift=shift)
         both = {**over_the_image(scene, separated).data_vars, "emissivity_difference": away}
         parts.append(read.assign(both))
     label = xr.DataArray(list(views), dims="cameras", name="cameras")
@@ -163,6 +164,7 @@ def at_thermocouple(
     scene: xr.Dataset,
     corrected: xr.Dataset,
     response: xr.Dataset,
+    separated: xr.Dataset,
     variants: Mapping[str, Mapping[str, Any]],
     rng: np.random.Generator,
     *,
@@ -175,7 +177,7 @@ def at_thermocouple(
     probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
     number of probes, so that the result does not depend on one probe's error. Variants are label ->
     `method` of `separation.solve` and its arguments, with the shift of the reflections where it
-    takes one.
+    takes one; the default method without arguments is what has been separated.
 
     Returns
     -------
@@ -191,8 +193,11 @@ def at_thermocouple(
         for _ in range(probes)
     ]
     seed = int(rng.integers(2**32))  # of random starts: each capture has its own
+    bead = separated["object_temperature"].isel(square).mean(("y", "x"), skipna=False)
     estimates = [
-        _mean(corrected, response, square, {"seed": seed, **variant}, reflection_shift)
+        bead
+        if variant == {"method": "subspace"}
+        else _mean(corrected, response, square, {"seed": seed, **variant}, reflection_shift)
         for variant in variants.values()
     ]
     label = xr.DataArray(list(variants), dims="variant", name="variant")
@@ -229,7 +234,7 @@ def _mean(
     if shift is not None and variant["method"] in SHIFTED:
         options["reflection_shift"] = shift
     seen = corrected
-    if variant["method"] in SLOW:
+    if variant["method"] in PIXELWISE:
         reach = REACH if "reflection_shift" in options else 0
         around = {
             dim: slice(max(0, part.start - reach), part.stop + reach)

@@ -5,6 +5,7 @@ Temperatures are those that a thermal camera reads of skin and clothes indoors.
 
 import itertools
 from dataclasses import dataclass
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -106,6 +107,7 @@ def person(route: Route, *, height: float = 0.0) -> list[Actor]:
 def _walking(part: Actor, route: Route, floor: float, joint: float, swing: float) -> Actor:
     """Part of a body on its route, swinging in step about a joint at a height."""
 
+    @cache  # two cameras ask for each time
     def motion(time: float) -> Pose:
         upright = Rotation.from_euler("z", route.heading(time))
         angle = Rotation.from_euler("y", swing * np.sin(route.phase(time)))
@@ -154,6 +156,7 @@ def _finger(number: int, motion: Motion, skin: float, flex: float, rate: float) 
     finger = FINGERS[number]
     root, tip = ((x, 0.0, z) for x, z in (finger.root, finger.tip))
 
+    @cache
     def bent(time: float) -> Pose:
         phase = 2.0 * np.pi * rate * (1.0 + 0.13 * number) * time + number
         return motion(time) @ hinged(root, Rotation.from_euler("x", flex * np.sin(phase)))

@@ -7,14 +7,19 @@ as blackbodies: skin, clothes, walls and hot drinks have emissivities of 0.95 an
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import cast
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from numba import njit
 from scipy.spatial.transform import Rotation
 
 from reproduction.twins.rays import Array, Caster, Hits
+
+Rays = tuple[Array, Array]
+
+_MARGIN: Final = 1e-3  # about a body's box, in units of its size: above single precision's rounding
 
 
 @dataclass(frozen=True)
@@ -81,17 +86,55 @@ def painted(parts: Sequence[tuple[trimesh.Trimesh, float]], motion: Motion | Non
     return Actor(cast("trimesh.Trimesh", whole), np.concatenate(warmth), motion)
 
 
+@njit(nogil=True, error_model="numpy", cache=True)
+def _approaching(rays: Rays, sphere: tuple[Array, float], pose: Rays, box: Rays) -> tuple[Any, ...]:
+    """Numbers of the rays that meet a sphere and a box; their origins and directions in its frame.
+
+    Rays are origins and directions (ray, 3); of the sphere the middle and the radius; of the box
+    its rotation and place in the world, and its lowest and highest corners in its own frame.
+    """
+    (origins, directions), (middle, radius), (rotation, place), (low, high) = (
+        rays,
+        sphere,
+        pose,
+        box,
+    )
+    numbers, inwards = np.empty(len(origins), np.int64), np.empty((2, len(origins), 3))
+    count = 0
+    for ray in range(len(origins)):
+        square = along = 0.0
+        for k in range(3):
+            away = middle[k] - origins[ray, k]
+            square += away * away
+            along += away * directions[ray, k]
+        if square > radius**2 and (along < 0.0 or square - along**2 > radius**2):
+            continue
+        enter, leave = 0.0, np.inf
+        for axis in range(3):
+            origin = direction = 0.0
+            for k in range(3):
+                origin += (origins[ray, k] - place[k]) * rotation[k, axis]
+                direction += directions[ray, k] * rotation[k, axis]
+            inwards[0, count, axis], inwards[1, count, axis] = origin, direction
+            one, other = (low[axis] - origin) / direction, (high[axis] - origin) / direction
+            enter, leave = max(enter, min(one, other)), min(leave, max(one, other))
+        if not enter > leave:  # NaN: along a face
+            numbers[count] = ray
+            count += 1
+    return numbers[:count], inwards[0, :count], inwards[1, :count]
+
+
 class _Target:
     """One actor, ready for rays of fixed origins and directions (ray, 3)."""
 
     def __init__(self, actor: Actor, origins: Array, directions: Array) -> None:
         self.actor, self.caster = actor, Caster(actor.mesh)
         self.rays = (origins, directions)
-        self.square = np.einsum("rx,rx->r", origins, origins)
-        self.ahead = np.einsum("rx,rx->r", origins, directions)
         low, high = actor.mesh.bounds
         self.middle = (low + high) / 2.0
         self.radius = float(np.max(np.linalg.norm(actor.mesh.vertices - self.middle, axis=1)))
+        margin = _MARGIN * self.radius
+        self.box = (low - margin, high + margin)
 
     def at(self, time: float) -> tuple[npt.NDArray[np.int64], Hits]:
         """Numbers of the rays that meet the actor at a time [s], and their intersections."""
@@ -104,18 +147,11 @@ class _Target:
         return self._cast(Pose())
 
     def _cast(self, pose: Pose) -> tuple[npt.NDArray[np.int64], Hits]:
-        origins, directions = self.rays
-        near = np.flatnonzero(self._near(pose.outwards(self.middle)))
-        hits = self.caster.cast(*pose.inwards(origins[near], directions[near]))
+        sphere = (pose.outwards(self.middle), self.radius)
+        frame = (pose.rotation.as_matrix(), np.asarray(pose.translation, dtype=np.float64))
+        near, origins, directions = _approaching(self.rays, sphere, frame, self.box)
+        hits = self.caster.cast(origins, directions)
         return near[hits.met], hits.select(hits.met)
-
-    def _near(self, middle: Array) -> npt.NDArray[np.bool_]:
-        """Rays that pass through the sphere about the actor."""
-        origins, directions = self.rays
-        along = directions @ middle - self.ahead
-        square = self.square - 2.0 * (origins @ middle) + middle @ middle
-        inside = square < self.radius**2
-        return np.asarray(inside | ((along > 0) & (square - along**2 < self.radius**2)))
 
 
 def incident(
