@@ -76,7 +76,7 @@ def test_cameras_apart_are_as_good_as_at_one_place(moved: tuple[xr.Dataset, ...]
 
 
 def test_backgrounds_of_two_materials_are_told_before_the_pooled_object() -> None:
-    """The bend between the responses is that of the right background, not of one tens of kelvin off."""
+    """The bend between the responses is that of the right background, not of one far off."""
     width, shift, rig = 24, np.zeros((2, 20, 48)), simulation.Rig(noise=(0.003, 0.03))
     shift[1] = 4.0
     concrete = GLASS.copy(data=[0.928, 0.871])
