@@ -110,7 +110,7 @@ materials text*         as listed by 'data'; all by default
 
 _FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable"
 _COMMANDS: Final = f"""
-info describe.info files {_FORM}
+info files.info files {_FORM}
 say what a store or recording is: sizes, clock, bands, provenance, shares of the status
 capture.zarr
 video.seq

@@ -38,10 +38,8 @@ def laid_on(
         array = array.isel(band=schema.band_positions(array, names, label))
     for dim in shared:
         if array.sizes[dim] != reference.sizes[dim]:
-            raise ValueError(
-                f"Invalid size {array.sizes[dim]} of '{dim}' of {label}. Must be that of {of}, "
-                f"{reference.sizes[dim]}."
-            )
+            rule = f"Must be that of {of}, {reference.sizes[dim]}"
+            raise ValueError(f"Invalid size {array.sizes[dim]} of '{dim}' of {label}. {rule}.")
         if dim in array.coords and dim in reference.coords:
             _require_same(array[dim].values, reference[dim].values, f"'{dim}' of {label}", of)
     return array.assign_coords(

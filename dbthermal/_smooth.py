@@ -152,10 +152,8 @@ def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
     time = np.asarray(time, dtype=np.float64)
     frames = time.shape[-1]
     if not 1 <= order <= frames:
-        raise ValueError(
-            f"Invalid order {order} of the smooth subspace. Must lie in [1, {frames}], "
-            "the number of frames."
-        )
+        rule = f"Must lie in [1, {frames}], the number of frames"
+        raise ValueError(f"Invalid order {order} of the smooth subspace. {rule}.")
     span = time[..., -1:] - time[..., :1] if frames > 1 else 1.0
     position = 2.0 * (time - time[..., :1]) / span - 1.0
     columns, triangle = np.linalg.qr(np.polynomial.legendre.legvander(position, order - 1))

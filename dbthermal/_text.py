@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 
 Row = tuple[int, list[str]]  # row of a table and its line in the file, from 1
 
-TEXT_LIMIT: Final = 2**26
-"""Largest table that is read [byte]; the largest of the public libraries has 0.7 MB."""
-
+TEXT_LIMIT: Final = 2**26  # largest table that is read [byte]; public libraries have 0.7 MB
 YAML_LIMIT: Final = 2**20  # largest YAML file that is read [byte]
 SHOWN: Final = 60  # longest value in a message [character]
 

@@ -43,7 +43,6 @@ class Band:
     upper: float
 
     def __post_init__(self) -> None:
-        """Check the edges."""
         if not 0 < self.lower < self.upper < np.inf:
             raise ValueError(
                 f"Invalid edges {self.lower} m, {self.upper} m of band '{self.name}'. "
@@ -75,16 +74,14 @@ class Band:
 
         Raises ValueError for a temperature outside `TEMPERATURE_RANGE`.
         """
-        temperature = self._within_range(np.asarray(temperature, dtype=np.float64))
-        return self._integral(planck.spectral_radiance, temperature)
+        return self._integral(planck.spectral_radiance, self._within_range(temperature))
 
     def slope(self, temperature: npt.ArrayLike) -> Array:
         """Derivative dB/dT [W m^-2 sr^-1 K^-1] of the in-band radiance at temperatures [K].
 
         Raises ValueError for a temperature outside `TEMPERATURE_RANGE`.
         """
-        temperature = self._within_range(np.asarray(temperature, dtype=np.float64))
-        return self._integral(planck.spectral_radiance_slope, temperature)
+        return self._integral(planck.spectral_radiance_slope, self._within_range(temperature))
 
     def temperature(self, radiance: npt.ArrayLike) -> Array:
         r"""
@@ -123,8 +120,8 @@ class Band:
             total += weight * function(wavelength, temperature)
         return total
 
-    def _within_range(self, temperature: Array) -> Array:
-        lowest, highest = TEMPERATURE_RANGE
+    def _within_range(self, temperature: npt.ArrayLike) -> Array:
+        (lowest, highest), temperature = TEMPERATURE_RANGE, np.asarray(temperature, np.float64)
         bad = ~((temperature >= lowest) & (temperature <= highest))
         if np.any(bad):
             raise ValueError(
@@ -138,17 +135,10 @@ def _filter(name: str, centre_um: float, fwhm_um: float) -> Band:
     return Band(name, (centre_um - 0.5 * fwhm_um) * 1e-6, (centre_um + 0.5 * fwhm_um) * 1e-6)
 
 
+_FWHM: Final = {"8.5": 0.5, "9.5": 0.5, "10.6": 1.5, "12.1": 0.5}  # by centre [um]
 FILTERS: Final[Mapping[str, Band]] = MappingProxyType(
-    {
-        band.name: band
-        for band in (
-            Band("8-14", 8e-6, 14e-6),
-            _filter("8.5", 8.5, 0.5),
-            _filter("9.5", 9.5, 0.5),
-            _filter("10.6", 10.6, 1.5),
-            _filter("12.1", 12.1, 0.5),
-        )
-    }
+    {"8-14": Band("8-14", 8e-6, 14e-6)}
+    | {name: _filter(name, float(name), fwhm) for name, fwhm in _FWHM.items()}
 )
 """The camera's own band and the four filters of the paper (section 5, experimental setup;
 doi:10.48550/arXiv.2509.11334): centre and full width at half maximum, as top hats."""

@@ -81,10 +81,8 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     schema.check_numbers(truth, "the truth", "K")
     bad = ~(truth.values > zero_Celsius)
     if np.any(bad):
-        raise ValueError(
-            f"Invalid true temperature {truth.values[bad].flat[0]} K. Must be above "
-            f"{zero_Celsius} K, the zero of degrees Celsius."
-        )
+        rule = f"Must be above {zero_Celsius} K, the zero of degrees Celsius"
+        raise ValueError(f"Invalid true temperature {truth.values[bad].flat[0]} K. {rule}.")
     truth = laid_on(truth, estimate, "the truth", "the estimate")
     result = 100.0 * abs(estimate - truth) / (truth - zero_Celsius)
     label = "error relative to the true temperature in degrees Celsius"

@@ -117,8 +117,10 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     auto_first, cross, auto_second = (
         part / remaining for part in _trimmed_covariance(*differences)
     )
-    ratio = _lagged_ratio(*rapid)
+    one, other = rapid
+    lagged = (one[1:] * other[:-1] + one[:-1] * other[1:]).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = lagged / (2.0 * (one[1:] * one[:-1]).sum(axis=0))  # (pixel), one frame apart
         correlation = np.nan_to_num(cross / np.sqrt(auto_first * auto_second)).sum()
         # With y2 = ratio y1: var_1 = s_1^2 + v, var_2 = s_2^2 + ratio^2 v, cov = ratio v. Too small
         # to be seen in a pixel, v is still a bias of all: they are judged together.
@@ -183,11 +185,3 @@ def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Arra
     products = (first * first, first * second, second * second)
     auto_first, cross, auto_second = ((p * keep).sum(axis=0) / count for p in products)
     return auto_first, cross, auto_second
-
-
-def _lagged_ratio(first: Array, second: Array) -> Array:
-    """Ratio (pixel) of the bands' rapid changes, from covariances one frame apart."""
-    cross = (first[1:] * second[:-1] + first[:-1] * second[1:]).sum(axis=0)
-    auto = 2.0 * (first[1:] * first[:-1]).sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(cross / auto)

@@ -173,10 +173,8 @@ def require_range(temperature: npt.ArrayLike, curve: Curve, name: str) -> Array:
     values = np.asarray(temperature, dtype=np.float64)
     bad = ~((values >= curve.lowest) & (values <= curve.highest))
     if np.any(bad):
-        raise ValueError(
-            f"Invalid {name} {values[bad].flat[0]} K in band '{curve.band}'. Must lie in the "
-            f"response's range [{curve.lowest}, {curve.highest}] K."
-        )
+        rule = f"Must lie in the response's range [{curve.lowest}, {curve.highest}] K"
+        raise ValueError(f"Invalid {name} {values[bad].flat[0]} K in band '{curve.band}'. {rule}.")
     return values
 
 

@@ -4,7 +4,7 @@
 step. With a target on disk it works by rows, in the memory of some of them.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from dbthermal import schema, store
+from dbthermal import _rows, schema, store
 from dbthermal.alignment import align, reflection_shift, register
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.correction import correct_capture
@@ -119,7 +119,9 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     aligned, field = _aligned(corrected, response, {**aligning, "lazy": lazy})
     kept = ("clock", "time_offset", "frames_lost", "transform")
     attrs = {name: aligned.attrs[name] for name in kept if name in aligned.attrs}
-    halo = _halo(field)
+    halo = 1  # rows around others from which their object is told
+    if field is not None:
+        halo += int(np.ceil(_SHIFTS * np.nanmax(np.abs(field["shift"].sel(axis="y").values))))
 
     def separated(rows: slice) -> xr.Dataset:
         """Some rows of the result."""
@@ -135,9 +137,11 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
 
     if target is None:
         return separated(slice(0, aligned.sizes["y"]))
-    store.save_rows(
-        map(separated, _blocks(aligned, halo)), target, provenance or store.provenance({})
-    )
+    counts = aligned["counts"]
+    rows = _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"]) - 2 * halo
+    samples = max(_FEWEST, rows) * counts.size // aligned.sizes["y"]
+    blocks = _rows.blocks(counts.shape, samples)
+    store.save_rows(map(separated, blocks), target, provenance or store.provenance({}))
     return store.open_dataset(target)
 
 
@@ -251,19 +255,3 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
         values[name] = (field[name].dims, np.where(lost[near], np.nan, wide), field[name].attrs)
     here = {dim: aligned[dim] for dim in ("y", "x") if dim in aligned.coords}
     return xr.Dataset(values, coords={"axis": field["axis"], **here}, attrs=field.attrs)
-
-
-def _blocks(aligned: xr.Dataset, halo: int) -> Iterator[slice]:
-    """Rows that are separated together, with a halo on both sides."""
-    height = aligned.sizes["y"]
-    together = _MEMORY // (_SAMPLE * aligned.sizes["time"] * aligned.sizes["x"])
-    rows = max(_FEWEST, together - 2 * halo)
-    for top in range(0, height, rows):
-        yield slice(top, min(top + rows, height))
-
-
-def _halo(field: xr.Dataset | None) -> int:
-    """Rows around others from which their object is told, if the cameras see reflections apart."""
-    if field is None:
-        return 1
-    return 1 + int(np.ceil(_SHIFTS * np.nanmax(np.abs(field["shift"].sel(axis="y").values))))

@@ -58,7 +58,6 @@ class Bias:
     stray: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         for name in ("object_tolerance", "background_tolerance"):
             value = getattr(self, name)
             if not 0 <= value < np.inf:
@@ -159,12 +158,6 @@ class _Signals(NamedTuple):
         inner = np.eye(len(common)) + common @ (common / variance).T
         scaled = values / variance
         return np.asarray(scaled - (common / variance).T @ np.linalg.solve(inner, common @ scaled))
-
-    def adjusted_x(self, emissivity: float, weighted: Array) -> Array:
-        """Abscissa (n) [count] as the fit adjusts it, from the weighted residual (n)."""
-        # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
-        by_object = emissivity * self.emitted.covariance(weighted)
-        return self.x + by_object - (1.0 - emissivity) * self.reflected.covariance(weighted)
 
 
 def fit_emissivity(
@@ -274,13 +267,11 @@ def reflector_emissivity(
     measured : Dataset
         Stage `reflector`: `counts` of the object and `reflected_counts` of the foil (band,
         measurement) [count]; `object_temperature` by contact (measurement) [K].
-    response : Dataset
-        From `fit_response`, with its noise, which both counts have.
     reading_std : tuple of float
         Standard deviation of one reading of the contact thermometer, and of the reflected
         temperature beyond the camera's noise, as from one part of the foil to another [K].
-    bias : Bias
-        Errors that all contact readings have in common; its terms of the background are not used.
+    response, bias
+        As for `fit_emissivity`; the terms of the background are not used.
 
     Returns
     -------
@@ -375,8 +366,11 @@ def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]
     emissivity = float(x @ y / (x @ x))
     for _ in range(_ITERATIONS):
         # Scatter of the readings would pass for contrast and pull the slope down: York et al.
-        # (2004) weigh by the abscissa as the fit adjusts it.
-        adjusted = signals.adjusted_x(emissivity, signals.weighted(emissivity, y - emissivity * x))
+        # (2004) weigh by the abscissa as the fit adjusts it,
+        # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
+        weighted = signals.weighted(emissivity, y - emissivity * x)
+        adjusted = x + emissivity * signals.emitted.covariance(weighted)
+        adjusted = adjusted - (1.0 - emissivity) * signals.reflected.covariance(weighted)
         weights = signals.weighted(emissivity, adjusted)
         previous, emissivity = emissivity, float((weights @ y) / (weights @ x))
         if abs(emissivity - previous) < _CONVERGED:

@@ -243,15 +243,11 @@ def _check_blackbody(counts: xr.DataArray) -> None:
     schema.check_variable(counts, schema.STAGES["blackbody"]["counts"], "the blackbody counts")
     temperature = planck.require_positive("temperature [K]", counts["temperature"].values)
     if temperature[0] < bands.TEMPERATURE_RANGE[0]:
-        raise ValueError(
-            f"Invalid temperature {temperature[0]} K of a blackbody. Must be at least "
-            f"{bands.TEMPERATURE_RANGE[0]} K; temperatures are in kelvin."
-        )
+        rule = f"Must be at least {bands.TEMPERATURE_RANGE[0]} K; temperatures are in kelvin"
+        raise ValueError(f"Invalid temperature {temperature[0]} K of a blackbody. {rule}.")
     if temperature.size < MINIMUM_TEMPERATURES:
-        raise ValueError(
-            f"Invalid number of blackbody temperatures {temperature.size}. "
-            f"Must be at least {MINIMUM_TEMPERATURES}."
-        )
+        rule = f"Must be at least {MINIMUM_TEMPERATURES}"
+        raise ValueError(f"Invalid number of blackbody temperatures {temperature.size}. {rule}.")
     for name, row in zip(counts["band"].values, counts.values, strict=True):
         if not np.all(schema.measured(row)):
             raise ValueError(
@@ -335,10 +331,8 @@ def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
         lambda shape: linear_part(shape)[1] / span,
         (np.sqrt(shortest * longest), 1.0),
         bounds=((shortest, _GROWTH[0]), (longest, _GROWTH[1])),
-        xtol=1e-15,
-        ftol=1e-15,
-        gtol=1e-15,
         max_nfev=1000,
+        **dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15),
     )
     amplitude, offset = linear_part(fit.x)[0]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle

@@ -74,15 +74,18 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     frames = counts.sizes["frame"]
     if frames < 2:
         raise ValueError(f"Invalid movies of {frames} frame. Must have at least 2, for the noise.")
-    variance = _difference_variance(counts)
+    # Half the mean square of the frames' differences, (band, temperature and pixel).
+    variance = np.empty((*counts.shape[:2], *counts.shape[3:]))
+    for place in np.ndindex(*counts.shape[:2]):
+        movie = counts[place].values.astype(np.float32)  # signed: unsigned counts wrap around
+        variance[place] = 0.5 * np.square(np.diff(movie, axis=0)).mean(axis=0, dtype=float)
+    variance = variance.reshape(len(variance), -1)
     freedom = 2 * (frames - 1) ** 2 / (3 * (frames - 1) - 1)
     noise = np.sqrt(np.median(variance, axis=1) * freedom / chi2.median(freedom))
     for band, value in zip(counts["band"].values, noise, strict=True):
         if not value > 0:
-            raise ValueError(
-                f"Invalid noise {value} count of the movies in band '{band}'. Must be positive: "
-                "the samples must be finite and vary from frame to frame."
-            )
+            rule = "Must be positive: the samples must be finite and vary from frame to frame"
+            raise ValueError(f"Invalid noise {value} count of the movies in band '{band}'. {rule}.")
     means = counts.mean("frame", dtype=np.float64, skipna=False)
     variables = schema.variables("blackbody_frames", {"counts": means.values, "noise": noise})
     return xr.Dataset(variables, means.coords, {"frames": frames})
@@ -198,9 +201,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     TypeError, ValueError
         If bands or pixels are not the same, or a good pixel of the image is not finite.
     """
-    schema.check(correction, "correction")
-    if "bad" not in correction:
-        raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
+    _check(correction)
     schema.check_numbers(flat, "the flat image", "count")
     if flat.dims != ("band", "y", "x") or "band" not in flat.coords:
         raise ValueError(
@@ -315,15 +316,6 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
     return xr.DataArray(std, dims="band", attrs=schema.PATTERN_STD.attrs)
 
 
-def _difference_variance(counts: xr.DataArray) -> Array:
-    """Half the mean square of the frames' differences, (band, temperature and pixel)."""
-    result = np.empty((*counts.shape[:2], *counts.shape[3:]))
-    for place in np.ndindex(*counts.shape[:2]):
-        movie = counts[place].values.astype(np.float32)  # signed: unsigned counts wrap around
-        result[place] = np.square(np.diff(movie, axis=0)).mean(axis=0, dtype=float)
-    return 0.5 * result.reshape(len(result), -1)
-
-
 def _fit_band(
     frames: Array, band: str, threshold: float, maximum: int
 ) -> tuple[Array, Array, Mask, float, Array]:
@@ -382,13 +374,17 @@ def _inliers(values: Array, good: Mask, threshold: float) -> Mask:
     return np.asarray(np.abs(values - centre) <= threshold * max(scale, _ROUNDING))
 
 
-def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
-    """Finite `gain`, `offset` and `bad` (band, y, x) of the bands and pixels of a capture."""
+def _check(correction: xr.Dataset) -> None:
+    """Refuse what is no correction with its bad pixels."""
     schema.check(correction, "correction")
-    correction = laid_on(correction, counts, "the correction", "the capture")
     if "bad" not in correction or correction["bad"].dims != ("band", "y", "x"):
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
-    maps = correction[["gain", "offset", "bad"]]
+
+
+def _maps(correction: xr.Dataset, counts: xr.DataArray) -> xr.Dataset:
+    """Finite `gain`, `offset` and `bad` (band, y, x) of the bands and pixels of a capture."""
+    _check(correction)
+    maps = laid_on(correction, counts, "the correction", "the capture")[["gain", "offset", "bad"]]
     for name in ("gain", "offset"):
         if not np.all(schema.measured(maps[name])):
             raise ValueError(f"Invalid {name} of the correction: not finite. Must be finite.")

@@ -92,7 +92,9 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     segment = corrected["segment"].values if "segment" in corrected else None
     image = (counts.sizes["y"], counts.sizes["x"])
     noisy, jumping, unjudged = (np.zeros(image, dtype=bool) for _ in range(3))
-    reach = _reach(counts["time"].values.astype(np.float64))
+    reach, time = _REACH_FRAMES, counts["time"].values.astype(np.float64)
+    if time.size >= MINIMUM_FRAMES:
+        reach = max(reach, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band)
         frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
@@ -175,13 +177,6 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
             number[level].sum() - first, near[level].sum() - first, grain
         )
     return clipped, frozen & moving
-
-
-def _reach(time: Array) -> int:
-    """Frames by which neighbours may show a change earlier or later."""
-    if time.size < MINIMUM_FRAMES:
-        return _REACH_FRAMES
-    return max(_REACH_FRAMES, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
 
 
 def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:

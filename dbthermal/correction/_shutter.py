@@ -80,7 +80,8 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     runs = []
     for index, name in enumerate(counts["band"].values):
         marked = known[index] | _copies(counts.isel(band=index))
-        for first, after in _runs(marked):
+        edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
+        for first, after in np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], 1):
             renewed = bool(known[index, first:after].any()) or after - first >= _FEWEST_COPIES
             runs.append((str(name), first, after - first, renewed))
     return _events(runs, counts["time"].values.astype(np.float64))
@@ -173,19 +174,13 @@ def _copies(counts: xr.DataArray) -> Mask:
         )
     copies = np.zeros(counts.sizes["time"], dtype=bool)
     candidates = 1 + np.flatnonzero(valid.any(axis=(1, 2)) & ~changed.any(axis=(1, 2)))
-    if candidates.size:
-        copies[candidates] = _whole_copies(counts, candidates)
-    return copies
-
-
-def _whole_copies(counts: xr.DataArray, candidates: Integers) -> Mask:
-    """Candidates that repeat the frame before in all of the image, read in blocks of rows."""
-    needed = np.union1d(candidates, candidates - 1)
-    here, before = (np.searchsorted(needed, part) for part in (candidates, candidates - 1))
-    copies = np.ones(candidates.size, dtype=bool)
-    for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
-        block = counts.isel(time=needed, y=rows).values
-        copies &= ~_changed(block[before], block[here])[0].any(axis=(1, 2))
+    if candidates.size:  # the whole of their images
+        copies[candidates] = True
+        needed = np.union1d(candidates, candidates - 1)
+        here, before = (np.searchsorted(needed, part) for part in (candidates, candidates - 1))
+        for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
+            block = counts.isel(time=needed, y=rows).values
+            copies[candidates] &= ~_changed(block[before], block[here])[0].any(axis=(1, 2))
     return copies
 
 
@@ -193,12 +188,6 @@ def _changed(before: npt.NDArray[Any], after: npt.NDArray[Any]) -> tuple[Mask, M
     """Samples that differ between two frames, and those that are finite in both."""
     valid = np.isfinite(before) & np.isfinite(after)
     return (before != after) & valid, valid
-
-
-def _runs(marked: Mask) -> Integers:
-    """First position, and position after the last, of each run of true values, (run, 2)."""
-    edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
-    return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
 
 
 def _events(runs: list[tuple[str, int, int, bool]], time: Array) -> xr.Dataset:

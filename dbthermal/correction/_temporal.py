@@ -130,7 +130,13 @@ def undo_drift(
     rows, columns = np.nonzero(_patch(corrected, reference))
     patch = counts.isel(y=xr.DataArray(rows, dims="p"), x=xr.DataArray(columns, dims="p"))
     level = patch.mean("p", dtype=np.float64, skipna=False)
-    _require_whole(patch, level)
+    torn = np.isnan(level.values) & patch.notnull().any("p").values
+    if torn.any():  # its mean would jump with the pixels that remain
+        band, frame = np.argwhere(torn)[0]
+        raise ValueError(
+            f"Invalid reference: a part of it is NaN in frame {frame} of band "
+            f"'{patch['band'].values[band]}'. Must be NaN as a whole, or not at all."
+        )
     segment = corrected["segment"].values if "segment" in corrected else np.zeros(level.shape[1])
     curves = np.stack([_smooth_change(part, segment, order) for part in level])
 
@@ -168,17 +174,6 @@ def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> Mask:
     if not good.any():
         raise ValueError("Invalid reference: it marks no good pixel. Must mark at least one.")
     return good
-
-
-def _require_whole(patch: xr.DataArray, level: xr.DataArray) -> None:
-    """Refuse a patch that is NaN in part: its mean would jump with the pixels that remain."""
-    torn = np.isnan(level.values) & patch.notnull().any("p").values
-    if torn.any():
-        band, frame = np.argwhere(torn)[0]
-        raise ValueError(
-            f"Invalid reference: a part of it is NaN in frame {frame} of band "
-            f"'{patch['band'].values[band]}'. Must be NaN as a whole, or not at all."
-        )
 
 
 def _smooth_change(level: xr.DataArray, segment: npt.NDArray[np.generic], order: int) -> Array:

@@ -55,9 +55,8 @@ def explore(
     Parameters
     ----------
     data : Dataset, str or Path
-        Result of `separation`, or a capture; or the store of one. A store, and what is read lazily,
-        is copied film by film into a temporary file, frame after frame, when it is first shown
-        (see `View`).
+        Result of `separation`, or a capture; or the store of one, which is copied when it is first
+        shown (see `View`).
     capture : Dataset, str or Path, optional
         Capture that the result was made of: its bands are shown beside it.
     response : Dataset, str or Path, optional

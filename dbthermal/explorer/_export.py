@@ -11,24 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from PIL import Image
-from scipy.constants import zero_Celsius
 
 from dbthermal import figures, store
 from dbthermal._arrays import Array
-from dbthermal.explorer._films import Pane
 from dbthermal.explorer._regions import Region
 from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing
 
 SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc")
 _MOST_COLUMNS: Final = 3
-
-
-def unit(pane: Pane, *, celsius: bool) -> tuple[str, float]:
-    """Unit in which a pane is shown, and what is taken from its values for it."""
-    if pane.absolute and celsius:
-        return "\N{DEGREE SIGN}C", zero_Celsius
-    return pane.units, 0.0
 
 
 def figure(
@@ -52,9 +43,13 @@ def figure(
     for axis, name in zip(places, names, strict=False):
         pane = view.pane(name)
         if pane.kind == "status":
-            _draw_status(axis, view)
+            codes, legend = status_legend(view)
+            colors = [[int(color[at : at + 2], 16) for at in (1, 3, 5)] for _, color, _ in legend]
+            axis.imshow(np.array(colors)[codes].astype(np.uint8), interpolation="nearest")
+            axis.set(xticks=[], yticks=[])
+            axis.set_title("Status: green is without a flag", fontsize=9)
         else:
-            units, offset = unit(pane, celsius=celsius)
+            units, offset = pane.unit(celsius=celsius)
             low, high = limits.get(name) or view.limits(name)
             image = xr.DataArray(view.frame(name, index) - offset, dims=("y", "x"))
             label = units if units != "1" else ""
@@ -68,15 +63,6 @@ def figure(
     note = drawing.provenance_note(view.data)
     result.suptitle(f"{view.time[index]:.2f} s{note}", fontsize=10)
     return result
-
-
-def _draw_status(axis: Axes, view: View) -> None:
-    """Draw the most decisive flag of each pixel in its colour."""
-    codes, legend = status_legend(view)
-    colors = np.array([[int(color[at : at + 2], 16) for at in (1, 3, 5)] for _, color, _ in legend])
-    axis.imshow(colors[codes].astype(np.uint8), interpolation="nearest")
-    axis.set(xticks=[], yticks=[])
-    axis.set_title("Status: green is without a flag", fontsize=9)
 
 
 def status_legend(view: View) -> tuple[npt.NDArray[np.uint8], list[tuple[str, str, float]]]:
@@ -149,13 +135,9 @@ def save(  # noqa: PLR0913 - what the page shows, by name
             path, tiffinfo={270: text.encode("ascii", "ignore")}
         )
     else:
+        units = {one: {"units": view.panes[one].units} for one in names}
         frames = {
-            one.replace(" ", "_"): (
-                ("y", "x"),
-                view.frame(one, index),
-                {"units": view.panes[one].units},
-            )
-            for one in names
+            one.replace(" ", "_"): (("y", "x"), view.frame(one, index), units[one]) for one in names
         }
         result = xr.Dataset(frames, attrs={"time": float(view.time[index])})
         if regions and view.panes[name].kind != "status":
@@ -165,18 +147,16 @@ def save(  # noqa: PLR0913 - what the page shows, by name
 
 def _table(view: View, found: xr.Dataset, *, celsius: bool) -> str:
     """Curves as comma-separated values, a row a time, with names and units in the first."""
-    units, offset = unit(view.panes[found.attrs["pane"]], celsius=celsius)
+    units, offset = view.panes[found.attrs["pane"]].unit(celsius=celsius)
     names = [("mean", offset), ("minimum", offset), ("maximum", offset), ("std", 0.0)]
-    columns = {}
+    columns = {"time [s]": found["time"].values} if "time" in found.coords else {}
     for region in map(str, found["region"].values):
         one = found.sel(region=region)
         for name, zero in names:
             of = "K" if name == "std" and zero != offset else units
-            columns[f"{region} {name} [{of}]"] = np.atleast_1d(one[name].values - zero)
-        columns[f"{region} pixels"] = np.atleast_1d(one["pixels"].values)
-    rows = np.column_stack(list(columns.values()))
-    head = [f'"{name}"' for name in columns]
-    if "time" in found.coords:
-        rows, head = np.column_stack([found["time"].values, rows]), ["time [s]", *head]
-    lines = [",".join(f"{value:.6g}" for value in row) for row in rows]
-    return "\n".join([",".join(head), *lines]) + "\n"
+            columns[f'"{region} {name} [{of}]"'] = np.atleast_1d(one[name].values - zero)
+        columns[f'"{region} pixels"'] = np.atleast_1d(one["pixels"].values)
+    lines = [
+        ",".join(f"{value:.6g}" for value in row) for row in zip(*columns.values(), strict=True)
+    ]
+    return "\n".join([",".join(columns), *lines]) + "\n"

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.constants import zero_Celsius
 
 from dbthermal import _rows, schema, store
 from dbthermal._arrays import Array, Mask
@@ -22,32 +23,15 @@ Progress = Callable[[str, float], object]
 
 @dataclass(frozen=True, eq=False)
 class Pane:
-    """Picture of one quantity.
+    """Picture of one quantity."""
 
-    Attributes
-    ----------
-    name, label : str
-        Name in `View.panes`, and words for the title.
-    units : str
-        Unit of the values; those in kelvin of an `absolute` temperature are also shown in degrees
-        Celsius.
-    array : DataArray
-        Values (time, y, x) or (y, x), in memory or lazy.
-    absolute : bool
-        A temperature, not a difference of some.
-    std : str
-        Name of the pane of its standard deviation; empty without one.
-    curve : Curve, optional
-        Response by which counts are shown as apparent temperatures.
-    """
-
-    name: str
-    label: str
-    units: str
-    array: xr.DataArray
-    absolute: bool = False
-    std: str = ""
-    curve: Curve | None = None
+    name: str  # in `View.panes`
+    label: str  # words for the title
+    units: str  # of the values
+    array: xr.DataArray  # values (time, y, x) or (y, x), in memory or lazy
+    absolute: bool = False  # a temperature, also shown in degrees Celsius, not a difference of some
+    std: str = ""  # name of the pane of its standard deviation; empty without one
+    curve: Curve | None = None  # response by which counts are shown as apparent temperatures
 
     @property
     def kind(self) -> Literal["film", "map", "status"]:
@@ -55,6 +39,12 @@ class Pane:
         if self.name == "status":
             return "status"
         return "film" if self.array.ndim == 3 else "map"
+
+    def unit(self, *, celsius: bool) -> tuple[str, float]:
+        """Unit in which the values are shown, and what is taken from them for it."""
+        if self.absolute and celsius:
+            return "\N{DEGREE SIGN}C", zero_Celsius
+        return self.units, 0.0
 
     @cached_property
     def _source(self) -> npt.NDArray[Any]:

@@ -44,7 +44,6 @@ class Region:
     points: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
-        """Check the outline."""
         if self.kind not in get_args(Kind):
             raise ValueError(
                 f"Unknown kind of region {self.kind!r}. Must be one of {list(_LEAST)}."
@@ -135,13 +134,10 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
 
 
 def mean_std(std: Array, common: Array) -> Array:
-    r"""Standard deviation (time) of a mean over pixels, from theirs (time, pixel).
+    """Standard deviation (time) of a mean over pixels, from theirs (time, pixel); see `View.curve`.
 
-    .. math:: s^2 = \left(\frac1n \sum_i c_i\right)^2 + \frac1{n^2} \sum_i (s_i^2 - c_i^2)
-
-    Of each pixel's deviation :math:`s_i` the part :math:`c_i` is the same error in all pixels, so
-    that no number of them lessens it; at most all of it, and all of it where it is NaN. A pixel
-    whose deviation is NaN does not count.
+    The common part c is at most all of a pixel's s, and all of it where it is NaN. A pixel whose
+    deviation is NaN does not count.
     """
     part = np.where(np.isfinite(common), np.minimum(common, std), std)
     number = np.maximum(np.isfinite(std).sum(axis=-1), 1)

@@ -51,15 +51,6 @@ class Panel:
     warning: str = ""
 
 
-@dataclass(frozen=True)
-class _Artists:
-    """Updated parts of one band."""
-
-    image: AxesImage
-    text: Text
-    warning: Text
-
-
 class LiveFigure:
     """Figure whose pictures and texts are replaced while it stays the same.
 
@@ -108,15 +99,21 @@ class LiveFigure:
 
     def update(self, panels: Mapping[str, Panel], *, title: str, foot: str = "") -> None:
         """Show the `Panel` of each picture, a title, and a foot that belongs to none."""
-        for band, artists in self._artists.items():
+        for band, (image, text, warning) in self._artists.items():
             panel = panels[band]
-            image = self._empty if panel.image is None else panel.image
-            artists.image.set(data=image, clim=panel.limits)
-            artists.text.set_text(panel.text)
-            artists.warning.set_text(panel.warning)
+            data = self._empty if panel.image is None else panel.image
+            image.set(data=data, clim=panel.limits)
+            text.set_text(panel.text)
+            warning.set_text(panel.warning)
         self._title.set_text(title)
         self._foot.set_text(fill(foot, _LETTERS * len(self._artists)))
-        self._lay_out([len(f"{limit:.0f}") for panel in panels.values() for limit in panel.limits])
+        # Room is made where a text has other lines than before, or a colour bar other digits.
+        texts = [self._title, self._foot, *(text for _, text, _ in self._artists.values())]
+        room = [len(f"{limit:.0f}") for panel in panels.values() for limit in panel.limits]
+        room += [len(text.get_text().splitlines()) for text in texts]
+        if room != self._room:
+            self._engine.execute(self.figure)
+            self._room = room
 
     def pixels(self) -> npt.NDArray[np.uint8]:
         """Drawn figure: red, green, blue and opacity, uint8 (rows, columns, 4)."""
@@ -124,19 +121,11 @@ class LiveFigure:
         drawing.draw()
         return np.asarray(drawing.buffer_rgba())
 
-    def _lay_out(self, digits: list[int]) -> None:
-        """Make room where a text has other lines than before, or a colour bar other digits."""
-        texts = [self._title, self._foot, *(artists.text for artists in self._artists.values())]
-        room = digits + [len(text.get_text().splitlines()) for text in texts]
-        if room != self._room:
-            self._engine.execute(self.figure)
-            self._room = room
-
 
 def _artists(
     figure: Figure, axis: Axes, shape: tuple[int, int], title: str, label: str, cmap: str
-) -> _Artists:
-    """Artists before the first picture."""
+) -> tuple[AxesImage, Text, Text]:
+    """Picture, text and warning of one band before its first picture."""
     empty = xr.DataArray(np.full(shape, np.nan), dims=("y", "x"))
     draw_image(figure, axis, empty, title, label, cmap=cmap)
     image = axis.images[0]
@@ -147,4 +136,4 @@ def _artists(
     warning = axis.text(
         0.02, 0.97, "", transform=axis.transAxes, va="top", fontsize=9, color=_ALARM, bbox=box
     )
-    return _Artists(image, axis.set_xlabel("", loc="left", fontsize=9), warning)
+    return image, axis.set_xlabel("", loc="left", fontsize=9), warning

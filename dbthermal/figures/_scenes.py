@@ -172,19 +172,13 @@ def separated_film(
 
     Parameters
     ----------
-    apparent : DataArray
-        Apparent temperature of the inputs (band, time, y, x) [K].
-    emission : DataArray
-        Object temperature (time, y, x) [K]; pixels without a value are gray.
-    change : DataArray
-        Change by the reflection, `separation.reflected_change` (time, y, x) [K].
-    title : str
-        Name of the scene.
+    apparent, emission, change, title
+        As for `separated_temperatures` [K]; pixels without a value are gray.
 
     Yields
     ------
     ndarray of uint8, shape (rows, columns, 3)
-        Colours; both sizes even, as video codecs want them.
+        As from `film`.
     """
     emission = laid_on(emission, apparent, "the emission", "the inputs")
     change = laid_on(change, apparent, "the reflection", "the inputs")

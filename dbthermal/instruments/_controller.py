@@ -17,9 +17,8 @@ units, and addresses). Facts alone, no code.
 import logging
 import threading
 import time as system_time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Annotated, Final, Literal
 
 from pydantic import ConfigDict, Field
@@ -105,16 +104,11 @@ class Scale:
         return round(counts[0] * self.velocity), round(counts[1] * self.acceleration)
 
 
+# 200 full steps of 2048 microsteps, and of 128.
 BSC20X: Final = Scale(turn=409_600, velocity=53.68, acceleration=53.68 * 204.94e-6)
-"""200 full steps of 2048 microsteps."""
-
 BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
-"""200 full steps of 128 microsteps."""
-
-MODELS: Final[Mapping[str, Scale]] = MappingProxyType(
-    {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
-)
-"""Beginnings of the model names that are accepted; some BSC201 call themselves SCC201."""
+# Beginnings of the model names that are accepted; some BSC201 call themselves SCC201.
+MODELS: Final = {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
 
 
 class WheelError(RuntimeError):
@@ -188,7 +182,9 @@ class Controller:
         """
         for unit, motor in ADDRESSES:
             try:
-                info = self._greet(unit)
+                for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
+                    self._transport.write(apt.command(identifier, destination=unit))
+                info = apt.Info.parse(self._request(Id.HW_REQ_INFO, Id.HW_GET_INFO, unit=unit))
             except NoReplyError:
                 continue
             self._scale_of(info)
@@ -205,7 +201,14 @@ class Controller:
 
     def prepare(self) -> None:
         """Set the speeds, read them back, and enable the motor; WheelError if it takes not all."""
-        self._set_velocity()
+        wanted = self._settings.velocity, self._settings.acceleration
+        velocity, acceleration = self.scale.device_speeds(*wanted)
+        speeds = apt.VelocityParameters(CHANNEL, 0, acceleration, velocity)
+        self._send(Id.MOT_SET_VELPARAMS, data=speeds.pack())
+        reply = self._request(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
+        actual = apt.VelocityParameters.parse(reply)
+        _must_agree("velocity", actual.maximum, speeds.maximum)
+        _must_agree("acceleration", actual.acceleration, speeds.acceleration)
         self._set_home()
         self._send(Id.MOD_SET_CHANENABLESTATE, CHANNEL, apt.YES)
         reply = self._request(Id.MOD_REQ_CHANENABLESTATE, Id.MOD_GET_CHANENABLESTATE)
@@ -244,12 +247,6 @@ class Controller:
             self._notices.clear()
             raise WheelError(f"The controller is not well.{reported}")
 
-    def _greet(self, unit: int) -> apt.Info:
-        """Begin as the maker's example does, and ask for the identity."""
-        for identifier in (Id.HW_NO_FLASH_PROGRAMMING, Id.HW_STOP_UPDATEMSGS):
-            self._transport.write(apt.command(identifier, destination=unit))
-        return apt.Info.parse(self._request(Id.HW_REQ_INFO, Id.HW_GET_INFO, unit=unit))
-
     def _scale_of(self, info: apt.Info) -> Scale:
         """Scale of a controller, if it is one that drives this wheel."""
         expected = self._settings.serial_number
@@ -258,20 +255,8 @@ class Controller:
         for beginning, scale in MODELS.items():
             if info.model.startswith(beginning):
                 return scale
-        raise WrongDeviceError(
-            f"Wrong device '{info.model}', number {info.serial_number}. "
-            f"Its model must begin with one of {sorted(MODELS)}."
-        )
-
-    def _set_velocity(self) -> None:
-        wanted = self._settings.velocity, self._settings.acceleration
-        velocity, acceleration = self.scale.device_speeds(*wanted)
-        speeds = apt.VelocityParameters(CHANNEL, 0, acceleration, velocity)
-        self._send(Id.MOT_SET_VELPARAMS, data=speeds.pack())
-        reply = self._request(Id.MOT_REQ_VELPARAMS, Id.MOT_GET_VELPARAMS)
-        actual = apt.VelocityParameters.parse(reply)
-        _must_agree("velocity", actual.maximum, speeds.maximum)
-        _must_agree("acceleration", actual.acceleration, speeds.acceleration)
+        rule = f"Its model must begin with one of {sorted(MODELS)}"
+        raise WrongDeviceError(f"Wrong device '{info.model}', number {info.serial_number}. {rule}.")
 
     def _set_home(self) -> None:
         """Set the speed of homing, and direction and switch where the settings give them."""
@@ -326,8 +311,10 @@ class Controller:
             if not (received := self._transport.read(READ_SIZE, remaining)):
                 return None
             for message in reversed(self._sorted(received)):
-                is_reply = (message.id, message.source) == (reply, source)
-                if is_reply and channel in {0, _channel(message)}:
+                about = (
+                    int.from_bytes(message.data[:2], "little") if message.data else message.param1
+                )
+                if (message.id, message.source) == (reply, source) and channel in {0, about}:
                     return message
         return None
 
@@ -370,11 +357,6 @@ class Controller:
             f" It reported error {notice.code} of message 0x{notice.id:04X}: {notice.notes}."
             for notice in self._notices
         )
-
-
-def _channel(message: apt.Message) -> int:
-    """Channel that a message is about."""
-    return int.from_bytes(message.data[:2], "little") if message.data else message.param1
 
 
 def _must_agree(name: str, actual: int, expected: int) -> None:

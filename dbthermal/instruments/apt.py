@@ -157,10 +157,8 @@ def command(
     has data of this length.
     """
     if len(data) not in LENGTHS[identifier]:
-        raise ValueError(
-            f"Invalid data of {len(data)} bytes of {identifier.name}. "
-            f"Must be one of {LENGTHS[identifier]}."
-        )
+        rule = f"Must be one of {LENGTHS[identifier]}"
+        raise ValueError(f"Invalid data of {len(data)} bytes of {identifier.name}. {rule}.")
     return encode(Message(identifier, channel, value, destination, HOST, data))
 
 

@@ -180,25 +180,11 @@ class Stream:
 class FrameSource(Protocol):
     """An open camera that gives frames, one after the other."""
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the image, without telemetry [pixel]."""
-
-    @property
-    def telemetry_rows(self) -> int:
-        """Rows of telemetry that come with each frame, 0 for none."""
-
-    @property
-    def frame_rate(self) -> float:
-        """Nominal rate [Hz]."""
-
-    @property
-    def identity(self) -> Mapping[str, str]:
-        """Model, serial number and device; text by name."""
-
-    @property
-    def is_simulated(self) -> bool:
-        """True if the camera is emulated."""
+    shape: tuple[int, int]  # rows and columns of the image, without telemetry [pixel]
+    telemetry_rows: int  # that come with each frame, 0 for none
+    frame_rate: float  # nominal [Hz]
+    identity: Mapping[str, str]  # model, serial number and device; text by name
+    is_simulated: bool  # True if the camera is emulated
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
         """Wait at most `timeout` [s] for the next frame; damaged ones come with flags.
@@ -213,9 +199,7 @@ class FrameSource(Protocol):
 class CameraControl(Protocol):
     """The command port of a camera that has one; failures are RuntimeError or OSError."""
 
-    @property
-    def is_simulated(self) -> bool:
-        """True if the camera is emulated."""
+    is_simulated: bool  # True if the camera is emulated
 
     def identity(self) -> Identity:
         """Serial number, versions, modes and ``is_simulated``, for the record of a capture."""

@@ -34,12 +34,8 @@ from dbthermal.instruments.tc08 import TC08, Flag, Scan, TC08Error
 __all__ = ["Devices", "ReadingError", "Thermocouples", "open_devices"]
 __dir__ = __all__.copy
 
-SCAN_AGE: Final = 1.0
-"""Longest time for which a scan of all thermocouples gives the readings of its channels [s]."""
-
-FLUSH_TIMEOUT: Final = 2.0
-"""Longest time in which the frames that a driver holds are read and discarded [s]."""
-
+SCAN_AGE: Final = 1.0  # longest time for which a scan gives the readings of its channels [s]
+FLUSH_TIMEOUT: Final = 2.0  # longest time in which the frames that a driver holds are read [s]
 WHEEL: Final = "filter_wheel"  # name of the wheel, and of the reading of its slot
 
 
@@ -238,9 +234,16 @@ def open_devices(
             if camera.control is not None and open_control is not None:
                 url = f"sim://{camera.kind}/{band}" if session.simulated else camera.control
                 cameras[band] = stack.enter_context(open_control(url, world))
-        wheel = stack.enter_context(_wheel(session, world)) if session.filters else None
-        logger = stack.enter_context(_logger(session, world)) if session.thermocouples else None
-        scans = None if logger is None else Thermocouples(logger, session.thermocouples)
+        wheel = logger = scans = None
+        if session.filters:
+            url = "sim://apt" if session.simulated else session.devices[WHEEL]
+            opened = FilterWheel.from_url(url, session.filters, session.wheel, world=world)
+            wheel = stack.enter_context(opened)
+        if session.thermocouples:
+            url = "sim://tc08" if session.simulated else session.devices["thermocouples"]
+            logger = stack.enter_context(TC08.from_url(url, world=world))
+            logger.set_channels(session.thermocouples)
+            scans = Thermocouples(logger, session.thermocouples)
         yield Devices(session, sources, cameras, wheel, logger, world, scans)
 
 
@@ -262,19 +265,3 @@ def _frames(
         camera.kind, band, world, pictures, unfiltered, stream
     )
     return source
-
-
-def _wheel(session: Session, world: Any) -> FilterWheel:
-    url = "sim://apt" if session.simulated else session.devices[WHEEL]
-    return FilterWheel.from_url(url, session.filters, session.wheel, world=world)
-
-
-def _logger(session: Session, world: Any) -> TC08:
-    url = "sim://tc08" if session.simulated else session.devices["thermocouples"]
-    logger = TC08.from_url(url, world=world)
-    try:
-        logger.set_channels(session.thermocouples)
-    except BaseException:
-        logger.close()
-        raise
-    return logger

@@ -48,17 +48,13 @@ MOVE_TIMEOUT: Final = 20.0  # longest move [s]
 START_TIMEOUT: Final = 1.0  # until a move is seen to start [s]
 STALL_TIMEOUT: Final = 2.0  # for which the position may not change in a move [s]
 POLL_INTERVAL: Final = 0.05  # between two status requests [s]
-
-FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
-"""State that is an error; it is uncertain if a wheel's controller sets these bits."""
-
 BAUDRATE: Final = 115_200  # [bit/s]
-
+# State that is an error; it is uncertain if a wheel's controller sets these bits.
+FAULTS: Final = apt.StatusBits.POSITION_ERROR | apt.StatusBits.OVERLOAD
+# Bits of a wheel that moves. The jogging bits are left out: they were seen to stick.
 MOVING: Final = (
     apt.StatusBits.MOVING_FORWARD | apt.StatusBits.MOVING_REVERSE | apt.StatusBits.HOMING
 )
-"""Bits of a wheel that moves. The jogging bits are left out: they were seen to stick."""
-
 CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is over, or failed
 
 
@@ -236,27 +232,22 @@ class FilterWheel(Closing):
     def _follow(self, motion: "_Motion", is_over: "Callable[[_Motion, apt.Status], bool]") -> None:
         """Poll until a motion is over; stop the wheel if it takes too long."""
         motion.began = motion.changed = self._clock()
-        confirmed = 0
+        controller, confirmed = self._controller, 0
         while confirmed < CONFIRMATIONS:
-            status = self._poll(motion)
+            status = controller.status()
+            controller.raise_notice()
+            if faults := status.bits & FAULTS:
+                controller.stop()
+                raise StalledWheelError(
+                    f"The controller reports {faults.name}, and the wheel was stopped. "
+                    "Must be none."
+                )
+            motion.update(status, self._clock())
+            motion.reported = controller.has_reported(motion.end)
             confirmed = confirmed + 1 if is_over(motion, status) else 0
             if not confirmed:
                 self._check(motion, status)
             self._sleep(POLL_INTERVAL)
-
-    def _poll(self, motion: "_Motion") -> apt.Status:
-        """Take in the motor's state."""
-        controller = self._controller
-        status = controller.status()
-        controller.raise_notice()
-        if faults := status.bits & FAULTS:
-            controller.stop()
-            raise StalledWheelError(
-                f"The controller reports {faults.name}, and the wheel was stopped. Must be none."
-            )
-        motion.update(status, self._clock())
-        motion.reported = controller.has_reported(motion.end)
-        return status
 
     def _check(self, motion: "_Motion", status: apt.Status) -> None:
         """Raise if the wheel rests where it should not, stands still, or takes too long."""

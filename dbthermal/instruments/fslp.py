@@ -13,6 +13,7 @@ LJMUAstroecology/flirpy issue 21.
 
 import binascii
 import operator
+import re
 import struct
 from dataclasses import dataclass
 from typing import Final
@@ -42,11 +43,11 @@ MAXIMUM_DATA: Final = 751
 MAXIMUM_FRAME: Final = 2048
 """Most unescaped bytes of a received frame: the buffer of the vendor's own receiver."""
 
-_START, _END, _ESCAPE = 0x8E, 0xAE, 0x9E
+_START, _END, _ESCAPE = b"\x8e", b"\xae", b"\x9e"
+_SPECIAL = _START + _END + _ESCAPE
 # An escaped byte is sent as the escape byte and the value less this.
 _SHIFT = 0x0D
-_SPECIAL = (_START, _END, _ESCAPE)
-_UNESCAPED = {value - _SHIFT: value for value in _SPECIAL}
+_ESCAPED = re.compile(rb"\x9e[\x81\x91\xa1]")
 _HEADER = struct.Struct(">BIII")
 _CHECKSUM = struct.Struct(">H")
 # CRC-16/AUG-CCITT, also called SPI-FUJITSU: polynomial 0x1021, no reflection, no final xor.
@@ -99,13 +100,8 @@ def encode(
         raise ValueError(f"Invalid data of {len(data)} bytes. Must be at most {MAXIMUM_DATA}.")
     content = _HEADER.pack(channel, sequence, command, status) + data
     content += _CHECKSUM.pack(checksum(content))
-    return bytes((_START, *_escaped(content), _END))
-
-
-def _escaped(content: bytes) -> bytes:
-    """Content with escapes in place of start, end and escape bytes."""
-    pieces = (bytes((_ESCAPE, v - _SHIFT)) if v in _SPECIAL else bytes((v,)) for v in content)
-    return b"".join(pieces)
+    pieces = (_ESCAPE + bytes((v - _SHIFT,)) if v in _SPECIAL else bytes((v,)) for v in content)
+    return _START + b"".join(pieces) + _END
 
 
 def next_sequence(sequence: int) -> int:
@@ -140,8 +136,7 @@ class Decoder:
 
     def __init__(self) -> None:
         self.damaged = 0
-        self._content: bytearray | None = None  # None between frames
-        self._escaping = False
+        self._content: bytes | None = None  # since the last start byte; None between frames
 
     @property
     def is_open(self) -> bool:
@@ -150,43 +145,28 @@ class Decoder:
 
     def feed(self, received: bytes) -> list[Frame]:
         """Take in any number of bytes; return the undamaged frames that they complete."""
-        return [frame for byte in received if (frame := self._step(byte)) is not None]
+        found = []
+        for number, piece in enumerate(bytes(received).split(_START)):
+            if number:  # a start byte came before it
+                self.damaged += self.is_open
+                self._content = b""
+            if self._content is None:
+                continue
+            self._content, end, _ = (self._content + piece).partition(_END)
+            if end or len(self._content) > 2 * MAXIMUM_FRAME:  # each byte may be escaped
+                frame, self._content = _frame(self._content), None
+                found += [frame] if frame else []
+                self.damaged += frame is None
+        return found
 
-    def _step(self, byte: int) -> Frame | None:
-        """Take in one byte; return the frame that it ends."""
-        if byte == _START:
-            self.damaged += self.is_open
-            self._content, self._escaping = bytearray(), False
-        elif self._content is not None:
-            if byte == _END:
-                return self._end(bytes(self._content))
-            self._append(self._content, byte)
+
+def _frame(escaped: bytes) -> Frame | None:
+    """Frame of the bytes between start and end; None if it is damaged."""
+    content = _ESCAPED.sub(lambda pair: bytes((pair[0][1] + _SHIFT,)), escaped)
+    body, sent = content[: -_CHECKSUM.size], content[-_CHECKSUM.size :]
+    if _ESCAPE in _ESCAPED.sub(b"", escaped) or not _HEADER.size <= len(body) < MAXIMUM_FRAME - 1:
         return None
-
-    def _append(self, content: bytearray, byte: int) -> None:
-        """Add one byte to the open frame, or drop the frame."""
-        if (self._escaping and byte not in _UNESCAPED) or len(content) == MAXIMUM_FRAME:
-            self._drop()
-        elif self._escaping:
-            content.append(_UNESCAPED[byte])
-            self._escaping = False
-        elif byte == _ESCAPE:
-            self._escaping = True
-        else:
-            content.append(byte)
-
-    def _end(self, content: bytes) -> Frame | None:
-        """Return the frame that ends here, if it is undamaged."""
-        body, sent = content[: -_CHECKSUM.size], content[-_CHECKSUM.size :]
-        whole = len(body) >= _HEADER.size and not self._escaping
-        if not whole or _CHECKSUM.pack(checksum(body)) != sent:
-            self._drop()
-            return None
-        self._content = None
-        channel, sequence, command, status = _HEADER.unpack_from(body)
-        return Frame(channel, sequence, command, status, body[_HEADER.size :])
-
-    def _drop(self) -> None:
-        """Give up the open frame."""
-        self.damaged += 1
-        self._content, self._escaping = None, False
+    if _CHECKSUM.pack(checksum(body)) != sent:
+        return None
+    channel, sequence, command, status = _HEADER.unpack_from(body)
+    return Frame(channel, sequence, command, status, body[_HEADER.size :])

@@ -11,7 +11,6 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import usb.core
@@ -47,15 +46,11 @@ KINDS: Final = (
 )
 """Types of devices that are looked for."""
 
-SPEEDS: Final = MappingProxyType({1: "low", 2: "full", 3: "high", 4: "super", 5: "super plus"})
-"""Name of each speed of libusb: 1.5, 12, 480, 5000 and 10000 Mbit/s."""
-
+# Name of each speed of libusb: 1.5, 12, 480, 5000 and 10000 Mbit/s.
+SPEEDS: Final = {1: "low", 2: "full", 3: "high", 4: "super", 5: "super plus"}
+# Largest data rate of a high-speed bus [bit/s]: 13 bulk packets of 512 bytes in 125 us (Universal
+# Serial Bus Specification 2.0, table 5-10).
 HIGH_SPEED_PAYLOAD: Final = 13 * 512 * 8 * 8000
-"""Largest data rate of a high-speed bus [bit/s]: 13 bulk packets of 512 bytes in 125 us.
-
-Universal Serial Bus Specification 2.0, table 5-10.
-"""
-
 PIXELS: Final = 640 * 512  # of a frame, 16 bits each
 RULES: Final = "/etc/udev/rules.d/70-dbthermal.rules"  # below 73, or ``uaccess`` comes too late
 
@@ -171,22 +166,18 @@ def _device(kind: Kind, raw: Any, sysfs: Path, dev: Path) -> Device:
     opened = nodes if kind.families else [dev / f"bus/usb/{raw.bus:03d}/{raw.address:03d}"]
     denied = [node for node in opened if node.exists() and not os.access(node, os.R_OK | os.W_OK)]
     if denied:
-        warnings.append(f"No permission for {', '.join(map(str, denied))}. {_udev_advice(kind)}")
+        # A rule that admits the user at the machine, and the group plugdev.
+        rule = (
+            f'ATTRS{{idVendor}}=="{kind.vendor:04x}", ATTRS{{idProduct}}=="{kind.product:04x}", '
+            'MODE="0660", GROUP="plugdev", TAG+="uaccess"'
+        )
+        warnings.append(
+            f"No permission for {', '.join(map(str, denied))}. Type this, and plug it in again: "
+            f"echo '{rule}' | sudo tee -a {RULES} && sudo udevadm control --reload"
+        )
     serial = number.read_text("utf-8", "backslashreplace").strip() if number.exists() else ""
     return replace(
         device, serial=serial, nodes=tuple(str(node) for node in nodes), warnings=tuple(warnings)
-    )
-
-
-def _udev_advice(kind: Kind) -> str:
-    """Line to type: a rule that admits the user at the machine, and the group plugdev."""
-    rule = (
-        f'ATTRS{{idVendor}}=="{kind.vendor:04x}", ATTRS{{idProduct}}=="{kind.product:04x}", '
-        'MODE="0660", GROUP="plugdev", TAG+="uaccess"'
-    )
-    return (
-        f"Type this, and plug it in again: echo '{rule}' | sudo tee -a {RULES} "
-        "&& sudo udevadm control --reload"
     )
 
 

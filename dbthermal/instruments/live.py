@@ -110,8 +110,16 @@ class Watch:
     def note(self, preview: Preview) -> bool:
         """Take the next preview; return True if it is the first one of a recording."""
         before, self._last = self._last, preview
-        if before is None or _is_other(before, preview):
-            before = None
+        if before is not None and (
+            tuple(before.totals) != tuple(preview.totals)
+            or preview.time < before.time
+            or any(
+                one["frames"] < before.totals[band]["frames"]
+                for band, one in preview.totals.items()
+            )
+        ):
+            before = None  # of another recording
+        if before is None:
             self._past.clear()
             self._ffc_seen.clear()
         for band in preview.totals:
@@ -153,15 +161,6 @@ class Watch:
             return (now - before) / (stop - start)
         is_old = self._past[-1][0] - self._past[0][0] >= _WINDOW
         return 0.0 if is_old else math.nan
-
-
-def _is_other(before: Preview, now: Preview) -> bool:
-    """True if a preview is of another recording than the one before it."""
-    return (
-        tuple(before.totals) != tuple(now.totals)
-        or now.time < before.time
-        or any(now.totals[band]["frames"] < before.totals[band]["frames"] for band in now.totals)
-    )
 
 
 def _fpa_temperature(band: str, preview: Preview) -> float:
@@ -299,7 +298,9 @@ class View:
             self._show(preview)
 
     def _show(self, preview: Preview) -> None:
-        from dbthermal.figures import LiveFigure, Panel  # noqa: PLC0415 - loads matplotlib
+        from matplotlib.image import imsave  # noqa: PLC0415 - see the module's imports
+
+        from dbthermal.figures import LiveFigure, Panel  # noqa: PLC0415
 
         status, frames = self._watch.status(), preview.frames
         bands, shape = tuple(preview.totals), next(iter(frames.values())).counts.shape
@@ -317,7 +318,9 @@ class View:
         self._drawn.update(panels, title=title, foot=foot)
         if self._display is not None:
             lines = [f"{band}: {one.text}\n{one.warning}" for band, one in status.items()]
-            picture = Picture(_png(self._drawn), "\n".join((title, *lines, foot)))
+            png, fast = io.BytesIO(), {"compress_level": _COMPRESSION}  # rather than small
+            imsave(png, self._drawn.pixels(), format="png", pil_kwargs=fast)
+            picture = Picture(png.getvalue(), "\n".join((title, *lines, foot)))
             (self._display.update if self._is_shown else self._display.display)(picture)
             self._is_shown = True
 
@@ -353,15 +356,6 @@ def _reading(name: str, value: float, unit: str) -> str:
     if unit == "K":
         return _celsius(value)
     return f"{value:g}" if unit == "1" else f"{value:g} {unit}"
-
-
-def _png(drawn: "LiveFigure") -> bytes:
-    """Write the figure as PNG, fast rather than small."""
-    from matplotlib.image import imsave  # noqa: PLC0415 - see the module's imports
-
-    buffer = io.BytesIO()
-    imsave(buffer, drawn.pixels(), format="png", pil_kwargs={"compress_level": _COMPRESSION})
-    return buffer.getvalue()
 
 
 def _celsius(temperature: float) -> str:

@@ -8,7 +8,7 @@ of these is a recording of its own. `dbthermal.instruments.recording` opens the 
 import threading
 import time as system_time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.constants import zero_Celsius
 
 from dbthermal import store
-from dbthermal.instruments.camera import Identity, SourceLostError
+from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary, record
 from dbthermal.instruments.recording._reader import (
@@ -214,16 +214,9 @@ def record_scene(
     devices.flush()
     if devices.world is not None:
         devices.world.begin()
-    options = {"limits": limits, "preview": preview, "stop": stop}
-    return _record(devices, path, identities, **options)
-
-
-def _record(
-    devices: Devices, path: str | Path, identities: Mapping[str, Identity], **options: Any
-) -> Summary:
-    """Record all sources and readings of open devices, with the options of `record`."""
-    session, sources, readings = devices.session, devices.sources, devices.readings()
-    return record(session, sources, path, readings=readings, identities=identities, **options)
+    options: dict[str, Any] = {"limits": limits, "preview": preview, "stop": stop}
+    options |= {"readings": devices.readings(), "identities": identities}
+    return record(devices.session, devices.sources, path, **options)
 
 
 def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
@@ -231,10 +224,8 @@ def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summ
     if not path.exists():
         return None
     if not is_complete(path):
-        raise ValueError(
-            f"Incomplete recording '{path}'. Must be complete: move it away, and this step is "
-            "recorded again."
-        )
+        rule = "Must be complete: move it away, and this step is recorded again"
+        raise ValueError(f"Incomplete recording '{path}'. {rule}.")
     attrs = store.open_dataset(path).attrs
     was = attrs["provenance"]["parameters"]["blackbody"]["temperatures"]
     if was[number : number + 1] != [temperature]:
@@ -252,9 +243,10 @@ def _record_step(
 ) -> Summary:
     """Turn the filter into the beam, and record to the end."""
     selected = devices if band is None else devices.select(band)
-    identities = selected.identities()
+    options: dict[str, Any] = {"limits": limits, "preview": preview}
+    options |= {"readings": selected.readings(), "identities": selected.identities()}
     selected.flush()
-    summary = _record(selected, path, identities, limits=limits, preview=preview)
+    summary = record(selected.session, selected.sources, path, **options)
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
     require_filter(summary.path, band)

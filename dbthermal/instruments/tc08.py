@@ -146,7 +146,7 @@ class TC08(Closing):
         self._has_channels = False
 
     @classmethod
-    def from_url(cls, url: str = "tc08:", *, world: object | None = None) -> Self:
+    def from_url(cls, url: str = "tc08:", *, world: Any = None) -> Self:
         """Load the library and open the first free unit, at ``tc08:`` or ``sim://tc08`` in a world.
 
         No address names a library: only the variable `ENVIRONMENT` does. ValueError if it is
@@ -168,8 +168,8 @@ class TC08(Closing):
                 f"Invalid address '{url}'. Must be sim://tc08 with a world, and only then."
             )
         if world is not None:
-            module = importlib.import_module("dbthermal.instruments.emulated.tc08")
-            return cls(module.EmulatedTC08.from_world(world)).open()
+            module: Any = importlib.import_module("dbthermal.instruments.emulated.tc08")
+            return cls(module.EmulatedTC08(world.thermocouple_temperature)).open()
         parse(url, ("tc08",))
         return cls(load()).open()
 

@@ -108,9 +108,7 @@ class TransportError(OSError):
 class Transport(Protocol):
     """A line to a device, as a driver needs it; a context manager in each implementation."""
 
-    @property
-    def is_simulated(self) -> bool:
-        """True if the device is emulated."""
+    is_simulated: bool  # True if the device is emulated
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device is gone."""
@@ -128,7 +126,7 @@ class Transport(Protocol):
 class SerialTransport(Closing):
     """An open serial port of pyserial, see `open_serial`; `url` is its name in messages."""
 
-    is_simulated: Final = False
+    is_simulated = False
 
     def __init__(self, port: "serial.Serial", url: str) -> None:
         self.url = url
@@ -201,10 +199,8 @@ def open_serial(
             path, baudrate, rtscts=rtscts, exclusive=True, write_timeout=WRITE_TIMEOUT
         )
     except OSError as error:
-        raise TransportError(
-            f"Could not open '{path}': {error}. It must exist, be yours to use, and in no "
-            "other program's use."
-        ) from error
+        rule = "It must exist, be yours to use, and in no other program's use"
+        raise TransportError(f"Could not open '{path}': {error}. {rule}.") from error
     with ExitStack() as stack:
         line = stack.enter_context(SerialTransport(port, url))
         if rtscts:

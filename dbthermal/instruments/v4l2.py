@@ -114,7 +114,7 @@ class Capture(Closing):
     format or rate.
     """
 
-    is_simulated: Final = False
+    is_simulated = False
 
     def __init__(
         self, path: str, stream: Stream, kernel: Kernel | None = None, decode: Decode | None = None

@@ -15,8 +15,8 @@ from dbthermal._arrays import Array, Mask
 from dbthermal.limits._fisher import QUANTITIES, TEMPERATURES, Truth, deviations, smallest_order
 from dbthermal.response import Curve, require_range
 
+# Standard deviation of a uniform number, over the width of its interval.
 _UNIFORM: Final = 1.0 / np.sqrt(12.0)
-"""Standard deviation of a uniform number, over the width of its interval."""
 
 
 def reflection_ratio(emissivity: npt.ArrayLike) -> Array:

@@ -57,22 +57,17 @@ class CaptureDesign:
     duration: float = 2.0
 
     def __post_init__(self) -> None:
-        """Refuse conditions that are no capture."""
         for name in ("seconds", "rate", "start", "level", "period", "duration"):
             planck.require_positive(name, getattr(self, name))
         for name in ("span", "amplitude"):
             if not np.isfinite(getattr(self, name)):
                 raise ValueError(f"Invalid {name} {getattr(self, name)} K. Must be finite.")
         if self.duration > self.period:
-            raise ValueError(
-                f"Invalid duration {self.duration} s of a pulse. Must be at most the period, "
-                f"{self.period} s."
-            )
+            rule = f"Must be at most the period, {self.period} s"
+            raise ValueError(f"Invalid duration {self.duration} s of a pulse. {rule}.")
         if round(self.seconds * self.rate) < 2:
-            raise ValueError(
-                f"Invalid capture of {self.seconds} s at {self.rate} 1/s. "
-                "Must have at least two frames."
-            )
+            rule = "Must have at least two frames"
+            raise ValueError(f"Invalid capture of {self.seconds} s at {self.rate} 1/s. {rule}.")
 
 
 def plan(
@@ -133,7 +128,14 @@ def plan(
     design = CaptureDesign() if design is None else design
     emissivity = _emissivities(table)
     names = [str(name) for name in table["band"].values]
-    sets = _combinations(names, beside, together)
+    if beside not in names:
+        raise ValueError(f"Missing band '{beside}' in the table. Has {names}.")
+    others = [place for place, name in enumerate(names) if name != beside]
+    if not 1 <= together <= len(others):
+        raise ValueError(
+            f"Invalid together {together}. Must lie in [1, {len(others)}], the number of filters."
+        )
+    sets = [[names.index(beside), *chosen] for chosen in combinations(others, together)]
     std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
     bodies = [TopHat(bands.get(name), temperature) for name in names]
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
@@ -229,18 +231,6 @@ def _emissivities(table: xr.Dataset) -> Array:
             "Must lie in (0, 1)."
         )
     return np.asarray(values.values.T, dtype=np.float64)
-
-
-def _combinations(names: list[str], beside: str, together: int) -> list[list[int]]:
-    """Places of the bands of each combination, the one always recorded first."""
-    if beside not in names:
-        raise ValueError(f"Missing band '{beside}' in the table. Has {names}.")
-    others = [place for place, name in enumerate(names) if name != beside]
-    if not 1 <= together <= len(others):
-        raise ValueError(
-            f"Invalid together {together}. Must lie in [1, {len(others)}], the number of filters."
-        )
-    return [[names.index(beside), *chosen] for chosen in combinations(others, together)]
 
 
 def _expected(truth: Truth, bodies: Sequence[TopHat], noise: Array) -> dict[str, Array]:

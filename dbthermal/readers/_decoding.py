@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 from dbthermal import _text as texts
 
 MEMORY: Final = 2.0**30  # largest memory that a video may take, by default [byte]
-
-PIXEL: Final = 9
-"""Memory of a pixel of a frame: number of its colour, position in the palette, mask [byte]."""
+PIXEL: Final = 9  # memory of a pixel: number of its colour, position in the palette, mask [byte]
 
 _CONTAINERS: Final = {
     "mp4": (4, (b"ftyp", b"moov", b"mdat", b"wide", b"free")),
@@ -42,15 +40,19 @@ def decode(path: Path, width: int | None, memory: float, sha256: str | None) -> 
     import av  # noqa: PLC0415  (a spectrum needs no video codec)
 
     content = texts.regular_file(path, int(memory)).read_bytes()
+    kinds = _CONTAINERS.items()
+    form = next((name for name, (at, marks) in kinds if content[at : at + 4] in marks), None)
     found = hashlib.sha256(content).hexdigest()
     if sha256 is not None and found != sha256:
         raise ValueError(f"Wrong SHA-256 {found} of '{path.name}'. Must be {sha256}.")
+    if form is None:
+        raise ValueError(f"Invalid video '{path.name}'. Must be MP4, MOV, Matroska, WebM or AVI.")
     # The largest frame that may be decoded, and checks where a codec has checksums.
     options = {"max_pixels": str(int(memory / PIXEL)), "err_detect": "crccheck"}
     try:
         with av.open(
             io.BytesIO(content),
-            format=_container(content, path),
+            format=form,
             options=options,
             metadata_errors="replace",
             io_open=_refuse_to_open,
@@ -65,13 +67,6 @@ def _refuse_to_open(url: str, *_: Any) -> NoReturn:
     raise PermissionError(f"Refused to open '{url}', which a video names. Must be one file.")
 
 
-def _container(content: bytes, path: Path) -> str:
-    for name, (offset, marks) in _CONTAINERS.items():
-        if content[offset : offset + 4] in marks:
-            return name
-    raise ValueError(f"Invalid video '{path.name}'. Must be MP4, MOV, Matroska, WebM or AVI.")
-
-
 def _frames(
     container: Any, options: dict[str, str], width: int | None, memory: float, path: Path
 ) -> Film:
@@ -83,7 +78,13 @@ def _frames(
     packets = [*container.demux(stream)]  # the last is empty: it asks for the frames still held
     number = sum(packet.size > 0 for packet in packets)
     height, columns = stream.codec_context.height, stream.codec_context.width
-    _check_size(number, stream.frames, (height, columns), memory, path)
+    if number != (stream.frames or number):
+        _refuse_truncated(path, f"{number} frames present, {stream.frames} declared")
+    if (needed := number * height * columns * PIXEL) > memory:
+        raise ValueError(
+            f"Invalid size of '{path.name}': {number} frames of {height} x {columns} pixels "
+            f"take {needed:.3g} bytes. Must be at most memory={memory:.3g}."
+        )
     if width is not None and not 0 < width <= columns:
         rule = f"Must be from 1 to {columns} pixels"
         raise ValueError(f"Invalid width {width} for '{path.name}'. {rule}.")
@@ -107,19 +108,6 @@ def _frames(
         raise ValueError(f"Unordered timestamps in '{path.name}'. Must increase strictly.")
     _check_duration(container, seconds, path)
     return Film(codes, seconds - seconds[0])
-
-
-def _check_size(
-    number: int, declared: int, shape: tuple[int, int], memory: float, path: Path
-) -> None:
-    """Raise ValueError if frames are missing, or all of them need more memory than is allowed."""
-    if number != (declared or number):
-        _refuse_truncated(path, f"{number} frames present, {declared} declared")
-    if (needed := number * shape[0] * shape[1] * PIXEL) > memory:
-        raise ValueError(
-            f"Invalid size of '{path.name}': {number} frames of {shape[0]} x {shape[1]} pixels "
-            f"take {needed:.3g} bytes. Must be at most memory={memory:.3g}."
-        )
 
 
 def _undamaged(packets: Sequence[Any], path: Path) -> Iterator[Any]:

@@ -242,7 +242,7 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     """Byte order of the counts, which are swapped in place if need be, and what decided it."""
     if form.codec == "jpegls":
         return "none: numbers are coded", "codec"
-    found = next((sign for frame in counts if (sign := recordings.smoother(frame))), 0)
+    found = recordings.smoother(counts)
     if stated is None and (found < 0 if form.order else found == 0):
         raise ValueError(
             f"Unclear byte order in '{name}': its images are smoother with their bytes swapped, or "

@@ -70,10 +70,13 @@ def check_memory(shape: Sequence[int], memory: float, name: str) -> None:
         )
 
 
-def smoother(frame: Counts) -> int:
-    """Byte order in which a frame is clearly smoother: 1 as it is, -1 swapped, 0 unclear."""
-    as_is, swapped = _roughness(frame), _roughness(frame.byteswap())
-    return int(_SMOOTHER * as_is < swapped) - int(_SMOOTHER * swapped < as_is)
+def smoother(counts: Counts) -> int:
+    """Byte order in which the first clear frame is smoother: 1 as it is, -1 swapped, 0 unclear."""
+    for frame in counts:
+        as_is, swapped = _roughness(frame), _roughness(frame.byteswap())
+        if sign := int(_SMOOTHER * as_is < swapped) - int(_SMOOTHER * swapped < as_is):
+            return sign
+    return 0
 
 
 def _roughness(frame: Counts) -> float:
@@ -89,13 +92,6 @@ def check_unit(unit: str, name: str) -> None:
             "counts, and no longer in temperatures (temperature-linear data). Record or export raw "
             "counts."
         )
-
-
-def check_order(counts: Counts, name: str) -> None:
-    """Raise ValueError if images are smoother with their bytes swapped."""
-    if next((sign for frame in counts if (sign := smoother(frame))), 0) < 0:
-        rule = "Must be the other byte order, or another shape or header"
-        raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
 
 
 def byte_order(name: str, value: str) -> str:
@@ -157,7 +153,9 @@ def recording(
         "exposure_time": ("time", exposed - exposed[known[0]], schema.EXPOSURE_TIME.attrs),
         "frame_flags": ("time", flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)),
     }
-    time = filled(exposed, period)
+    slots = np.arange(exposed.size)  # unknown times on the line between their neighbours
+    outside = slots - np.clip(slots, known[0], known[-1])
+    time = np.interp(slots, known, exposed[known]) + period * outside
     coordinate = ("time", time - time[0], schema.COORDINATES["time"].attrs)
     return xr.Dataset(variables, {"time": coordinate}, {"origin": "measured", **attrs})
 
@@ -166,13 +164,6 @@ def clocked(counts: Counts, clock: Clock, name: str, **attrs: str) -> xr.Dataset
     """Dataset of one band of a file that tells no times, from a rate [Hz] or times [s]."""
     seconds = stamps(clock, len(counts), name)
     return recording(counts, seconds, name, {"source": name, **attrs})
-
-
-def filled(exposed: Array, period: float) -> Array:
-    """Times [s] of all frames, unknown ones (NaN) on the line between their neighbours."""
-    slots, (known,) = np.arange(exposed.size), np.nonzero(np.isfinite(exposed))
-    outside = slots - np.clip(slots, known[0], known[-1])
-    return np.asarray(np.interp(slots, known, exposed[known]) + period * outside)
 
 
 def label(paths: Sequence[Path]) -> str:

@@ -95,7 +95,15 @@ def ecostress(path: str | Path) -> xr.Dataset:
     header = _header(lines[:blank], path)
     rows = [(i, line.split()) for i, line in enumerate(lines, 1) if i > blank and line.strip()]
     wavelength, reflectance = texts.numbers(rows, 2, path.name).T
-    _check_extent(header, wavelength, path)
+    stated = {"Number of X Values": wavelength.size}
+    stated |= {"First X Value": wavelength[0], "Last X Value": wavelength[-1]}
+    for key, value in stated.items():
+        declared = header.get(key, "")
+        if not abs(texts.number(declared, f"{path.name}, {key}") - value) <= 1e-3:
+            raise ValueError(
+                f"Truncated or altered '{path.name}': {key} is {value:g}, declared '{declared}'. "
+                "Must be equal."
+            )
     notes = {note: header.get(key, "") for note, key in NOTES.items()}
     return _spectrum(wavelength, 1 - reflectance / 100, notes, _File(path.name, rows))
 
@@ -218,22 +226,6 @@ def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
         if not re.search(rule, text := header.get(key, ""), re.IGNORECASE):
             raise ValueError(f"Invalid {key} '{text}' in '{path.name}'. Must match '{rule}'.")
     return header
-
-
-def _check_extent(header: Mapping[str, str], wavelength: Array, path: Path) -> None:
-    """Compare the values with the number and the ends that the header declares."""
-    actual = {
-        "Number of X Values": wavelength.size,
-        "First X Value": wavelength[0],
-        "Last X Value": wavelength[-1],
-    }
-    for key, value in actual.items():
-        declared = header.get(key, "")
-        if not abs(texts.number(declared, f"{path.name}, {key}") - value) <= 1e-3:
-            raise ValueError(
-                f"Truncated or altered '{path.name}': {key} is {value:g}, declared '{declared}'. "
-                "Must be equal."
-            )
 
 
 def _table(path: Path) -> tuple[list[str], list[texts.Row]]:

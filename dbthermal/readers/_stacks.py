@@ -160,7 +160,9 @@ def raw(
     recordings.check_memory((frames, *shape), memory, name)
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
     counts = np.memmap(one, form, "r", offset=header)["counts"].astype(np.uint16)
-    recordings.check_order(counts, name)
+    if recordings.smoother(counts) < 0:
+        rule = "Must be the other byte order, or another shape or header"
+        raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
     return recordings.clocked(counts, clock, name, format="raw", **decided)
 

@@ -68,7 +68,13 @@ def two_bands(
             f"Different sizes {shapes[0]} and {shapes[1]} pixels of the bands {names}. Must be "
             "equal: resample the second recording, or crop the first."
         )
-    late = _offset(first, second) if offset is None else float(offset)
+    late = offset
+    if late is None:
+        dates = [one.attrs.get("start") for one in pair]
+        if None in dates:
+            raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
+        begun, later = (datetime.fromisoformat(str(date)) for date in dates)
+        late = (later - begun).total_seconds()
     starts, stops = ([one["time"].values[place] for one in pair] for place in (0, -1))
     overlap = min(stops[0], stops[1] + late) - max(starts[0], starts[1] + late)
     if not overlap > 0 and max(one.sizes["time"] for one in pair) > 1:
@@ -114,12 +120,3 @@ def _check(one: xr.Dataset, name: str) -> None:
     if one["counts"].dtype != np.uint16:
         dtype = one["counts"].dtype
         raise TypeError(f"Invalid dtype {dtype} of the counts of band '{name}'. Must be uint16.")
-
-
-def _offset(first: xr.Dataset, second: xr.Dataset) -> float:
-    """Time from the date of one recording to that of another [s]."""
-    dates = [one.attrs.get("start") for one in (first, second)]
-    if None in dates:
-        raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
-    begun, later = (datetime.fromisoformat(str(date)) for date in dates)
-    return (later - begun).total_seconds()

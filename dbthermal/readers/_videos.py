@@ -48,9 +48,8 @@ def palette_video(
     Noise takes pixels off the palette: how far is stated, and only a video that another common
     palette fits better is refused.
 
-    A frame that its decoder marks as damaged, a frame too few or a length other than the declared
-    one is an error. H.264 carries no checksum, though: of 200 files with one flipped bit, a block
-    of zeros or a cut, up to 60 decode to other values without complaint. `sha256` excludes that.
+    H.264 carries no checksum: of 200 files with one flipped bit, a block of zeros or a cut, up to
+    60 decode to other values without complaint. `sha256` excludes that.
 
     Parameters
     ----------

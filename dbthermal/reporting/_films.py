@@ -4,13 +4,12 @@ import base64
 import math
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
 from markupsafe import Markup
-from scipy.constants import zero_Celsius
 
 from dbthermal import figures, store
 from dbthermal.explorer import View
@@ -22,22 +21,6 @@ _FASTEST: Final = 30.0  # Hz
 _SAMPLES: Final = 1_300_000  # of each film in the viewer, at most, and of these frames:
 VIEWED: Final = 100
 _NO_VALUE: Final = 65535  # of 16 bits
-
-
-class Unit:
-    """Temperatures as they are shown: degrees Celsius or kelvin."""
-
-    def __init__(self, *, celsius: bool) -> None:
-        self.zero: float = zero_Celsius if celsius else 0.0
-        self.name = "\N{DEGREE SIGN}C" if celsius else "K"
-
-    def of(self, values: Any, pane: Any) -> Any:
-        """Values of a pane, in this unit if they are temperatures."""
-        return values - self.zero if pane.absolute else values
-
-    def label(self, pane: Any) -> str:
-        """Unit of a pane's values."""
-        return self.name if pane.absolute else str(pane.units)
 
 
 def _films(view: View) -> list[str]:
@@ -56,13 +39,14 @@ def sampled(view: View, name: str, frames: int, samples: int) -> tuple[xr.DataAr
     return xr.DataArray(values, {"time": time}, ("time", "y", "x")), step
 
 
-def video(view: View, unit: Unit, title: str, codec: Literal["vp9", "h264"]) -> Markup:
+def video(view: View, title: str, codec: Literal["vp9", "h264"], *, celsius: bool) -> Markup:
     """Film of the inputs, the object and what it reflects."""
     panels = []
     for name in _films(view):
         pane = view.panes[name]
         values, _ = sampled(view, name, _FILMED, _FILMED * 100_000)
-        panels.append(figures.FilmPanel(unit.of(values, pane), pane.label, f"[{unit.label(pane)}]"))
+        unit, zero = pane.unit(celsius=celsius)
+        panels.append(figures.FilmPanel(values - zero, pane.label, f"[{unit}]"))
     span = float(view.time[-1] - view.time[0])
     rate = min(_FASTEST, max(1.0, (panels[0].values.sizes["time"] - 1) / span)) if span else 1.0
     with TemporaryDirectory() as folder:
@@ -71,28 +55,28 @@ def video(view: View, unit: Unit, title: str, codec: Literal["vp9", "h264"]) -> 
         return film_tag(path, "The scene. Gray: no value.")
 
 
-def viewer(view: View, unit: Unit) -> Markup:
+def viewer(view: View, *, celsius: bool) -> Markup:
     """Viewer of some frames and pixels of the films, and of the curve of each pixel."""
     quantities, step, time = [], 1, view.time
     stds = [f"{name}_std" for name in FILMS]
     for name in [*_films(view), *(name for name in stds if name in view.panes)]:
         pane = view.panes[name]
         film, step = sampled(view, name, VIEWED, _SAMPLES)
-        values, time = unit.of(film.values.astype(np.float64), pane), film["time"].values
+        unit, zero = pane.unit(celsius=celsius)
+        values, time = film.values.astype(np.float64) - zero, film["time"].values
         finite = values[np.isfinite(values)]
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
         high = high if high > low else low + 1.0
         scaled = np.nan_to_num((values - low) / (high - low)) * (_NO_VALUE - 1)
         codes = np.where(np.isfinite(values), np.rint(scaled), _NO_VALUE).astype("<u2")
-        shown = unit.of(np.array(view.limits(name)), pane)
         quantities.append(
             {
                 "name": name,
                 "label": pane.label,
-                "unit": unit.label(pane),
+                "unit": unit,
                 "low": float(low),
                 "high": float(high),
-                "shown": [float(one) for one in shown],
+                "shown": [float(one - zero) for one in view.limits(name)],
                 "data": base64.b64encode(codes.tobytes()).decode(),
             }
         )

@@ -150,16 +150,7 @@ def film_tag(path: str | Path, text: str) -> Markup:
 
 
 def viewer_tag(film: Mapping[str, Any], text: str) -> Markup:
-    """Viewer of films: a picture, a slider for the time, and the curve of a pixel.
-
-    Parameters
-    ----------
-    film : mapping
-        `height`, `width`, `step` between pixels, `times` [s], `palette` (256 colours) and
-        `quantities`, as viewer.js reads them.
-    text : str
-        What to do with it.
-    """
+    """Viewer of films as viewer.js reads them, with a text: picture, slider, curve of a pixel."""
     script = resources.files("dbthermal.reporting").joinpath("viewer.js").read_text("utf-8")
     return Markup(
         '<div class="viewer"><div class="controls"><select data-part="quantity"></select>'

@@ -15,19 +15,12 @@ from dbthermal import emissivity, figures, schema
 from dbthermal._arrays import Array
 from dbthermal.explorer import Region, View
 from dbthermal.figures import drawing
-from dbthermal.reporting._films import FILMS, VIEWED, Unit, sampled, video, viewer
-from dbthermal.reporting._page import (
-    Section,
-    image_tag,
-    save_page,
-    table,
-)
+from dbthermal.reporting._films import FILMS, VIEWED, sampled, video, viewer
+from dbthermal.reporting._page import Section, image_tag, save_page, table
 from dbthermal.schema import Status
 
 Curves = Mapping[str, Mapping[str, xr.Dataset]]
 
-_FILMED: Final = 240  # frames of the film, at most
-_FASTEST: Final = 30.0  # Hz
 _SPREAD: Final = 0.02  # of emissivities of samples of one material
 _WORDS: Final = {
     "method": "method",
@@ -110,25 +103,29 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     view = View(data, capture, response)
     if "object_temperature" not in view.panes:
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
-    result, unit = view.data, Unit(celsius=celsius)
+    result = view.data
     chosen = dict(regions) or {
         "whole image": Region("rectangle", ((0, 0), (view.shape[0], view.shape[1])))
     }
+    shown = [one for one in view.panes if one in FILMS or one.startswith("emissivity ")]
     curves = {
-        name: {pane: view.curve(pane, region) for pane in view.panes if _is_averaged(pane)}
-        for name, region in chosen.items()
+        name: {pane: view.curve(pane, region) for pane in shown} for name, region in chosen.items()
     }
     table_ = emissivity.embedded_table() if materials is None else materials
-    numbers = {
-        "scene": _scene(view),
+    (rows, columns), frames = view.shape, int(view.time.size)
+    seconds = float(view.time[-1] - view.time[0])
+    sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
+    if "method" in result.attrs:
+        sentence += f"; separated by the method '{result.attrs['method']}'"
+    numbers: dict[str, Any] = {
+        "scene": {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds},
         "validity": _validity(view),
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
+    film = video(view, title, codec, celsius=celsius)
     sections = [
-        Section(
-            "Scene", [_scene_sentence(view), video(view, unit, title, codec), viewer(view, unit)]
-        ),
-        Section("Regions", list(_regions(view, unit, chosen, curves))),
+        Section("Scene", [f"{sentence}.", film, viewer(view, celsius=celsius)]),
+        Section("Regions", list(_regions(view, chosen, curves, celsius=celsius))),
         Section("What can be trusted", list(_trust(view, numbers["validity"]))),
         Section("Emissivities", list(_emissivities(numbers["regions"]))),
         Section("What was assumed", [_assumed(view)]),
@@ -143,26 +140,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     )
 
 
-def _is_averaged(name: str) -> bool:
-    """A pane of which the regions' means are wanted."""
-    return name in FILMS or name.startswith("emissivity ")
-
-
-def _scene(view: View) -> dict[str, Any]:
-    """Size and duration."""
-    rows, columns = view.shape
-    seconds = float(view.time[-1] - view.time[0])
-    return {"rows": rows, "columns": columns, "frames": int(view.time.size), "duration_s": seconds}
-
-
-def _scene_sentence(view: View) -> str:
-    """Size, duration and method in a sentence."""
-    scene, attrs = _scene(view), view.data.attrs
-    text = f"{scene['rows']} rows of {scene['columns']} pixels, {scene['frames']} frames in "
-    text += f"{scene['duration_s']:.1f} s"
-    return text + (f"; separated by the method '{attrs['method']}'." if "method" in attrs else ".")
-
-
 def _origin(view: View) -> str:
     """Origin of the data: measured, simulated, emulated, or not stated."""
     holders = [one for one in (view.data, view.capture) if one is not None]
@@ -172,38 +149,33 @@ def _origin(view: View) -> str:
 
 
 def _regions(
-    view: View, unit: Unit, chosen: Mapping[str, Region], curves: Curves
+    view: View, chosen: Mapping[str, Region], curves: Curves, *, celsius: bool
 ) -> Iterator[Markup | str]:
     """Yield where the regions are, and their curves with two standard deviations."""
-    yield image_tag(_outlines(view, unit, chosen), "Object temperature, mean over time; regions.")
+    yield image_tag(
+        _outlines(view, chosen, celsius=celsius), "Object temperature, mean over time; regions."
+    )
     names = [name for name in FILMS if name in view.panes]
     figure, axes = drawing.canvas(len(names), 1, (9.0, 2.9 * len(names)))
+    unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
     for axis, name in zip(axes[:, 0], names, strict=True):
-        pane = view.panes[name]
         for region, color in zip(chosen, cycle(drawing.COLORS), strict=False):
             curve = curves[region][name]
-            mean, two = unit.of(curve["mean"].values, pane), 2 * curve["std"].values
+            mean, two = curve["mean"].values - zero, 2 * curve["std"].values
             axis.plot(view.time, mean, color=color, label=region, linewidth=1.2)
             axis.fill_between(
                 view.time, mean - two, mean + two, color=color, alpha=0.25, linewidth=0
             )
-        axis.set(title=pane.label, ylabel=f"[{unit.label(pane)}]")
+        axis.set(title=view.panes[name].label, ylabel=f"[{unit}]")
         axis.legend(frameon=False, fontsize=8)
     axes[-1, 0].set_xlabel("time [s]")
     yield image_tag(figure, "Means of the regions, and two standard deviations of these means.")
-    head = ["region", "pixels that count", f"object temperature [{unit.name}]", "its std [K]"]
+    head = ["region", "pixels that count", f"object temperature [{unit}]", "its std [K]"]
     rows = []
     for region in chosen:
         curve = curves[region]["object_temperature"]
-        mean = unit.of(curve["mean"].values, view.panes["object_temperature"])
-        rows.append(
-            [
-                region,
-                int(curve["pixels"].max()),
-                _range(mean),
-                _text(_plain(curve["std"].mean()), 3),
-            ]
-        )
+        std = _text(_plain(curve["std"].mean()), 3)
+        rows.append([region, int(curve["pixels"].max()), _range(curve["mean"].values - zero), std])
     yield table(head, rows)
     yield (
         "Pixels with a flag do not count, but those that were completed do. Errors that the pixels "
@@ -211,19 +183,18 @@ def _regions(
     )
 
 
-def _outlines(view: View, unit: Unit, chosen: Mapping[str, Region]) -> Figure:
+def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Figure:
     """Mean picture of the object with the regions on it."""
     pane = view.panes["object_temperature"]
+    unit, zero = pane.unit(celsius=celsius)
     film, step = sampled(view, pane.name, VIEWED, VIEWED * 200_000)
     with np.errstate(invalid="ignore"):
         count = film.notnull().sum("time")
-        image = unit.of(film.sum("time") / count.where(count > 0), pane)
+        image = film.sum("time") / count.where(count > 0) - zero
     aspect = view.shape[0] / view.shape[1]
     figure, axes = drawing.canvas(1, 1, (5.6, 4.6 * aspect + 0.5))
-    label = f"[{unit.label(pane)}]"
-    drawing.draw_image(
-        figure, axes[0, 0], image, pane.label, label, limits=drawing.limits_of(image)
-    )
+    limits = drawing.limits_of(image)
+    drawing.draw_image(figure, axes[0, 0], image, pane.label, f"[{unit}]", limits=limits)
     for (name, region), color in zip(chosen.items(), cycle(drawing.COLORS), strict=False):
         mask = region.mask((view.shape[0], view.shape[1]))[::step, ::step]
         if mask.all():

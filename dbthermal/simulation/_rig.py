@@ -58,7 +58,6 @@ class Rig:
     bad_fraction: float = 0.001
 
     def __post_init__(self) -> None:
-        """Check bands, noise and fraction."""
         for name in self.bands:
             bands.get(name)
         if len(self.noise) != len(self.bands):

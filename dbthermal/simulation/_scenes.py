@@ -46,7 +46,6 @@ class Background:
     drift: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the kind and the numbers."""
         if self.kind not in _BACKGROUNDS:
             raise ValueError(f"Unknown background '{self.kind}'. Must be one of {_BACKGROUNDS}.")
         if not 0 <= self.count[0] <= self.count[1]:
@@ -63,21 +62,16 @@ class Background:
         increasing(time, "a background")
         change = np.zeros((time.size, pixels))
         if self.kind == "pulses":
-            change = self._pulses(time, pixels, rng)
+            number = rng.integers(self.count[0], self.count[1] + 1, pixels)
+            for pulse in range(self.count[1]):
+                start = rng.uniform(time[0], time[-1], pixels)
+                stop = start + rng.uniform(*self.duration, pixels)
+                inside = (time[:, np.newaxis] >= start) & (time[:, np.newaxis] < stop)
+                change += self.amplitude * (inside & (pulse < number))
         elif self.kind == "random walk":
             change = self._walk(time, pixels, rng)
         ramp = self.drift * (time - time[0]) / (time[-1] - time[0])
         return np.asarray(self.level + ramp[:, np.newaxis] + change)
-
-    def _pulses(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
-        change = np.zeros((time.size, pixels))
-        number = rng.integers(self.count[0], self.count[1] + 1, pixels)
-        for pulse in range(self.count[1]):
-            start = rng.uniform(time[0], time[-1], pixels)
-            stop = start + rng.uniform(*self.duration, pixels)
-            inside = (time[:, np.newaxis] >= start) & (time[:, np.newaxis] < stop)
-            change += self.amplitude * (inside & (pulse < number))
-        return change
 
     def _walk(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
         change = np.empty((time.size, pixels))

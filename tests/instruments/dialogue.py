@@ -5,7 +5,6 @@ The idea is pymeasure's ``expected_protocol``.
 
 from collections.abc import Iterable, Sequence
 from types import TracebackType
-from typing import Final
 
 from dbthermal.instruments.transport import Closing
 
@@ -22,7 +21,7 @@ class Dialogue(Closing):
     is a read that times out, and so is a read for which nothing is left.
     """
 
-    is_simulated: Final = True
+    is_simulated = True
 
     def __init__(self, pairs: Iterable[Pair]) -> None:
         self._pairs = list(pairs)

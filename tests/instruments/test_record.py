@@ -1,9 +1,11 @@
 """A recording keeps every frame, counts the lost ones, and survives faults and interrupts."""
 
 import errno
+import shutil
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -338,11 +340,11 @@ def test_wrong_sources_are_refused(tmp_path: Path) -> None:
 def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Too little space is an error before it begins, and ends it on the way with all it has."""
     limits = Limits(chunk=CHUNK, reserve=1000)
-    monkeypatch.setattr(_recorder, "_free", lambda _: 5000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5000))
     with pytest.raises(OSError, match=r"Too little space: 5000 bytes are free\. Must be 47080"):
         record(session(), bench(), tmp_path / "a.zarr", limits=limits)
     answers = iter([10**9, 10**9, 999])
-    monkeypatch.setattr(_recorder, "_free", lambda _: next(answers))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=next(answers)))
     with pytest.raises(OSError, match="Too little space: 999 bytes") as raised:
         record(session(), bench(), tmp_path / "a.zarr", limits=limits)
     assert raised.value.errno == errno.ENOSPC

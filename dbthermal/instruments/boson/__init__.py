@@ -49,16 +49,10 @@ EnumT = TypeVar("EnumT", bound=IntEnum)
 
 BAUDRATE: Final = 921600  # speed of the line [bit/s]; over USB probably without effect
 REPLY_TIMEOUT: Final = 1.0  # longest wait for a reply [s], as in the vendor's own software
-
-REPEATS: Final = 2
-"""Repetitions of a reading without a reply; a command that changes the camera is sent once."""
-
+REPEATS: Final = 2  # of a reading without a reply; what changes the camera is sent once
 FFC_TIMEOUT: Final = 10.0  # longest wait for a flat-field correction [s]
 POLL: Final = 0.05  # time between two questions while waiting [s]
-
-MAXIMUM_RECEIVED: Final = 65536
-"""Most bytes to search for one reply: a line that talks without end is an error."""
-
+MAXIMUM_RECEIVED: Final = 65536  # most bytes to search for one reply: some lines talk without end
 _READ_SIZE: Final = 4096
 
 
@@ -117,11 +111,9 @@ class Boson(Closing):
         self._lock = threading.Lock()
 
     @classmethod
-    def from_url(
-        cls, url: str, *, timeout: float = REPLY_TIMEOUT, world: object | None = None
-    ) -> "Boson":
+    def from_url(cls, url: str, world: object | None = None) -> "Boson":
         """Open ``serial:///dev/ttyACM0`` or ``sim://boson``, see `open_serial`; nothing is sent."""
-        return cls(open_serial(url, baudrate=BAUDRATE, world=world), timeout=timeout)
+        return cls(open_serial(url, baudrate=BAUDRATE, world=world))
 
     def close(self) -> None:
         """Release the port, once an exchange of another thread is over; the camera goes on."""
@@ -257,17 +249,11 @@ class Boson(Closing):
                     "Must be a Boson's command port that no other program uses."
                 )
             key = (fslp.COMMAND_CHANNEL, self._sequence)
-            replies = [
-                frame
-                for frame in self._decoder.feed(piece)
-                if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST
-            ]
-            if replies:
-                return replies[0]
-        raise BosonTimeoutError(
-            f"No reply to '{name}' within {self.timeout:g} s. Must be a Boson's command port, "
-            "and the camera through with booting."
-        )
+            for frame in self._decoder.feed(piece):
+                if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST:
+                    return frame
+        rule = "Must be a Boson's command port, and the camera through with booting"
+        raise BosonTimeoutError(f"No reply to '{name}' within {self.timeout:g} s. {rule}.")
 
 
 def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource]:
@@ -277,9 +263,5 @@ def _open_frames(url: str, stream: Stream) -> AbstractContextManager[FrameSource
     return v4l2.open_url(url, stream, decode=telemetry.metadata)
 
 
-def _open_control(url: str, world: object | None) -> Boson:
-    return Boson.from_url(url, world=world)
-
-
-KIND: Final = CameraKind(_open_frames, _open_control, telemetry_rows=(0, telemetry.ROWS))
+KIND: Final = CameraKind(_open_frames, Boson.from_url, telemetry_rows=(0, telemetry.ROWS))
 """The kind of camera of a session's ``kind: boson``."""

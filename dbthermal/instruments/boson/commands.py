@@ -116,14 +116,12 @@ def _kelvin(tenths: int) -> float:
     return float(tenths / 10.0 + zero_Celsius)
 
 
-def _revision(*parts: int) -> str:
-    return ".".join(map(str, parts))
-
-
 SERIAL_NUMBER: Final = Reading("serial number", 0x00050002, ">I", int)
 PART_NUMBER: Final = Reading("part number", 0x00050004, ">20s", _text)
 SENSOR_SERIAL_NUMBER: Final = Reading("sensor serial number", 0x00050006, ">I", int)
-SOFTWARE_REVISION: Final = Reading("software revision", 0x00050022, ">III", _revision)
+SOFTWARE_REVISION: Final = Reading(
+    "software revision", 0x00050022, ">III", lambda *parts: ".".join(map(str, parts))
+)
 FPA_TEMPERATURE: Final = Reading("FPA temperature [K]", 0x00050030, ">h", _kelvin)
 FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, ">h", Switch)
 FFC_STATUS: Final = Reading("FFC status", 0x00050054, ">i", FfcStatus)

@@ -7,7 +7,6 @@ which the public descriptions leave open, are choices made here.
 
 import math
 import struct
-from types import MappingProxyType
 from typing import Any, Final
 
 from scipy.constants import zero_Celsius
@@ -19,14 +18,6 @@ from dbthermal.instruments.emulated.line import Line
 from dbthermal.instruments.emulated.world import SERIAL_NUMBERS, World
 
 FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source counts [Hz]
-
-DEFAULTS: Final = MappingProxyType(
-    {
-        **{setting.set_command: 0 for setting in commands.SETTINGS},
-        commands.FFC_MODE.set_command: int(FfcMode.AUTO),
-    }
-)
-"""Settings at power-on, by the identifier that sets them; not those of a real camera."""
 
 _STATUS, _RANGE, _FEW, _MANY, _UNKNOWN = 0x162, 0x203, 0x17D, 0x17E, 0x161
 
@@ -42,7 +33,9 @@ class EmulatedBoson:
 
     def __init__(self, world: World, name: str) -> None:
         self.camera = world.camera(name)
-        self.settings = dict(DEFAULTS)
+        # By the identifier that sets them, at power-on; not those of a real camera.
+        self.settings = {setting.set_command: 0 for setting in commands.SETTINGS}
+        self.settings[commands.FFC_MODE.set_command] = int(FfcMode.AUTO)
         self._world = world
         self._name = name
         self._decoder = fslp.Decoder()

@@ -9,7 +9,7 @@ telemetry, serial line and frozen image, see `camera.next_shutter`.
 import math
 import time as system_time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Final
 
@@ -34,12 +34,8 @@ from dbthermal.instruments.transport import Closing
 
 Picture = Callable[[float], Counts]
 NETD: Final = 0.1  # noise of the emulated cameras near 25 degrees Celsius [K]
-
-BUFFERS: Final = 32
-"""Frames that are held while no program reads, as by the V4L2 driver; beyond, they are dropped."""
-
-CLOSED: Final = 10_000
-"""Counts of every pixel where no filter is in the beam: a closed aperture [count]."""
+BUFFERS: Final = 32  # frames that are held while no program reads, as by the V4L2 driver
+CLOSED: Final = 10_000  # of every pixel where no filter is in the beam [count]
 
 MODELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
     {"boson": ("emulated Boson", math.inf), "y16": ("emulated Y16 camera", 120.0)}
@@ -65,24 +61,20 @@ class EmulatedCamera(Closing):
     sleep: Callable[[float], None] = system_time.sleep  # injected by tests, with the world's clock
     kind: str = "boson"  # of `MODELS`
 
-    is_simulated: Final = True
+    is_simulated: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
         self._state = self.world.camera(self.name)
         self._state.has_frames = True
-        self._number = 0
-        self._start: float | None = None
-        self._last: Counts = np.full(self.shape, CLOSED, dtype=np.uint16)
-        self._open = True
-
-    @property
-    def identity(self) -> Mapping[str, str]:
-        """Device, model and number, labelled as emulated."""
-        return {
+        self.identity: Mapping[str, str] = {
             "device": f"sim://{self.kind}/{self.name}",
             "model": MODELS[self.kind][0],
             "serial_number": str(self._state.serial_number),
         }
+        self._number = 0
+        self._start: float | None = None
+        self._last: Counts = np.full(self.shape, CLOSED, dtype=np.uint16)
+        self._open = True
 
     def close(self) -> None:
         """Give no more frames; a second call does nothing."""

@@ -33,7 +33,7 @@ class Line(Closing):
     Bytes that a driver does not read are kept. `TransportError` once the device is pulled out.
     """
 
-    is_simulated: Final = True
+    is_simulated = True
 
     def __init__(
         self,

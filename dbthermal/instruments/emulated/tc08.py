@@ -7,10 +7,10 @@ it. Signatures, error numbers and NaN for channels that are off are those of the
 
 import math
 from collections.abc import Callable, MutableSequence
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from dbthermal.instruments import thermocouple
-from dbthermal.instruments.emulated.world import ROOM, World
+from dbthermal.instruments.emulated.world import ROOM
 from dbthermal.instruments.tc08 import CHANNELS, KELVIN
 
 Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
@@ -39,11 +39,6 @@ class EmulatedTC08:
         self._temperature, self._sleep = temperature, sleep
         self._is_open, self._error = False, 0
         self._kinds: dict[int, str] = {}
-
-    @classmethod
-    def from_world(cls, world: World) -> Self:
-        """Unit whose thermocouples are where `World.thermocouples` says."""
-        return cls(world.thermocouple_temperature)
 
     def usb_tc08_open_unit_async(self) -> int:
         """Begin to open the unit: 1, or 0 if it fails."""

@@ -18,10 +18,7 @@ from dbthermal.instruments.session import Session
 
 ROOM: Final = 296.15  # default temperature of the room [K]
 FPA: Final = 308.15  # default temperature of a focal-plane array [K]
-
-FFC_DURATION: Final = 0.5
-"""Duration of an emulated flat-field correction [s]; the real one is not documented publicly."""
-
+FFC_DURATION: Final = 0.5  # of a flat-field correction [s]; the real one is not documented publicly
 SERIAL_NUMBERS: Final = 93588  # number of the first emulated camera of a session; the others follow
 
 
@@ -106,10 +103,8 @@ class World:
             return math.nan
         temperatures = self.scene_temperatures()
         if place not in temperatures:
-            raise KeyError(
-                f"Unknown place '{place}' of thermocouple {channel}. "
-                f"Must be one of {sorted(temperatures)}."
-            )
+            rule = f"Must be one of {sorted(temperatures)}"
+            raise KeyError(f"Unknown place '{place}' of thermocouple {channel}. {rule}.")
         return temperatures[place]
 
     def add_camera(self, name: str, serial_number: int) -> CameraState:

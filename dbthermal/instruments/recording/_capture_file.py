@@ -188,7 +188,10 @@ class CaptureFile:
         attrs: Mapping[str, Any],
         chunk: int = CHUNK,
     ) -> None:
-        (rows, columns), telemetry_rows = _common_format(sources)
+        formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
+        if len(set(formats.values())) != 1:
+            raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
+        (rows, columns), telemetry_rows = next(iter(formats.values()))
         self._variables = {**VARIABLES, **(TELEMETRY if telemetry_rows else {})}
         self._sizes = {"y": rows, "x": columns, "telemetry_row": telemetry_rows}
         self._origin, self._chunk = origin, chunk
@@ -196,22 +199,12 @@ class CaptureFile:
         self._names = [*sources, *readings, _RECORDER]
         self._notes: list[tuple[float, ...]] = []
         self.broken = False
-        self.recording = store.Recording(
-            path,
-            self._variables,
-            self._sizes,
-            list(sources),
-            chunk=chunk,
-            attrs={
-                **attrs,
-                "comment": ABOUT,
-                "clock_origin": origin,
-                "log_sources": self._names,
-                "log_units": dict(readings),
-                "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
-            },
-            fills=_FILLS,
-        )
+        about = {"comment": ABOUT, "clock_origin": origin, "log_sources": self._names}
+        about |= {"log_units": dict(readings)}
+        about |= {"log_kinds": {kind.name.lower(): int(kind) for kind in Note}}
+        options: dict[str, Any] = {"chunk": chunk, "attrs": {**attrs, **about}, "fills": _FILLS}
+        form = self._variables, self._sizes, list(sources)
+        self.recording = store.Recording(path, *form, **options)
         self._place = self.recording.place()
         self._bands = {band: _Band(self._new_block()) for band in sources}
 
@@ -371,10 +364,3 @@ class CaptureFile:
             for name, variable in self._variables.items()
             if variable.dims[0] == "band"
         }
-
-
-def _common_format(sources: Mapping[str, FrameSource]) -> tuple[tuple[int, int], int]:
-    formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
-    if len(set(formats.values())) != 1:
-        raise ValueError(f"Invalid formats {formats} of the sources. Must be the same.")
-    return next(iter(formats.values()))

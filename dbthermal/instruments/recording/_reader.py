@@ -5,7 +5,6 @@ of; temperatures are the readings during them.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -193,32 +192,6 @@ def is_complete(path: str | Path) -> bool:
         return False
 
 
-@dataclass(frozen=True)
-class _Sweep:
-    """Session of a sweep, as its recordings tell it."""
-
-    folder: Path
-    name: str
-    temperatures: list[float]
-    stability: float
-    bands: list[str | None]
-    attrs: Mapping[str, Any]
-
-    def steps(self) -> Iterator[list[Path]]:
-        """Recordings of each temperature, one for each filter; ValueError unless complete."""
-        for number in range(len(self.temperatures)):
-            paths = [step_path(self.folder, self.name, number, band) for band in self.bands]
-            for path in paths:
-                if not is_complete(path):
-                    state = "Incomplete" if path.exists() else "Missing"
-                    raise ValueError(
-                        f"{state} recording '{path}' of the sweep. Must be recorded to its end."
-                    )
-            for path, band in zip(paths, self.bands, strict=True):
-                require_filter(path, band)
-            yield paths
-
-
 def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
     """Join the recordings of a blackbody sweep into one dataset.
 
@@ -245,17 +218,17 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         If a recording is missing or incomplete, has fewer good frames in a band, or no reading of
         the blackbody, or those of a step differ by more than the session's stability.
     """
-    sweep = _find(folder, name)
+    steps, stability, shared = _sweep(folder, name)
     temperatures, movies = [], []
-    for paths in sweep.steps():
-        temperatures.append(_agreed(paths, BLACKBODY, sweep.stability))
+    for paths in steps:
+        temperatures.append(_agreed(paths, BLACKBODY, stability))
         movies.append(_movie(paths, frames))
     order, attrs = np.argsort(temperatures), schema.COORDINATES["temperature"].attrs
     axis = xr.Variable("temperature", np.array(temperatures)[order], attrs)
     counts = xr.concat([movies[place] for place in order], "temperature")
     counts = counts.transpose("band", "temperature", "frame", "y", "x")
     joined = counts.to_dataset(name="counts").assign_coords(temperature=axis)
-    return schema.check(joined.assign_attrs(sweep.attrs), "blackbody_movies")
+    return schema.check(joined.assign_attrs(shared), "blackbody_movies")
 
 
 def bench_series(
@@ -288,14 +261,14 @@ def bench_series(
     FileNotFoundError, ValueError
         As `open_sweep`; or if a region has no pixel or a band no good frame.
     """
-    sweep = _find(folder, name)
+    steps, stability, shared = _sweep(folder, name)
     series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
-    for paths in sweep.steps():
-        background = _agreed(paths, BLACKBODY, sweep.stability)
+    for paths in steps:
+        background = _agreed(paths, BLACKBODY, stability)
         captures = dict(_bands(paths))
         for material, place in region.items():
             measured = {
-                "object_temperature": _agreed(paths, material, sweep.stability),
+                "object_temperature": _agreed(paths, material, stability),
                 "background_temperature": background,
             }
             counts = [_mean(captures[band], band, place, correction) for band in captures]
@@ -306,28 +279,31 @@ def bench_series(
         one = xr.concat(measurements, "measurement").transpose("band", "measurement")
         for variable, described in schema.STAGES["contact"].items():
             one[variable].attrs = described.attrs
-        one.attrs = {**sweep.attrs, "material": material}
+        one.attrs = {**shared, "material": material}
         joined[material] = schema.check(one, "contact")
     return joined
 
 
-def _find(folder: str | Path, name: str) -> _Sweep:
-    """Description of a sweep, from the first of its recordings."""
+def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict[str, Any]]:
+    """Recordings of each temperature, one for each filter, stability [K] and origin of a sweep."""
     for path in sorted(Path(folder).glob(f"{name}_[0-9][0-9]*.zarr")):
         attrs = store.open_dataset(path).attrs
         session = attrs["provenance"]["parameters"]
-        if session["name"] == name and session["blackbody"] is not None:
-            filters = session["filters"].values()
-            behind = [band for band in session["cameras"] if band in filters]
-            return _Sweep(
-                Path(folder),
-                name,
-                session["blackbody"]["temperatures"],
-                session["blackbody"]["stability"],
-                session["sweep"] or behind or [None],
-                {name: attrs[name] for name in ("is_simulated", "origin")},
-            )
-    raise FileNotFoundError(f"No recording of a sweep '{name}' in '{folder}'. Must have one.")
+        if session["name"] == name and (blackbody := session["blackbody"]) is not None:
+            break
+    else:
+        raise FileNotFoundError(f"No recording of a sweep '{name}' in '{folder}'. Must have one.")
+    behind = [band for band in session["cameras"] if band in session["filters"].values()]
+    bands, steps = session["sweep"] or behind or [None], []
+    for number in range(len(blackbody["temperatures"])):
+        steps.append([step_path(folder, name, number, band) for band in bands])
+        for path, band in zip(steps[-1], bands, strict=True):
+            if not is_complete(path):
+                state = "Incomplete" if path.exists() else "Missing"
+                rule = "Must be recorded to its end"
+                raise ValueError(f"{state} recording '{path}' of the sweep. {rule}.")
+            require_filter(path, band)
+    return steps, blackbody["stability"], {key: attrs[key] for key in ("is_simulated", "origin")}
 
 
 def _agreed(paths: list[Path], source: str, stability: float) -> float:

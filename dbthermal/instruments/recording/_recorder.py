@@ -124,10 +124,8 @@ def _check(session: Session, sources: Mapping[str, FrameSource]) -> None:
             ("shape", source.shape, session.shape),
         ):
             if value != expected:
-                raise ValueError(
-                    f"Invalid source of band '{band}': {name} is {value}. Must be {expected}, as "
-                    "the session says."
-                )
+                rule = f"Must be {expected}, as the session says"
+                raise ValueError(f"Invalid source of band '{band}': {name} is {value}. {rule}.")
 
 
 def _new_file(
@@ -155,14 +153,8 @@ def _new_file(
         "started": _utc(),
         "provenance": store.provenance(asdict(session)),
     }
-    return CaptureFile(
-        path,
-        sources,
-        readings={name: reading.units for name, reading in readings.items()},
-        origin=monotonic(),
-        attrs=attrs,
-        chunk=limits.chunk,
-    )
+    units, start = {name: reading.units for name, reading in readings.items()}, monotonic()
+    return CaptureFile(path, sources, readings=units, origin=start, attrs=attrs, chunk=limits.chunk)
 
 
 def _utc() -> str:
@@ -345,11 +337,6 @@ class _Run:
 
 
 def _check_space(path: Path, least: int) -> None:
-    if (available := _free(path)) < least:
+    if (available := shutil.disk_usage(path).free) < least:
         message = f"Too little space: {available} bytes are free. Must be {least}"
         raise OSError(errno.ENOSPC, message, os.path.realpath(path))
-
-
-def _free(path: Path) -> int:
-    """Space that is free on the file system of a folder [byte]."""
-    return shutil.disk_usage(path).free

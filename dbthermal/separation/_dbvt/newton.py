@@ -11,6 +11,7 @@ Beyond its threshold the Huber loss has no curvature: a share of that of a parab
 
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 from typing import Final
 
 import numpy as np
@@ -25,6 +26,7 @@ from dbthermal.separation._dbvt.objective import Columns, Images, Unknowns
 # Unknowns of a step: noise of both bands, smooth signal, and the border.
 _FIRST, _SECOND, _SMOOTH, _OFFSET, _EMISSION, _REFLECTION = range(6)
 _BORDER: Final = (_OFFSET, _EMISSION, _REFLECTION)
+_SYMMETRIC: Final = torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places of the border's pairs
 # Weight of the noise where it is not modelled.
 _NO_NOISE: Final = 1e8
 # Damping of the emissivities, per frame: first, range, and its factors after a step that lowers the
@@ -134,7 +136,7 @@ class _System:
     """
 
     def __init__(self, terms: list[_Term], like: Tensor) -> None:
-        self._like, self._terms = like, terms
+        self._zero, self._terms = torch.zeros_like(like), terms
         a = self._curvature(_FIRST, _FIRST)
         b = self._curvature(_FIRST, _SECOND)
         c = self._curvature(_SECOND, _SECOND)
@@ -147,18 +149,16 @@ class _System:
         self._response = {name: self._solve(*pair) for name, pair in self._coupling.items()}
 
     def _curvature(self, one: int, other: int) -> Tensor:
-        total = torch.zeros_like(self._like)
-        for term in self._terms:
-            if one in term.slopes and other in term.slopes:
-                total = total + term.curvature * term.slopes[one] * term.slopes[other]
-        return total
+        parts = [
+            term.curvature * (term.slopes[one] * term.slopes[other])
+            for term in self._terms
+            if one in term.slopes and other in term.slopes
+        ]
+        return sum(parts[1:], parts[0]) if parts else self._zero
 
     def _force(self, name: int) -> Tensor:
-        total = torch.zeros_like(self._like)
-        for term in self._terms:
-            if name in term.slopes:
-                total = total - term.gradient * term.slopes[name]
-        return total
+        parts = [term.gradient * term.slopes[name] for term in self._terms if name in term.slopes]
+        return -sum(parts[1:], parts[0])
 
     def _solve(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         """Solve the 2x2 block of each frame's noise."""
@@ -205,12 +205,12 @@ def _propose(
     )
     # Schur complement of the border (offset, k_1, k_2): B - sides^T S, f - sides^T s
     forces = torch.stack([system.force(name).sum(dim=0) for name in _BORDER])
-    forces = forces - torch.einsum("btc,tc->bc", torch.stack(sides), solved[:, 0])
+    across = torch.stack(sides).transpose(0, 1)
+    forces = forces - (across * solved[:, :1]).sum(dim=0)
     forces[1] = forces[1] - stiff * emission * square
-    border = torch.stack(
-        [torch.stack([system.curvature(a, b).sum(dim=0) for b in _BORDER]) for a in _BORDER]
-    )
-    border = border - torch.einsum("atc,tbc->abc", torch.stack(sides), solved[:, 1:])
+    pairs = combinations_with_replacement(_BORDER, 2)
+    sums = torch.stack([system.curvature(a, b).sum(dim=0) for a, b in pairs])
+    border = sums[_SYMMETRIC] - (across[:, :, None] * solved[:, None, 1:]).sum(dim=0)
     border[1, 1] = border[1, 1] + stiff * square
     damping = search.damping * smooth.shape[0]
     emissivity = _emissivity(unknowns.emissivity, border, forces, damping, settings)
@@ -240,12 +240,12 @@ def _emissivity(
     force = forces[1:] - border[1:, 0] * forces[0] / border[0, 0]
     # With J = d(k_1, k_2) / d(e_1, e_2): (J^T A J + damping) de = J^T f
     first, second = emissivity
-    zero = torch.zeros_like(first)
     of_emission = torch.stack([-second / first**2, 1 / first])
-    of_reflection = torch.stack([(1 - second) / (1 - first) ** 2, zero - 1 / (1 - first)])
+    of_reflection = torch.stack([(1 - second) / (1 - first) ** 2, -1 / (1 - first)])
     jacobian = torch.stack([of_emission, of_reflection])
-    square = torch.einsum("aic,abc,bjc->ijc", jacobian, pair, jacobian)
-    push = torch.einsum("aic,ac->ic", jacobian, force)
+    turned = (pair[:, :, None] * jacobian).sum(dim=1)
+    square = (jacobian[:, :, None] * turned[:, None]).sum(dim=0)
+    push = (jacobian * force[:, None]).sum(dim=0)
     a, b, c = square[0, 0] + damping, square[0, 1], square[1, 1] + damping
     change = torch.stack([c * push[0] - b * push[1], a * push[1] - b * push[0]]) / (a * c - b * b)
     change = change * (settings.largest_step / change.abs().amax(dim=0)).clamp(max=1.0)

@@ -322,7 +322,7 @@ def _excess(residual: Array, change: Array, null_variance: Array, noise: float) 
     at = xp.zeros_like(residual, dtype=xp.bool)
     at[1:] |= steps
     at[:-1] |= steps
-    count = at.sum(axis=0)
+    count = xp.sum(at, axis=0, dtype=xp.float64)
     energy = xp.einsum("tp,tp->p", residual * at, residual) / null_variance
     mean = quotient(energy, count, 1.0)
     # The cube root of a chi-square over its n degrees has the mean 1 - v and the variance v.
