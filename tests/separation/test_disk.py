@@ -229,56 +229,6 @@ def test_a_join_that_is_cut_short_loses_nothing(
     assert files(tmp_path / "cut.zarr") == files(tmp_path / "rest.zarr")
 
 
-LARGE = """
-import re, sys
-import numpy as np, xarray as xr
-from pathlib import Path
-from dbthermal import separation, simulation, store
-def peak():
-    return 1024 * int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
-if __name__ == "__main__":
-    response = simulation.Rig().response()
-    few = store.open_dataset(sys.argv[1])
-    separation.run(few.isel(y=slice(16)).chunk({"y": 16}), sys.argv[2] + "/few.zarr", response)
-    Path("/proc/self/clear_refs").write_text("5")
-    before = peak()
-    alike = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
-    many = xr.concat([few.chunk({"y": 16})] * int(sys.argv[3]), "y", **alike)
-    separation.run(many, sys.argv[2] + "/many.zarr", response, memory=float(sys.argv[4]))
-    print(before, peak(), many["counts"].nbytes)
-"""
-
-
-@pytest.mark.slow
-def test_ten_times_the_memory(tmp_path: Path) -> None:
-    """A capture of ten times what the memory leaves for it goes through, and the memory holds."""
-    pytest.importorskip("dask.array", reason="dask is not installed")
-    if not Path("/proc/self/clear_refs").exists():
-        pytest.skip("the peak of a process's memory is read from Linux's /proc")
-    rng, times, shape = np.random.default_rng(4), np.arange(350) / 10.0, (128, 160)
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
-    scene = simulation.walkers(times, shape, glass, rng)
-    capture = simulation.observe(scene, RIG.response(), rng).drop_vars(["y", "x"], errors="ignore")
-    store.save(capture, tmp_path / "few.zarr", {})
-    separation.solve(capture.isel(y=slice(1)), RIG.response())  # compiles
-    room, copies = 100e6, 18
-    command = [sys.executable, "-c", LARGE, str(tmp_path / "few.zarr"), str(tmp_path)]
-    command += [str(copies), str(_run._BASE + room)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    before, peak, size = map(int, done.stdout.split())
-    print(
-        f"{size / 1e6:.0f} MB in {room / 1e6:.0f}: from {before / 1e6:.0f} to {peak / 1e6:.0f} MB"
-    )
-    assert size >= 10 * room
-    assert peak <= _run._BASE + room
-    result = store.open_dataset(tmp_path / "many.zarr")
-    for top in (120, 500):
-        rows = np.arange(top, top + 16)
-        expected = separation.solve(capture.isel(y=rows % 128), RIG.response())
-        found = result.isel(y=rows).load().drop_vars(["y", "x"], errors="ignore")
-        xr.testing.assert_equal(found, expected.drop_vars(["y", "x"], errors="ignore"))
-
-
 KILLED = """
 import sys
 from dbthermal import separation, simulation
