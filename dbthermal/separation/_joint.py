@@ -149,10 +149,10 @@ def solve(
         weights, every = system.weights(inputs, raw)[1:], slice(0, result.sizes["y"])
         weights = np.where(solved, weights, 0.0)
 
-        def moved(frames: slice | Whole) -> Array | float:
+        def moved(frames: slice | Whole) -> Array:
             """Part (pixel, frame) [K] of q that the inputs of the result were without."""
             apart = 0.0 if before is None else before.difference(every, frames).T
-            return np.sum(weights.T[:, np.newaxis] * apart, axis=2)
+            return np.asarray(np.sum(weights.T[:, np.newaxis] * apart, axis=2))
 
         both = partial(_both, curve, solved, system.coefficients(inputs, raw, solved))
         looked_at = partial(both, _bridge(film[some], solved), moved(some), change[:, some])
@@ -192,7 +192,7 @@ def _both(
     solved: Mask,
     shares: Array,
     alone: Array,
-    moved: Array | float,
+    moved: Array,
     change: Array,
     equations: system.Equations,
 ) -> tuple[Array, Array, Array]:

@@ -87,8 +87,9 @@ def test_backgrounds_of_two_materials_are_told_before_the_pooled_object() -> Non
     # The second camera sees glass beside the first columns of concrete: a ratio of its own.
     columns = np.repeat([0, 1, 2], [width, 4, width - 4])
     labels = xr.DataArray(np.tile(columns, (20, 1)), dims=("y", "x"))
-    options = {"pool": labels, "reflection_shift": field(shift)}
-    got = judged(scene, separation.solve(capture, rig.response(), **options))
+    known = field(shift)
+    result = separation.solve(capture, rig.response(), pool=labels, reflection_shift=known)
+    got = judged(scene, result)
     print(got)
     assert got["good"] > 0.85
     assert got["rmse"] < 0.005
