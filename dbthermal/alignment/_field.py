@@ -83,31 +83,30 @@ class Spline:
         if around is not None:
             target += matrix @ around.nodes
             sharp, trials = around.sharpness, around.penalty * _STEPS
-        ridge = np.eye(len(matrix)) / self.prior**2
-        blocks = [(bends.T @ (bends * part[:, np.newaxis])).toarray() for part in sharp]
-        bending, best = block_diag(*blocks), -np.inf
+        ridge, best = np.eye(bends.shape[1]) / self.prior**2, -np.inf
+        blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
         for trial in trials:
             # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
-            trial_factor = cho_factor(matrix + trial * bending + ridge)
+            before = trial * blocks + ridge
+            trial_factor = cho_factor(matrix + block_diag(*before))
             trial_nodes = cho_solve(trial_factor, target)
-            before = np.linalg.cholesky(trial * bending + ridge)
-            logs = [2.0 * np.sum(np.log(np.diag(part))) for part in (before, trial_factor[0])]
+            roots = [np.diagonal(np.linalg.cholesky(before), 0, 1, 2), np.diag(trial_factor[0])]
+            logs = [2.0 * np.sum(np.log(part)) for part in roots]
             likelihood = logs[0] - logs[1] + target @ trial_nodes
             if likelihood > best:
                 best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
         squares = np.stack([(bends @ part) ** 2 for part in np.split(nodes, 2)])
         sharp = (_FREEDOM + 1.0) / (_FREEDOM + penalty * squares)
-        covariance = cho_solve(factor, np.eye(len(matrix)))
-        return Field(self, nodes, covariance, float(penalty), sharp)
+        return Field(self, nodes, factor, float(penalty), sharp)
 
 
 @dataclass(frozen=True)
 class Field:
-    """Nodes (rows', then columns') [pixel] of a displacement field, and their covariance."""
+    """Nodes (rows', then columns') [pixel] of a displacement field, and their information."""
 
     spline: Spline
     nodes: Array
-    covariance: Array
+    factor: tuple[Array, bool]  # of the information, by Cholesky
     penalty: float
     sharpness: Array  # weight of each bending (2, bending) [1]
 
@@ -121,7 +120,8 @@ class Field:
         """Variance (2, y, x) of the displacement at each place [pixel^2]."""
         rows, columns = (_pairs(part) for part in self.spline.values(centres))
         height, width = self.spline.nodes
-        blocks = self.covariance.reshape(2, height, width, 2, height, width)
+        covariance = cho_solve(self.factor, np.eye(self.nodes.size))
+        blocks = covariance.reshape(2, height, width, 2, height, width)
         parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
         return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in parts])
 

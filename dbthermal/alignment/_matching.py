@@ -107,9 +107,11 @@ def _whole_pixels(
     best, where = np.zeros((height, width)), np.zeros((2, height, width))
     for down, right in np.ndindex(2 * reach[0] + 1, 2 * reach[1] + 1):
         there = slice(down, down + height), slice(right, right + width)
+        if right == 0:  # a row's pairs of pixels at once: faster than those in reach
+            pairs = [padded[there[0]] @ part.transpose(0, 2, 1) for part in others]
         gain = np.zeros(best.shape)
-        for part in others:
-            cross = np.einsum("yxt,yxt->yx", padded[there], part).astype(np.float64)
+        for pair in pairs:
+            cross = pair.diagonal(-right, 1, 2).astype(np.float64)
             gain += np.maximum(gaussian_filter(cross, WINDOW), 0.0) ** 2
         gain /= np.maximum(gaussian_filter(energies[0][there], WINDOW), freedom)
         better = gain > best
@@ -180,11 +182,9 @@ def _moments(
                 most = (_TAIL * match.variance[rows, :, np.newaxis]).astype(np.float32)
                 weight = 1.0 / (1.0 + (square / most) ** 2)
                 out[11, rows] = np.median(square, axis=2)
-                other_time = np.roll(weight * residual, frames // 2, axis=2)
+                other_time = weight * np.roll(weight * residual, frames // 2, axis=2)
                 for place in (1, 2):
-                    out[11 + place, rows] = np.einsum(
-                        "yxt,yxt,yxt->yx", weight, four[place], other_time
-                    )
+                    out[11 + place, rows] = np.einsum("yxt,yxt->yx", four[place], other_time)
             out[10, rows] = weight.sum(axis=2)
             weighted = [weight * one for one in four]
             for place, (i, j) in enumerate(combinations_with_replacement(range(4), 2)):

@@ -20,7 +20,7 @@ from dbthermal import store
 from dbthermal.separation import _inputs
 from dbthermal.separation._inputs import BLOCK_ROWS, Method
 from dbthermal.separation._solve import get_method, solve
-from dbthermal.separation._tiles import PIXELS, SAMPLES
+from dbthermal.separation._tiles import largest
 
 if TYPE_CHECKING:
     from dbthermal.separation._solve import Settings
@@ -32,8 +32,8 @@ _BASE: Final = 450_000_000
 _READ: Final = 4
 # of a sample of a band in a block: results (8), and those on the way to the disk;
 _SAMPLE: Final = 12
-# of a sample of a band in the tile of a compiled method (110 to 140), whose tiles have so many
-# times the pixels; of another in about the same proportion more (500 to 900).
+# of a sample of a band in the tile of a compiled method (110 to 140); of another so many times it
+# (500 to 900).
 _TILE: Final = 140
 _TIMES: Final = 8
 
@@ -84,7 +84,8 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         two threads if not given, or one where the memory is too small for two.
     memory : float
         Largest memory of a process [byte]; if it is tight, a block has fewer rows than 32. Each
-        process of an executor separates one block at a time, but that of a ThreadPoolExecutor.
+        process of an executor separates one block at a time, but that of a ThreadPoolExecutor. The
+        first process after the installation, which compiles, takes 0.35 GB more.
     provenance : mapping, optional
         See `store.save`.
     progress : bool
@@ -175,7 +176,8 @@ class _Job:
         if target.exists() and store.open_dataset(target).attrs.get("provenance") == provenance:
             shutil.rmtree(parts, ignore_errors=True)  # of a run that was killed at its very end
             return
-        threads, height, read = _share(capture, self.memory, self.executor, get_method(self.method))
+        method, settings = get_method(self.method), self.options["settings"]
+        threads, height, read = _share(capture, self.memory, self.executor, method, settings)
         _begin(parts, {"height": height, **provenance})
         end = capture.sizes["y"]
         paths = {top: parts / f"{top:06d}.zarr" for top in range(0, end, height)}
@@ -260,14 +262,14 @@ def _with_noise(
 
 
 def _share(
-    capture: xr.Dataset, memory: float, executor: Executor | None, method: Method
+    capture: xr.Dataset, memory: float, executor: Executor | None, method: Method, settings: Any
 ) -> tuple[int, int, int]:
     """Threads of a process, rows of a block, as `solve` reads at once or fewer, and of a read."""
     counts = capture["counts"]
     row, lazy = counts[..., 0, :].size, counts.chunksizes.get("y", ())
     chunk = max(lazy, default=counts.encoding.get("preferred_chunks", {}).get("y", 1))
-    long = min(PIXELS * capture.sizes["time"], SAMPLES) * capture.sizes["band"]
-    each, tile = _TILE * (1 if method.compiled else _TIMES), _TILE * _TIMES * long
+    each = _TILE if method.compiled and capture.sizes["band"] == 2 else _TILE * _TIMES
+    tile = each * largest(method, settings, capture) * row / capture.sizes["x"]
 
     def read(height: int) -> tuple[int, bool]:
         """Rows that are read together: blocks as far as a chunk of dask's; whether no more is."""
