@@ -348,8 +348,8 @@ def _level(frames: Array, good: Mask, band: str) -> Array:
     level = frames[:, good].mean(axis=1)
     if np.any(np.diff(level) <= 0):
         raise ValueError(
-            f"Invalid levels {level.tolist()} count of the blackbody in band '{band}'. Must rise "
-            "with its temperature."
+            f"Invalid levels {level.round(1).tolist()} count of the blackbody in band '{band}'. "
+            "Must rise with its temperature."
         )
     return np.asarray(level)
 

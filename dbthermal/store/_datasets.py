@@ -191,9 +191,8 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     (True, {'frames': 2})
     """
     if not Path(path).is_dir():
-        raise FileNotFoundError(
-            f"No dataset '{path}'. Must be a zarr folder: has its notebook been run?"
-        )
+        rule = "Must be a zarr folder, as `save`, a notebook or a command leaves it"
+        raise FileNotFoundError(f"No dataset '{path}'. {rule}.")
     checked = CheckedStore(path)
     dataset = _open(checked) if checked.closed else _open_valid_part(checked)
     dataset.attrs = {name: value for name, value in dataset.attrs.items() if name not in MARK}
