@@ -99,10 +99,15 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         rule = "Must be corrected: by 'dbthermal correct', or with --correction"
         raise ValueError(f"Invalid raw counts of '{options.capture}'. {rule}.")
     if options.correction:
-        chosen: dict[str, Any] = {"target": options.output, "provenance": provenance(options)}
-        chosen["registration"] = None if options.register == "none" else options.register
-        fitted, settings = opened(options.correction).load(), {**known, "progress": shown}
-        scene.separate_capture(source, fitted, response, separating=settings, **chosen)
+        scene.separate_capture(
+            source,
+            opened(options.correction).load(),
+            response,
+            registration=None if options.register == "none" else options.register,
+            separating={**known, "progress": shown},
+            target=options.output,
+            provenance=provenance(options),
+        )
     elif options.method is None:
         return saved(separation.separate(source.load(), response, **known, progress=shown), options)
     else:
@@ -110,9 +115,15 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         if options.emissivity:
             axis = {"band": source["band"].values}
             emissivities = xr.DataArray(options.emissivity, dims="band", coords=axis)
-        chosen = {"emissivity": emissivities, "provenance": provenance(options)}
-        paths = options.capture, options.output
-        separation.run(*paths, response, options.method, progress=shown, **chosen)
+        separation.run(
+            options.capture,
+            options.output,
+            response,
+            options.method,
+            emissivity=emissivities,
+            provenance=provenance(options),
+            progress=shown,
+        )
     return described(options.output)
 
 

@@ -331,8 +331,10 @@ def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
         lambda shape: linear_part(shape)[1] / span,
         (np.sqrt(shortest * longest), 1.0),
         bounds=((shortest, _GROWTH[0]), (longest, _GROWTH[1])),
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
         max_nfev=1000,
-        **dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15),
     )
     amplitude, offset = linear_part(fit.x)[0]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle

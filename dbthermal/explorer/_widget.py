@@ -125,9 +125,14 @@ class Explorer(anywidget.AnyWidget):
         view = self.view
         codes, legend = _export.status_legend(view)
         panes = [
-            {name: getattr(pane, name) for name in ("name", "label", "kind", "absolute")}
-            | {"units": pane.units if pane.units != "1" else ""}
-            | {"shown": "_std" not in pane.name or pane.name == f"{next(iter(FILMS))}_std"}
+            {
+                "name": pane.name,
+                "label": pane.label,
+                "units": pane.units if pane.units != "1" else "",
+                "kind": pane.kind,
+                "absolute": pane.absolute,
+                "shown": "_std" not in pane.name or pane.name == f"{next(iter(FILMS))}_std",
+            }
             for pane in view.panes.values()
         ]
         classes = np.where(view.status == 0, 0, np.where((view.status & COMPLETED) != 0, 1, 2))
@@ -196,7 +201,15 @@ class Explorer(anywidget.AnyWidget):
         """Answer a file of what is seen."""
         with TemporaryDirectory() as folder:
             path = Path(folder) / f"explored{asked['suffix']}"
-            shown = {name: asked[name] for name in ("celsius", "pixels", "palette")}
-            shown["limits"] = {name: tuple(pair) for name, pair in asked["limits"].items()}
-            _export.save(self.view, path, asked["panes"], asked["index"], self.regions, **shown)
+            _export.save(
+                self.view,
+                path,
+                asked["panes"],
+                asked["index"],
+                self.regions,
+                celsius=asked["celsius"],
+                pixels=asked["pixels"],
+                palette=asked["palette"],
+                limits={name: tuple(pair) for name, pair in asked["limits"].items()},
+            )
             return {"name": path.name}, [np.frombuffer(path.read_bytes(), dtype=np.uint8)]

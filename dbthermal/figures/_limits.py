@@ -46,9 +46,12 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     known = best[np.isin(best.values, std["filter"].values)]
     for index, name in enumerate(known["material"].values):
         chosen = str(known.sel(material=name).item())
-        line = durations["object_temperature_std"].sel(material=name, filter=chosen)
-        style = {"label": f"{name}, {chosen} {_MICRO}", **drawing.marked_line(index)}
-        right.loglog(durations["seconds"], line, **style)
+        right.loglog(
+            durations["seconds"],
+            durations["object_temperature_std"].sel(material=name, filter=chosen),
+            label=f"{name}, {chosen} {_MICRO}",
+            **drawing.marked_line(index),
+        )
     drawing.plain_ticks(right, durations["seconds"])
     plain_decades(right)
     right.set(xlabel="length of the film [s]", ylabel="expected std [K]")

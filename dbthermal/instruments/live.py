@@ -110,16 +110,8 @@ class Watch:
     def note(self, preview: Preview) -> bool:
         """Take the next preview; return True if it is the first one of a recording."""
         before, self._last = self._last, preview
-        if before is not None and (
-            tuple(before.totals) != tuple(preview.totals)
-            or preview.time < before.time
-            or any(
-                one["frames"] < before.totals[band]["frames"]
-                for band, one in preview.totals.items()
-            )
-        ):
-            before = None  # of another recording
-        if before is None:
+        if before is None or _is_other(before, preview):
+            before = None
             self._past.clear()
             self._ffc_seen.clear()
         for band in preview.totals:
@@ -161,6 +153,15 @@ class Watch:
             return (now - before) / (stop - start)
         is_old = self._past[-1][0] - self._past[0][0] >= _WINDOW
         return 0.0 if is_old else math.nan
+
+
+def _is_other(before: Preview, now: Preview) -> bool:
+    """True if a preview is of another recording than the one before it."""
+    return (
+        tuple(before.totals) != tuple(now.totals)
+        or now.time < before.time
+        or any(now.totals[band]["frames"] < before.totals[band]["frames"] for band in now.totals)
+    )
 
 
 def _fpa_temperature(band: str, preview: Preview) -> float:

@@ -8,7 +8,7 @@ of these is a recording of its own. `dbthermal.instruments.recording` opens the 
 import threading
 import time as system_time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.constants import zero_Celsius
 
 from dbthermal import store
-from dbthermal.instruments.camera import SourceLostError
+from dbthermal.instruments.camera import Identity, SourceLostError
 from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.recording import Limits, Preview, Summary, record
 from dbthermal.instruments.recording._reader import (
@@ -214,9 +214,15 @@ def record_scene(
     devices.flush()
     if devices.world is not None:
         devices.world.begin()
-    options: dict[str, Any] = {"limits": limits, "preview": preview, "stop": stop}
-    options |= {"readings": devices.readings(), "identities": identities}
-    return record(devices.session, devices.sources, path, **options)
+    return _record(devices, path, identities, limits=limits, preview=preview, stop=stop)
+
+
+def _record(
+    devices: Devices, path: str | Path, identities: Mapping[str, Identity], **options: Any
+) -> Summary:
+    """Record all sources and readings of open devices, with the options of `record`."""
+    session, sources, readings = devices.session, devices.sources, devices.readings()
+    return record(session, sources, path, readings=readings, identities=identities, **options)
 
 
 def _kept(number: int, temperature: float, band: str | None, path: Path) -> Summary | None:
@@ -243,10 +249,9 @@ def _record_step(
 ) -> Summary:
     """Turn the filter into the beam, and record to the end."""
     selected = devices if band is None else devices.select(band)
-    options: dict[str, Any] = {"limits": limits, "preview": preview}
-    options |= {"readings": selected.readings(), "identities": selected.identities()}
+    identities = selected.identities()
     selected.flush()
-    summary = record(selected.session, selected.sources, path, **options)
+    summary = _record(selected, path, identities, limits=limits, preview=preview)
     if summary.ended != "duration":
         raise SourceLostError(f"Recording '{path}' ended: {summary.ended}. Must go to its end.")
     require_filter(summary.path, band)

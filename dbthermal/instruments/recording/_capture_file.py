@@ -199,12 +199,22 @@ class CaptureFile:
         self._names = [*sources, *readings, _RECORDER]
         self._notes: list[tuple[float, ...]] = []
         self.broken = False
-        about = {"comment": ABOUT, "clock_origin": origin, "log_sources": self._names}
-        about |= {"log_units": dict(readings)}
-        about |= {"log_kinds": {kind.name.lower(): int(kind) for kind in Note}}
-        options: dict[str, Any] = {"chunk": chunk, "attrs": {**attrs, **about}, "fills": _FILLS}
-        form = self._variables, self._sizes, list(sources)
-        self.recording = store.Recording(path, *form, **options)
+        self.recording = store.Recording(
+            path,
+            self._variables,
+            self._sizes,
+            list(sources),
+            chunk=chunk,
+            attrs={
+                **attrs,
+                "comment": ABOUT,
+                "clock_origin": origin,
+                "log_sources": self._names,
+                "log_units": dict(readings),
+                "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
+            },
+            fills=_FILLS,
+        )
         self._place = self.recording.place()
         self._bands = {band: _Band(self._new_block()) for band in sources}
 
