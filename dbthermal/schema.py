@@ -211,9 +211,9 @@ def check(dataset: xr.Dataset, stage: str) -> xr.Dataset:
         raise TypeError(f"Invalid {stage} of type {type(dataset).__name__}. Must be a Dataset.")
     for name, variable in STAGES[stage].items():
         if name not in dataset:
-            others = [one for one in sorted(STAGES) if set(STAGES[one]) <= set(dataset)]
-            other = max(others, key=lambda one: len(STAGES[one]), default="")
-            found = f"{sorted(map(str, dataset))}{other and f', those of stage {other!r}'}"
+            fitting = [one for one in STAGES if STAGES[one].keys() <= set(dataset)]
+            most = max(fitting, key=lambda one: len(STAGES[one]), default="")
+            found = f"{sorted(map(str, dataset))}" + (f", as has a {most}" if most else "")
             raise ValueError(f"Missing variable '{name}' in the {stage}. Has {found}.")
         check_variable(dataset[name], variable, f"'{name}' of the {stage}")
     return dataset

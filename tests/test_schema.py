@@ -58,6 +58,12 @@ def test_every_variable_is_needed(stage: str) -> None:
             schema.check(example(stage).drop_vars(name), stage)
 
 
+def test_another_stage_is_named() -> None:
+    """A response where a correction is wanted is said to be one."""
+    with pytest.raises(ValueError, match=r"Missing variable 'gain' .*, as has a response\."):
+        schema.check(example("response"), "correction")
+
+
 def test_absent_units_are_the_agreed_ones(capture: xr.Dataset) -> None:
     """An array without a unit passes, and so does any real dtype."""
     counts = capture["counts"].drop_attrs(deep=False).astype(np.float32)
