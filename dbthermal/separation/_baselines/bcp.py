@@ -97,7 +97,9 @@ def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array,
         curve = tile.curves[band]
         value = require_range(settings.reflected_temperature, curve, "reflected_temperature")
         known = float(tile.blackbody(band, value))
-    for frame, (signal, usable) in enumerate(zip(tile.signals[band], _usable(tile, band))):
+    for frame, (signal, usable) in enumerate(
+        zip(tile.signals[band], _usable(tile, band), strict=True)
+    ):
         some = usable.any() and not usable.all()
         filled = np.where(usable, signal, np.median(signal[usable])) if some else signal
         image = filled.reshape(tile.shape)
