@@ -62,7 +62,8 @@ files path+             files of one camera, then a '+' and the other's; or a st
 session path            YAML file, see dbthermal.instruments.session
 folder path             where the recordings go
 capture path            store of a capture
-correction path?        store of gain and offset; none if the cameras correct them
+correction path?        store of gain and offset
+--corrected-by-camera flag  in place of it: each camera corrects gain and offset itself
 response path           store of the cameras' response
 result path             store of a result
 shown path*             its capture, and the cameras' response, to be shown beside it
@@ -130,9 +131,10 @@ fit the cameras' response, and each pixel's gain and offset, to a blackbody
 --sweep recordings response -o response.zarr
 --maker scene.zarr -o response.zarr
 
-correct steps.correct capture correction --no-shutter --time-constant --output
+correct steps.correct capture correction --corrected-by-camera --no-shutter --time-constant --output
 correct a capture: gain and offset, shutter events, bad pixels, lag
 scene.zarr nuc.zarr -o corrected.zarr
+scene.zarr --corrected-by-camera -o corrected.zarr
 
 align steps.align capture --register --offset --reference --output
 bring two cameras onto one clock and one pixel grid

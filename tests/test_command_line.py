@@ -254,22 +254,37 @@ def test_record_names_the_devices(tmp_path: Path) -> None:
 
 def test_nothing_is_overwritten(results: Path) -> None:
     """A dry run writes nothing; an output that is there is kept, unless it may be replaced."""
-    command = ["correct", "scene.zarr", "-o", "again.zarr"]
+    command = ["correct", "scene.zarr", "nuc.zarr", "-o", "again.zarr"]
     planned = done(results, *command, "--dry-run")
-    assert planned == {"would_read": ["scene.zarr"], "would_write": ["again.zarr"]}
+    assert planned == {"would_read": ["scene.zarr", "nuc.zarr"], "would_write": ["again.zarr"]}
     assert not (results / "again.zarr").exists()
     shutil.copytree(results / "response.zarr", results / "again.zarr")
     before = store.checksum(results / "again.zarr")
     assert "Must be new, or --overwrite" in refused(results, *command)
     assert store.checksum(results / "again.zarr") == before
     done(results, *command, "--overwrite", "--no-shutter")
-    again = store.open_dataset(results / "again.zarr")
-    np.testing.assert_allclose(
-        again["counts"][:, 0], store.open_dataset(results / "scene.zarr")["counts"][:, 0]
-    )
+    assert store.open_dataset(results / "again.zarr").attrs["gain_offset_corrected"] == 1
     line = refused(results, "correct", "scene.zarr", "-o", "scene.zarr", "--overwrite")
     assert "it is read. Must be another place" in line
     assert "No file or folder 'none.zarr'" in refused(results, "info", "none.zarr")
+
+
+def test_no_correction_must_be_stated(results: Path) -> None:
+    """Raw counts without a file of gain and offset need an option, and the pattern is warned of."""
+    command = ["correct", "scene.zarr", "-o", "raw.zarr"]
+    assert "only if the cameras correct gain and offset themselves" in refused(results, *command)
+    command.append("--corrected-by-camera")
+    assert "both a file and" in refused(results, *command[:2], "nuc.zarr", *command[2:])
+    found = run(results, *command)
+    assert found.returncode == 0, found.stderr
+    assert "Warning: Fixed pattern of " in found.stderr
+    made = store.open_dataset(results / "raw.zarr")
+    assert made.attrs["gain_offset_corrected"] == 0
+    assert made.attrs["gain_offset_by_camera"] == 1
+    assert min(made.attrs["fixed_pattern"]) > 20
+    assert max(store.open_dataset(results / "corrected.zarr").attrs["fixed_pattern"]) < 0.5
+    raw = store.open_dataset(results / "scene.zarr")["counts"][:, 0]
+    np.testing.assert_allclose(made["counts"][:, 0], raw)
 
 
 def test_refusals_are_one_line(results: Path) -> None:

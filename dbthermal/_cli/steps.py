@@ -71,12 +71,20 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
 
 def correct(options: argparse.Namespace) -> dict[str, Any]:
     """Command `correct`."""
-    raw = opened(options.capture)
+    raw, by_camera = opened(options.capture), options.corrected_by_camera
+    files = raw.attrs.get("files", {}).values()
+    # A maker's Planck constants hold for all pixels alike.
+    of_maker = bool(files) and all("file_planck_R1" in one for one in files)
+    if by_camera == bool(options.correction) and (by_camera or not of_maker):
+        found = "both a file and --corrected-by-camera" if by_camera else "neither"
+        raise ValueError(
+            f"Invalid correction of gain and offset: {found}. Must be the file of 'dbthermal "
+            "calibrate --correction-output nuc.zarr' or, only if the cameras correct gain and "
+            "offset themselves, --corrected-by-camera."
+        )
+    fitted = correction.corrected_by_camera(raw)
     if options.correction:
         fitted = opened(options.correction).load()
-    else:
-        ones = xr.ones_like(raw["counts"].isel(time=0, drop=True), dtype=np.float64)
-        fitted = xr.Dataset({"gain": ones, "offset": 0 * ones, "bad": ones < 0}).drop_attrs()
     chosen = {"shutter": not options.no_shutter, "time_constant": options.time_constant}
     return saved(correction.correct_capture(raw, fitted, lazy=True, **chosen), options)
 
