@@ -340,6 +340,43 @@ def test_mistakes_are_explained_in_words_of_the_commands(
     assert reason in refused(results, *arguments.split())
 
 
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        ("seperate a b", "separate"),
+        ("align a.zarr --ofset 0 -o x.zarr", "--offset"),
+        ("align a.zarr --register homograph -o x.zarr", "homography"),
+        ("plan plate_window_glas --noise 0.03", "plate window glass"),
+        ("export result.zarr --variable emisivity -o x.tif", "emissivity"),
+        ("separate aligned.zarr response.zarr --method callibrated -o x.zarr", "calibrated"),
+    ],
+)
+def test_a_misspelt_name_is_recognised(results: Path, arguments: str, meant: str) -> None:
+    """A command, an option, a choice, or a name that the library knows: the nearest is named."""
+    found = run(results, *arguments.split())
+    assert found.returncode > 0
+    assert found.stderr.rstrip().endswith(f"Did you mean '{meant}'?")
+
+
+def test_what_has_no_time_makes_no_curve(results: Path) -> None:
+    """The names for a curve are those over time, which a map is not."""
+    line = refused(results, "export", "result.zarr", "--variable", "emissivity", "-o", "x.csv")
+    assert "Unknown variable 'emissivity' for .csv. Must be one of ['background_temper" in line
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("278C", "551.15 K; kelvin are written 278K"),
+        ("22K", "-251.15 degrees Celsius; these are written 22C"),
+    ],
+)
+def test_a_doubtful_unit_is_noticed(text: str, said: str, tmp_path: Path) -> None:
+    """Celsius that look like kelvin, and the reverse, are taken as written, with a warning."""
+    found = run(tmp_path, "complete", *"abc", "--surroundings", text, "-o", "d.zarr")
+    assert f"Warning: {text} is {said}.\n" in found.stderr
+
+
 def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
     """Bash takes the completion over, and completes a command and an option of one."""
     (tmp_path / "completion").write_text(run(tmp_path, "completion").stdout, encoding="utf-8")
