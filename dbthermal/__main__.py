@@ -101,7 +101,8 @@ materials text*         as listed by 'data'; all by default
 --correction-output path   store of gain and offset, where the blackbody fills the view
 --no-shutter flag       no camera has a shutter
 --time-constant number  thermal, of the pixels [s]
---register none|translation|affine|homography   transform between the views, none if on one grid
+--register none|translation|affine|homography   between the views (homography); none: on one grid
+--search whole=5        largest delay that is sought, either way [frame]
 --reference text        band whose frames are left as they are in time
 --correction path       store of gain and offset: all steps of a raw capture, by rows
 --method text           one step alone, by rows: subspace, calibrated, naive, ratio, bcp, dbvt
@@ -146,13 +147,13 @@ correct a capture: gain and offset, shutter events, bad pixels, lag
 scene.zarr nuc.zarr -o corrected.zarr
 scene.zarr --corrected-by-camera -o corrected.zarr
 
-align steps.align capture --register --offset --reference --output
+align steps.align capture --register --offset --search --reference --output
 bring two cameras onto one clock and one pixel grid
 corrected.zarr -o aligned.zarr
 corrected.zarr --register none --offset 0 -o aligned.zarr
 
-separate steps.separate capture response --correction --register --method --emissivity \
-    --surroundings --prior --workers --output
+separate steps.separate capture response --correction --register --offset --method \
+    --emissivity --surroundings --prior --workers --output
 separate emission and reflection: temperatures, emissivities, deviations, status
 aligned.zarr response.zarr -o result.zarr
 scene.zarr response.zarr --correction nuc.zarr -o result.zarr
@@ -257,9 +258,7 @@ def _options(kind: str, text: str) -> dict[str, Any]:
     if kind == "flag":
         return {"action": "store_true", "help": text}
     if "|" in kind:
-        choices = kind.split("|")
-        default = "homography" if "homography" in choices else None
-        return {"choices": choices, "default": default, "help": text}
+        return {"choices": kind.split("|"), "help": text}
     ((name, number, default),) = re.findall(r"^([a-z]+)([0-9+*?]?)[!&]?=?(.*)$", kind)
     made: dict[str, Any] = {"type": _KINDS[name], "help": text}
     made |= {"nargs": int(number) if number.isdigit() else number} if number else {}
