@@ -272,14 +272,14 @@ def test_nothing_is_overwritten(results: Path) -> None:
 
 def test_no_correction_must_be_stated(results: Path) -> None:
     """Raw counts without a file of gain and offset need an option, and the pattern is warned of."""
-    command = ["correct", "scene.zarr", "-o", "raw.zarr"]
+    command = ["correct", "scene.zarr", "-o", "uncorrected.zarr"]
     assert "only if the cameras correct gain and offset themselves" in refused(results, *command)
     command.append("--corrected-by-camera")
     assert "both a file and" in refused(results, *command[:2], "nuc.zarr", *command[2:])
     found = run(results, *command)
     assert found.returncode == 0, found.stderr
     assert "Warning: Fixed pattern of " in found.stderr
-    made = store.open_dataset(results / "raw.zarr")
+    made = store.open_dataset(results / "uncorrected.zarr")
     assert made.attrs["gain_offset_corrected"] == 0
     assert made.attrs["gain_offset_by_camera"] == 1
     assert min(made.attrs["fixed_pattern"]) > 20

@@ -157,7 +157,7 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
                 medians = [round(float(np.median(one)), 4) for one in values]
                 said[f"median_{name}{unit}"] = dict(zip(said["bands"], medians, strict=True))
     if not everything:
-        return said | {key: dataset.attrs[key] for key in ("warnings",) if key in dataset.attrs}
+        return said
     said["variables"] = {
         str(name): f"{one.dtype} {one.dims} [{one.attrs.get('units', '-')}]"
         for name, one in dataset.data_vars.items()

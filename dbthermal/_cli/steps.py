@@ -18,7 +18,10 @@ from dbthermal import (
     scene,
     separation,
 )
+from dbthermal._cli import PLUS, leaves
 from dbthermal._cli.files import capture, described, opened, provenance, saved, staged
+from dbthermal._warnings import warned
+from dbthermal.separation._plausibility import against_response, hardly_measured
 
 _REGISTERED = 200  # frames whose mean is registered
 
@@ -38,7 +41,11 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
         blackbody = correction.blackbody_statistics(blackbody)
     fitted = correction.fit_correction(blackbody) if "y" in blackbody.dims else None
     counts = blackbody["counts"] if fitted is None else fitted["level"]
-    said = saved(calibration.fit_response(counts, blackbody.get("noise")), options)
+    response = calibration.fit_response(counts, blackbody.get("noise"))
+    parts = leaves([options.at, options.blackbody, options.sweep])
+    files = [str(one) for one in parts if isinstance(one, str | Path) and one != PLUS]
+    response.attrs["blackbody"] += f"; of {', '.join(files)}"
+    said = saved(response, options)
     if fitted is not None and options.correction_output:
         said |= saved(fitted, options, options.correction_output)
     return said
@@ -124,7 +131,11 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
             provenance=provenance(options),
         )
     elif options.method is None:
-        return saved(separation.separate(source.load(), response, **known, progress=shown), options)
+        doubts = [one for data in (source, response) for one in data.attrs.get("warnings", [])]
+        doubts += against_response(source, response)
+        result = separation.separate(source.load(), response, **known, progress=shown)
+        result = warned(result, *doubts, *hardly_measured(result))
+        return saved(result, options)
     else:
         emissivities = None
         if options.emissivity:
