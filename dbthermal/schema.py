@@ -233,8 +233,8 @@ def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
     if counts.dtype.kind != "f":
         raise TypeError(
             f"Invalid dtype {counts.dtype} of 'counts' of the corrected: raw counts. Must be "
-            "floating: corrected by correction.correct_capture or, of a camera that corrects "
-            "itself, counts.astype('float32')."
+            "floating: corrected by correction.correct_capture, of a camera that corrects itself "
+            "with correction.corrected_by_camera(capture)."
         )
     return dataset
 

@@ -20,9 +20,12 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     options.variable = options.variable or "object_temperature"
     if suffix not in _WRITERS:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
-    if options.variable not in result:
-        names = sorted(map(str, result.data_vars))
-        raise ValueError(f"Unknown variable '{options.variable}'. Must be one of {names}.")
+    names = sorted(map(str, result.data_vars))
+    if suffix == ".csv":  # curves over time
+        names = [name for name in names if result[name].dims == ("time", "y", "x")]
+    if options.variable not in names:
+        kind = f"variable '{options.variable}' for {suffix}"
+        raise ValueError(f"Unknown {kind}. Must be one of {names}.")
     with store.whole(options.output, suffix) as part:
         return {str(options.output): _WRITERS[suffix](result, part, options)}
 
@@ -42,8 +45,6 @@ def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict
         where = f"pixel {top} {left}" if one else label
         for name, values in curve.items():
             columns[f"{where} {name} [{values.attrs.get('units', '1')}]"] = values
-    if any(values.dims != ("time",) for values in columns.values()):
-        raise ValueError(f"Invalid '{options.variable}' without time. Must be a film.")
     xr.Dataset(columns).to_dataframe().to_csv(path, index_label="time [s]")
     return {"columns": ["time [s]", *columns]}
 

@@ -1,16 +1,19 @@
 """Response of a camera per band, of blackbodies or its maker: Sakuma-Hattori and linear pair."""
 
 from collections.abc import Mapping
+from itertools import permutations
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+from scipy.constants import zero_Celsius
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from dbthermal import bands, planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
+from dbthermal._warnings import warned
 from dbthermal.response import Curve
 
 AMBIENT: Final = 298.15
@@ -36,6 +39,7 @@ _GROWTH: Final = (0.6, 1.1)
 _SHAPE_UNIT: Final = planck.SECOND_RADIATION_CONSTANT / 5.0
 _FALSE_ALARM: Final = 1e-4  # good counts are refused once in so many sweeps
 _FALLING: Final = 5.0  # standard deviations of a difference by which noise may let counts fall
+_QUIETER: Final = 0.5  # NETD relative to a containing band's, below which bands may be exchanged
 _ROUNDING: Final = 1.0 / 12.0  # variance of rounding to whole counts [count^2]
 # Points at which a maker's curve is fitted over the camera's range, and its largest error [K].
 _POINTS, _LARGEST_ERROR = 64, 0.2
@@ -79,7 +83,14 @@ def fit_response(
         `offset` O, `linear_slope` a, `linear_intercept` b (band); `residual`, `linear_residual`
         (band, temperature) [count] and the measured `counts`; `reference_temperature`,
         `temperature_min`, `temperature_max` [K]; and, with a noise, `noise` (band) [count] and
-        `netd` (band) [K].
+        `netd` (band) [K]. Attribute ``blackbody``, the temperatures and their deviation in words,
+        which results and reports repeat: an error that all temperatures share is not seen.
+
+    Warns
+    -----
+    UserWarning
+        If the NETD of a band of `bands.FILTERS` is less than half that of one that contains it:
+        then their names or files may be exchanged.
 
     Raises
     ------
@@ -138,10 +149,30 @@ def fit_response(
     for name, kind in (("residual", "exact"), ("linear_residual", "linear")):
         fitted = [responses.curve(result, band, kind).counts(temperature) for band in names]
         result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
+    celsius = ", ".join(f"{one - zero_Celsius:.2f}" for one in temperature)
+    stated = f"standard deviation of a reading {temperature_std:g} K"
+    result.attrs["blackbody"] = f"{temperature.size} temperatures of {celsius} degC; {stated}"
     if noise is None:
         return result
     netd = noises / np.array([curve.reference_slope for curve in curves])
-    return result.assign(schema.variables("response", {"noise": noises, "netd": netd}))
+    result = result.assign(schema.variables("response", {"noise": noises, "netd": netd}))
+    return warned(result, *_exchanged(dict(zip(names, netd, strict=True))))
+
+
+def _exchanged(netd: Mapping[str, float]) -> list[str]:
+    """Sentences on bands that are much quieter than one that contains them."""
+    known = [name for name in netd if name in bands.FILTERS]
+    found = []
+    for inner, outer in permutations(known, 2):
+        part, whole = bands.get(inner), bands.get(outer)
+        within = whole.lower <= part.lower and part.upper <= whole.upper
+        if within and netd[inner] < _QUIETER * netd[outer]:
+            found.append(
+                f"Noise of {netd[inner]:.3g} K in band '{inner}', of {netd[outer]:.3g} K in "
+                f"'{outer}', which contains it. A filter must raise the noise: are the names of "
+                "the bands, or the files of the blackbody, exchanged?"
+            )
+    return found
 
 
 def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:

@@ -13,6 +13,7 @@ from dbthermal.correction._nonuniformity import (
     OUTLIER,
     blackbody_statistics,
     correct,
+    corrected_by_camera,
     fit_correction,
     renew_offset,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "blackbody_statistics",
     "correct",
     "correct_capture",
+    "corrected_by_camera",
     "find_shutter",
     "fit_correction",
     "lag_coefficients",

@@ -47,8 +47,9 @@ def correct_capture(
         Stage `capture` of `schema`, raw: `counts` (band, time, y, x) [count], uint16; optionally
         `frame_flags` and `exposure_time` (band, time), as recorded.
     correction : Dataset
-        From `fit_correction`, or `gain` [1], `offset` [count] and `bad` (bool) of your own, each
-        (band, y, x); it may hold more bands.
+        From `fit_correction`, or `corrected_by_camera` where no file of gain and offset is needed,
+        or `gain` [1], `offset` [count] and `bad` (bool) of your own, each (band, y, x); it may hold
+        more bands.
     flat : DataArray, optional
         Mean raw frames (band, y, x) [count] of a uniform view, taken before the capture: they renew
         the offsets.

@@ -24,6 +24,7 @@ OUTLIER: Final = 6.0
 """Robust z-score beyond which a pixel is bad [1]: 1 of 5e8 normal pixels."""
 
 _PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "offset_renewed"}
+_PARAMETERS |= {"by_camera"}
 _PATTERN = {"offset_std", "gain_std", "centre"}
 _PASSES = 2
 _LEVELS = 65536  # about as many samples of a band tell its levels
@@ -179,6 +180,36 @@ def fit_correction(
     return xr.Dataset(schema.variables("correction", values), coords, attrs)
 
 
+def corrected_by_camera(capture: xr.Dataset) -> xr.Dataset:
+    """State that each camera corrects gain and offset of its pixels itself.
+
+    Nothing in the counts proves it: of a camera that does not, each pixel would be off by kelvins.
+
+    Parameters
+    ----------
+    capture : Dataset
+        Stage `capture` of `schema`.
+
+    Returns
+    -------
+    Dataset
+        Stage `correction` for `correct_capture`: gain 1, offset 0 and no bad pixel (band, y, x);
+        attribute ``by_camera`` = 1. TypeError or ValueError if there is no capture.
+
+    Examples
+    --------
+    >>> import numpy as np, xarray as xr
+    >>> counts = (("band", "time", "y", "x"), np.full((1, 2, 2, 2), 18000, np.uint16))
+    >>> capture = xr.Dataset({"counts": counts}, {"band": ["8-14"], "time": [0.0, 0.1]})
+    >>> correct(capture, corrected_by_camera(capture)).gain_offset_corrected
+    0
+    """
+    ones = xr.ones_like(schema.check(capture, "capture")["counts"][:, 0], dtype=np.float64)
+    ones = ones.drop_vars("time", errors="ignore")
+    maps = {"gain": ones, "offset": 0 * ones, "bad": ones < 0}
+    return xr.Dataset(maps).drop_attrs().assign_attrs(by_camera=1)
+
+
 def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     r"""One-point correction: new offsets from one image of a uniform view, the gains kept.
 
@@ -244,8 +275,8 @@ def correct(
         bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or at 0) of
         `schema.Status`, whose counts are kept; `pattern_std` (band) [count] where the correction
         has its deviations, root mean square over the levels of the capture. Attributes:
-        ``gain_offset_corrected`` = 1, the parameters of the fit (``gain_offset_...``), and the
-        numbers of marked pixels.
+        ``gain_offset_corrected`` = 1, or 0 where the camera does it, the parameters of the fit
+        (``gain_offset_...``), and the numbers of marked pixels.
 
     Raises
     ------
@@ -279,7 +310,8 @@ def correct(
     done = {
         f"gain_offset_{key}": correction.attrs[key] for key in _PARAMETERS & correction.attrs.keys()
     }
-    done |= {"gain_offset_corrected": 1, "detector_maximum": maximum}
+    by_camera = correction.attrs.get("by_camera", 0)
+    done |= {"gain_offset_corrected": 1 - by_camera, "detector_maximum": maximum}
     done |= {"dead_pixels": int(bad.sum()), "saturated_pixels": int(saturated.sum())}
     return schema.check(result.assign_attrs(done), "corrected")
 

@@ -14,6 +14,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from dbthermal import _rows, schema
 from dbthermal import _samples as samples
 from dbthermal._arrays import Array, Mask
+from dbthermal._warnings import warned
 from dbthermal.correction._nonuniformity import OUTLIER
 from dbthermal.noise import MAD, MINIMUM_FRAMES
 from dbthermal.schema import Status
@@ -29,6 +30,15 @@ _SHARED = 0.3
 _REACH_SECONDS = 0.2
 _REACH_FRAMES = 5
 _LONGEST_GAP: Final = 2  # samples in a row that may be NaN within a jump
+# A pattern of the detector is as strong from pixel to pixel as over two, where detail of a scene,
+# blurred by the lens, has less; warned of where it is so many times the noise of a frame [1].
+_WHITE, _PATTERN = 0.7, 5.0
+_UNCORRECTED: Final = (
+    "Fixed pattern of {} times the noise of a frame: the pixels differ from each other as without "
+    "a correction of gain and offset, or with an old one. Must be below 5: correct the raw capture "
+    "with gain and offset of these cameras, as of 'calibrate', renewed since the shutter's last "
+    "event; no flag and no error bar has this error"
+)
 _ROUNDING = 0.01  # differences of the logarithm of the noise that are rounding [1]
 _BLOCK = 8_000_000  # samples of a block of rows
 
@@ -49,6 +59,10 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     count; a jump is seen over two NaN samples of a pixel, over more it is not. A scene's detail one
     pixel wide, such as a wire, cannot be told from a pixel that blinks, and is marked, too.
 
+    Pattern. What the mean picture has beside planes and edges, from one pixel to the next, is the
+    fixed pattern p of gains and offsets (by the mask of [1]_). A UserWarning says where it is more
+    than 5 m and no less than 0.7 of the same over two pixels, as detail behind a lens would be.
+
     Parameters
     ----------
     corrected : Dataset
@@ -63,13 +77,18 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         The dataset with the bit `Status.DEAD_PIXEL` set in `status` (y, x), the counts unchanged;
         and the attributes ``noisy_pixels`` and ``jumping_pixels``, their numbers,
         ``unjudged_pixels``, those with fewer than 16 samples that are not NaN in a band, which get
-        no bit here, and ``bad_threshold``.
+        no bit here, ``bad_threshold``, and ``fixed_pattern`` (band), p / m [1].
 
     Raises
     ------
     TypeError, ValueError
         If the threshold is not positive, or a band has fewer frames that are not NaN than 16, or
         than 0.4 s and three frames more, or no pixel with 16 samples.
+
+    References
+    ----------
+    .. [1] Immerkaer (1996), Computer Vision and Image Understanding 64, 300,
+       doi:10.1006/cviu.1996.0060
 
     Examples
     --------
@@ -92,6 +111,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     segment = corrected["segment"].values if "segment" in corrected else None
     image = (counts.sizes["y"], counts.sizes["x"])
     noisy, jumping, unjudged = (np.zeros(image, dtype=bool) for _ in range(3))
+    patterns: list[float] = []
     reach, time = _REACH_FRAMES, counts["time"].values.astype(np.float64)
     if time.size >= MINIMUM_FRAMES:
         reach = max(reach, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
@@ -100,9 +120,10 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         frames = _frames(movie, max(MINIMUM_FRAMES, 2 * reach + 3))
         part = np.zeros(frames.size) if segment is None else segment[frames]
         movie, stepped = movie.isel(time=frames), np.diff(part) != 0
-        level = np.empty(image)
+        level, still = np.empty(image), np.empty(image)
         for rows in _rows.blocks(movie.shape, _BLOCK):
-            level[rows] = samples.noise(_samples(movie, rows))
+            block = _samples(movie, rows)
+            level[rows], still[rows] = samples.noise(block), _mean(block)
         known = np.isfinite(level)
         if not known.any():
             raise ValueError(
@@ -112,16 +133,42 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         unjudged |= ~known
         usual = np.where(known, level, np.median(level[known]))
         usual = median_filter(usual, size=_WINDOW, mode="mirror")
+        patterns.append(_pattern(still) / float(np.median(usual)))
         noisy |= _outliers(level, usual, threshold)
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
     status = before | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
-    return corrected.assign(status=(("y", "x"), status, schema.status_attrs())).assign_attrs(
+    names = corrected["band"].values
+    found = [f"{one:.3g} in band '{name}'" for name, one in zip(names, patterns, strict=True)]
+    strong = [one for one, ratio in zip(found, patterns, strict=True) if ratio > _PATTERN]
+    return warned(
+        corrected.assign(status=(("y", "x"), status, schema.status_attrs())),
+        *([_UNCORRECTED.format(", ".join(strong))] if strong else []),
+    ).assign_attrs(
         noisy_pixels=int(noisy.sum()),
         jumping_pixels=int(jumping.sum()),
         unjudged_pixels=int(unjudged.sum()),
         bad_threshold=threshold,
+        fixed_pattern=[round(one, 3) for one in patterns],
     )
+
+
+def _mean(block: Single) -> Array:
+    """Mean picture (y, x) of frames (time, y, x); NaN of pixels without a sample."""
+    number = np.isfinite(block).sum(axis=0)
+    total = block.sum(axis=0, dtype=np.float64, where=np.isfinite(block))
+    return np.asarray(np.divide(total, number, out=total * np.nan, where=number > 0))
+
+
+def _pattern(image: Array) -> float:
+    """Deviation of the fixed pattern of a picture (y, x) [count]; 0 where it may be detail."""
+    scales = []
+    for step in (1, 2):
+        rows = image[: -2 * step] - 2.0 * image[step:-step] + image[2 * step :]
+        mask = rows[:, : -2 * step] - 2.0 * rows[:, step:-step] + rows[:, 2 * step :]
+        finite = np.abs(mask[np.isfinite(mask)])
+        scales.append(MAD * float(np.median(finite)) / 6.0 if finite.size else 0.0)
+    return scales[0] if scales[0] >= _WHITE * scales[1] else 0.0
 
 
 def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> xr.Dataset:

@@ -90,7 +90,7 @@ class View:
         self.data = opened(data, "data")
         alone = "object_temperature" not in self.data and "counts" in self.data
         self.capture = None if capture is None else opened(capture, "capture")
-        self._response = None if response is None else opened(response, "response")
+        self.response = None if response is None else opened(response, "response")
         given = {"result": data, "capture": capture, "response": response}
         if alone:
             if capture is not None:
@@ -169,10 +169,10 @@ class View:
             counts = laid_on(counts, reference, "the capture", "the result")
         for place, band in enumerate(map(str, counts["band"].values)):
             one, label = counts.isel(band=place), f"{band} \N{MICRO SIGN}m input"
-            if self._response is None:
+            if self.response is None:
                 yield Pane(f"input {band}", label, "count", one)
             else:
-                curve = responses.curve(self._response, band)
+                curve = responses.curve(self.response, band)
                 yield Pane(f"input {band}", label, "K", one, absolute=True, curve=curve)
 
     def pane(self, name: str) -> Pane:
@@ -342,7 +342,7 @@ class View:
     def _noise(self, pane: Pane, values: Values) -> Array:
         """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""
         assert self.capture is not None
-        holders = (self._response, self.data)
+        holders = (self.response, self.data)
         noise = next((one["noise"] for one in holders if one is not None and "noise" in one), None)
         if noise is None:
             return np.full(values.shape, np.nan)

@@ -18,6 +18,7 @@ from dbthermal.figures import drawing
 from dbthermal.reporting._films import FILMS, VIEWED, sampled, video, viewer
 from dbthermal.reporting._page import Section, image_tag, save_page, table
 from dbthermal.schema import Status
+from dbthermal.separation._plausibility import against_response, hardly_measured
 
 Curves = Mapping[str, Mapping[str, xr.Dataset]]
 
@@ -27,6 +28,8 @@ _WORDS: Final = {
     "settings": "its options",
     "response_kind": "response of the cameras",
     "calibration": "calibration",
+    "blackbody": "blackbody of the calibration",
+    "gain_offset_by_camera": "gain and offset corrected by the cameras, as was stated",
     "noise_source": "noise taken from",
     "emissivity_source": "emissivities taken from",
     "not_estimated": "not estimated",
@@ -224,7 +227,11 @@ def _validity(view: View) -> dict[str, float]:
 
 
 def _trust(view: View, shares: Mapping[str, float]) -> Iterator[Markup | str]:
-    """Yield the map of the status, and a table of the flags with what they mean."""
+    """Yield what speaks against all of it, the map of the status, and a table of the flags."""
+    doubts = [*view.data.attrs.get("warnings", []), *hardly_measured(view.data)]
+    if view.capture is not None and view.response is not None:
+        doubts += against_response(view.capture, view.response)
+    yield from (Markup("<p><strong>{}</strong></p>").format(one) for one in dict.fromkeys(doubts))
     if "status" not in view.panes:
         yield "The result has no status: nothing is said of what can be trusted."
         return

@@ -48,6 +48,7 @@ _MODULES: Final = {
     "apparent": ("_baselines.pyrometry", "APPARENT"),
 }
 _KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
+_ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera", "warnings"}
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
 
@@ -227,6 +228,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
             _separate_all(inputs, pooled, result, threads, bar)
         else:
             _solve_jointly(inputs, result, threads, bar)
+    held = response.attrs | corrected.attrs
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
     attrs = {"units": "count", "long_name": "noise, as used"}
     result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
@@ -235,7 +237,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         method=method,
         pooled=int(pool is not None),
         response_kind=response_kind,
-        **{key: response.attrs[key] for key in ("calibration",) if key in response.attrs},
+        **{key: held[key] for key in sorted(_ASSUMED & held.keys())},
         noise_source="response" if "noise" in response else "capture",
         emissivity_source="capture" if emissivity is None else "given",
         not_estimated=" ".join(inputs.method.not_estimated + ratios),

@@ -36,6 +36,7 @@ def test_fast_frames_are_no_bad_pixels() -> None:
     assert np.mean(false) < 1e-4
 
 
+@pytest.mark.filterwarnings("ignore:Fixed pattern")  # of offsets that the shutter renewed
 def test_shutter_makes_no_bad_pixel() -> None:
     """New offsets after a known shutter event are not marked as blinking pixels."""
     capture = simulation.fire_shutter(walkers(1), 17.0, np.random.default_rng(4))

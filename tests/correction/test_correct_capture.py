@@ -89,6 +89,7 @@ def test_everything_undone_leaves_the_noise(recorded: Recorded) -> None:
     assert float(stuck.where(~recorded.spoiled).mean()) < 0.01
 
 
+@pytest.mark.filterwarnings("ignore:Fixed pattern")  # of offsets that were not renewed
 @pytest.mark.parametrize(
     "off",
     [
@@ -131,6 +132,7 @@ def flagged(raw: xr.Dataset, band: int, frames: slice) -> xr.Dataset:
     return raw.assign(frame_flags=(("band", "time"), flags, attrs))
 
 
+@pytest.mark.filterwarnings("ignore:Fixed pattern")
 def test_recorded_flags_tell_the_shutter(recorded: Recorded) -> None:
     """Frames with the recorded flag of a closed shutter are left out though their images differ."""
     raw = flagged(recorded.raw.isel(time=slice(100)), 1, slice(40, 45))
@@ -156,6 +158,7 @@ def test_a_missing_dataset_is_named(recorded: Recorded) -> None:
         correct_capture(None, recorded.correction)  # type: ignore[arg-type]
 
 
+@pytest.mark.filterwarnings("ignore:Fixed pattern")
 def test_damaged_frames_are_left_out(recorded: Recorded) -> None:
     """A frame without an exposure time is NaN, and after the lag is undone so is the next."""
     raw = recorded.raw.isel(time=slice(100))

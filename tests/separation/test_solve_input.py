@@ -142,7 +142,7 @@ def test_raw_counts_are_refused(glass: Glass) -> None:
     """Whole numbers are raw counts, and the error says both ways on."""
     _, capture, response = glass
     raw = capture.assign(counts=capture["counts"].astype(np.uint16))
-    message = "correct_capture or, of a camera that corrects itself, counts.astype"
+    message = r"correct_capture, of a camera that corrects itself with correction.corrected_by"
     with pytest.raises(TypeError, match=message):
         separation.solve(raw, response)
     with pytest.raises(TypeError, match=message):

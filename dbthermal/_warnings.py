@@ -1,0 +1,17 @@
+"""Sentences on what speaks against data that pass, which stay with these."""
+
+import warnings
+from typing import Final
+
+import xarray as xr
+
+NAME: Final = "warnings"
+"""Attribute, a list of sentences."""
+
+
+def warned(dataset: xr.Dataset, *sentences: str) -> xr.Dataset:
+    """Dataset with sentences in its attribute ``warnings``; each is a UserWarning, too."""
+    for sentence in dict.fromkeys(sentences):
+        warnings.warn(sentence, stacklevel=3)
+    known = dict.fromkeys([*dataset.attrs.get(NAME, []), *sentences])
+    return dataset.assign_attrs({NAME: [*known]}) if known else dataset
