@@ -40,6 +40,7 @@ from dbthermal.separation._displaced import without
 from dbthermal.separation._equations import Array, Mask, Whole
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import residuals
+from dbthermal.separation._tiles import Material
 
 # Rounds of the emissivities and the object, and the change that ends them [1].
 _ROUNDS: Final = 20
@@ -124,16 +125,17 @@ def solve(
     result: xr.Dataset,
     threads: Executor,
     *,
-    pooled: bool = False,
+    material: Material | None = None,
     before: Joint | None = None,
     blur: float = 0.0,
 ) -> Joint | None:
     """
     Solve the equations of all pixels, from a result that takes x(p) for x(r).
 
-    Or from one of inputs with the difference of a solution `before`. Writes x(r) as the object
-    temperature and x(p) as the background temperature of the result. None, and nothing is written,
-    where the object hardly differs between the two places.
+    Or from one of inputs with the difference of a solution `before`, and with emissivities that are
+    pooled by `material`. Writes x(r) as the object temperature and x(p) as the background
+    temperature of the result. None, and nothing is written, where the object hardly differs between
+    the two places.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         film, there, stds = (
@@ -163,7 +165,9 @@ def solve(
         if not np.any(solved) or np.nanquantile(share[:, solved], _MOST) <= _MATTERS:
             return None
         emissivity, of_slope = system.inside(raw), np.zeros(solved.size)
-        if not (pooled or inputs.method.knows_emissivity):
+        if material is not None:
+            of_slope = np.nan_to_num(material.noise_variance)
+        elif not inputs.method.knows_emissivity:
             equations, emissivity, of_slope = _emissivities(
                 inputs, result, raw, solved, equations, looked_at, (first, steps)
             )

@@ -8,21 +8,25 @@ cent, which a pixel's own residual does not show. So the ratios are those of ban
 alike, in which the edges count little; and as certain as neighbours agree on them.
 """
 
+from concurrent.futures import Executor
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter, median_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 from scipy.special import chdtri
 
 from dbthermal.schema import Status
 from dbthermal.separation._equations import Array, Mask
 from dbthermal.separation._inputs import Inputs
+from dbthermal.separation._pooling import pool
 from dbthermal.separation._tiles import Material
 
 # Deviation of the blur of the bands of which ratios are told [pixel].
 BLUR: Final = 1.0
+# Deviations of the blur from which a neighbour has no part in a pixel.
+_REACH: Final = 2.0
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
@@ -74,6 +78,48 @@ def ratios(inputs: Inputs, result: xr.Dataset) -> Material:
         emissivity=none,
         noise_variance=none,
         drift_variance=none,
+    )
+
+
+def materials(
+    inputs: Inputs, threads: Executor, bar: Any, *, every: bool = False
+) -> Material | None:
+    """Ratios and emissivity as of `pool.materials`, of bands that are blurred alike.
+
+    Surveyed are the pixels that no neighbour's blur reaches. What twice the blur changes may be as
+    much again beyond it: a variance. A material too narrow for it has that of the others.
+    """
+    displacement = inputs.displacement
+    assert displacement is not None
+    assert inputs.labels is not None
+    labels, found = inputs.labels.reshape(displacement.shape), None
+    for blur in (0.0, BLUR, 2.0 * BLUR):
+        size = 1 + 2 * int(np.ceil(_REACH * blur))
+        inner = minimum_filter(labels, size) == maximum_filter(labels, size)
+        alike = replace(inputs, displacement=replace(displacement, blur=blur))
+        surveyed = np.where(inner, labels, -1).ravel()
+        more = pool.materials(alike, threads, bar, every=every, surveyed=surveyed)
+        found = more if found is None or more is None else _beyond(found, more, inputs)
+    return found
+
+
+def _beyond(found: Material, more: Material, inputs: Inputs) -> Material:
+    """Materials of more blur, or else of less, with what it changes as a variance."""
+    noise = inputs.noise[inputs.bands][:, np.newaxis]
+    known, slope = np.isfinite(more.ratio[-1]), np.isfinite(more.emissivity)
+    ratio = np.where(known, more.ratio, found.ratio)
+    change = (more.ratio / found.ratio - 1.0)[1:]
+    change = np.where(known, change, np.nanmedian(np.abs(change), axis=1, keepdims=True))
+    # Eq. 4, solved for sigma^2.
+    error = noise[1:] ** 2 + (ratio[1:] * noise[0]) ** 2
+    inverse = np.where(known, more.inverse_energy, found.inverse_energy)
+    off = np.where(slope, more.emissivity - found.emissivity, 0.0)
+    return Material(
+        ratio=ratio,
+        inverse_energy=inverse + ((change * ratio[1:]) ** 2 / error).max(axis=0),
+        emissivity=np.where(slope, more.emissivity, found.emissivity),
+        noise_variance=np.where(slope, more.noise_variance, found.noise_variance) + off**2,
+        drift_variance=np.where(slope, more.drift_variance, found.drift_variance),
     )
 
 

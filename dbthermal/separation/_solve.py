@@ -303,12 +303,13 @@ def _solve_jointly(
             films = result[["object_temperature", "background_temperature"]].copy(deep=True)
             both = replace(both, result=films)
             apart = replace(inputs, difference=both.difference)
-        material = pooling.materials(apart, threads, bar, every=True)
+        material = neighbours.materials(apart, threads, bar, every=True)
         _separate_all(apart, material, result, threads, bar)
-        both = joint.solve(inputs, result, threads, pooled=True, before=both)
+        both = joint.solve(inputs, result, threads, material=material, before=both)
     if both is not None:
         apart = replace(inputs, difference=both.difference)
-        material = material if inputs.labels is None else pooling.materials(apart, threads, bar)
+        if inputs.labels is not None:
+            material = neighbours.materials(apart, threads, bar)
         _separate_all(apart, material, result, threads, bar)
         both.finish()
 

@@ -30,16 +30,23 @@ _LEAST_ENERGY: Final = 0.01
 
 
 def materials(
-    inputs: Inputs, threads: Executor, bar: Any, *, every: bool = False
+    inputs: Inputs,
+    threads: Executor,
+    bar: Any,
+    *,
+    every: bool = False,
+    surveyed: Labels | None = None,
 ) -> Material | None:
     """Ratios and emissivity of the material of each pixel of the image; None if none are told.
 
     Pixels that have an emissivity alone are a selection by their ratios: unless they are nearly
-    all, or `every` is set, all are surveyed again with the ratios of their material.
+    all, or `every` is set, all are surveyed again with the ratios of their material. Of labels
+    (pixel) other than its own, -1 for none, the pixels that are `surveyed` for it.
     """
-    labels = inputs.labels
-    if labels is None:
+    whole = inputs.labels
+    if whole is None:
         return None
+    labels = whole if surveyed is None else surveyed
     selected, blocks = select(labels), inputs.blocks
 
     def pooled(before: Material | None) -> tuple[Material | None, float]:
@@ -49,11 +56,11 @@ def materials(
         if not surveys:
             return None, 0.0
         places = np.concatenate([place for place, _ in surveys])
-        whole = surveys[0][1].join([part for _, part in surveys[1:]])
+        together = surveys[0][1].join([part for _, part in surveys[1:]])
         noise = inputs.noise[inputs.bands]
-        found = estimate(labels[places], int(labels.max()) + 1, whole, noise)
-        told = np.isfinite(whole.emissivity).sum() / max((whole.frames > 0).sum(), 1)
-        return expand(found, labels), told
+        found = estimate(labels[places], int(whole.max()) + 1, together, noise)
+        told = np.isfinite(together.emissivity).sum() / max((together.frames > 0).sum(), 1)
+        return expand(found, whole), told
 
     material, told = pooled(None)
     if material is None or every or told > _MOST_TOLD:
