@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import warnings
 from collections.abc import Sequence
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from io import StringIO
@@ -323,6 +324,51 @@ def test_missing_extras_are_named(
     assert found.returncode == 1
     (line,) = found.stderr.splitlines()
     assert f"pip install 'dbthermal[{extra}]'" in line
+
+
+ONE = f"import a.tif b.tif {' '.join(STATED)}"
+SWEEP = f"calibrate {' '.join(STATED)} --at 5C a5.tif b5.tif --at 70C a70.tif b70.tif -o x.zarr"
+REFUSED = {
+    "Invalid TIFF ... Invalid bits of a pixel 8": f"{ONE} --offset 0 -o x.zarr".replace("b.", "8."),
+    "Invalid TIFF ... Must be 16-bit counts, not temperatures": f"{ONE} -o x.zarr".replace(
+        "b.", "f."
+    ),
+    "Damaged TIFF": f"{ONE} -o x.zarr".replace("b.", "text."),
+    "Invalid unit": f"{ONE} --unit celsius -o x.zarr",
+    "Different sizes ... of the bands": f"{ONE} --offset 0 -o x.zarr".replace("b.", "small."),
+    "Unknown dates of the recordings": f"{ONE} -o x.zarr",
+    "Invalid offset ... do not overlap": f"{ONE} --offset 500 -o x.zarr",
+    "Invalid levels ... Must rise with its temperature": f"{SWEEP} --at 278C a25.tif b25.tif",
+    "Invalid counts ... Planck curve": (
+        f"{SWEEP} --at 30C a25.tif b25.tif --at 45C a45.tif b45.tif"
+    ),
+    "Invalid correction of gain and offset: neither": "correct scene.zarr -o x.zarr",
+    "Warning: Fixed pattern of": "correct scene.zarr --corrected-by-camera -o none.zarr",
+    "Invalid clock": f"{ONE} --clock 0 -o x.zarr",
+    "Invalid capture ... of stage ... Must be of stage": "align scene.zarr -o x.zarr",
+    "Missing time offset ... no rapid change that both bands see": (
+        f"{ONE} --offset 3 -o later.zarr; correct later.zarr nuc.zarr -o late.zarr; "
+        "align late.zarr --register none -o x.zarr"
+    ),
+}
+
+
+def test_the_table_of_refusals_is_what_the_program_says(results: Path) -> None:
+    """Every message that docs/own_captures.md lists is what a command answers to such a mistake."""
+    stack = tifffile.imread(results / "b.tif")
+    mistakes = {"8": stack.astype("u1"), "f": stack / np.float32(100), "small": stack[:, :-1]}
+    for name, wrong in mistakes.items():
+        tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
+    (results / "text.tif").write_text("hello", encoding="utf-8")
+    page = (ROOT / "docs" / "own_captures.md").read_text(encoding="utf-8")
+    table = page.partition("| the message begins")[2]
+    assert re.findall(r"(?m)^\| `(.+?)` \|", table) == [*REFUSED]
+    for message, commands in REFUSED.items():
+        for command in commands.split("; "):
+            with warnings.catch_warnings(action="always"):
+                _, _, error = said(results, *command.split())
+        begin = ".*".join(map(re.escape, message.split(" ... ")))
+        assert re.search(rf"(?m)^(dbthermal \w+: )?{begin}", error), error
 
 
 def test_compiling_is_noticed_once(tmp_path: Path) -> None:
