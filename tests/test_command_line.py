@@ -22,7 +22,7 @@ import tifffile
 import xarray as xr
 
 from dbthermal import __main__ as command_line
-from dbthermal import simulation, store
+from dbthermal import schema, simulation, store
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -205,9 +205,26 @@ def test_curves_films_pictures(results: Path) -> None:
     assert rows[0][:2] == ["time [s]", "pixel 12 16 mean [K]"]
     assert len(rows) == 201
     assert float(rows[-1][1]) == pytest.approx(object_[-1, 12, 16], abs=1e-3)  # [K]
+    assert rows[0][-1] == "pixel 12 16 status"
+    assert {row[-1] for row in rows[1:]} == {"no_flag"}
+    status = result["status"].values
+    worst = np.argwhere(status & schema.Status.DEAD_PIXEL)[0].tolist()
+    places = ["--pixel", *map(str, worst), "--region", "0", "24", "0", "32"]
+    done(results, "export", "result.zarr", *places, "-o", "places.csv")
+    with (results / "places.csv").open(encoding="utf-8", newline="") as stream:
+        last = [*csv.DictReader(stream)][-1]
+    assert "dead_pixel" in last[f"pixel {worst[0]} {worst[1]} status"]
+    whole = "rows 0 to 24, columns 0 to 32, measured"
+    assert last[f"{whole} status"] == "no_flag"
+    assert float(last[f"{whole} pixels [1]"]) == (status == 0).sum()
     for suffix in ("tif", "png", "nc"):
         done(results, "export", "result.zarr", "-o", f"out.{suffix}")
     np.testing.assert_array_equal(tifffile.imread(results / "out.tif"), object_)
+    np.testing.assert_array_equal(tifffile.imread(results / "out_status.tif"), status)
+    assert (results / "out_status.png").read_bytes().startswith(b"\x89PNG")
+    (results / "out.tif").unlink()
+    line = refused(results, "export", "result.zarr", "-o", "out.tif")
+    assert "There is something at 'out_status.tif'" in line
     with xr.open_dataset(results / "out.nc", engine="scipy") as opened:
         np.testing.assert_array_equal(opened["object_temperature"], object_)
         np.testing.assert_array_equal(opened["status"], result["status"])
