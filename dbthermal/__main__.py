@@ -13,9 +13,10 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from dbthermal._cli import is_source, leaves
 
@@ -35,14 +36,23 @@ _EXTRAS: Final = {
 }
 """Library -> the extra that has it."""
 
+_UNIT_DOUBTED: Final = 200.0  # from which degrees Celsius, and below which kelvin, are doubted
+
 
 def _kelvin(text: str) -> float:
     """Temperature [K] of a text with its unit; 273.15 as in scipy, whose import takes long."""
     try:
-        return float(text[:-1]) + {"C": 273.15, "K": 0.0}[text[-1:]]
+        value, unit = float(text[:-1]), text[-1:]
+        kelvin = value + {"C": 273.15, "K": 0.0}[unit]
     except (KeyError, ValueError) as error:
         rule = "Must be a number with its unit, such as 20C or 293.15K"
         raise argparse.ArgumentTypeError(f"Invalid temperature '{text}'. {rule}.") from error
+    if unit == "C" and value > _UNIT_DOUBTED:
+        warnings.warn(f"{text} is {kelvin:g} K; kelvin are written {value:g}K.", stacklevel=1)
+    elif unit == "K" and value < _UNIT_DOUBTED:
+        degrees = f"{kelvin - 273.15:g} degrees Celsius"
+        warnings.warn(f"{text} is {degrees}; these are written {value:g}C.", stacklevel=1)
+    return kelvin
 
 
 def _kelvin_or_path(text: str) -> float | Path:
@@ -91,7 +101,8 @@ materials text*         as listed by 'data'; all by default
 --correction-output path   store of gain and offset, where the blackbody fills the view
 --no-shutter flag       no camera has a shutter
 --time-constant number  thermal, of the pixels [s]
---register none|translation|affine|homography   transform between the views, none if on one grid
+--register none|translation|affine|homography   between the views (homography); none: on one grid
+--search whole=5        largest delay that is sought, either way [frame]
 --reference text        band whose frames are left as they are in time
 --correction path       store of gain and offset: all steps of a raw capture, by rows
 --method text           one step alone, by rows: subspace, calibrated, naive, ratio, bcp, dbvt
@@ -136,13 +147,13 @@ correct a capture: gain and offset, shutter events, bad pixels, lag
 scene.zarr nuc.zarr -o corrected.zarr
 scene.zarr --corrected-by-camera -o corrected.zarr
 
-align steps.align capture --register --offset --reference --output
+align steps.align capture --register --offset --search --reference --output
 bring two cameras onto one clock and one pixel grid
 corrected.zarr -o aligned.zarr
 corrected.zarr --register none --offset 0 -o aligned.zarr
 
-separate steps.separate capture response --correction --register --method --emissivity \
-    --surroundings --prior --workers --output
+separate steps.separate capture response --correction --register --offset --method \
+    --emissivity --surroundings --prior --workers --output
 separate emission and reflection: temperatures, emissivities, deviations, status
 aligned.zarr response.zarr -o result.zarr
 scene.zarr response.zarr --correction nuc.zarr -o result.zarr
@@ -187,9 +198,43 @@ print the completion of commands for bash and zsh, taken over by: eval "$(dbther
 """Command, its function and arguments; its summary; examples."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """Parser whose errors name the command, option or choice that was probably meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with the usage and a message."""
+        super().error(_hinted(message))
+
+
+def _hinted(message: str) -> str:
+    """Message on an unknown name; if one of those that it lists is close to it, with this one."""
+    head, *listed = re.split(r"Must be one of|choose from", message, maxsplit=1)
+    named = re.search(r"'([^']+)'", head)
+    if not listed or not named:
+        return message
+    close = get_close_matches(named.group(1), re.findall(r"[\w.-][^',()\[\]]*", listed[0]), n=1)
+    return f"{message} Did you mean '{close[0]}'?" if close else message
+
+
+def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Options of a command line; an option that the command has not is refused with its options."""
+    parser = _parser()
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        command = _commands(parser)[options.command]
+        names = ", ".join(f"'{name}'" for name in command._option_string_actions)
+        command.error(f"unknown argument '{unknown[0]}' (choose from {names})")
+    return options
+
+
+def _commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Parsers of the commands by their names."""
+    return dict(next(one for one in parser._actions if one.choices).choices or {})
+
+
 def _parser() -> argparse.ArgumentParser:
     plain: Any = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-    parser = argparse.ArgumentParser("dbthermal", description=__doc__, **plain)
+    parser = _Parser("dbthermal", description=__doc__, **plain)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     table = {line.split()[0]: line.split(maxsplit=2)[1:] for line in _ARGUMENTS.split("\n")[1:-1]}
     for block in _COMMANDS.replace(" \\\n    ", " ").strip().split("\n\n"):
@@ -213,9 +258,7 @@ def _options(kind: str, text: str) -> dict[str, Any]:
     if kind == "flag":
         return {"action": "store_true", "help": text}
     if "|" in kind:
-        choices = kind.split("|")
-        default = "homography" if "homography" in choices else None
-        return {"choices": choices, "default": default, "help": text}
+        return {"choices": kind.split("|"), "help": text}
     ((name, number, default),) = re.findall(r"^([a-z]+)([0-9+*?]?)[!&]?=?(.*)$", kind)
     made: dict[str, Any] = {"type": _KINDS[name], "help": text}
     made |= {"nargs": int(number) if number.isdigit() else number} if number else {}
@@ -228,8 +271,8 @@ def _options(kind: str, text: str) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out one command, and return its exit status; see the module."""
-    options = _parser().parse_args(arguments)
     warnings.showwarning = lambda message, *_, **__: print(f"Warning: {message}", file=sys.stderr)
+    options = _parsed(arguments)
     try:
         return _carry_out(options)
     except BrokenPipeError:  # nobody reads the summary any more
@@ -243,7 +286,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status, reason = 1, _reason(error, options.command)
         for name in vars(options):  # of an argument of Python, as it is named here
             reason = re.sub(f" {name}= ?", f" --{name.replace('_', '-')} ", reason)
-    print(f"dbthermal {options.command}: {reason}", file=sys.stderr)
+    print(f"dbthermal {options.command}: {_hinted(reason)}", file=sys.stderr)
     return status
 
 
@@ -292,8 +335,8 @@ def _carry_out(options: argparse.Namespace) -> int:
 
 def _completion() -> str:
     """Function of bash, and of zsh, for names of commands and options; files are left to it."""
-    commands: Any = next(one for one in _parser()._actions if one.choices)
-    named = {name: " ".join(one._option_string_actions) for name, one in commands.choices.items()}
+    commands = _commands(_parser()).items()
+    named = {name: " ".join(one._option_string_actions) for name, one in commands}
     cases = "\n".join(f"    {name}) words='{words}';;" for name, words in named.items())
     return f"""_dbthermal() {{
   local words='{" ".join(named)}'

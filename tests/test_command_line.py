@@ -121,6 +121,7 @@ def test_two_stacks_to_temperatures(
     assert np.nanmedian(abs(error)) < 0.25  # [K]
     provenance = result.attrs["provenance"]
     assert provenance["parameters"]["command"] == "separate"
+    assert not provenance["parameters"].keys() & {"register", "place", "json"}
     assert provenance["inputs"]["capture 0"] == store.checksum(results / "aligned.zarr")
 
 
@@ -171,10 +172,10 @@ def test_raw_files_need_their_form(results: Path) -> None:
     for place in (0, 1):
         tifffile.imwrite(results / f"part{place}.tif", stack[20 * place : 20 * place + 20])
     form = ["--shape", "24", "32", "--byte-order", "big", "--offset", "0", *STATED]
-    done(results, "import", "a.raw", "a.raw", *form, "-o", "raw.zarr")
+    done(results, "import", "a.raw", "a.raw", *form, "-o", "numbers.zarr")
     parts = ["part0.tif", "part1.tif", "+", "a.npy"]
     done(results, "import", *parts, "--offset", "0", *STATED, "-o", "parts.zarr")
-    for name in ("raw", "parts"):
+    for name in ("numbers", "parts"):
         counts = store.open_dataset(results / f"{name}.zarr")["counts"]
         np.testing.assert_array_equal(counts.values, [stack, stack])
     line = refused(results, "import", "a.raw", "b.tif", *form[:3], *STATED, "-o", "x.zarr")
@@ -345,8 +346,15 @@ def test_missing_extras_are_named(
     ("arguments", "reason"),
     [
         ("import a.tif b.tif --bands 8-14 9.5 --unit count --clock 10 -o x.zarr", "--offset [s]."),
-        ("separate scene.zarr response.zarr -o x.zarr", "Invalid raw counts of 'scene.zarr'."),
-        ("separate response.zarr scene.zarr -o x.zarr", "Invalid dims ('band', 'temperature')"),
+        ("separate scene.zarr response.zarr -o x.zarr", "'separate --correction' takes raw counts"),
+        ("separate response.zarr aligned.zarr -o x.zarr", "Exchanged with the response?"),
+        ("align scene.zarr -o x.zarr", "of stage 'capture'. Must be of stage 'corrected', as from"),
+        (
+            "correct scene.zarr response.zarr -o x.zarr",
+            "of stage 'response'. Must be of stage 'corr",
+        ),
+        ("separate aligned.zarr response.zarr --offset 0 -o x.zarr", "Unused option --offset."),
+        ("info result.zarr/status", "an array. Must be the store that it is in: 'result.zarr'."),
         ("report result.zarr -o x.html --region 0 900 0 4", "Invalid rows 0 to 900, columns 0 to"),
     ],
 )
@@ -355,6 +363,43 @@ def test_mistakes_are_explained_in_words_of_the_commands(
 ) -> None:
     """Missing options, raw counts, exchanged stores and places outside have a line each."""
     assert reason in refused(results, *arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        ("seperate a b", "separate"),
+        ("align a.zarr --ofset 0 -o x.zarr", "--offset"),
+        ("align a.zarr --register homograph -o x.zarr", "homography"),
+        ("plan plate_window_glas --noise 0.03", "plate window glass"),
+        ("export result.zarr --variable emisivity -o x.tif", "emissivity"),
+        ("separate aligned.zarr response.zarr --method callibrated -o x.zarr", "calibrated"),
+    ],
+)
+def test_a_misspelt_name_is_recognised(results: Path, arguments: str, meant: str) -> None:
+    """A command, an option, a choice, or a name that the library knows: the nearest is named."""
+    found = run(results, *arguments.split())
+    assert found.returncode > 0
+    assert found.stderr.rstrip().endswith(f"Did you mean '{meant}'?")
+
+
+def test_what_has_no_time_makes_no_curve(results: Path) -> None:
+    """The names for a curve are those over time, which a map is not."""
+    line = refused(results, "export", "result.zarr", "--variable", "emissivity", "-o", "x.csv")
+    assert "Unknown variable 'emissivity' for .csv. Must be one of ['background_temper" in line
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("278C", "551.15 K; kelvin are written 278K"),
+        ("22K", "-251.15 degrees Celsius; these are written 22C"),
+    ],
+)
+def test_a_doubtful_unit_is_noticed(text: str, said: str, tmp_path: Path) -> None:
+    """Celsius that look like kelvin, and the reverse, are taken as written, with a warning."""
+    found = run(tmp_path, "complete", *"abc", "--surroundings", text, "-o", "d.zarr")
+    assert f"Warning: {text} is {said}.\n" in found.stderr
 
 
 def test_bash_completes_commands_and_options(tmp_path: Path) -> None:

@@ -20,12 +20,15 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     options.variable = options.variable or "object_temperature"
     if suffix not in _WRITERS:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
-    if options.variable not in result:
-        names = sorted(map(str, result.data_vars))
-        raise ValueError(f"Unknown variable '{options.variable}'. Must be one of {names}.")
+    names = sorted(map(str, result.data_vars))
+    if suffix == ".csv":  # curves over time
+        names = [name for name in names if result[name].dims == ("time", "y", "x")]
+    if options.variable not in names:
+        kind = f"variable '{options.variable}' for {suffix}"
+        raise ValueError(f"Unknown {kind}. Must be one of {names}.")
     outputs = {options.output: options.variable}
-    if suffix in (".tif", *_PICTURES) and "status" in result:
-        outputs.setdefault(options.output.with_stem(f"{options.output.stem}_status"), "status")
+    if suffix in (".tif", *_PICTURES) and "status" in result and options.variable != "status":
+        outputs[options.output.with_stem(f"{options.output.stem}_status")] = "status"
     said = {}
     for path, options.variable in outputs.items():
         if path.exists() and not options.overwrite:
@@ -55,8 +58,6 @@ def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict
         flags = " ".join(bit.label for bit in bits) or "no_flag"
         flags = flags if "status" in view.panes else "unknown"
         columns[f"{where} status"] = xr.full_like(curve["mean"], flags, dtype=object)
-    if any(values.dims != ("time",) for values in columns.values()):
-        raise ValueError(f"Invalid '{options.variable}' without time. Must be a film.")
     xr.Dataset(columns).to_dataframe().to_csv(path, index_label="time [s]")
     return {"columns": ["time [s]", *columns]}
 

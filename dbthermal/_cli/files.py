@@ -12,7 +12,15 @@ from tqdm import tqdm
 from dbthermal import _rows, readers, schema, store
 from dbthermal._cli import PLUS, is_source, leaves
 
+_MADE_BY = {
+    "capture": "import",
+    "correction": "calibrate --correction-output",
+    "corrected": "correct ('separate --correction' takes raw counts)",
+    "response": "calibrate",
+    "separated": "separate",
+}
 _TIFF = {".tif", ".tiff", ".btf"}
+_NOT_RECORDED = {"dry_run", "json", "overwrite", "place", "traceback"}
 _ARRAYS = {".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".zarr"}
 
 
@@ -24,6 +32,21 @@ def opened(path: Path) -> xr.Dataset:
     from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
     return recording.open_capture(path)
+
+
+def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
+    """Stores that arguments name, each of a stage of `schema`, or of one of several: ``a|b``."""
+    datasets = {name: opened(getattr(options, name)) for name in stages}
+    found = {name: _stage(dataset) for name, dataset in datasets.items()}
+    for name, wanted in stages.items():
+        if found[name] not in wanted.split("|"):
+            others = [one for one in stages if found[name] in stages[one].split("|")]
+            hint = f" Exchanged with the {others[0]}?" if others else ""
+            label = f"{name} '{getattr(options, name)}' of stage '{found[name]}'"
+            stage = wanted.partition("|")[0]
+            rule = f"Must be of stage '{stage}', as from: dbthermal {_MADE_BY[stage]}"
+            raise ValueError(f"Invalid {label}. {rule}.{hint}")
+    return [*datasets.values()]
 
 
 def recording(paths: list[Path], options: argparse.Namespace) -> xr.Dataset:
@@ -99,7 +122,7 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
         sources = [one for one in parts if is_source(name, one)]
         inputs |= {f"{name} {number}": path for number, path in enumerate(sources)}
         plain = [one for one in parts if one is not None and not isinstance(one, Path)]
-        if plain:
+        if plain and name not in _NOT_RECORDED:
             parameters[name] = plain if isinstance(value, list) else value
     return store.provenance(parameters, inputs)
 

@@ -19,7 +19,7 @@ from dbthermal import (
     separation,
 )
 from dbthermal._cli import PLUS, leaves
-from dbthermal._cli.files import capture, described, opened, provenance, saved
+from dbthermal._cli.files import capture, described, opened, provenance, saved, staged
 from dbthermal._warnings import warned
 from dbthermal.separation._plausibility import against_response, hardly_measured
 
@@ -78,7 +78,9 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
 
 def correct(options: argparse.Namespace) -> dict[str, Any]:
     """Command `correct`."""
-    raw, by_camera = opened(options.capture), options.corrected_by_camera
+    given = {"correction": "correction"} if options.correction else {}
+    raw, *fitted = staged(options, capture="capture|corrected", **given)
+    by_camera = options.corrected_by_camera
     files = raw.attrs.get("files", {}).values()
     # A maker's Planck constants hold for all pixels alike.
     of_maker = bool(files) and all("file_planck_R1" in one for one in files)
@@ -89,36 +91,41 @@ def correct(options: argparse.Namespace) -> dict[str, Any]:
             "calibrate --correction-output nuc.zarr' or, only if the cameras correct gain and "
             "offset themselves, --corrected-by-camera."
         )
-    fitted = correction.corrected_by_camera(raw)
-    if options.correction:
-        fitted = opened(options.correction).load()
+    gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
     chosen = {"shutter": not options.no_shutter, "time_constant": options.time_constant}
-    return saved(correction.correct_capture(raw, fitted, lazy=True, **chosen), options)
+    return saved(correction.correct_capture(raw, gain, lazy=True, **chosen), options)
 
 
 def align(options: argparse.Namespace) -> dict[str, Any]:
     """Command `align`."""
-    corrected, transform = opened(options.capture), None
+    (corrected,), transform = staged(options, capture="corrected"), None
+    options.register = options.register or "homography"
     if options.register != "none":
         some = slice(None, None, max(1, corrected.sizes["time"] // _REGISTERED))
         transform = alignment.register(corrected.isel(time=some).load(), model=options.register)
-    chosen = {"offset": options.offset, "clock": options.reference, "transform": transform}
-    return saved(alignment.align(corrected, lazy=True, **chosen), options)
+    chosen = {"offset": options.offset, "search": options.search, "clock": options.reference}
+    aligned = alignment.align(corrected, transform=transform, lazy=True, **chosen)
+    return saved(aligned, options)
 
 
 def separate(options: argparse.Namespace) -> dict[str, Any]:
     """Command `separate`."""
-    source, response = opened(options.capture), opened(options.response).load()
-    known, shown = _known(options), sys.stderr.isatty()
-    if not options.correction and "counts" in source and source["counts"].dtype.kind == "u":
-        rule = "Must be corrected: by 'dbthermal correct', or with --correction"
-        raise ValueError(f"Invalid raw counts of '{options.capture}'. {rule}.")
+    stages = {"capture": "corrected", "response": "response"}
     if options.correction:
+        stages |= {"capture": "capture|corrected", "correction": "correction"}
+        options.register = options.register or "homography"
+    _refuse_unused(options)
+    source, response, *fitted = staged(options, **stages)
+    response.load()
+    known, shown = _known(options), sys.stderr.isatty()
+    if options.correction:
+        offset = {} if options.offset is None else {"offset": options.offset}
         scene.separate_capture(
             source,
-            opened(options.correction).load(),
+            fitted[0].load(),
             response,
             registration=None if options.register == "none" else options.register,
+            aligning=offset,
             separating={**known, "progress": shown},
             target=options.output,
             provenance=provenance(options),
@@ -146,6 +153,20 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     return described(options.output)
 
 
+def _refuse_unused(options: argparse.Namespace) -> None:
+    """Refuse an option of `separate` that another one leaves without effect."""
+    apart = "without --correction, for the capture is aligned"
+    unused = {"emissivity": "without --method", "register": apart, "offset": apart}
+    if options.correction:
+        unused = dict.fromkeys(("method", "emissivity"), "with --correction")
+    elif options.method:
+        unused = dict.fromkeys(("surroundings", "prior"), "with --method: 'dbthermal complete'")
+        unused |= {"register": apart, "offset": apart}
+    for name, why in unused.items():
+        if getattr(options, name) is not None:
+            raise ValueError(f"Unused option --{name}. Must be left out {why}.")
+
+
 def _known(options: argparse.Namespace) -> dict[str, Any]:
     """Options of the completion, and the number of threads."""
     return {name: getattr(options, name) for name in ("surroundings", "prior", "workers")}
@@ -153,9 +174,8 @@ def _known(options: argparse.Namespace) -> dict[str, Any]:
 
 def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
-    result, source, response = (
-        opened(path).load() for path in (options.result, options.capture, options.response)
-    )
+    stages = {"result": "separated", "capture": "corrected", "response": "response"}
+    result, source, response = (one.load() for one in staged(options, **stages))
     completed = separation.complete(
         result, source, response, result.get("material"), **_known(options)
     )

@@ -175,7 +175,9 @@ def _try(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
 def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> float:
     """Offset of two bands [s], of signals (band, time, pixel) [count] at stamps (band, time)."""
     names = [str(name) for name in pair["band"].values]
-    label = f"of band '{names[1]}' against '{names[0]}'"
+    start = [row[np.isfinite(row)][0] for row in stamps]
+    times = f"times begin at {start[1]:.4g} and {start[0]:.4g} s"
+    label = f"of band '{names[1]}' against '{names[0]}', whose {times}"
     # Frames of the one side of a pause never meet those of the other, at any lag.
     shared = _on_one_clock(signals, stamps, clocks.segments(pair), search + 3)
     lag = _peak(_covariances(shared, search, names)[0], label)
@@ -188,7 +190,7 @@ def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> flo
     if not std <= _PRECISION:
         raise ValueError(
             f"Invalid time offset {label}: {delays[0]:.2f} +- {std:.2f} frames. Must be known "
-            f"within {_PRECISION}: too little moves, or in too few pixels; give the offset."
+            f"within {_PRECISION}: too little moves, or in too few pixels; give offset= [s]."
         )
     return float(delays[0] * clocks.frame_period(shared.times))
 
@@ -327,13 +329,15 @@ def _peak(cross: Array, label: str) -> int:
     score = groups.mean() / (groups.std(ddof=1) / np.sqrt(_GROUPS))
     if not score > _SIGNIFICANCE:
         raise ValueError(
-            f"Missing time offset {label}: no rapid change that both bands see (a covariance of "
-            f"{score:.1f} standard deviations). Must exceed {_SIGNIFICANCE:g}; give the offset."
+            f"Missing time offset {label}: no rapid change that both bands see within {middle - 2} "
+            f"frames of these (a covariance of {score:.1f} standard deviations, over "
+            f"{_SIGNIFICANCE:g} if there is one). Must be seen: mend the times if they are not "
+            "right, search farther by search= [frame], or give offset= [s] beyond the times."
         )
     if abs(lag) == middle - 2:
         raise ValueError(
             f"Invalid time offset {label}: the largest covariance is at {lag} "
-            "frames, the end of the search. Must lie inside; search farther."
+            "frames, the end of the search. Must lie inside: search farther by search= [frame]."
         )
     return lag
 

@@ -14,7 +14,7 @@ from dbthermal import noise as noises
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment._offset import present, require_one_clock, sample, time_offset
+from dbthermal.alignment._offset import SEARCH, present, require_one_clock, sample, time_offset
 from dbthermal.noise import MAD
 
 Movie = npt.NDArray[np.float32]
@@ -43,6 +43,7 @@ def align(
     *,
     offset: float | xr.DataArray | None = None,
     transform: xr.DataArray | None = None,
+    search: int = SEARCH,
     clock: str | None = None,
     reflection_shift: xr.Dataset | None = None,
     lazy: bool = False,
@@ -75,6 +76,8 @@ def align(
         axis, y, x) [pixel], the row and column in each view of each pixel of the first. The views
         are interpolated by polynomials through 6x6 pixels, near the border and bad pixels by
         lines. Pixels outside a view, or without a place in it (NaN), are NaN.
+    search : int
+        Largest lag that `time_offset` searches, either way [frame].
     clock : str, optional
         Band whose samples are not touched in time.
     reflection_shift : Dataset, optional
@@ -128,7 +131,7 @@ def align(
     counts, alike = corrected["counts"], corrected
     if reflection_shift is not None and offset is None:
         alike, _ = _registered(corrected, _reflected(reflection_shift, corrected), lazy=lazy)
-    offsets = _offsets(alike, offset, names)
+    offsets = _offsets(alike, offset, names, search)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     signals = sample(corrected)
     for band in () if offset is None else range(1, len(names)):  # `time_offset` has done it
@@ -223,10 +226,13 @@ def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
     return np.asarray(np.round(np.stack([row, column]) / scale, _DIGITS))
 
 
-def _offsets(corrected: xr.Dataset, offset: float | xr.DataArray | None, names: list[str]) -> Array:
+def _offsets(
+    corrected: xr.Dataset, offset: float | xr.DataArray | None, names: list[str], search: int
+) -> Array:
     """Offset of each band against the first [s]."""
     if offset is None:
-        return np.array([0.0, *(time_offset(corrected, band=name) for name in names[1:])])
+        found = [time_offset(corrected, band=name, search=search) for name in names[1:]]
+        return np.array([0.0, *found])
     if isinstance(offset, xr.DataArray):
         places = schema.band_positions(offset, names, "the time offset")
         if offset.attrs.get("units", "s") != "s":

@@ -110,12 +110,8 @@ def _numpy_file(path: Path, name: str | None, memory: float, stack: ExitStack) -
         if stream.read(2) == b"PK":
             archive = stack.enter_context(zipfile.ZipFile(path))
             names = [member.removesuffix(".npy") for member in archive.namelist()]
-            wanted = names[0] if name is None and len(names) == 1 else name
-            if wanted not in names:
-                raise ValueError(
-                    f"Missing array '{wanted}' in '{path.name}'. Must be one of {names}."
-                )
-            stream = stack.enter_context(archive.open(archive.namelist()[names.index(wanted)]))
+            place = names.index(recordings.array_name(names, name, path))
+            stream = stack.enter_context(archive.open(archive.namelist()[place]))
         else:
             stream.seek(0)
         return _numpy_array(stream, path.name, memory)

@@ -44,11 +44,7 @@ def read(
         stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
         warnings.simplefilter("error", UserWarning)  # as of one dimension twice
         found = {"zarr": _foreign_store, "HDF5": _hdf5, "NetCDF": _netcdf}[kind](path, stack)
-        wanted = next(iter(found)) if name is None and len(found) == 1 else name
-        if wanted not in found:
-            rule = f"Must be one of {sorted(found)}, which have three dimensions"
-            raise ValueError(f"Missing array '{wanted}' in '{path.name}'. {rule}.")
-        values, dims = found[wanted]
+        values, dims = found[recordings.array_name(found, name, path)]
         if "time" in dims[1:]:
             raise ValueError(f"Invalid dims {dims} of '{path.name}'. Must be (time, y, x).")
         for scale in {"scale_factor", "add_offset"} & set(values.attrs):

@@ -1,7 +1,7 @@
 """Parts that all readers of recordings share: files, byte order, clock, and the Dataset made."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -82,6 +82,19 @@ def smoother(counts: Counts) -> int:
 def _roughness(frame: Counts) -> float:
     values = frame.astype(np.int32)
     return sum(float(np.abs(np.diff(values, axis=axis)).sum()) for axis in (0, 1))
+
+
+def array_name(found: Collection[str], name: str | None, path: Path) -> str:
+    """Name of an array in a file, which may be left out if there is one alone."""
+    if name is None and len(found) == 1:
+        return next(iter(found))
+    if name in found:
+        return str(name)
+    if not found:
+        rule = "Must have one; a store of dbthermal that has two bands is a capture as it is"
+        raise ValueError(f"Missing array (time, y, x) in '{path.name}'. {rule}.")
+    wanted = "name of one of the arrays" if name is None else f"array '{name}'"
+    raise ValueError(f"Missing {wanted} in '{path.name}'. Must be one of {sorted(found)}.")
 
 
 def check_unit(unit: str, name: str) -> None:

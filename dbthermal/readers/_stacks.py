@@ -197,8 +197,9 @@ def _pages(path: Path) -> list[_Page]:
                 raise ValueError(complaints.get().getMessage())
             _check_apart(file, pages)
     except _DAMAGE as error:
-        rule = "" if "Must " in str(error) else ". Must be a whole TIFF or BigTIFF."
-        raise ValueError(f"Invalid or damaged TIFF '{path.name}': {error}{rule}") from error
+        refused = "Must " in str(error)
+        state, rule = ("Invalid", "") if refused else ("Damaged", ". Must be whole, or BigTIFF.")
+        raise ValueError(f"{state} TIFF '{path.name}': {error}{rule}") from error
     finally:
         log.removeHandler(handler)
     if len(pages) == 1 and stated > 1:  # one page for a stack without gaps: ImageJ beyond 4 GB
@@ -230,6 +231,14 @@ def _check_apart(file: Any, pages: list[_Page]) -> None:
 
 def _page(page: Any, path: Path, order: str, number: int) -> _Page:
     """Page of tifffile, as one image of uncompressed counts."""
+    if page.compression == 1 and page.dtype is not None and page.dtype.kind == "f":
+        length = min(page.databytecounts[0], path.stat().st_size) // page.dtype.itemsize
+        form = page.dtype.newbyteorder(order)
+        values = np.fromfile(path, form, length, offset=page.dataoffsets[0])
+        values = values[np.isfinite(values)]
+        span = f" from {values.min():g} to {values.max():g}" if values.size else ""
+        rule = "Must be 16-bit counts, not temperatures: record or export those"
+        raise ValueError(f"Invalid values of page {number}, {page.dtype}{span}. {rule}.")
     for attribute, label, value, rule in _FORM:
         if (found := getattr(page, attribute)) != value:
             raise ValueError(f"Invalid {label} {found} of page {number}. Must be {rule}.")

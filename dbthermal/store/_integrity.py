@@ -70,9 +70,13 @@ class CheckedStore(SummedStore):
             content = self._content(GROUP)
         self._compare(GROUP, content)
         try:
-            self.attrs: dict[str, Any] = json.loads(content or b"")["attributes"]
+            group = json.loads(content or b"")
+            self.attrs: dict[str, Any] = group["attributes"]
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(f"Invalid {self._named(GROUP)}. Must be a zarr group.") from error
+        if group.get("node_type") == "array":
+            rule = f"Must be the store that it is in: '{self.root.parent}'"
+            raise ValueError(f"Invalid store '{self.root}', an array. {rule}.")
         mark = {name: self.attrs[name] for name in MARK if name in self.attrs}
         self.closed = mark != GROWING if mark else bool(self.attrs.get("closed", True))
         if mark and not self._sums:

@@ -159,6 +159,20 @@ def test_end_of_the_search(scene: xr.Dataset) -> None:
         alignment.time_offset(recorded(scene, 3), search=2)
 
 
+def test_times_that_are_wrong(scene: xr.Dataset) -> None:
+    """Times 3 s apart that are not right are named with the remedies, of which two help."""
+    capture = recorded(scene, 0, stamped=True)
+    capture["exposure_time"][1] += 3.0
+    begin = capture["exposure_time"].values[:, 0]
+    expected = rf"times begin at {begin[1]:.4g} and {begin[0]:.4g} s: .* search farther by search="
+    with pytest.raises(ValueError, match=expected):
+        alignment.align(capture)
+    found = alignment.align(capture, search=60).attrs["time_offset"][1]
+    print(f"found {found:.4f} s, true -3 s")
+    assert abs(found + 3.0) < 0.1 * PERIOD
+    assert alignment.align(capture, offset=-3.0).attrs["time_offset"] == [0.0, -3.0]
+
+
 def test_shutter_steps_are_no_motion(scene: xr.Dataset) -> None:
     """A step in both bands after a shutter event does not pull the offset to zero."""
     capture = recorded(scene, 1.5)

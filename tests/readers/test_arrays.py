@@ -15,7 +15,7 @@ from flir_files import damaged, scene
 from numpy.testing import assert_allclose, assert_array_equal
 from zarr.codecs import BloscCodec
 
-from dbthermal import readers
+from dbthermal import readers, store
 
 
 def read(source: Any, name: str | None = None, **options: Any) -> xr.Dataset:
@@ -36,8 +36,18 @@ def test_files_of_numpy(tmp_path: Path, order: str, layout: Any) -> None:
         assert_array_equal(found.counts, scene())
         assert found.counts.dtype == np.dtype("uint16")
         assert_allclose(found.time, [0, 0.1, 0.2])
-    with pytest.raises(ValueError, match=r"Missing array 'None' .* one of \['warm', 'dark'\]"):
+    with pytest.raises(ValueError, match=r"name of one of the arrays in .* \['dark', 'warm'\]"):
         read(tmp_path / "b.npz")
+
+
+def test_a_store_of_our_own_is_no_camera(tmp_path: Path) -> None:
+    """A capture's store, which has no array of one band, is said to be a capture."""
+    one = read(scene())
+    both = readers.two_bands(one, one, bands=("8-14", "9.5"), offset=0.0)
+    store.save(both, tmp_path / "scene.zarr", store.provenance({}))
+    expected = r"Missing array \(time, y, x\) in 'scene.zarr'.*two bands is a capture as it is"
+    with pytest.raises(ValueError, match=expected):
+        read(tmp_path / "scene.zarr")
 
 
 def test_arrays_of_other_libraries() -> None:

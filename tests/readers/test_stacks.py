@@ -26,6 +26,9 @@ FORMS: dict[str, dict[str, Any]] = {
 }
 
 
+HALVES = f"{0.5 * scene()[0].min():g} to {0.5 * scene()[0].max():g}"
+
+
 def write(path: Path, counts: Any, **options: Any) -> None:
     """TIFF of gray values, unless it is to have colours."""
     tifffile.imwrite(path, counts, **{"photometric": "minisblack", **options})
@@ -63,7 +66,12 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
     ("counts", "options", "message"),
     [
         (scene(), {"compression": "zlib"}, "Invalid compression 8 of page 0. Must be none"),
-        (scene().astype("f4"), {}, "Invalid bits of a pixel 32 of page 0"),
+        (
+            0.5 * scene().astype("f4"),
+            {},
+            f"Invalid TIFF 'a.tif': Invalid values of page 0, float32 from {HALVES}",
+        ),
+        (scene().astype("f2") / 9, {}, "Invalid values of page 0, float16 from"),
         (scene().astype("i2"), {}, "Invalid sample format 2 of page 0"),
         (scene().astype("u1"), {}, "Invalid bits of a pixel 8 of page 0"),
         (scene(3), {"photometric": "rgb", "planarconfig": "separate"}, "values of a pixel 3"),
@@ -84,7 +92,7 @@ def test_unit_must_be_stated(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Invalid unit 'K' of 'a\.tif'.*Record or export raw"):
         readers.tiff(path, unit="K", clock=10)
     path.write_bytes(b"II*\0" + bytes(20))
-    with pytest.raises(ValueError, match=r"Invalid or damaged TIFF 'a\.tif'"):
+    with pytest.raises(ValueError, match=r"Damaged TIFF 'a\.tif'"):
         read(path)
 
 

@@ -132,19 +132,22 @@ def test_huber_loss_has_slope_one_beyond_its_threshold() -> None:
 def directional(
     unknowns: Unknowns, images: Images, weights: DbvtSettings, way: Unknowns
 ) -> np.ndarray:
-    """Derivative of the objective along a direction, from the forms of the Newton step."""
+    """Derivative of the objective along a direction, from the forces of the Newton step."""
     emission, _ = objective.ratios(unknowns.emissivity)
     first, second = unknowns.emissivity
     to_first, to_second = way.emissivity
     change = (to_second - emission * to_first) / first
     reflection = (to_first * (1 - second) / (1 - first) - to_second) / (1 - first)
     start = unknowns.smooth[0]
-    steps = [*way.noise, way.smooth, way.offset - change * start - emission * way.smooth[0]]
-    steps += [change, reflection]
-    total = torch.zeros_like(unknowns.smooth)
-    for term in newton._terms(unknowns, torch.ones(3, dtype=torch.float64), images, weights):
-        for name, slope in term.slopes.items():
-            total = total + term.gradient * slope * steps[name]
+    offset = way.offset - change * start - emission * way.smooth[0]
+    system = newton._System(unknowns, torch.ones(3, dtype=torch.float64), images, weights)
+    second_step, error = offset + change * unknowns.smooth, reflection * system.first
+    # Forces are those of the noise eliminated, which follows the other unknowns.
+    still = torch.zeros_like(start)
+    moved = system.noise_step(way.smooth, emission * way.smooth + second_step, error)
+    apart = way.noise - (moved - system.noise_step(still, still, still))
+    total = (torch.stack(system._pull) * apart).sum(dim=0) - system.force * way.smooth
+    total = total - system.force_y * second_step - system.force_z * error
     bend, square = newton.bending(unknowns.smooth)
     stiff = weights.smoothness / (weights.curvature * images.interval**2) ** 2
     smooth = (1 + emission**2) * (bend * way.smooth).sum(dim=0) + emission * square * change

@@ -28,7 +28,7 @@ from dbthermal import planck
 from dbthermal.response import require_range
 from dbthermal.separation._baselines import WITHOUT_STD, point_estimate
 from dbthermal.separation._inputs import Method, require
-from dbthermal.separation._tiles import Array, Estimate, Tile
+from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,7 @@ def separate(tile: Tile, settings: BcpSettings) -> Estimate:
     """
     object_signal, reflected, transmission = _remove(tile, settings, 0)
     transmissions = np.stack([transmission, _remove(tile, settings, 1)[2]])
-    usable = np.isfinite(tile.temperature(0, tile.signals[0]))
-    temperature = np.where(usable, tile.temperature(0, object_signal), np.nan)
+    temperature = np.where(_usable(tile, 0), tile.temperature(0, object_signal), np.nan)
     background = np.tile(tile.temperature(0, reflected)[:, np.newaxis], temperature.shape[1])
     status = np.zeros(temperature.shape[1], dtype=np.uint32)
     estimate = point_estimate(tile, temperature, status, transmissions, background)
@@ -98,9 +97,11 @@ def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array,
         curve = tile.curves[band]
         value = require_range(settings.reflected_temperature, curve, "reflected_temperature")
         known = float(tile.blackbody(band, value))
-    for frame, signal in enumerate(tile.signals[band]):
-        usable = np.isfinite(tile.temperature(band, signal))
-        filled = np.where(usable, signal, np.median(signal[usable])) if usable.any() else signal
+    for frame, (signal, usable) in enumerate(
+        zip(tile.signals[band], _usable(tile, band), strict=True)
+    ):
+        some = usable.any() and not usable.all()
+        filled = np.where(usable, signal, np.median(signal[usable])) if some else signal
         image = filled.reshape(tile.shape)
         level = float(np.percentile(image, settings.percentile)) if known is None else known
         transmission = _transmission(image, level, settings)
@@ -109,6 +110,15 @@ def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array,
         cleaned[frame], reflected[frame] = (excess + level).ravel(), level
         total += transmission.ravel()
     return cleaned, reflected, total / tile.time.size
+
+
+def _usable(tile: Tile, band: int) -> Mask:
+    """Samples (time, pixel) that have a temperature: all, where a frame's lowest signal has one."""
+    signals = tile.signals[band]
+    lost = np.isnan(tile.temperature(band, signals.min(axis=1)))
+    usable = np.ones(signals.shape, dtype=bool)
+    usable[lost] = np.isfinite(tile.temperature(band, signals[lost]))
+    return usable
 
 
 def _transmission(image: Array, level: float, settings: BcpSettings) -> Array:

@@ -9,9 +9,9 @@ Beyond its threshold the Huber loss has no curvature: a share of that of a parab
 1981, doi:10.1002/0471725250) is added, as much as it takes to lower the objective.
 """
 
+import itertools
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
 from typing import Final
 
 import numpy as np
@@ -23,9 +23,6 @@ from dbthermal._arrays import Array
 from dbthermal.separation._dbvt import DbvtSettings, objective
 from dbthermal.separation._dbvt.objective import Columns, Images, Unknowns
 
-# Unknowns of a step: noise of both bands, smooth signal, and the border.
-_FIRST, _SECOND, _SMOOTH, _OFFSET, _EMISSION, _REFLECTION = range(6)
-_BORDER: Final = (_OFFSET, _EMISSION, _REFLECTION)
 _SYMMETRIC: Final = torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places of the border's pairs
 # Weight of the noise where it is not modelled.
 _NO_NOISE: Final = 1e8
@@ -73,161 +70,132 @@ def step(
     return Unknowns(*(torch.where(better, new, old) for new, old in pairs)), after
 
 
-@dataclass(frozen=True)
-class _Term:
-    """Part of the objective that depends on one linear form of the unknowns, per frame."""
-
-    slopes: dict[int, Tensor | float]  # of the form, by unknown
-    gradient: Tensor  # with the form
-    curvature: Tensor
-
-
-def _terms(
-    unknowns: Unknowns, share: Tensor, images: Images, settings: DbvtSettings
-) -> list[_Term]:
-    """Half the derivatives of the objective but its smoothness, times the number of frames."""
-    emission, reflection = objective.ratios(unknowns.emissivity)
-    first, second, error = objective.departures(unknowns, images)
-    # p_2 = I_2 - n_2 - I2~, with I2~ of equation (1) of the objective
-    of_second: dict[int, Tensor | float] = {
-        _SECOND: -1.0,
-        _SMOOTH: -emission,
-        _OFFSET: -1.0,
-        _EMISSION: -unknowns.smooth,
-    }
-    of_first: dict[int, Tensor | float] = {_FIRST: -1.0, _SMOOTH: -1.0}
-    terms = []
-    for band, (part, slopes) in enumerate(((first, of_first), (second, of_second))):
-        variance = images.sigma[band] ** 2
-        square = (settings.noise or _NO_NOISE) / variance
-        # Jensen: the square of a mean lies below a mean of squares that touches it here.
-        mean = settings.noise_mean / variance
-        noise = unknowns.noise[band]
-        gradient = square * noise + mean * noise.mean(dim=0)
-        terms.append(_Term({band: 1.0}, gradient, square + mean))
-        terms.append(_huber_term(part, slopes, images, settings, band, share))
-    # r = p_2 - k_2 p_1
-    weight = settings.reconstruction * images.share / images.sigma[1] ** 2
-    of_error = of_second | {_FIRST: reflection, _SMOOTH: reflection - emission, _REFLECTION: -first}
-    return [*terms, _Term(of_error, weight * error, weight)]
-
-
-def _huber_term(
-    part: Tensor,
-    slopes: dict[int, Tensor | float],
-    images: Images,
-    settings: DbvtSettings,
-    band: int,
-    share: Tensor,
-) -> _Term:
-    """Huber loss of one band; beyond the threshold a share of the touching parabola's curvature."""
-    threshold = settings.huber_threshold * images.sigma[band]
-    size = part.abs()
-    parabola = 0.5 * settings.huber / images.deviation[band] / torch.maximum(size, threshold)
-    curvature = torch.where(size <= threshold, parabola, share * parabola)
-    return _Term(slopes, parabola * part, curvature)
-
-
 class _System:
-    r"""Newton's equations of a step, the noise of each frame eliminated.
+    r"""Newton's equations of each frame, the noise eliminated, in the changes of three forms.
 
-    With N the 2x2 block of a frame's noise, c its coupling to another unknown and f the forces
-    (negative gradients), :math:`H - c^T N^{-1} c` and :math:`f - c^T N^{-1} f_n` are left.
+    .. math:: x = d\tilde I_1, \quad y = d\tilde I_2, \quad z = p_1\, dk_2
+
+    With the curvatures q of the noise, h of the Huber losses and w of the reconstruction, the
+    noise has the block :math:`N = diag(q + h) + w v v^T, v = (k_2, -1)`. Curvatures and forces
+    (negative gradients) are half the derivatives of the objective, times the number of frames.
     """
 
-    def __init__(self, terms: list[_Term], like: Tensor) -> None:
-        self._zero, self._terms = torch.zeros_like(like), terms
-        a = self._curvature(_FIRST, _FIRST)
-        b = self._curvature(_FIRST, _SECOND)
-        c = self._curvature(_SECOND, _SECOND)
-        self._block = (a, b, c, a * c - b * b)
-        self._coupling = {
-            name: (self._curvature(_FIRST, name), self._curvature(_SECOND, name))
-            for name in (_SMOOTH, *_BORDER)
-        }
-        self._pull = self._solve(self._force(_FIRST), self._force(_SECOND))
-        self._response = {name: self._solve(*pair) for name, pair in self._coupling.items()}
-
-    def _curvature(self, one: int, other: int) -> Tensor:
-        parts = [
-            term.curvature * (term.slopes[one] * term.slopes[other])
-            for term in self._terms
-            if one in term.slopes and other in term.slopes
+    def __init__(
+        self, unknowns: Unknowns, share: Tensor, images: Images, settings: DbvtSettings
+    ) -> None:
+        self.emission, self._reflection = k1, k2 = objective.ratios(unknowns.emissivity)
+        self.smooth = unknowns.smooth
+        self.first, second, error = objective.departures(unknowns, images)
+        variance = images.sigma**2
+        self._weight = w = settings.reconstruction * images.share / variance[1]
+        # Jensen: the square of a mean lies below a mean of squares that touches it here.
+        square, mean = (settings.noise or _NO_NOISE) / variance, settings.noise_mean / variance
+        self._noise = q1, q2 = square + mean
+        own = [
+            square[band] * noise + mean[band] * noise.mean(dim=0)
+            for band, noise in enumerate(unknowns.noise)
         ]
-        return sum(parts[1:], parts[0]) if parts else self._zero
-
-    def _force(self, name: int) -> Tensor:
-        parts = [term.gradient * term.slopes[name] for term in self._terms if name in term.slopes]
-        return -sum(parts[1:], parts[0])
+        h1, pull1 = _huber(self.first, images, settings, 0, share)
+        h2, pull2 = _huber(second, images, settings, 1, share)
+        a, c = q1 + h1, q2 + h2
+        # det N = a c + w (a + k_2^2 c)
+        self._diagonal = a + w * k2**2, c + w
+        self._inverse = 1 / (a * c + w * (a + k2**2 * c))
+        error = w * error
+        self._pull = own[0] - pull1 + k2 * error, own[1] - pull2 - error
+        # What is left of the quadratic form: with K = N - diag(q), diag(q) N^-1 K in x and y.
+        scaled = w * self._inverse
+        self.yy = q2 * (h2 * self._diagonal[0] + w * a) * self._inverse
+        xx = q1 * (h1 * self._diagonal[1] + w * k2**2 * c) * self._inverse
+        xy = -q1 * q2 * k2 * scaled
+        xz, self.yz, self.zz = -q1 * k2 * c * scaled, q2 * a * scaled, a * c * scaled
+        # Of the smooth signal, x = ds and y = k_1 ds, and with y and z
+        self.with_y = xy + k1 * self.yy
+        self.with_z = xz + k1 * self.yz
+        self.curvature = xx + k1 * (xy + self.with_y)
+        n1, n2 = self._solve(*self._pull)
+        self.force_y = own[1] - q2 * n2
+        self.force_z = error - w * (k2 * n1 - n2)
+        self.force = own[0] - q1 * n1 + k1 * self.force_y
 
     def _solve(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         """Solve the 2x2 block of each frame's noise."""
-        a, b, c, determinant = self._block
-        return (c * first - b * second) / determinant, (a * second - b * first) / determinant
+        (a, c), across = self._diagonal, self._weight * self._reflection
+        return (
+            (c * first + across * second) * self._inverse,
+            (across * first + a * second) * self._inverse,
+        )
 
-    def curvature(self, one: int, other: int) -> Tensor:
-        """Curvature (time, column) with the noise eliminated."""
-        (u, v), (f, s) = self._coupling[one], self._response[other]
-        return self._curvature(one, other) - u * f - v * s
+    def noise_step(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """Step of the noise (2, time, column) that follows from those of the forms."""
+        (q1, q2), (pull1, pull2), error = self._noise, self._pull, self._weight * z
+        n1, n2 = self._solve(q1 * x + self._reflection * error - pull1, q2 * y - error - pull2)
+        return torch.stack([n1 - x, n2 - y])
 
-    def force(self, name: int) -> Tensor:
-        """Force (time, column) with the noise eliminated."""
-        u, v = self._coupling[name]
-        return self._force(name) - u * self._pull[0] - v * self._pull[1]
 
-    def noise_step(self, steps: dict[int, Tensor]) -> Tensor:
-        """Step of the noise (2, time, column) that follows from those of the others."""
-        parts = [
-            self._pull[band] - sum(self._response[name][band] * by for name, by in steps.items())
-            for band in (0, 1)
-        ]
-        return torch.stack(parts)
+def _huber(
+    part: Tensor, images: Images, settings: DbvtSettings, band: int, share: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Curvature of a band, beyond the threshold a share of a parabola's, and gradient."""
+    threshold = settings.huber_threshold * images.sigma[band]
+    size = part.abs()
+    parabola = 0.5 * settings.huber / images.deviation[band] / torch.maximum(size, threshold)
+    return torch.where(size <= threshold, parabola, share * parabola), parabola * part
 
 
 def _propose(
     unknowns: Unknowns, search: Search, images: Images, settings: DbvtSettings
 ) -> Unknowns:
     """Unknowns after a Newton step: noise, then smooth signal, then border are eliminated."""
-    emission, reflection = objective.ratios(unknowns.emissivity)
-    smooth = unknowns.smooth
-    system = _System(_terms(unknowns, search.huber_share, images, settings), smooth)
+    system = _System(unknowns, search.huber_share, images, settings)
+    smooth, emission, first = system.smooth, system.emission, system.first
     # The smoothness loss is stiff (1 + k_1^2) |D s|^2 / 2, in the smooth signal s and in k_1.
     stiff = settings.smoothness / (settings.curvature * images.interval**2) ** 2
     bend, square = bending(smooth)
-    sides = [system.curvature(_SMOOTH, name) for name in _BORDER]
+    # y = k_1 ds + dO + s dk_1, z = p_1 dk_2
+    sides = [system.with_y, smooth * system.with_y, first * system.with_z]
     sides[1] = sides[1] + stiff * emission * bend
-    force = system.force(_SMOOTH) - stiff * (1 + emission**2) * bend
+    force = system.force - stiff * (1 + emission**2) * bend
     # (diag(h) + lambda D^T D) [s, S] = [force, sides]
     solved = whittaker(
-        system.curvature(_SMOOTH, _SMOOTH),
+        system.curvature,
         stiff * (1 + emission**2),
         torch.stack([force, *sides], dim=1),
     )
     # Schur complement of the border (offset, k_1, k_2): B - sides^T S, f - sides^T s
-    forces = torch.stack([system.force(name).sum(dim=0) for name in _BORDER])
-    across = torch.stack(sides).transpose(0, 1)
-    forces = forces - (across * solved[:, :1]).sum(dim=0)
+    step, *responses = solved.unbind(dim=1)
+    parts = [system.force_y, smooth * system.force_y, first * system.force_z]
+    forces = torch.stack(
+        [(part - side * step).sum(dim=0) for part, side in zip(parts, sides, strict=True)]
+    )
     forces[1] = forces[1] - stiff * emission * square
-    pairs = combinations_with_replacement(_BORDER, 2)
-    sums = torch.stack([system.curvature(a, b).sum(dim=0) for a, b in pairs])
-    border = sums[_SYMMETRIC] - (across[:, :, None] * solved[:, None, 1:]).sum(dim=0)
+    by_smooth, by_first = smooth * system.yy, first * system.yz
+    pairs = [system.yy, by_smooth, by_first]
+    pairs += [smooth * by_smooth, smooth * by_first, first**2 * system.zz]
+    products = itertools.combinations_with_replacement(range(3), 2)
+    sums = [
+        (pair - sides[one] * responses[other]).sum(dim=0)
+        for pair, (one, other) in zip(pairs, products, strict=True)
+    ]
+    border = torch.stack(sums)[_SYMMETRIC]
     border[1, 1] = border[1, 1] + stiff * square
     damping = search.damping * smooth.shape[0]
     emissivity = _emissivity(unknowns.emissivity, border, forces, damping, settings)
     # Back substitution: the ratios as they became, then the offset, the smooth signal, the noise.
-    new_emission, new_reflection = objective.ratios(emissivity)
-    changes = torch.stack([new_emission - emission, new_reflection - reflection])
+    new_emission, _ = after = objective.ratios(emissivity)
+    changes = torch.stack(after) - torch.stack(objective.ratios(unknowns.emissivity))
     offset = (forces[0] - (border[0, 1:] * changes).sum(dim=0)) / border[0, 0]
     moves = torch.stack([offset, *changes])
-    smooth_step = solved[:, 0] - (solved[:, 1:] * moves).sum(dim=1)
-    steps = dict(zip(_BORDER, moves, strict=True)) | {_SMOOTH: smooth_step}
+    for response, move in zip(responses, moves, strict=True):
+        step = step - response * move
+    second_step = emission * step + offset + smooth * changes[0]
     # The border's offset is that of the line between the smooth signals: back to the first frame.
     line = unknowns.offset - emission * smooth[0] + offset
     return Unknowns(
-        smooth + smooth_step,
-        line + new_emission * (smooth + smooth_step)[0],
+        smooth + step,
+        line + new_emission * (smooth + step)[0],
         emissivity,
-        unknowns.noise + system.noise_step(steps),
+        unknowns.noise + system.noise_step(step, second_step, first * changes[1]),
     )
 
 
