@@ -167,17 +167,26 @@ def test_info_of_stores_and_files(results: Path) -> None:
 def test_raw_files_need_their_form(results: Path) -> None:
     """Raw numbers of a stated form, and lists with a '+', give the same capture."""
     stack = tifffile.imread(results / "a.tif")[:40]
-    (stack.astype(">u2")).tofile(results / "a.raw")
-    np.save(results / "a.npy", stack)
+    for name, part in {"a": stack, "c": stack + 1}.items():
+        part.astype(">u2").tofile(results / f"{name}.raw")
+        np.save(results / f"{name}.npy", part)
     for place in (0, 1):
         tifffile.imwrite(results / f"part{place}.tif", stack[20 * place : 20 * place + 20])
     form = ["--shape", "24", "32", "--byte-order", "big", "--offset", "0", *STATED]
-    done(results, "import", "a.raw", "a.raw", *form, "-o", "numbers.zarr")
-    parts = ["part0.tif", "part1.tif", "+", "a.npy"]
+    done(results, "import", "a.raw", "c.raw", *form, "-o", "numbers.zarr")
+    parts = ["part0.tif", "part1.tif", "+", "c.npy"]
     done(results, "import", *parts, "--offset", "0", *STATED, "-o", "parts.zarr")
     for name in ("numbers", "parts"):
         counts = store.open_dataset(results / f"{name}.zarr")["counts"]
-        np.testing.assert_array_equal(counts.values, [stack, stack])
+        np.testing.assert_array_equal(counts.values, [stack, stack + 1])
+    line = refused(results, "import", "a.raw", "a.raw", *form, "-o", "x.zarr")
+    assert "Same counts in both recordings" in line
+    for name in "ac":
+        np.save(results / f"short_{name}.npy", np.load(results / f"{name}.npy")[:5])
+    names = ["import", "short_a.npy", "short_c.npy", "--offset", "0", *STATED, "-o", "short.zarr"]
+    found = run(results, *names)
+    assert found.returncode == 0, found.stderr
+    assert "Warning: The capture has 5 frames. Must be at least 32" in found.stderr
     line = refused(results, "import", "a.raw", "b.tif", *form[:3], *STATED, "-o", "x.zarr")
     assert "Invalid byte_order" in line
 

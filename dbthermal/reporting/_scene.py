@@ -113,8 +113,10 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     result = view.data
     for name, one in regions.items():
         if not isinstance(one, Region):
-            rule = 'Must be an explorer.Region, such as Region("rectangle", ((10, 5), (40, 30)))'
-            raise TypeError(f"Invalid region {name!r}, {one!r}. {rule} of corners (row, column).")
+            raise TypeError(
+                f"Invalid region {name!r}, {one!r}. Must be an explorer.Region, such as "
+                'Region("rectangle", ((10, 5), (40, 30))) of corners (row, column).'
+            )
     chosen = dict(regions) or {
         "measured pixels of the whole image": Region(
             "rectangle", ((0, 0), (view.shape[0], view.shape[1]))
