@@ -295,8 +295,7 @@ def _reason(error: Exception, command: str) -> str:
     extra = _EXTRAS.get(str(error.name).split(".")[0]) if isinstance(error, ImportError) else None
     if isinstance(error, ImportError) and extra:
         extra = command if command == "report" else extra  # which has all that it needs
-        rule = f"Must be installed: python -m pip install 'dbthermal[{extra}]'"
-        return f"Missing library '{error.name}', of the extra '{extra}'. {rule}."
+        return str(import_module("dbthermal._text").missing_library(error.name, extra))
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
     if isinstance(error, OSError | ValueError | TypeError | KeyError | ImportError | RuntimeError):
         return message

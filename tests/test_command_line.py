@@ -351,6 +351,30 @@ def test_missing_extras_are_named(
     assert f"pip install 'dbthermal[{extra}]'" in line
 
 
+def test_compiling_is_noticed_once(tmp_path: Path) -> None:
+    """What is compiled anew, however much, is one line on the standard error."""
+    code = """if True:
+    from dbthermal._cli import compiling
+    from numba import njit
+    compiling.tell()
+    for power in (1, 2):
+        assert njit(lambda x: x**power)(3) == 3**power
+    """
+    found = run(tmp_path, "data", before=f"exec({code!r}); ")
+    told, took = found.stderr.splitlines()
+    assert told == "Compiling the separation, once after an installation: about a minute."
+    assert took.startswith("data: ")
+
+
+def test_the_explorer_says_what_it_lacks(tmp_path: Path) -> None:
+    """Without the explorer's extra, its notebook comes with the command that installs it."""
+    (tmp_path / "a.zarr").mkdir()
+    command = ["explore", "a.zarr", "--overwrite", "-o", "a.ipynb"]
+    for missing in ("anywidget", "jupyterlab"):
+        found = run(tmp_path, *command, before=f"sys.modules['{missing}'] = None; ")
+        assert "opened by: python -m pip install 'dbthermal[explorer]' jupyter" in found.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [

@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,10 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4}
     with store.whole(options.output, ".ipynb") as part:
         part.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
-    return {str(options.output): f"opened by: jupyter lab {options.output}"}
+    before = ""
+    if any(find_spec(one) is None for one in ("anywidget", "jupyterlab")):
+        before = "python -m pip install 'dbthermal[explorer]' jupyterlab; "
+    return {str(options.output): f"opened by: {before}jupyter lab {options.output}"}
 
 
 _PICTURES = (".png", ".pdf", ".svg")

@@ -116,6 +116,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
         options.register = options.register or "homography"
     _refuse_unused(options)
     source, response, *fitted = staged(options, **stages)
+    _tell_of_compiling()
     response.load()
     known, shown = _known(options), sys.stderr.isatty()
     if options.correction:
@@ -167,6 +168,13 @@ def _refuse_unused(options: argparse.Namespace) -> None:
             raise ValueError(f"Unused option --{name}. Must be left out {why}.")
 
 
+def _tell_of_compiling() -> None:
+    """Notice from now on that the separation is compiled."""
+    from dbthermal._cli import compiling  # noqa: PLC0415 - takes long
+
+    compiling.tell()
+
+
 def _known(options: argparse.Namespace) -> dict[str, Any]:
     """Options of the completion, and the number of threads."""
     return {name: getattr(options, name) for name in ("surroundings", "prior", "workers")}
@@ -176,6 +184,7 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
     result, source, response = (one.load() for one in staged(options, **stages))
+    _tell_of_compiling()
     completed = separation.complete(
         result, source, response, result.get("material"), **_known(options)
     )

@@ -13,12 +13,13 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from dbthermal import store
+from dbthermal._text import missing_library
 
 try:
     from jinja2 import Environment, select_autoescape
     from markupsafe import Markup
 except ImportError as error:
-    raise ImportError("A report needs Jinja2: pip install dbthermal[report]") from error
+    raise ImportError(missing_library(error.name, "report")) from error
 
 
 @dataclass(frozen=True)

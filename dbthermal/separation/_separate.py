@@ -111,9 +111,11 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         alone = one(reflection_shift=reflection_shift)
     result, pooled = alone, None
     if materials is None and find_spec("skimage") is not None:
-        pooled = pooling.regions(pooling.materials(alone, corrected, response), alone)
+        regions = pooling.others(pooling.regions(alone, corrected, response), alone)
+        pooled = pooling.without_borders(regions, alone, response)
         result = one(pool=pooled, reflection_shift=reflection_shift)
-        materials = pooling.joined(pooled, result)
+        joined = pooling.joined(regions, result, response)
+        materials = pooling.without_borders(joined, alone, response)
     if materials is not None and (pooled is None or not materials.equals(pooled)):
         result = one(pool=materials, reflection_shift=reflection_shift)
     result = complete(

@@ -12,7 +12,7 @@ from scipy import ndimage
 from dbthermal import _smooth as smooth
 from dbthermal import separation, simulation
 from dbthermal.separation._pooling import feature_maps, region_merging
-from dbthermal.separation._pooling.materials import NONE, materials, step
+from dbthermal.separation._pooling.materials import NONE, materials, regions, step, without_borders
 from dbthermal.separation._pooling.region_merging import Features, Regions
 from dbthermal.simulation import Rig
 
@@ -283,8 +283,8 @@ def test_step_counts_in_standard_deviations() -> None:
 @settings(max_examples=15)
 @given(seed=st.integers(0, 10_000), name=st.sampled_from(list(SHAPES)))
 def test_labels_are_connected_and_ordered(seed: int, name: str) -> None:
-    """Labels are ordered by size, and each is one connected region."""
-    labels = materials(*drawn(scene_of(where(name, (24, 40)), seed, frames=64), seed)).values
+    """Regions are ordered by size, and each is connected."""
+    labels = regions(*drawn(scene_of(where(name, (24, 40)), seed, frames=64), seed)).values
     sizes = np.bincount(labels[labels != NONE], minlength=1)
     assert np.all(np.diff(sizes) <= 0)
     for label in np.unique(labels[labels != NONE]):
@@ -365,3 +365,26 @@ def test_bad_input_is_a_clear_error(small: Inputs, what: str) -> None:
     call, message = BAD[what]
     with pytest.raises(ValueError, match=message):
         call(small)
+
+
+@pytest.mark.parametrize("surer", [1.0, 0.1])
+def test_a_pixel_beside_another_material_stays_only_if_its_ratio_tells(
+    small: Inputs, surer: float
+) -> None:
+    """Of labels whose border is off by a column, that column goes; what is told apart stays."""
+    result, _, response = small
+    true = where("side by side", SMALL)
+    ratio, std = ratio_of(scene_of(true, 2, frames=120))
+    error = surer * std * np.random.default_rng(5).standard_normal(std.shape)
+    labels = np.roll(true, 1, axis=1)
+    labels[:, 0] = False
+    drawn_again = with_ratio(result, ratio + error, surer * std)
+    kept = without_borders(xr.DataArray(labels * 1, dims=("y", "x")), drawn_again, response).values
+    wrong, column = kept[labels != true], np.flatnonzero(np.any(labels != true, axis=0))[0]
+    beside = kept[:, [column - 1, column + 1]]
+    shares = [float(np.mean(part >= 0)) for part in (wrong, beside)]
+    print(f"labelled: {shares[0]:.1%} of the wrong column, {shares[1]:.1%} of those beside it")
+    assert shares[0] < 0.02
+    assert (shares[1] > 0.8) == (surer < 1.0)
+    far = np.abs(np.arange(SMALL[1]) - column) > 1
+    np.testing.assert_array_equal(kept[:, far], labels[:, far])

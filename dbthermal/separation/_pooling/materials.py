@@ -16,6 +16,7 @@ pooling is a bias that no deviation covers, while a body in two parts costs a li
 """
 
 from dataclasses import replace
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -51,6 +52,8 @@ _TOLERANCE: Final = 0.0025
 _VAGUE: Final = 0.3
 # Fewest pixels of a material: remainders at a border, which stand out by their errors, have fewer.
 _SMALLEST: Final = 16
+# Square of the deviations by which a ratio tells two materials apart.
+_TELLING: Final = 9.0
 _NEEDED: Final = tuple(
     name + ending
     for name in ("reflection_ratio", "emissivity", "background_temperature")
@@ -89,9 +92,10 @@ def materials(
     Returns
     -------
     DataArray
-        `material` (y, x), int32: connected regions from 0, the largest first; -1 for pixels without
-        a signal, for regions in which no pixel has a ratio and that no neighbour takes in, and for
-        regions of less than 16 pixels.
+        `material` (y, x), int32: connected regions from 0, the largest first, less what at their
+        borders may be of the neighbour; -1 for that, for pixels without a signal, for regions in
+        which no pixel has a ratio and that no neighbour takes in, and for those of less than 16
+        pixels.
 
     Raises
     ------
@@ -107,8 +111,9 @@ def materials(
     background's slow part), so its mean is taken to be no surer than that of one pixel. The
     deviations of the ratios of several bands are taken as independent.
 
-    Borders are found within 2 pixels, single pixels apart. A few pixels at a border may belong to
-    no material, and those where nothing moved and the object hardly changed.
+    Borders are found within 2 pixels. A pixel beside another material stays with its own if its own
+    ratio tells the two apart, by three standard deviations; else, and where nothing moved and the
+    object hardly changed, it belongs to none.
 
     Examples
     --------
@@ -126,17 +131,26 @@ def materials(
     0
     >>> pooled = separation.solve(capture, response, pool=labels)
     """
+    found = regions(result, corrected, response, error_rate=error_rate, resolution=resolution)
+    return without_borders(found, result, response)
+
+
+def regions(
+    result: xr.Dataset,
+    corrected: xr.Dataset,
+    response: xr.Dataset,
+    *,
+    error_rate: float = 0.01,
+    resolution: float = 0.1,
+) -> xr.DataArray:
+    """Regions (y, x) of `materials`, with all that lies at their borders."""
     result = _checked(result, corrected, error_rate, resolution)
     if "segment" in corrected:  # means across a shutter event would show the pattern's step
         segments, counts = np.unique(corrected["segment"], return_counts=True)
         frames = corrected["segment"].values == segments[np.argmax(counts)]
         corrected, result = corrected.isel(time=frames), result.isel(time=frames)
-    # Bands from the quietest, which is the reference.
-    names = [str(name) for name in result["band"].values]
-    slopes = np.array([responses.curve(response, name).reference_slope for name in names])
-    noise = result["noise"].values / slopes  # [K]
-    bands = [int(band) for band in np.argsort(noise, kind="stable")]
-    means, variances = feature_maps.mean_signals(corrected, response, bands, noise[bands])
+    bands, noise = _bands(result, response)
+    means, variances = feature_maps.mean_signals(corrected, response, bands, noise)
     change = feature_maps.signal_change(corrected, response, bands[0])
     reflected, reflected_variance = feature_maps.reflected_difference(result, bands)
     ratios, features = _features(result, bands)
@@ -156,7 +170,33 @@ def materials(
     return _labelled(cells, regions, result)
 
 
-def regions(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
+def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Dataset) -> xr.DataArray:
+    """Labels (y, x) less the pixels beside another one that may as well be of that, or of both.
+
+    Lenses and resampling mix what meets at a border, and the maps show it within a pixel or two. A
+    pixel stays if its own ratio is its region's, and no neighbour's, by three deviations.
+    """
+    ratios, _ = _features(result, _bands(result, response)[0])
+    cells = np.asarray(labels.values + 1, dtype=np.intp)
+    every = np.arange(cells.max() + 1)[np.newaxis]
+    means, variances, known = (part[:, 0] for part in Regions(cells, ratios, 0.01).pooled(every))
+
+    def distance(others: Labels) -> Array:
+        """Squares of deviations (y, x) by which the own ratios differ from those of cells."""
+        total = ratios.variances + variances[:, others]
+        square = np.sum((ratios.values - means[:, others]) ** 2 / total, axis=0)
+        return np.where(np.all(known[:, others], axis=0), square, np.nan)
+
+    own, stays, around = distance(cells), np.ones(cells.shape, dtype=bool), np.pad(cells, 1)
+    height, width = cells.shape
+    for y, x in product(range(3), repeat=2):
+        other = around[y : y + height, x : x + width]
+        apart = (distance(other) > own + _TELLING) | ~known[0, other]
+        stays &= (other == cells) | (other == 0) | ((own < _TELLING) & apart)
+    return labels.where(stays, NONE)
+
+
+def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
     """Materials (y, x), and connected pixels of none of them as further labels."""
     free = (labels.values < 0) & ((result["status"].values & int(_UNUSABLE)) == 0)
     others = feature_maps.connected(free.astype(np.intp)) * free
@@ -166,16 +206,16 @@ def regions(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
     return labels.copy(data=np.where(numbers > 0, labels.values.max() + numbers, labels))
 
 
-def joined(labels: xr.DataArray, pooled: xr.Dataset, *, resolution: float = 0.1) -> xr.DataArray:
+def joined(
+    labels: xr.DataArray, pooled: xr.Dataset, response: xr.Dataset, *, resolution: float = 0.1
+) -> xr.DataArray:
     """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
 
     A material is cut where ratios of single pixels are biased by what their order leaves of the
     object; pooled ratios are not.
     """
-    bands = [str(name) for name in pooled["band"].values]
-    reference = bands.index(pooled.attrs["reference_band"])
     cells = np.asarray(labels.values + 1, dtype=np.intp)
-    _, features = _features(pooled, [reference, *np.delete(np.arange(len(bands)), reference)])
+    _, features = _features(pooled, _bands(pooled, response)[0])
     found = Regions(cells, replace(features, common=np.ones_like(features.common)), 0.01)
     found.join_alike(region_merging.neighbours(cells), resolution)
     return _labelled(cells, found, pooled)
@@ -200,6 +240,15 @@ def _checked(
             "reflection ratio. Must be of one that does, as 'subspace'."
         )
     return laid_on(result, corrected, "the result", "the capture")
+
+
+def _bands(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
+    """Numbers of the bands from the quietest, which is the reference, and their noise [K]."""
+    names = [str(name) for name in result["band"].values]
+    slopes = [responses.curve(response, name).reference_slope for name in names]
+    noise = result["noise"].values / slopes
+    bands = [int(band) for band in np.argsort(noise, kind="stable")]
+    return bands, noise[bands]
 
 
 def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:

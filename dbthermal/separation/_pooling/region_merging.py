@@ -103,7 +103,7 @@ class Regions:
         The statistic is 0 where no feature can be compared. The resolution is the relative
         difference of the first feature that would reach the limit, infinite where it is unknown.
         """
-        mean, variance, known = self._pooled(np.stack([first, second]))  # (feature, 2, pair)
+        mean, variance, known = self.pooled(np.stack([first, second]))  # (feature, 2, pair)
         both = np.all(known, axis=1)
         # var(f_a - f_b) = var(f_a) + var(f_b) + (epsilon f)^2
         total = variance.sum(axis=1) + (self._tolerance * mean.mean(axis=1)) ** 2
@@ -145,8 +145,8 @@ class Regions:
             if first != second and self._compare_one(first, second)[0] <= 1.0:
                 self._merge(first, second)
 
-    def _pooled(self, regions: Labels) -> tuple[Array, Array, Mask]:
-        """Means, their variances, and valid ones: (feature, *shape of regions)."""
+    def pooled(self, regions: Labels) -> tuple[Array, Array, Mask]:
+        """Means of regions, by their roots, variances, and valid ones: (feature, *shape)."""
         # mean = sum w f / sum w,  var = 1 / sum w, times the pixels for an error that all share
         total = self._total[:, regions]
         known = total > 0
